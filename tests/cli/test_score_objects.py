@@ -233,3 +233,33 @@ def test_tracking_needs_scenes_and_times(
     assert capsys.readouterr().err.startswith(
         f"foredrive: {wrong}: frame a1 has no scene_token and timestamp"
     )
+
+
+def test_folders_of_kitti(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Two cars of one frame: one found 0.3 m off, the other 3 m. Tracks are those of the image boxes."""
+    boxes = {"truth": (20.0, 30.0), "found": (20.3, 33.0)}
+    for name, depths in boxes.items():
+        for task, start in (("detection", ""), ("tracking", "0 {n} ")):
+            folder = tmp_path / task / name
+            folder.mkdir(parents=True)
+            lines = [
+                start.format(n=n) + f"Car 0 0 0 {100 * n} 100 {100 * n + 50} 150 1.5 1.6 4 0 1.6 {depth} 0"
+                for n, depth in enumerate(depths)
+            ]
+            end = " 0.9" if name == "found" else ""
+            (folder / "000000.txt").write_text("".join(f"{line}{end}\n" for line in lines))
+    figures: dict[str, Any] = {}
+    for task in ("detection", "tracking"):
+        out = tmp_path / "out"
+        folders = [str(tmp_path / task / name) for name in ("found", "truth")]
+        assert main(["score", folders[0], "--truth", folders[1], "--task", task, "--out", str(out)]) == 0
+        figures |= json.loads((out / "summary.json").read_text())
+    assert figures["detection.kitti.car.ap_4m"] == pytest.approx(1.0)
+    assert figures["detection.kitti.car.ap_0.5m"] < 0.5
+    assert figures["tracking.kitti.car.hota"] == pytest.approx(1.0)
+    assert "detection.kitti.ave_mps" not in figures
+    wrong = tmp_path / "detection" / "found" / "000000.txt"
+    wrong.write_text("Car 0 0 0 0 100 50 150 1.5 1.6 4 0 1.6 20 0 7\n")
+    folders = [str(wrong.parent), "--truth", str(tmp_path / "detection" / "truth")]
+    assert main(["score", *folders, "--task", "detection", "--out", str(tmp_path / "out")]) == 2
+    assert capsys.readouterr().err == f"foredrive: {wrong}: line 1 has a score outside [0, 1]\n"

@@ -29,8 +29,9 @@ def score(
     Args:
         results: For sets: nuScenes or COCO results (JSON), or a folder of KITTI's text files; docs/sets.md
             describes how such files state their uncertainty. For detection, tracking and motion: nuScenes
-            results (JSON), for motion with futures. For map: JSON of MapTR, or of StreamMapNet's family. For
-            occupancy: a folder of npz files as Occ3D or OpenOcc define them.
+            results (JSON), for motion with futures; for detection and tracking also a folder of KITTI's text
+            files. For map: JSON of MapTR, or of StreamMapNet's family. For occupancy: a folder of npz files
+            as Occ3D or OpenOcc define them.
         truth: The ground truth in the same format; for COCO its instances. For detection and tracking also a
             folder of nuScenes' tables (v1.0-*), or of 123D logs.
         task: sets: detections as a random finite set. The others are scored under all published protocols of

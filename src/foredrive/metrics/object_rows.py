@@ -47,7 +47,7 @@ class ObjectRows:
     def __len__(self) -> int:
         return len(self.frame)
 
-    def __getitem__(self: R, which: Shaped[ndarray, "_"]) -> R:
+    def __getitem__(self: R, which: Shaped[ndarray, "_"] | slice) -> R:
         columns = {field.name: getattr(self, field.name)[which] for field in dataclasses.fields(self)}
         return dataclasses.replace(self, **columns)
 

@@ -39,8 +39,22 @@ _TRACKING = {
 }
 
 
+_KITTI_TRACKING = {
+    "hota": Column("HOTA"),
+    "det_a": Column("DetA"),
+    "ass_a": Column("AssA"),
+    "loc_a": Column("LocA"),
+    "mota": Column("MOTA"),
+    "motp_overlap": Column("MOTP"),
+    **{key: _TRACKING[key] for key in ("recall", "ids", "frag", "mt", "ml", "fp", "fn")},
+}
+
+
 def detection_tables(figures: Summary) -> list[Table]:
     """Return the figures of each protocol, and those of each class under nuScenes' own."""
+    if figures.get("data_set") == "kitti":
+        columns = {key: c for key, c in _DETECTION_CLASS.items() if key not in ("ave_mps", "aae")}
+        return [_kitti_table(figures, "detection", columns)]
     protocols = {name: protocol.title for name, protocol in DETECTION_PROTOCOLS.items()}
     classes = DETECTION_PROTOCOLS["nuscenes"].classes
     notes = _notes(figures)
@@ -52,6 +66,8 @@ def detection_tables(figures: Summary) -> list[Table]:
 
 def tracking_tables(figures: Summary) -> list[Table]:
     """Return the figures of each protocol, and those of each class under nuScenes' own."""
+    if figures.get("data_set") == "kitti":
+        return [_kitti_table(figures, "tracking", _KITTI_TRACKING)]
     protocols = {name: protocol.title for name, protocol in TRACKING_PROTOCOLS.items()}
     classes = TRACKING_PROTOCOLS["nuscenes"].classes
     return [
@@ -84,6 +100,16 @@ def _class_table(figures: Summary, task: str, classes: tuple[str, ...], columns:
         if any(key.startswith(f"{prefix}.{name}.") for key in figures)
     ]
     return simple_table([Column(align="left"), *columns.values()], rows, "Classes, nuScenes")
+
+
+def _kitti_table(figures: Summary, task: str, columns: dict[str, Column]) -> Table:
+    parts = [key.split(".") for key in figures if key.startswith(f"{task}.kitti.")]
+    classes = dict.fromkeys(part[2] for part in parts if len(part) > 3)
+    rows = [
+        (words(name), *(figures.get(f"{task}.kitti.{name}.{figure}") for figure in columns))
+        for name in classes
+    ]
+    return simple_table([Column(align="left"), *columns.values()], rows, f"{task.title()}, KITTI")
 
 
 def _notes(figures: Summary) -> list[str]:

@@ -31,7 +31,7 @@ LOWER = np.array([0.0, -60.0, -10.0, -3.0, -3.0, -3.0])
 UPPER = np.array([120.0, 60.0, 10.0, 4.0, 4.0, 4.0])
 
 
-class _Line(NamedTuple):
+class KittiLine(NamedTuple):
     """One line of a file, without its type's name in the numbers."""
 
     name: str
@@ -46,24 +46,14 @@ def read_kitti(folder: Path, truth: Path, family: Family) -> DetectionSet:
     Raises:
         InputError: a file or a line is wrong. The message names the first.
     """
-    true_paths, paths = sorted(truth.glob("*.txt")), {path.name for path in folder.glob("*.txt")}
-    if not true_paths:
-        raise InputError(f"{truth}: holds no text files")
-    unknown = sorted(paths - {path.name for path in true_paths})
-    if unknown:
-        raise InputError(f"{folder / unknown[0]}: there is no such frame in {truth}")
-    true = {path.name: _lines(path, 15) for path in true_paths}
-    found = {name: _lines(folder / name, 16) if name in paths else [] for name in true}
-    classes, true_classes = order_classes(
-        *({line.kind for lines in each.values() for line in lines} for each in (true, found))
-    )
+    true, found, classes, true_classes = read_frames(folder, truth)
     counts = {
-        "frames_without_detections": len(set(true) - paths),
+        "frames_without_detections": sum(not (folder / name).exists() for name in true),
         "boxes_without_covariance": sum(len(lines) for lines in found.values()),
     }
     frames = []
     for name, lines in true.items():
-        true_state, true_yaw = _states(lines)
+        true_state, true_yaw = box_states(lines)
         labels = [classes.index(line.kind) for line in lines]
         frames.append(
             DetectionFrame(
@@ -79,8 +69,30 @@ def read_kitti(folder: Path, truth: Path, family: Family) -> DetectionSet:
     return DetectionSet(frames, classes, True, counts, true_classes)
 
 
-def _detections(lines: Sequence[_Line], classes: Sequence[str], family: Family) -> MultiBernoulli:
-    state, yaw = _states(lines)
+def read_frames(
+    folder: Path, truth: Path
+) -> tuple[dict[str, list[KittiLine]], dict[str, list[KittiLine]], list[str], int]:
+    """Return true and found lines by file, the classes (see `order_classes`), and how many the truth has.
+
+    Raises:
+        InputError: a file or a line is wrong. The message names the first.
+    """
+    true_paths, paths = sorted(truth.glob("*.txt")), {path.name for path in folder.glob("*.txt")}
+    if not true_paths:
+        raise InputError(f"{truth}: holds no text files")
+    unknown = sorted(paths - {path.name for path in true_paths})
+    if unknown:
+        raise InputError(f"{folder / unknown[0]}: there is no such frame in {truth}")
+    true = {path.name: _lines(path, 15) for path in true_paths}
+    found = {name: _lines(folder / name, 16) if name in paths else [] for name in true}
+    classes, true_classes = order_classes(
+        *({line.kind for lines in each.values() for line in lines} for each in (true, found))
+    )
+    return true, found, classes, true_classes
+
+
+def _detections(lines: Sequence[KittiLine], classes: Sequence[str], family: Family) -> MultiBernoulli:
+    state, yaw = box_states(lines)
     return make_detections(
         [line.name for line in lines],
         np.array([line.values[14] for line in lines]),
@@ -93,7 +105,7 @@ def _detections(lines: Sequence[_Line], classes: Sequence[str], family: Family) 
     )
 
 
-def _lines(path: Path, fields: int) -> list[_Line]:
+def _lines(path: Path, fields: int) -> list[KittiLine]:
     """Return the lines that are not `DontCare`."""
     try:
         text = path.read_text()
@@ -114,11 +126,11 @@ def _lines(path: Path, fields: int) -> list[_Line]:
             raise InputError(f"{name} has a number that is not finite, or beyond {MAX_NUMBER:g}")
         if not (values[7:10] > 0).all():
             raise InputError(f"{name} has a box without size")
-        lines.append(_Line(name, words[0], values))
+        lines.append(KittiLine(name, words[0], values))
     return lines
 
 
-def _states(lines: Sequence[_Line]) -> tuple[Float[ndarray, "n 6"], Float[ndarray, "n"]]:
+def box_states(lines: Sequence[KittiLine]) -> tuple[Float[ndarray, "n 6"], Float[ndarray, "n"]]:
     """Return centre and log length, width, height; and heading."""
     values = np.array([line.values[:14] for line in lines]).reshape(-1, 14)
     height, width, length, x, y, z, rotation = values[:, 7:14].T

@@ -4,6 +4,7 @@ Source: Luiten et al., "HOTA: A Higher Order Metric for Evaluating Multi-Object 
 matching and its order are those of trackeval 1.3.0 (metrics/hota.py).
 """
 
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -111,7 +112,7 @@ def _match(true: TrackRows, similar: Candidates, score: Float[ndarray, "P"]) -> 
     matched = np.full(len(score), -1)
     frame = true.frame[similar.true_row]
     starts = np.flatnonzero(np.diff(frame, prepend=-1))
-    for start, stop in zip(starts, [*starts[1:], len(frame)], strict=True):
+    for start, stop in itertools.pairwise([*starts, len(frame)]):
         rows, row = np.unique(similar.true_row[start:stop], return_inverse=True)
         columns, column = np.unique(similar.found_row[start:stop], return_inverse=True)
         table, place = np.zeros((len(rows), len(columns))), np.full((len(rows), len(columns)), -1)

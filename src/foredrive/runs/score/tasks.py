@@ -10,6 +10,8 @@ from foredrive.errors import InputError
 from foredrive.evaluation.maps.files import read_maps
 from foredrive.evaluation.maps.score import score_map_files
 from foredrive.evaluation.motion.score import score_motion_results
+from foredrive.evaluation.objects.kitti_boxes import score_kitti_boxes
+from foredrive.evaluation.objects.kitti_tracks import score_kitti_tracks
 from foredrive.evaluation.objects.score import read_objects, score_detections, score_tracks
 from foredrive.evaluation.provenance import collect_provenance, peak_rss_gib
 from foredrive.evaluation.summary import Figures, write_summary
@@ -41,12 +43,16 @@ def score_motion(results: Path, truth: Path, poses: Path | None) -> Figures:
 def score_detection(results: Path, truth: Path, poses: Path | None) -> Figures:
     """Return the figures of detections, see `evaluation.objects`."""
     _check_no_poses("detection", poses)
+    if results.is_dir():
+        return score_kitti_boxes(results, truth)
     return score_detections(*read_objects(results, truth, "detection"))
 
 
 def score_tracking(results: Path, truth: Path, poses: Path | None) -> Figures:
     """Return the figures of tracks, see `evaluation.objects`."""
     _check_no_poses("tracking", poses)
+    if results.is_dir():
+        return score_kitti_tracks(results, truth)
     return score_tracks(*read_objects(results, truth, "tracking"))
 
 

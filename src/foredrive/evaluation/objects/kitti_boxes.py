@@ -1,0 +1,71 @@
+"""Detections in KITTI's text format as rows, for average precision and errors by distance.
+
+KITTI's own average precision is by overlap; this is nuScenes' matching, without ranges, on KITTI's classes.
+"""
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+
+from foredrive.errors import InputError
+from foredrive.evaluation.detections.kitti_labels import KittiLine, box_states, read_frames
+from foredrive.evaluation.summary import Figures
+from foredrive.metrics.detection_protocols import DETECTION_PROTOCOLS, evaluate_detections
+from foredrive.metrics.object_rows import ObjectRows, Region, make_rows
+
+_UNKNOWN = frozenset({"ave_mps", "aae"})
+"""Errors of what KITTI's text does not tell."""
+
+
+def score_kitti_boxes(folder: Path, truth: Path) -> Figures:
+    """Return average precision at each distance and the errors that KITTI's text allows, by class.
+
+    Raises:
+        InputError: a file or a line is wrong. The message names the first.
+    """
+    true, found, classes, true_classes = read_frames(folder, truth)
+    protocol = dataclasses.replace(
+        DETECTION_PROTOCOLS["nuscenes"],
+        title="KITTI, by distance",
+        classes=tuple(classes[:true_classes]),
+        region=Region("circle", {}),
+        without=dict.fromkeys(classes, _UNKNOWN),
+    )
+    found_rows = _rows(list(found.values()), protocol.classes, scored=True)
+    true_rows = _rows(list(true.values()), protocol.classes, scored=False)
+    scored = evaluate_detections(found_rows, true_rows, true_rows[:0], protocol)
+    figures: Figures = {
+        "data_set": "kitti",
+        "frames_counted": len(true),
+        "objects": len(true_rows),
+        "found": len(found_rows),
+        "detection.kitti.map": scored.mean_ap,
+        **{f"detection.kitti.{key}": scored.errors[key] for key in scored.errors if key not in _UNKNOWN},
+    }
+    for name, of_class in scored.by_class.items():
+        label = name.lower()
+        figures[f"detection.kitti.{label}.ap"] = float(np.mean([*of_class.ap.values()]))
+        figures |= {f"detection.kitti.{label}.ap_{at:g}m": ap for at, ap in of_class.ap.items()}
+        known = {key: error for key, error in of_class.errors.items() if key not in _UNKNOWN}
+        figures |= {f"detection.kitti.{label}.{key}": error for key, error in known.items()}
+    return figures
+
+
+def _rows(frames: list[list[KittiLine]], classes: tuple[str, ...], *, scored: bool) -> ObjectRows:
+    lines = [line for each in frames for line in each]
+    state, yaw = box_states(lines)
+    frame = np.repeat(np.arange(len(frames)), [len(each) for each in frames])
+    label_of = {name: n for n, name in enumerate(classes)}
+    score = np.array([line.values[14] if scored else np.nan for line in lines]).reshape(-1)
+    wrong = np.flatnonzero((score < 0) | (score > 1))
+    if len(wrong):
+        raise InputError(f"{lines[wrong[0]].name} has a score outside [0, 1]")
+    return make_rows(
+        frame,
+        np.array([label_of.get(line.kind, -1) for line in lines], dtype=np.int64),
+        state[:, :3],
+        np.exp(state[:, 3:]),
+        yaw,
+        score=score.astype(np.float64),
+    )
