@@ -7,9 +7,9 @@ from typing import Any
 import pytest
 from oracles.compare import check_clear, check_detection, check_hota, check_tracking
 from oracles.make_golden import GOLDEN, REGIONS, SEEDS
-from oracles.synthetic import make_drives
 from oracles.track_sequences import make_sequence
 
+from benchmarks.common.object_drives import make_drives
 from foredrive.metrics.tracking.protocols import TRACKING_PROTOCOLS
 
 

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from oracles.synthetic import Drives, detection_boxes, tracking_boxes, truth_file
 from oracles.track_sequences import LEAST_SIMILARITY, Sequence, as_rows
 
+from benchmarks.common.object_drives import Drives, detection_boxes, tracking_boxes, truth_file
 from foredrive.evaluation.objects.nuscenes_json import read_json_truth, read_results
 from foredrive.metrics.detection_protocols import DETECTION_PROTOCOLS, evaluate_detections
 from foredrive.metrics.tracking.clear import Candidates, clear_mot

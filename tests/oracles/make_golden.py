@@ -5,10 +5,10 @@ import warnings
 from pathlib import Path
 from typing import Any
 
-from oracles import devkit
-from oracles.synthetic import make_drives
 from oracles.track_sequences import clear_by_motmetrics, hota_by_trackeval, make_sequence
 
+from benchmarks.common import nuscenes_devkit as devkit
+from benchmarks.common.object_drives import make_drives
 from foredrive.metrics.tracking.protocols import TRACKING_PROTOCOLS
 
 GOLDEN = Path(__file__).with_name("golden.json")

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from oracles.compare import check_clear, check_detection, check_hota, check_tracking
 from oracles.make_golden import REGIONS
-from oracles.synthetic import Size, make_drives
 from oracles.track_sequences import clear_by_motmetrics, hota_by_trackeval, make_sequence
 
+from benchmarks.common.object_drives import Size, make_drives
 from foredrive.evaluation.objects.kitti_tracks import score_kitti_tracks
 from foredrive.metrics.tracking.protocols import TRACKING_PROTOCOLS
 
@@ -24,7 +24,7 @@ DENSE = Size(scenes=2, frames=10, objects=60, false=30, reach_m=25.0)
 @pytest.mark.parametrize("name", list(REGIONS))
 def test_detection(seed: int, name: str, tmp_path: Path) -> None:
     pytest.importorskip("nuscenes.eval.detection.evaluate", exc_type=ImportError)
-    from oracles import devkit
+    from benchmarks.common import nuscenes_devkit as devkit
 
     drives = make_drives(seed, DENSE, ties=seed % 2 == 0)
     check_detection(drives, name, devkit.detection(drives, REGIONS[name]), tmp_path)
@@ -35,7 +35,7 @@ def test_detection(seed: int, name: str, tmp_path: Path) -> None:
 def test_tracking(seed: int, name: str, tmp_path: Path) -> None:
     pytest.importorskip("motmetrics", exc_type=ImportError)
     pytest.importorskip("nuscenes.eval.tracking.evaluate", exc_type=ImportError)
-    from oracles import devkit
+    from benchmarks.common import nuscenes_devkit as devkit
 
     drives = make_drives(seed, DENSE, ties=seed % 2 == 0)
     expected = devkit.tracking(drives, TRACKING_PROTOCOLS[name].min_score)

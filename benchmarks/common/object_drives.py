@@ -10,6 +10,8 @@ from foredrive.metrics.detection_protocols import CLASSES
 from foredrive.scene.boxes import Attribute
 
 Box = dict[str, Any]
+SHARES = np.array([493, 88, 16, 25, 15, 220, 13, 12, 98, 152]) / 1132
+"""Shares of the annotations of nuScenes' training and validation logs, by class (www.nuscenes.org)."""
 ATTRIBUTES = sorted(each.label for each in Attribute)
 RACK = "static_object.bicycle_rack"
 
@@ -37,6 +39,10 @@ class Size:
     """Number of objects of a scene."""
     false: int = 10
     """Largest number of false boxes of a frame."""
+    false_frames: int = 1000
+    """Frames in which a false track keeps its identity."""
+    shares: bool = False
+    """Whether classes are as frequent as in nuScenes (`SHARES`), or all alike."""
     reach_m: float = 60.0
     """Objects are at most this far from the start, along each axis."""
 
@@ -60,7 +66,8 @@ def make_drives(seed: int, size: Size = Size(), *, ties: bool = True) -> Drives:
 def _add_scene(drives: Drives, scene: int, size: Size, rng: np.random.Generator) -> None:
     n, reach = size.objects, size.reach_m
     start = np.array([*rng.uniform(200, 1500, 2), 0.0])
-    names = [str(name) for name in rng.choice(CLASSES, n)]
+    shares = SHARES if size.shares else None
+    names = [str(name) for name in rng.choice(CLASSES, n, p=shares)]
     place = start + np.c_[rng.uniform(-reach, reach, (n, 2)), rng.normal(1, 0.3, n)]
     speed, lwh = rng.normal(0, 4, (n, 2)), rng.uniform(0.5, 5, (n, 3))
     yaw, sure = rng.uniform(-math.pi, math.pi, n), np.clip(rng.beta(3, 2, n), 0.02, 0.98)
@@ -89,9 +96,13 @@ def _add_scene(drives: Drives, scene: int, size: Size, rng: np.random.Generator)
                 )  # fmt: skip
                 found.append(_found(rng, box, sure[k] + rng.normal(0, 0.1), identity[k]))
         for k in range(int(rng.integers(0, size.false + 1))):
-            name, at = str(rng.choice(CLASSES)), ego + np.array([*rng.uniform(-reach, reach, 2), 1.0])
+            name, at = (
+                str(rng.choice(CLASSES, p=shares)),
+                ego + np.array([*rng.uniform(-reach, reach, 2), 1.0]),
+            )
             box = _box(token, at, ego, rng.uniform(0.5, 5, 3), rng.uniform(-3, 3), rng.normal(0, 3, 2), name)
-            found.append(_found(rng, box, rng.beta(1, 3), f"false{scene}_{k}_{name}"))
+            false = f"false{scene}_{k}_{name}_{f // size.false_frames}"
+            found.append(_found(rng, box, rng.beta(1, 3), false))
         offsets = np.pad(rng.uniform(-30, 30, (int(rng.integers(0, 3)), 2)), ((0, 0), (0, 1)))
         drives.racks[token] = [
             _box(token, at, ego, rng.uniform(4, 15, 3), 0.3, speed[0], RACK) for at in ego + offsets

@@ -3,7 +3,8 @@
 from typing import Any
 
 import numpy as np
-from oracles.synthetic import RACK, Drives, detection_boxes, tracking_boxes
+
+from benchmarks.common.object_drives import RACK, Drives, detection_boxes, tracking_boxes
 
 
 class FakeTables:
@@ -44,6 +45,14 @@ class FakeTables:
 
 def detection(drives: Drives, region: str = "circle") -> dict[str, Any]:
     """The devkit's metrics_summary of detections; "rectangle" takes VAD's ranges."""
+    metrics, _ = prepare_detection(drives, region).evaluate()
+    summary: dict[str, Any] = metrics.serialize()
+    summary.pop("cfg"), summary.pop("eval_time")
+    return summary
+
+
+def prepare_detection(drives: Drives, region: str = "circle") -> Any:
+    """A DetectionEval whose boxes are filtered, by the devkit's filter."""
     from nuscenes.eval.common import loaders
     from nuscenes.eval.common.config import config_factory
     from nuscenes.eval.common.data_classes import EvalBoxes
@@ -64,10 +73,7 @@ def detection(drives: Drives, region: str = "circle") -> dict[str, Any]:
         boxes.append(loaders.filter_eval_boxes(FakeTables(drives), read, reach))
     run = DetectionEval.__new__(DetectionEval)
     run.__dict__.update(pred_boxes=boxes[0], gt_boxes=boxes[1], cfg=cfg, verbose=False)
-    metrics, _ = run.evaluate()
-    summary: dict[str, Any] = metrics.serialize()
-    summary.pop("cfg"), summary.pop("eval_time")
-    return summary
+    return run
 
 
 def tracking(drives: Drives, min_score: float = 0.0) -> dict[str, Any]:
