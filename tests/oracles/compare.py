@@ -10,6 +10,9 @@ import pytest
 from oracles.track_sequences import LEAST_SIMILARITY, Sequence, as_rows
 
 from benchmarks.common.object_drives import Drives, detection_boxes, tracking_boxes, truth_file
+from foredrive.evaluation.detections.files import read_detections
+from foredrive.evaluation.detections.score import score_frames
+from foredrive.evaluation.detections.summary import summarise_scores
 from foredrive.evaluation.objects.nuscenes_json import read_json_truth, read_results
 from foredrive.metrics.detection_protocols import DETECTION_PROTOCOLS, evaluate_detections
 from foredrive.metrics.tracking.clear import Candidates, clear_mot
@@ -47,6 +50,17 @@ def check_detection(drives: Drives, name: str, expected: dict[str, Any], folder:
             assert figures.errors[key] == pytest.approx(
                 expected["label_tp_errors"][label][theirs], abs=1e-9, nan_ok=True
             )
+    if name == "nuscenes":
+        check_precision_of_sets(results, truth, expected)
+
+
+def check_precision_of_sets(results: Path, truth: Path, expected: dict[str, Any]) -> None:
+    """Fail unless average precision beside the likelihood of sets is the devkit's, by class."""
+    read = read_detections(results, truth)
+    figures = summarise_scores(read, score_frames(read)).figures
+    for label in read.classes[: read.true_classes]:
+        precisions = list(expected["label_aps"][label].values())
+        assert figures[f"ap.{label}"] == pytest.approx(np.mean(precisions), abs=1e-9)
 
 
 def check_tracking(drives: Drives, name: str, expected: dict[str, Any], folder: Path) -> None:
