@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.common import nuscenes_devkit
+from benchmarks.common import forecast_scoring, nuscenes_devkit
 from benchmarks.common.object_drives import (
     Drives,
     Size,
@@ -28,12 +28,10 @@ from foredrive.evaluation.objects.nuscenes_json import ObjectTask
 from foredrive.evaluation.objects.score import read_objects
 from foredrive.evaluation.objects.truth import ObjectTruth
 from foredrive.metrics.detection_protocols import CLASSES, DETECTION_PROTOCOLS, evaluate_detections
-from foredrive.metrics.motion.agents import PredictedAgents, TrueAgents
 from foredrive.metrics.motion.protocols import PROTOCOLS as MOTION_PROTOCOLS
 from foredrive.metrics.motion.scores import score_motion
 from foredrive.metrics.object_rows import Frames, ObjectRows, make_rows
 from foredrive.metrics.tracking.protocols import TRACKING_PROTOCOLS, evaluate_tracking
-from foredrive.scene import Category
 
 FIFTEEN_SCENES = Size(scenes=15, frames=40, objects=60, false=420, false_frames=3, reach_m=45.0, shares=True)
 """600 frames of some 250 detections."""
@@ -137,25 +135,8 @@ def _validation_tracking(rng: np.random.Generator) -> Callable[[], object]:
 
 
 def _validation_motion(rng: np.random.Generator) -> Callable[[], object]:
-    """Six straight futures of 6 s for each found box; true objects drive straight on."""
-    category = tuple(Category[name.upper()] for name in CLASSES)
-    found, true, _ = _validation_rows(rng)
-    ahead = 0.5 * np.arange(1, 13, dtype=np.float32)[:, None]
-    velocity = rng.normal(0, 3, (len(found), 6, 1, 2)).astype(np.float32)
-    places = [rows.from_ego.astype(np.float32) for rows in (found, true)]
-    labels = [np.array(category)[rows.label].astype(np.int64) for rows in (found, true)]
-    predicted = PredictedAgents(
-        found.frame,
-        labels[0],
-        found.score,
-        places[0],
-        places[0][:, None, None] + velocity * ahead,
-        np.full((len(found), 6), 1 / 6),
-    )
-    driven = places[1][:, None] + rng.normal(0, 3, (len(true), 1, 2)).astype(np.float32) * ahead
-    known = np.ones((len(true), 12), bool)
-    agents = TrueAgents(true.frame, labels[1], places[1], driven, known, np.ones(len(true), bool))
-    return lambda: score_motion(predicted, agents, MOTION_PROTOCOLS["uniad"])
+    predicted, true = forecast_scoring.scene(rng, FRAMES)
+    return lambda: score_motion(predicted, true, MOTION_PROTOCOLS["uniad"])
 
 
 VALIDATION_TASKS: dict[str, Callable[[np.random.Generator], Callable[[], object]]] = {
