@@ -44,7 +44,8 @@ test-slow: install
 
 # Reference code of other people, in an environment of its own that sees the packages of .venv.
 # The devkit's own requirements are older than ours, so each package is installed without its dependencies.
-ORACLES := nuscenes-devkit==1.2.0 motmetrics==1.4.0 trackeval==1.3.0 xmltodict cachetools pyquaternion
+ORACLES := nuscenes-devkit==1.2.0 motmetrics==1.4.0 trackeval==1.3.0 xmltodict cachetools pyquaternion \
+	av2==0.3.6 universal-pathlib pathlib-abc polars polars-runtime-32 kornia kornia-rs click tqdm
 ORACLE_STAMP := .venv-oracles/.installed
 
 $(ORACLE_STAMP): $(STAMP)
@@ -60,6 +61,7 @@ test-oracles: $(ORACLE_STAMP)
 
 golden: $(ORACLE_STAMP)
 	PYTHONPATH=src:tests .venv-oracles/bin/python tests/oracles/make_golden.py
+	PYTHONPATH=src:tests .venv-oracles/bin/python tests/oracles/av2_forecasting.py
 
 clean:
 	rm -rf .venv .venv-oracles runs build dist

@@ -42,7 +42,10 @@ def test_motion(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(flags) == 2
     error = capsys.readouterr().err
     assert error.count("\n") == 1
-    assert f"{results}: frame elsewhere (1 in all) is not in {truth}: of another split?" in error
+    assert (
+        f"{results}: none of its 1 frames is in {truth} (first: elsewhere): results of another split?"
+        in error
+    )
 
 
 def test_forecasts_of_argoverse(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -144,7 +144,7 @@ WRONG: dict[str, tuple[Any, str]] = {
     ),
     "score": (maptr({"a": [("divider", LINE, 1.2)]}), "frame a, vector 0: the score 1.2 is not in [0, 1]"),
     "no score": (maptr({"a": [("divider", LINE, 1.0)]}, truth=True)["GTs"], "the score None is not in"),
-    "split": (maptr({"x": [], "y": []}), "frame x (2 in all) is not in "),
+    "split": (maptr({"x": [], "y": []}), "none of its 2 frames is in "),
     "twice": (
         {"results": [{"sample_token": "a", "vectors": []}, {"sample_token": "a", "vectors": []}]},
         "frame a is there twice",

@@ -130,7 +130,7 @@ WRONG: dict[str, tuple[Any, str]] = {
         {"a": [found_box(1.0, 1.0, predict_traj_score=[1.0])]},
         "frame a, box 0 has 1 probabilities for 2 futures",
     ),
-    "split": ({"x": []}, "frame x (1 in all) is not in "),
+    "split": ({"x": []}, "none of its 1 frames is in "),
     "object": ({"a": ["box"]}, "frame a, box 0 is no object"),
     "list": ([], "not an object of boxes by sample token"),
     "lists": ({"a": 3}, "there must be a list of boxes by sample token"),

@@ -3,17 +3,19 @@
 import dataclasses
 import json
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
 from metrics.motion_scenes import joined, joined_truth, one_agent, perfect, random_predictions, random_truth
-from oracles.av2_forecasting import CLASSES, forecasting_scene, single_agents
+from oracles.av2_forecasting import (
+    GOLDEN,
+    check_forecasting,
+    check_single_agents,
+    forecasting_scene,
+    single_agents,
+)
 
 from foredrive.metrics.motion.argoverse import (
-    DISTANCES_M,
-    MEAN_SPEED_MPS,
-    MOTION_NAMES,
     NON_LINEAR,
     STATIC,
     forecast_errors,
@@ -22,8 +24,6 @@ from foredrive.metrics.motion.argoverse import (
 )
 from foredrive.metrics.motion.moving import is_moving, score_moving
 from foredrive.scene import Category
-
-GOLDEN = Path(__file__).parents[1] / "oracles" / "av2_forecasting.json"
 
 
 def test_the_best_future_ends_nearest() -> None:
@@ -73,30 +73,10 @@ def test_unmatched_detections_are_false_for_their_own_kind_alone() -> None:
     assert figures["static.map_f"] == pytest.approx(0.25)
 
 
-def test_parity_of_single_agents_with_av2() -> None:
-    golden = json.loads(GOLDEN.read_text())["single_agents"]
-    future, probability, true = single_agents()
-    errors = forecast_errors(future, probability, true)
-    best = np.array(golden["fde"]).argmin(1)
-    row = np.arange(len(best))
-    np.testing.assert_allclose(errors.fde_m, np.array(golden["fde"])[row, best], atol=1e-9)
-    np.testing.assert_allclose(errors.ade_m, np.array(golden["ade"])[row, best], atol=1e-9)
-    np.testing.assert_allclose(errors.brier_fde_m, np.array(golden["brier_fde"])[row, best], atol=1e-9)
-    np.testing.assert_array_equal(errors.missed, np.array(golden["missed"])[row, best])
-
-
-def test_parity_of_forecasting_precision_with_av2() -> None:
-    golden = json.loads(GOLDEN.read_text())["forecasting"]
-    figures = forecast_precision(*forecasting_scene(), CLASSES)
-    for name in CLASSES:
-        for motion in MOTION_NAMES:
-            expected = golden[f"{name}.{motion}"]
-            for key, of_av2 in (("map_f", "ap"), ("ade_m", "ade"), ("fde_m", "fde")):
-                assert figures[f"{name}.{motion}.{key}"] == pytest.approx(
-                    math.nan if expected[of_av2] is None else expected[of_av2], abs=1e-9, nan_ok=True
-                )
-    assert len(DISTANCES_M) == 4
-    assert len(MEAN_SPEED_MPS) == 26
+def test_parity_with_av2() -> None:
+    golden = json.loads(GOLDEN.read_text())
+    check_single_agents(*single_agents(), golden["single_agents"])
+    check_forecasting(*forecasting_scene(), golden["forecasting"])
 
 
 def test_moving_vehicles_alone() -> None:

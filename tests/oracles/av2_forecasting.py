@@ -7,26 +7,29 @@ writes `av2_forecasting.json` beside this file, in an environment that holds av2
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from foredrive.metrics.motion.agents import PredictedAgents, TrueAgents
+from foredrive.metrics.motion.argoverse import forecast_errors, forecast_precision
 
+GOLDEN = Path(__file__).with_suffix(".json")
 CLASSES = ["REGULAR_VEHICLE", "PEDESTRIAN", "BICYCLIST", "BUS"]
 FRAMES, AGENTS, STEPS, FUTURES = 10, 24, 6, 5
 
 
-def single_agents() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def single_agents(seed: int = 11) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """40 agents with 6 futures of 60 steps at 10 Hz: futures, probabilities, truth."""
-    rng = np.random.default_rng(11)
+    rng = np.random.default_rng(seed)
     true = np.cumsum(rng.normal(0.3, 0.4, (40, 60, 2)), axis=1)
     future = true[:, None] + np.cumsum(rng.normal(0, 0.25, (40, 6, 60, 2)), axis=2)
     return future, rng.dirichlet(np.ones(6), 40), true
 
 
-def forecasting_scene() -> tuple[PredictedAgents, TrueAgents]:
+def forecasting_scene(seed: int = 12) -> tuple[PredictedAgents, TrueAgents]:
     """Agents of four classes that stand, drive on or turn, up to 55 m away, some with a short future."""
-    rng = np.random.default_rng(12)
+    rng = np.random.default_rng(seed)
     n = FRAMES * AGENTS
     t = 0.5 * np.arange(1, STEPS + 1)
     motion = rng.integers(0, 3, n)
@@ -59,7 +62,7 @@ def forecasting_scene() -> tuple[PredictedAgents, TrueAgents]:
     return predicted, true
 
 
-def _of_av2(predicted: PredictedAgents, true: TrueAgents) -> dict[str, dict[str, float | None]]:
+def forecasting_of_av2(predicted: PredictedAgents, true: TrueAgents) -> dict[str, dict[str, float | None]]:
     """What av2's `accumulate` says of each class and kind of motion: the mean AP, and the errors at 2 m."""
     from av2.evaluation.forecasting import constants, utils
     from av2.evaluation.forecasting.eval import accumulate
@@ -106,21 +109,48 @@ def _of_av2(predicted: PredictedAgents, true: TrueAgents) -> dict[str, dict[str,
     return found
 
 
-def main() -> None:
+def single_agents_of_av2(future: np.ndarray, probability: np.ndarray, true: np.ndarray) -> dict[str, Any]:
+    """What av2's measures say of each future of each agent."""
     from av2.datasets.motion_forecasting.eval import metrics
 
-    future, probability, true = single_agents()
     measures = {"ade": metrics.compute_ade, "fde": metrics.compute_fde}
     measures["missed"] = metrics.compute_is_missed_prediction
-    single = {
+    found = {
         key: [measure(f, t).tolist() for f, t in zip(future, true, strict=True)]
         for key, measure in measures.items()
     }
-    single["brier_fde"] = [
+    found["brier_fde"] = [
         metrics.compute_brier_fde(f, t, p).tolist() for f, t, p in zip(future, true, probability, strict=True)
     ]
-    golden = {"single_agents": single, "forecasting": _of_av2(*forecasting_scene())}
-    Path(__file__).with_suffix(".json").write_text(json.dumps(golden) + "\n")
+    return found
+
+
+def check_single_agents(future: np.ndarray, probability: np.ndarray, true: np.ndarray, of_av2: Any) -> None:
+    """Compare the future that ends nearest."""
+    errors = forecast_errors(future, probability, true)
+    best = np.array(of_av2["fde"]).argmin(1)
+    row = np.arange(len(best))
+    pairs = {"fde": errors.fde_m, "ade": errors.ade_m, "brier_fde": errors.brier_fde_m}
+    for key, values in pairs.items():
+        np.testing.assert_allclose(values, np.array(of_av2[key])[row, best], atol=1e-9)
+    np.testing.assert_array_equal(errors.missed, np.array(of_av2["missed"])[row, best])
+
+
+def check_forecasting(predicted: PredictedAgents, true: TrueAgents, of_av2: Any) -> None:
+    """Compare every class and kind of motion."""
+    figures = forecast_precision(predicted, true, CLASSES)
+    for group, expected in of_av2.items():
+        for key, name in (("map_f", "ap"), ("ade_m", "ade"), ("fde_m", "fde")):
+            value = np.nan if expected[name] is None else expected[name]
+            np.testing.assert_allclose(figures[f"{group}.{key}"], value, atol=1e-9, err_msg=group)
+
+
+def main() -> None:
+    golden = {
+        "single_agents": single_agents_of_av2(*single_agents()),
+        "forecasting": forecasting_of_av2(*forecasting_scene()),
+    }
+    GOLDEN.write_text(json.dumps(golden) + "\n")
 
 
 if __name__ == "__main__":

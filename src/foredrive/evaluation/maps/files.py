@@ -23,8 +23,8 @@ from numpy import ndarray
 
 from foredrive.data.map_elements import read_map_elements
 from foredrive.errors import InputError
+from foredrive.evaluation.frames_of_results import check_known_frames, log_frames
 from foredrive.evaluation.json_files import read_json
-from foredrive.evaluation.log_frames import log_frames
 from foredrive.metrics.maps.lines import LineSet
 from foredrive.metrics.maps.protocols import HALF_XY_M, Area
 from foredrive.scene.map_elements import ElementKind
@@ -85,11 +85,7 @@ def read_maps(results: Path, truth: Path) -> MapFiles:
     if truth.is_dir():
         return _against_logs(predicted, results, truth)
     true = _read(truth, predicted=False)
-    unknown = [token for token in predicted if token not in true]
-    if unknown:
-        raise InputError(
-            f"{results}: frame {unknown[0]} ({len(unknown)} in all) is not in {truth}: of another split?"
-        )
+    check_known_frames(results, predicted, truth, list(true))
     if not true:
         raise InputError(f"{truth}: holds no frames")
     tokens = _in_order(true)

@@ -31,8 +31,8 @@ from foredrive.data.agent_futures import read_futures
 from foredrive.data.boxes import read_boxes
 from foredrive.errors import InputError
 from foredrive.evaluation.detections.frames import read_number_rows, read_numbers
-from foredrive.evaluation.json_files import read_json
-from foredrive.evaluation.log_frames import log_frames
+from foredrive.evaluation.frames_of_results import check_known_frames, log_frames
+from foredrive.evaluation.objects.nuscenes_json import read_object
 from foredrive.metrics.motion.agents import PredictedAgents, TrueAgents
 from foredrive.metrics.motion.protocols import STEP_S
 from foredrive.scene import Boxes, Category
@@ -86,16 +86,12 @@ def read_agents(results: Path, truth: Path) -> AgentFiles:
     Raises:
         InputError: a file cannot be read, or an entry is wrong. The message names both.
     """
-    boxes = _by_token(_object(results), results)
+    boxes = _by_token(read_object(results), results)
     if truth.is_dir():
         return _against_logs(boxes, results, truth)
-    true_content = _object(truth)
+    true_content = read_object(truth)
     true_boxes = _by_token(true_content, truth)
-    unknown = [token for token in boxes if token not in true_boxes]
-    if unknown:
-        raise InputError(
-            f"{results}: frame {unknown[0]} ({len(unknown)} in all) is not in {truth}: of another split?"
-        )
+    check_known_frames(results, boxes, truth, list(true_boxes))
     if not true_boxes:
         raise InputError(f"{truth}: holds no frames")
     tokens = list(true_boxes)
@@ -193,13 +189,6 @@ class _Ego:
         cos, sin = np.cos(yaw), np.sin(yaw)
         x, y = offset[..., 0], offset[..., 1]
         return np.stack([cos * x + sin * y, cos * y - sin * x], axis=-1)
-
-
-def _object(path: Path) -> Mapping[str, Any]:
-    content = read_json(path)
-    if not isinstance(content, dict):
-        raise InputError(f"{path}: not an object of boxes by sample token")
-    return content
 
 
 def _by_token(content: Mapping[str, Any], path: Path) -> Mapping[str, Sequence[Box]]:

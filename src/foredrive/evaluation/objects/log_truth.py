@@ -7,10 +7,9 @@ import numpy as np
 import torch
 
 from foredrive.data.boxes import read_boxes
-from foredrive.data.log_paths import find_logs
-from foredrive.data.logs import Log
 from foredrive.errors import InputError
-from foredrive.evaluation.objects.truth import ObjectTruth, check_known_frames, lacking
+from foredrive.evaluation.frames_of_results import log_frames
+from foredrive.evaluation.objects.truth import ObjectTruth, lacking
 from foredrive.metrics.object_rows import Frames, ObjectRows, make_rows
 from foredrive.scene import Boxes, Category
 
@@ -31,22 +30,16 @@ def read_log_truth(folder: Path, listed: Iterable[str], path: Path, classes: Seq
     wanted = dict.fromkeys(listed)
     names: list[str] = []
     rows, ego, scene, time_us = [], [], [], []
-    for number, log_path in enumerate(find_logs(folder)):
-        if not any(name.startswith(f"{log_path.name}@") for name in wanted):
-            continue
-        log = Log(log_path)
-        for frame, t_us in enumerate(log.t_us.tolist()):
-            if (name := f"{log_path.name}@{t_us}") not in wanted:
-                continue
-            boxes = read_boxes(log, frame)
-            if boxes is None:
-                raise InputError(f"{path}: frame {name} is not annotated in {log_path.folder}")
-            rows.append(_rows(boxes, log.T_world_ego[frame], len(names), classes))
-            names.append(name)
-            ego.append(log.T_world_ego[frame, :2, 3])
-            scene.append(number)
-            time_us.append(t_us)
-    check_known_frames(path, wanted, folder, names)
+    for each in log_frames(folder, wanted, path):
+        boxes = read_boxes(each.log, each.frame)
+        if boxes is None:
+            raise InputError(f"{path}: frame {each.name} is not annotated in {each.log.path.folder}")
+        T_world_ego = each.log.T_world_ego[each.frame]
+        rows.append(_rows(boxes, T_world_ego, len(names), classes))
+        names.append(each.name)
+        ego.append(T_world_ego[:2, 3])
+        scene.append(each.drive)
+        time_us.append(int(each.log.t_us[each.frame]))
     every = _stacked(rows)
     return ObjectTruth(
         names,

@@ -12,7 +12,6 @@ place of the ego vehicle; in a box it is the box's offset from it.
 """
 
 import itertools
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,6 +24,8 @@ from numpy import ndarray
 from foredrive.errors import InputError
 from foredrive.evaluation.detections.frames import read_numbers
 from foredrive.evaluation.detections.nuscenes_results import read_geometry
+from foredrive.evaluation.frames_of_results import check_known_frames
+from foredrive.evaluation.json_files import read_json
 from foredrive.evaluation.objects.nuscenes_columns import (
     Box,
     read_attributes,
@@ -39,7 +40,6 @@ from foredrive.evaluation.objects.truth import (
     BoxNames,
     FoundObjects,
     ObjectTruth,
-    check_known_frames,
     check_tracks,
     lacking,
     number_names,
@@ -74,7 +74,7 @@ def read_results(
     Raises:
         InputError: a box is wrong, or a frame has no ground truth. The message names the first.
     """
-    found = boxes_by_frame(path, read_json(path))
+    found = boxes_by_frame(path, read_object(path))
     check_known_frames(path, found, truth_path, truth.names)
     for name, each in found.items():
         if len(each) > max_boxes:
@@ -106,7 +106,7 @@ def read_json_truth(path: Path, task: ObjectTask, classes: Sequence[str]) -> Obj
     Raises:
         InputError: a box is wrong, or tracking lacks a scene, a time or an identity.
     """
-    whole = read_json(path)
+    whole = read_object(path)
     content, stated = boxes_by_frame(path, whole), whole.get("samples", {})
     if not isinstance(stated, dict) or not all(isinstance(each, dict) for each in stated.values()):
         raise InputError(f"{path}: its `samples` must be objects by sample token")
@@ -162,18 +162,13 @@ def boxes_by_frame(path: Path, content: Mapping[str, Any]) -> dict[str, Sequence
     return boxes
 
 
-def read_json(path: Path) -> Mapping[str, Any]:
+def read_object(path: Path) -> Mapping[str, Any]:
     """Read a JSON object.
 
     Raises:
         InputError: the file has none.
     """
-    try:
-        content = json.loads(path.read_text())
-    except OSError as error:
-        raise InputError(f"{path}: {error.strerror or error}") from error
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"{path}: not JSON that can be read") from error
+    content = read_json(path)
     if not isinstance(content, dict):
         raise InputError(f"{path}: not an object of boxes by sample token")
     return content

@@ -8,8 +8,8 @@ from foredrive.evaluation.objects.log_truth import read_log_truth
 from foredrive.evaluation.objects.nuscenes_json import (
     ObjectTask,
     boxes_by_frame,
-    read_json,
     read_json_truth,
+    read_object,
     read_results,
 )
 from foredrive.evaluation.objects.nuscenes_tables import find_tables, read_tables_truth
@@ -46,7 +46,7 @@ def read_objects(results: Path, truth: Path, task: ObjectTask) -> tuple[FoundObj
     if truth.is_file():
         true = read_json_truth(truth, task, protocol.classes)
     else:
-        listed = boxes_by_frame(results, read_json(results))
+        listed = boxes_by_frame(results, read_object(results))
         tables = find_tables(truth)
         if tables is None:
             true = read_log_truth(truth, listed, results, protocol.classes)

@@ -91,22 +91,3 @@ def lacking(boxes: ObjectRows) -> frozenset[str]:
         "range": np.isfinite(boxes.from_ego).all(1),
     }
     return frozenset(name for name, each in known.items() if len(boxes) and not each.any())
-
-
-def check_known_frames(path: object, listed: Iterable[str], truth: object, known: Sequence[str]) -> None:
-    """Refuse results of frames that the truth does not have.
-
-    Raises:
-        InputError: the message names the first and the number of them.
-    """
-    frames, there = list(listed), set(known)
-    unknown = [name for name in frames if name not in there]
-    if len(unknown) == len(frames) > 0:
-        raise InputError(
-            f"{path}: none of its {len(frames)} frames is in {truth} (first: {unknown[0]}): "
-            "results of another split?"
-        )
-    if unknown:
-        raise InputError(
-            f"{path}: frame {unknown[0]} ({len(unknown)} of {len(frames)}) has no ground truth in {truth}"
-        )

@@ -1,6 +1,6 @@
-"""Frames of 123D logs that results name LOG@T_US."""
+"""Frames that results name: those of the truth, and those of 123D logs, LOG@T_US."""
 
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -33,17 +33,33 @@ def log_frames(folder: Path, wanted: Collection[str], path: Path) -> Iterator[Lo
     Raises:
         InputError: a frame is not in the logs. The message names the first.
     """
-    left = dict.fromkeys(wanted)
+    found = []
     for drive, log_path in enumerate(find_logs(folder)):
-        if not any(name.startswith(f"{log_path.name}@") for name in left):
+        if not any(name.startswith(f"{log_path.name}@") for name in wanted):
             continue
         log = Log(log_path)
         for frame, t_us in enumerate(log.t_us.tolist()):
             name = f"{log_path.name}@{t_us}"
-            if name in left:
-                del left[name]
+            if name in wanted:
+                found.append(name)
                 yield LogFrame(name, log, frame, drive)
-    if left:
+    check_known_frames(path, wanted, folder, found)
+
+
+def check_known_frames(path: object, listed: Iterable[str], truth: object, known: Sequence[str]) -> None:
+    """Refuse results of frames that the truth does not have.
+
+    Raises:
+        InputError: the message names the first and the number of them.
+    """
+    frames, there = list(listed), set(known)
+    unknown = [name for name in frames if name not in there]
+    if len(unknown) == len(frames) > 0:
         raise InputError(
-            f"{path}: frame {next(iter(left))} ({len(left)} in all) is not in {folder}: of another split?"
+            f"{path}: none of its {len(frames)} frames is in {truth} (first: {unknown[0]}): "
+            "results of another split?"
+        )
+    if unknown:
+        raise InputError(
+            f"{path}: frame {unknown[0]} ({len(unknown)} of {len(frames)}) has no ground truth in {truth}"
         )
