@@ -97,7 +97,7 @@ def nemo_town() -> NemoRecipe:
         ),
         model=dataclasses.replace(
             tiny.model,
-            motion=dataclasses.replace(tiny.model.motion, stride=2),
+            motion=dataclasses.replace(tiny.model.motion, stride=2, ego="measured"),
             renderer=dataclasses.replace(tiny.model.renderer, far_m=48.0),
         ),
         planner=dataclasses.replace(

@@ -198,7 +198,7 @@ class NemoObjective(nn.Module):
         with torch.set_grad_enabled(stage.past_gradient and torch.is_grad_enabled()):
             past = lift_frames(frames[items, :-1], world.backbone, world.encoder)
         history = torch.cat([past, present[items]], dim=1)
-        return [now, *world.imagine(Belief(volume=now.volume[items], history=history), steps)]
+        return [now, *world.imagine(world.believe(frames[items], history), steps)]
 
 
 def set_planner_trainable(planner: VolumePlanner, trainable: bool) -> None:

@@ -1,7 +1,7 @@
 """NeMo's motion flow module: flow of the scene and motion of the ego vehicle (§3.2, eq. 7–8)."""
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -21,6 +21,8 @@ class MotionConfig:
     """Size of the plane that the SE(3) head flattens. It keeps coarse positions, which rotation needs."""
     xi_scale: float = 0.1
     """Factor from outputs of the rigid head to metres and radians. It keeps early warps small."""
+    ego: Literal["predicted", "measured"] = "predicted"
+    """Ego motion is predicted as in the paper, or relative to going on as measured (`continued_motion`)."""
     stride: int = 1
     """Stride along y and x of the grid from which flow and ego motion are predicted. From a coarser grid than
     the volume's, the flow is interpolated. The paper has 1."""

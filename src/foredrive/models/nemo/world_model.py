@@ -16,6 +16,7 @@ from foredrive.models.averaging import AveragingConfig, AveragingEncoder
 from foredrive.models.backbone import BackboneConfig, ImageBackbone
 from foredrive.models.bev import BevConfig, BevEncoder
 from foredrive.models.lifting import LiftingConfig, LiftingEncoder, lift_frames
+from foredrive.models.nemo.ego_motion import continued_motion
 from foredrive.models.nemo.motion import MotionConfig, MotionFlow
 from foredrive.models.nemo.rendering import RendererConfig, VolumeRenderer
 from foredrive.ops.volume import compose_flows, warp_volume
@@ -80,6 +81,7 @@ class Nemo(nn.Module):
         levels = 1 if finest_alone else config.backbone.levels or len(config.backbone.stages)
         self.spec, self.channels, self.dt_s = spec, channels, dt_s
         self.past_frames, self.max_steps = past_frames, max_steps
+        self.starts_from_measured = config.motion.ego == "measured"
         self.backbone = ImageBackbone(config.backbone, channels=channels, levels=levels, fetch=fetch)
         self.encoder = ENCODERS[type(config.encoder)](config.encoder, spec, channels=channels, levels=levels)
         self.motion = MotionFlow(config.motion, channels=channels, frames=past_frames + 1, steps=max_steps)
@@ -99,8 +101,12 @@ class Nemo(nn.Module):
 
     def encode(self, frames: Frames) -> Belief:
         """Do the work of `observe`. No step depends on the values of the data."""
-        volumes = lift_frames(frames, self.backbone, self.encoder)
-        return Belief(volume=volumes[:, -1], history=volumes)
+        return self.believe(frames, lift_frames(frames, self.backbone, self.encoder))
+
+    def believe(self, frames: Frames, volumes: Float[Tensor, "b T D Z Y X"]) -> Belief:
+        """Return the belief about now from the volumes of T_p + 1 frames."""
+        measured = continued_motion(frames, self.max_steps) if self.starts_from_measured else None
+        return Belief(volume=volumes[:, -1], history=volumes, T_prev_next=measured)
 
     def imagine(
         self,
@@ -129,6 +135,8 @@ class Nemo(nn.Module):
         since_now_m = torch.zeros_like(motion.flow[:, 0])
         futures = []
         for k in range(steps):
+            if belief.T_prev_next is not None:
+                T_now_ego = compose_se3(T_now_ego, belief.T_prev_next[:, k])
             T_now_ego = compose_se3(T_now_ego, motion.T_prev_next[:, k])
             since_now_m = compose_flows(motion.flow[:, k], since_now_m, self.spec.voxel_m)
             futures.append(
