@@ -99,6 +99,7 @@ def nemo_town() -> NemoRecipe:
             tiny.model,
             motion=dataclasses.replace(tiny.model.motion, stride=2, ego="measured"),
             renderer=dataclasses.replace(tiny.model.renderer, far_m=48.0),
+            step_features=True,
         ),
         planner=dataclasses.replace(
             tiny.planner,
@@ -108,7 +109,14 @@ def nemo_town() -> NemoRecipe:
         ),
         path=PathFit(),
         pretrain=rescheduled(
-            dataclasses.replace(tiny.pretrain, ray_stride=16, imagine_every=2), steps=2400, warmup_steps=190
+            dataclasses.replace(
+                tiny.pretrain,
+                weights=dataclasses.replace(tiny.pretrain.weights, future=0.5),
+                ray_stride=16,
+                imagine_every=2,
+            ),
+            steps=2400,
+            warmup_steps=190,
         ),
         finetune=rescheduled(tiny.finetune, steps=300, warmup_steps=20),
         precision="bf16-mixed",

@@ -32,7 +32,7 @@ class Belief(Record):
     statics: Float[Tensor, "b _C Y X"] | None = None
     """Features of the static scene in the plane, for models that pass them on without warping."""
     T_prev_next: Float[Tensor, "b F 4 4"] | None = None
-    """Ego motion over each of the next key frames that measured poses and speeds suggest: the ego frame at t+k+1
+    """Ego motion over each of the next key frames that poses and speeds suggest: the ego frame at t+k+1
     -> the ego frame at t+k. Given if `imagine` starts from it."""
     flow_mps: Float[Tensor, "b 3 Z Y X"] | None = None
     """Velocity over ground of the content of each voxel, in the ego axes. Given if imagining predicted it."""

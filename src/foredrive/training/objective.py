@@ -113,9 +113,8 @@ class NemoObjective(nn.Module):
         imagines = self.steps > 0 or (plans and agent.planner.imagined_frames > 0)
         if stage.imagine_every > 1:
             self.register_buffer("steps_done", torch.zeros((), dtype=torch.long))
-        world.motion.requires_grad_(imagines)
-        if world.unseen is not None:
-            world.unseen.requires_grad_(imagines)
+        for parameter in world.imagination():
+            parameter.requires_grad_(imagines)
         world.occupancy.requires_grad_(weights.occ > 0 or weights.recon > 0)
         world.renderer.requires_grad_(weights.recon > 0)
 
@@ -180,8 +179,7 @@ class NemoObjective(nn.Module):
 
     def _no_change(self) -> Float[Tensor, ""]:
         """Return 0 with a gradient of 0 for the parameters of imagination: DDP needs one in every step."""
-        world = self.agent.world_model
-        unused = [*world.motion.parameters(), *(() if world.unseen is None else (world.unseen,))]
+        unused = self.agent.world_model.imagination()
         return 0.0 * torch.stack([parameter.sum() for parameter in unused]).sum()
 
     def _rollout(self, observed: Clip, steps: int) -> list[Belief]:

@@ -48,6 +48,9 @@ class NemoConfig:
     would hide what is behind."""
     unseen: Literal["zero", "learned"] = "zero"
     """Feature of voxels that come into view in imagined frames. The paper does not say."""
+    step_features: bool = False
+    """Add a learned feature to all voxels of an imagined volume, one for each step. Warped features are
+    smoother than observed ones; so the decoder knows. Not in the paper."""
     kind: Literal["nemo"] = "nemo"
 
 
@@ -87,9 +90,15 @@ class Nemo(nn.Module):
         self.motion = MotionFlow(config.motion, channels=channels, frames=past_frames + 1, steps=max_steps)
         self.renderer = VolumeRenderer(config.renderer, spec, channels=channels)
         self.unseen = nn.Parameter(torch.zeros(channels)) if config.unseen == "learned" else None
+        self.step_features = nn.Parameter(torch.zeros(max_steps, channels)) if config.step_features else None
         to_logit = nn.Linear(config.occupancy_hidden, 1)
         nn.init.constant_(to_logit.bias, math.log(config.occupied_prior / (1 - config.occupied_prior)))
         self.occupancy = nn.Sequential(nn.Linear(channels, config.occupancy_hidden), nn.ReLU(), to_logit)
+
+    def imagination(self) -> list[nn.Parameter]:
+        """Return the parameters that only imagined frames depend on."""
+        learned = (self.unseen, self.step_features)
+        return [*self.motion.parameters(), *(parameter for parameter in learned if parameter is not None)]
 
     def observe(self, clip: Clip) -> Belief:
         """Encode the last T_p + 1 frames, each in its own ego frame (V_t of eq. 1).
@@ -139,9 +148,12 @@ class Nemo(nn.Module):
                 T_now_ego = compose_se3(T_now_ego, belief.T_prev_next[:, k])
             T_now_ego = compose_se3(T_now_ego, motion.T_prev_next[:, k])
             since_now_m = compose_flows(motion.flow[:, k], since_now_m, self.spec.voxel_m)
+            volume = self._warped(belief.volume, since_now_m, T_now_ego, self.unseen)
+            if self.step_features is not None:
+                volume = volume + self.step_features[k].view(-1, 1, 1, 1)
             futures.append(
                 Belief(
-                    volume=self._warped(belief.volume, since_now_m, T_now_ego, self.unseen),
+                    volume=volume,
                     flow_mps=self._velocity(motion.flow[:, k], T_now_ego),
                     T_now_ego=T_now_ego,
                 )
