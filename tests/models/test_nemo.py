@@ -13,13 +13,14 @@ from foredrive.geometry.se3 import exp_se3
 from foredrive.models.agent import PlanningAgent
 from foredrive.models.bev import BevConfig
 from foredrive.models.lifting import project_to_cameras
-from foredrive.models.nemo import MotionConfig, MotionFlow, RendererConfig, VolumeRenderer
+from foredrive.models.nemo import MotionConfig, MotionFlow, Nemo, RendererConfig, VolumeRenderer
+from foredrive.models.nemo.ego_motion import continued_motion
 from foredrive.models.nemo.motion import Motion
 from foredrive.ops.volume import sample_volume_reference, warp_volume
 from foredrive.recipes.nemo import NemoRecipe, nemo_base, nemo_tiny
 from foredrive.recipes.nemo_ablations import nemo_ablations
 from foredrive.runs.build import build_agent, build_objective
-from foredrive.scene import Command, Example, VoxelSpec
+from foredrive.scene import Command, Example, VoxelSpec, last_frames
 from foredrive.training import NemoStage
 
 SPEC = VoxelSpec(lower_m=(-8.0, -8.0, -1.0), voxel_m=1.0, shape_zyx=(4, 16, 16))
@@ -359,3 +360,32 @@ def test_flow_from_a_coarser_grid_is_that_of_columns_that_are_all_alike(shape_yx
     assert flows[1].shape == (1, 2, 3, 4, *shape_yx)
     inner = (..., slice(8, -8), slice(8, -8))
     torch.testing.assert_close(flows[0][inner], flows[1][inner], rtol=1e-4, atol=1e-5)
+
+
+def test_imagination_starts_from_the_measured_ego_motion(agent: PlanningAgent, example: Example) -> None:
+    """Untrained, it moves the volume as the vehicle goes on, and adds each step's own feature."""
+    model = small_recipe().model
+    config = dataclasses.replace(
+        model, motion=dataclasses.replace(model.motion, ego="measured"), step_features=True
+    )
+    world = Nemo(config, SPEC, past_frames=1, max_steps=2, dt_s=0.5).eval()
+    assert world.step_features is not None
+    observed = example.clip.observed()
+    T_prev_next = continued_motion(last_frames(observed, 1), 2)
+    with torch.no_grad():
+        world.step_features[0] = 1.0
+        belief = world.observe(observed)
+        first, second = world.imagine(belief, 2)
+        assert belief.T_prev_next is not None
+        torch.testing.assert_close(belief.T_prev_next, T_prev_next)
+        standing = torch.zeros(len(belief.volume), 3, *SPEC.shape_zyx)
+        T_now_second = T_prev_next[:, 0] @ T_prev_next[:, 1]
+        expected = warp_volume(belief.volume, standing, T_now_second, SPEC.lower_m, SPEC.voxel_m)
+    torch.testing.assert_close(second.T_now_ego, T_now_second, atol=1e-5, rtol=0)
+    torch.testing.assert_close(second.volume, expected, atol=1e-4, rtol=0)
+    torch.testing.assert_close(
+        first.volume,
+        1.0 + warp_volume(belief.volume, standing, T_prev_next[:, 0], SPEC.lower_m, SPEC.voxel_m),
+        atol=1e-4,
+        rtol=0,
+    )
