@@ -117,6 +117,9 @@ def as_it_was(recipe: Any) -> Any:
             stages[name] = dataclasses.replace(stages[name], pixels="thinned")
     planner = dataclasses.replace(recipe.planner, final_norm=False)
     model, whole = recipe.of_pretraining.model, "world_model"
+    if model.kind == "driveworld" and model.prompt is not None:
+        prompts = ("occupancy", "forecast", "planning")
+        model = dataclasses.replace(model, prompt=dataclasses.replace(model.prompt, prompts=prompts))
     return dataclasses.replace(
         recipe, **stages, planner=planner, model=model, pretrained_model=None, transfer=whole
     )
