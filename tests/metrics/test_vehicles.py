@@ -6,6 +6,7 @@ import torch
 
 from foredrive.metrics.vehicles import car_columns, count_car_columns
 from foredrive.scene import Boxes, Category, VoxelGrid, VoxelSpec
+from foredrive.scene.boxes import unlabelled
 
 SPEC = VoxelSpec(lower_m=(-10.0, -10.0, -1.0), voxel_m=1.0, shape_zyx=(3, 20, 20))
 """Two of the three layers have centres at -0.5 and 0.5 m; the third at 1.5 m."""
@@ -22,6 +23,7 @@ def boxes(*rows: tuple[float, float, float, Category]) -> Boxes:
         track_id=torch.arange(count)[None],
         category=torch.tensor([[int(category) for *_, category in rows]]),
         valid=torch.ones(1, count, dtype=torch.bool),
+        **unlabelled(1, count),
     )
 
 
