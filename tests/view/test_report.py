@@ -31,6 +31,7 @@ from foredrive.view.summary_tables import (
     occupancy_table,
     planning_overview,
     planning_table,
+    task_table,
 )
 from foredrive.view.table import Cell, Table, number
 
@@ -303,3 +304,17 @@ def test_the_overview_needs_images(panel: ExamplePrediction, tmp_path: Path) -> 
     blind = dataclasses.replace(panel, example=dataclasses.replace(panel.example, clip=dark))
     with pytest.raises(InputError, match="no camera images"):
         write_overview(tmp_path / "none.png", blind)
+
+
+def test_figures_of_tasks_stand_beside_their_baselines() -> None:
+    """Only those that were evaluated; a baseline that is missing is a dash."""
+    found = {
+        "map.uniad.iou_lanes": 0.25,
+        "map.uniad.iou_lanes.best_constant": 0.125,
+        "motion.uniad.car.min_ade_m": 1.5,
+    }
+    assert cells_of(task_table(found)) == [
+        ["motion.uniad.car.min ade m", "1.500", "constant velocity", DASH],
+        ["map.uniad.iou lanes", "0.250", "best constant", "0.125"],
+    ]
+    assert task_table({}) is None

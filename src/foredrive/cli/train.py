@@ -7,6 +7,7 @@ import tyro
 
 from foredrive.cli.arguments import OptionalPath, Settings, SomePaths, check_out_folder, check_run
 from foredrive.data.log_paths import find_all_logs
+from foredrive.errors import InputError
 from foredrive.lazy import importing
 
 
@@ -17,6 +18,8 @@ def train(
     cache: OptionalPath = None,
     occupancy: Literal["lidar", "accumulated", "recorded"] = "lidar",
     start: OptionalPath = None,
+    tasks: str = "",
+    probe: bool = False,
     set: Settings = (),
 ) -> None:
     """Train a recipe on logs, or continue an interrupted run.
@@ -30,20 +33,37 @@ def train(
             passed through; "accumulated", those of sweeps within 3 s too; or "recorded", the exact occupancy
             that towns record, visible or not. A run with recorded labels is evaluated with them, others with
             those of the frame's sweep.
-        start: Another run's folder: use its pre-trained weights and begin with fine-tuning.
+        start: Another run's folder: use its pre-trained weights and begin with fine-tuning. With --probe, use
+            its world model and planner as they are.
+        tasks: Tasks to train heads for, separated by commas: detection, map, motion, occupancy.
+        probe: Train the heads of --tasks on the frozen world model. Its volumes are computed once and kept.
         set: Entries of the recipe to replace, such as finetune.schedule.lr=1e-3; `foredrive recipes RECIPE`
-            prints all entries.
+            prints all entries. With --probe, tasks.schedule.steps=100 and others for the heads
+            (tasks/config.yaml in the run's folder has all).
     """
     check_out_folder(out)
     if start is not None:
         start = check_run(start)
+    if probe != bool(tasks):
+        raise InputError("--probe trains the heads of --tasks: give both, or neither")
     found = find_all_logs(logs)
 
     with importing():
         from foredrive.recipes import find_recipe, with_occupancy_source
+        from foredrive.recipes.task_heads import town_heads, with_settings
         from foredrive.runs import train_run
+        from foredrive.runs.train.tasks import TASKS, probe_run, train_heads
 
-    chosen = with_occupancy_source(find_recipe(recipe, set), occupancy)
-    run = train_run(chosen, found, out, cache, start)
+    of_heads = tuple(entry.removeprefix(TASKS + ".") for entry in set if entry.startswith(TASKS + "."))
+    heads = with_settings(town_heads(tasks.split(",")), of_heads) if probe else None
+    others = set if heads is None else tuple(entry for entry in set if not entry.startswith(TASKS + "."))
+    chosen = with_occupancy_source(find_recipe(recipe, others), occupancy)
+    if heads is not None and start is not None:
+        run = probe_run(chosen, found, out, cache, start)
+    else:
+        run = train_run(chosen, found, out, cache, start)
+    if heads is not None:
+        train_heads(run, heads)
+        print(f"trained heads of {tasks}: {out / TASKS}")
     print(f"trained {run.recipe.name}: {run.weights}")
     print(f"next: foredrive evaluate {out} --logs ...")

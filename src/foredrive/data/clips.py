@@ -123,6 +123,10 @@ class ClipDataset(Dataset[Example]):
         number, frames = self._clips[index]
         return int(self._logs[number].t_us[frames[self.config.past_frames]])
 
+    def key(self, index: int) -> str:
+        """Return the name of the log and the time of the now of a clip, for messages."""
+        return f"{self._logs[self._clips[index][0]].path.name}@{self.now_us(index)}"
+
     def __getitem__(self, index: int) -> Example:
         """Read one clip with its labels.
 
@@ -145,7 +149,7 @@ class ClipDataset(Dataset[Example]):
                 values=torch.stack([label.flow_mps for label in labels]),
                 known=torch.stack([label.flow_known for label in labels]),
             ),
-            key=(f"{log.path.name}@{self.now_us(index)}",),
+            key=(self.key(index),),
             truth=self.truth(index),
         )
 

@@ -7,6 +7,7 @@ from typing import Protocol
 from foredrive.errors import InputError
 from foredrive.evaluation.predictor import Part, Prediction
 from foredrive.evaluation.summary import Figures
+from foredrive.evaluation.task_priors import TaskPriors
 from foredrive.metrics.occupancy import OccupancyPrior
 from foredrive.scene import Clip, Example, VoxelGrid
 
@@ -19,6 +20,8 @@ class EvaluationContext:
     """Time between key frames."""
     prior: OccupancyPrior | None = None
     """Occupancy prior of the training set, on the model's frames."""
+    task_priors: TaskPriors | None = None
+    """Priors of map and semantic occupancy, of the training set of the heads."""
 
     def frame_names(self, frames: int) -> list[str]:
         """Return the names of now and the key frames after it: now, future_500ms, future_1s, …"""

@@ -3,13 +3,24 @@
 from dataclasses import dataclass
 from typing import Literal, Protocol, runtime_checkable
 
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from foredrive.scene import Agent, Clip, Trajectory
+from foredrive.scene.agents import Agents, MapLines
 from foredrive.scene.record import Record
 
-Part = Literal["occupancy_logit", "plan", "flow_mps", "futures", "images"]
+Part = Literal[
+    "occupancy_logit",
+    "plan",
+    "flow_mps",
+    "futures",
+    "images",
+    "agents",
+    "map_lines",
+    "map_layers",
+    "semantics",
+]
 """A part of a `Prediction`, by the name of its field."""
 
 
@@ -30,6 +41,13 @@ class Prediction(Record):
     """Occupancy in K sampled futures, of the P = F - 1 key frames after now."""
     images: Float[Tensor, "b R C 3 h w"] | None = None
     """Rendered views of the clip's cameras, RGB from 0 to 1."""
+    agents: Agents | None = None
+    """Road users at now."""
+    map_lines: MapLines | None = None
+    map_layers: Float[Tensor, "b L H W"] | None = None
+    """Probability of each `RasterLayer` on the grid of the truth."""
+    semantics: UInt8[Tensor, "b Z Y X"] | None = None
+    """Index of the class of each voxel, in the classes and on the grid of the truth."""
     image_stride: int = 1
     """One pixel in `image_stride` along rows and columns is rendered, the first at `image_stride // 2`."""
 

@@ -15,9 +15,11 @@ from foredrive.evaluation.metric import EvaluationContext, Figures, MetricFactor
 from foredrive.evaluation.metrics import METRICS
 from foredrive.evaluation.predictor import Part, PlannerPredictor, Prediction, Predictor
 from foredrive.evaluation.provenance import peak_rss_gib
+from foredrive.evaluation.task_priors import TaskPriors
 from foredrive.metrics.occupancy import OccupancyPrior
 from foredrive.metrics.protocols import STEPS
 from foredrive.scene import Agent, Example, Trajectory
+from foredrive.scene.record import Record
 
 
 @dataclass(frozen=True)
@@ -46,6 +48,7 @@ def evaluate(
     metrics: Sequence[MetricFactory] = METRICS,
     baselines: Mapping[str, Agent] | None = None,
     prior: OccupancyPrior | None = None,
+    task_priors: TaskPriors | None = None,
     command_source: Mapping[str, int] | None = None,
     device: torch.device | str = "cpu",
     on_items: Callable[[int], None] = lambda items: None,
@@ -61,6 +64,7 @@ def evaluate(
         baselines: planners by name, judged by the metrics of plans on every item that they manage. Their keys
             are `METRIC.BASELINE.KEY`, where the model's are `METRIC.KEY`.
         prior: of the training set, on the model's frames; stands beside every occupancy figure.
+        task_priors: of the training set of the heads; stand beside figures of maps and semantic voxels.
         command_source: how many commands came from a route, the driven future, nowhere.
         on_items: called with the number of items after each batch.
 
@@ -72,7 +76,7 @@ def evaluate(
         InputError: if there are no items, or all of them failed.
     """
     started = time.perf_counter()
-    context = EvaluationContext(frame_dt_s, prior)
+    context = EvaluationContext(frame_dt_s, prior, task_priors)
     model = _EvaluatedMethod(predictor, metrics, context)
     planners = {
         name: _EvaluatedMethod(PlannerPredictor(planner), metrics, context, only=frozenset({"plan"}))
@@ -201,11 +205,14 @@ def _is_complete(prediction: Prediction) -> Bool[Tensor, "b"]:
     return torch.stack(fine).all(dim=0)
 
 
-def _is_part_complete(part: Trajectory | Tensor) -> Bool[Tensor, "b"]:
+def _is_part_complete(part: Record | Tensor) -> Bool[Tensor, "b"]:
     """Return which of b items are finite; a plan has all steps that are scored, too."""
     if isinstance(part, Trajectory):
         fine = part.valid & part.xy.isfinite().all(dim=-1) & part.yaw.isfinite()
         return fine[..., :STEPS].flatten(1).all(dim=-1)
+    if isinstance(part, Record):
+        tensors = [value for value in vars(part).values() if isinstance(value, Tensor)]
+        return torch.stack([_is_part_complete(tensor) for tensor in tensors]).all(dim=0)
     return part.flatten(1).isfinite().all(dim=-1)
 
 

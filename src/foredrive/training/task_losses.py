@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from foredrive.losses.map_elements import MapLossWeights, map_element_losses
@@ -41,7 +41,7 @@ class TaskWeights:
 def task_losses(
     output: HeadOutput,
     boxes: Boxes,
-    boxes_valid: Float[Tensor, "b"],
+    boxes_valid: Bool[Tensor, "b"],
     truth: TaskTruth,
     spec: VoxelSpec,
     class_weight: Float[Tensor, "C"] | None,
@@ -60,7 +60,7 @@ def task_losses(
     """
     losses: dict[str, Float[Tensor, ""]] = {}
     if output.agents is not None:
-        losses |= _agent_losses(output.agents, boxes, boxes_valid.bool(), truth, spec, weights)
+        losses |= _agent_losses(output.agents, boxes, boxes_valid, truth, spec, weights)
     if output.elements is not None and truth.elements is not None:
         losses["elements"] = _map_loss(output.elements, truth.elements, weights.map)
     if output.raster is not None and truth.raster is not None:
@@ -74,7 +74,7 @@ def task_losses(
 def _agent_losses(
     layers: list[AgentSet],
     boxes: Boxes,
-    boxes_valid: Tensor,
+    boxes_valid: Bool[Tensor, "b"],
     truth: TaskTruth,
     spec: VoxelSpec,
     weights: TaskWeights,

@@ -22,6 +22,7 @@ from foredrive.view.summary_tables import (
     planning_overview,
     planning_table,
     prior_comparison,
+    task_table,
     vehicle_table,
 )
 from foredrive.view.table import Value, number, words
@@ -86,6 +87,7 @@ def write_run_report(path: Path, report: RunReport) -> None:
         vehicle_table(summary),
         flow_table(summary),
         image_table(summary),
+        task_table(summary),
     )
     write_page(
         path,

@@ -47,6 +47,20 @@ BASELINE_TITLES = {
     "carried_copy": "ego-compensated persistence",
 }
 """Titles of the baselines by their keys in summary.json."""
+TASK_FIGURES = (
+    ("detection.nuscenes.map", "nothing_detected"),
+    ("detection.nuscenes.nds", "nothing_detected"),
+    ("detection.car_ap_2m_30m", "nothing_detected"),
+    ("motion.uniad.car.min_ade_m", "constant_velocity"),
+    ("motion.uniad.car.epa", "constant_velocity"),
+    ("motion.uniad.pedestrian.min_ade_m", "constant_velocity"),
+    ("map.maptr.map", "nothing_detected"),
+    ("map.uniad.iou_lanes", PRIOR),
+    ("map.uniad.iou_drivable", PRIOR),
+    ("occupancy.occ3d.miou_pct", PRIOR),
+    ("occupancy.occ3d_unmasked.miou_pct", PRIOR),
+)
+"""Main figures of the task heads, each with its baseline."""
 _BASELINE = re.compile(r"occupancy\.iou_\w+\.(\w+)")
 _PLANNING = re.compile(rf"planning\.(?:(\w+)\.)?({'|'.join(PROTOCOLS)})\.\w+")
 _OCCUPANCY = re.compile(r"occupancy\.iou_(\w+)")
@@ -57,7 +71,7 @@ _IMAGES = re.compile(r"(\w+(?:\.\w+)*)\.psnr_db")
 
 def print_summary(summary: Summary, console: Console, model: str) -> None:
     """Print the main metrics."""
-    for make in (occupancy_table, vehicle_table, planning_table, flow_table, image_table):
+    for make in (occupancy_table, vehicle_table, planning_table, flow_table, image_table, task_table):
         if table := make(summary):
             print_table(table, console)
     console.print(
@@ -179,6 +193,17 @@ def image_table(summary: Summary) -> Table | None:
         rows.append((when, summary[f"{prefix}.psnr_db"], summary.get(f"{prefix}.ssim")))
     columns = (Column(align="left"), Column("PSNR, dB", digits=2), Column("SSIM"))
     return simple_table(columns, rows, "Rendered images") if rows else None
+
+
+def task_table(summary: Summary) -> Table | None:
+    """Compare the main figures of detection, motion, map and semantic occupancy with their baselines."""
+    rows = [
+        (words(key), summary[key], words(baseline), summary.get(f"{key}.{baseline}"))
+        for key, baseline in TASK_FIGURES
+        if key in summary
+    ]
+    columns = (Column("figure", align="left"), Column(""), Column("baseline", align="left"), Column(""))
+    return simple_table(columns, rows, "Tasks at now") if rows else None
 
 
 def full_table(summary: Summary) -> Table:

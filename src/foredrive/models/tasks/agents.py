@@ -4,13 +4,14 @@ import math
 from dataclasses import dataclass, field
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from foredrive.models.detection import LOG_STD_RANGE, TYPICAL_LOG_LWH, BoxSet
 from foredrive.models.tasks.decoder import DecoderConfig, PlaceEmbedding, QueryDecoderLayer
 from foredrive.models.tasks.plane import Plane, PlaneFeatures
 from foredrive.scene import Attribute, Category
+from foredrive.scene.agents import Agents
 from foredrive.scene.record import Record
 
 AGENT_CLASSES = (
@@ -63,6 +64,29 @@ class AgentSet(Record):
     """Box centres at the steps after now in each mode, m. None without forecasts."""
     log_prob: Float[Tensor, "*b Q M"] | None = None
     """Log-probability of each mode."""
+
+    def agents(self, dt_s: float) -> Agents:
+        """Return the most probable class of each query, with its probability as the score.
+
+        Args:
+            dt_s: time between the steps of the futures.
+        """
+        mean, heading = self.boxes.mean, self.boxes.heading
+        score, label = self.boxes.logits.softmax(dim=-1)[..., :-1].max(dim=-1)
+        categories = torch.tensor([int(kind) for kind in AGENT_CLASSES], device=label.device)
+        return Agents(
+            centre=mean[..., :3],
+            size_lwh=mean[..., 3:].exp(),
+            yaw=torch.atan2(heading[..., 0], heading[..., 1]),
+            velocity=self.velocity,
+            category=categories[label],
+            score=score,
+            attribute=_possible(self.attribute, categories[label]).argmax(dim=-1),
+            track_id=torch.full_like(label, -1),
+            future_xy=self.future_xy,
+            log_prob=self.log_prob,
+            dt_s=dt_s,
+        )
 
 
 class AgentHead(nn.Module):
@@ -179,6 +203,16 @@ class MotionModes(nn.Module):
             future_xy=steady[:, :, None] + moved,
             log_prob=out[..., -1].log_softmax(dim=-1),
         )
+
+
+def _possible(logits: Float[Tensor, "*n A"], category: Int[Tensor, "*n"]) -> Float[Tensor, "*n A"]:
+    """Leave out the attributes that a category cannot have."""
+    of_vehicles, of_cycles = Attribute.CYCLE_WITH_RIDER, Attribute.PEDESTRIAN_MOVING
+    kind = torch.arange(logits.shape[-1], device=logits.device)
+    group = (kind >= of_vehicles).long() + (kind >= of_cycles).long()
+    cycle = (category == Category.MOTORCYCLE) | (category == Category.BICYCLE)
+    wanted = torch.where(cycle, 1, torch.where(category == Category.PEDESTRIAN, 2, 0))
+    return logits.masked_fill(group != wanted[..., None], -torch.inf)
 
 
 def spread_points(plane: PlaneFeatures, count: int) -> Float[Tensor, "count 2"]:

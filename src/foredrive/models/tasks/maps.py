@@ -10,6 +10,7 @@ from torch.nn import functional as F
 from foredrive.models.tasks.agents import spread_points
 from foredrive.models.tasks.decoder import DecoderConfig, PlaceEmbedding, QueryDecoderLayer
 from foredrive.models.tasks.plane import Plane, PlaneFeatures, cell_middles
+from foredrive.scene.agents import MapLines
 from foredrive.scene.map_elements import PlaneSpec, RasterLayer
 from foredrive.scene.record import Record
 
@@ -34,6 +35,11 @@ class MapSet(Record):
     """Logit of each kind by itself. If all are low, there is no element."""
     points: Float[Tensor, "*b E P 2"]
     """Points in order along the element, m."""
+
+    def lines(self) -> MapLines:
+        """Return the most probable kind of each element, with its probability as the score."""
+        score, kind = self.logits.sigmoid().max(dim=-1)
+        return MapLines(self.points, kind, score)
 
 
 class MapHead(nn.Module):

@@ -1,5 +1,6 @@
 """A trained agent in the form that an evaluation asks for."""
 
+import dataclasses
 from collections.abc import Sequence
 from typing import Any
 
@@ -9,8 +10,10 @@ from torch import Tensor
 
 from foredrive.evaluation.predictor import Part, Prediction
 from foredrive.models.agent import PlanningAgent
+from foredrive.models.tasks.heads import TaskHeads
 from foredrive.scene import Belief, Clip, Decoded, RayRenderer, WorldModel
 from foredrive.training import thinned_rays
+from foredrive.training.task_probe import task_volumes
 
 
 class AgentPredictor:
@@ -23,10 +26,19 @@ class AgentPredictor:
             world model that renders; 0 renders nothing.
         futures: number of futures to draw from a stochastic world model. Their random states depend on the
             order of the clips.
+        heads: trained task heads in evaluation mode; None predicts no further tasks.
     """
 
-    def __init__(self, agent: PlanningAgent[Any], steps: int, ray_stride: int, futures: int = 0) -> None:
+    def __init__(
+        self,
+        agent: PlanningAgent[Any],
+        steps: int,
+        ray_stride: int,
+        futures: int = 0,
+        heads: TaskHeads | None = None,
+    ) -> None:
         self.agent, self.steps, self.ray_stride, self.futures = agent, steps, ray_stride, futures
+        self.heads = heads
         self._generator = torch.Generator().manual_seed(0)
 
     @torch.no_grad()
@@ -45,13 +57,27 @@ class AgentPredictor:
                 for _ in range(self.futures)
             ]
             futures = torch.stack([_occupied(world, beliefs) for beliefs in drawn], dim=1)
-        return Prediction(
+        tasks = Prediction() if self.heads is None else self._tasks(self.heads, output.beliefs[0])
+        return dataclasses.replace(
+            tasks,
             occupancy_logit=torch.stack([frame.occupancy_logit for frame in decoded], dim=1),
             plan=output.plan,
             flow_mps=torch.stack(flow, dim=1) if len(flow) == len(decoded) else None,
             futures=futures,
             images=views,
             image_stride=max(self.ray_stride, 1),
+        )
+
+    def _tasks(self, heads: TaskHeads, now: Belief) -> Prediction:
+        """Return the parts of a prediction that the heads give; those without a head are None."""
+        found = heads(task_volumes(self.agent.world_model, now, heads.config.tasks).by_task())
+        motion = None if heads.agents is None else heads.agents.motion
+        dt_s = 0.5 if motion is None else motion.config.dt_s
+        return Prediction(
+            agents=None if found.agents is None else found.agents[-1].agents(dt_s),
+            map_lines=None if found.elements is None else found.elements[-1].lines(),
+            map_layers=None if found.raster is None else found.raster.sigmoid(),
+            semantics=None if found.voxels is None else found.voxels.argmax(dim=1).to(torch.uint8),
         )
 
     def _views(self, renderer: RayRenderer, observed: Clip, now: Decoded) -> Float[Tensor, "b C 3 h w"]:

@@ -11,6 +11,7 @@ from rich.progress import Progress
 from torch import Tensor
 
 from foredrive.data import ClipDataset, LogPath, collate
+from foredrive.data.task_truth import TaskTruthConfig
 from foredrive.errors import InputError
 from foredrive.evaluation.baselines import ConstantVelocity, StandStill
 from foredrive.evaluation.provenance import collect_provenance
@@ -21,6 +22,7 @@ from foredrive.runs.evaluate.predict import AgentPredictor
 from foredrive.runs.open_clips import open_clips
 from foredrive.runs.train.baselines import run_baselines
 from foredrive.runs.train.run import Run, load_agent
+from foredrive.runs.train.tasks import load_heads
 from foredrive.scene import Example, Trajectory
 
 SUMMARY = "summary.json"
@@ -44,17 +46,27 @@ class ExamplePrediction:
     """The plan; batch shape [1 T]."""
 
 
-def evaluation_data(run: Run, logs: Sequence[LogPath], stride_s: float | None = None) -> ClipDataset:
+def evaluation_data(
+    run: Run,
+    logs: Sequence[LogPath],
+    stride_s: float | None = None,
+    truth: TaskTruthConfig | None = None,
+) -> ClipDataset:
     """Open the clips of `logs` as the recipe defines them, with the boxes for collisions up to 3 s.
 
     Args:
         stride_s: time between the clips' nows, s; None: as in the recipe.
+        truth: truth of further tasks to read.
     """
     clips = run.recipe.clips
     frames = max(clips.future_frames, round(STEPS * STEP_S / clips.frame_dt_s))
     stride_s = stride_s or clips.now_stride_s
     config = dataclasses.replace(
-        clips.judged, future_frames=frames, future_images=False, now_stride_s=stride_s
+        clips.judged,
+        future_frames=frames,
+        future_images=False,
+        now_stride_s=stride_s,
+        tasks=truth or clips.tasks,
     )
     return open_clips(logs, config, run.cache_dir)
 
@@ -96,9 +108,9 @@ def evaluate_run(
     """
     if batch_size < 1:
         raise InputError(f"the batch size must be at least 1, got {batch_size}")
-    agent = load_agent(run)
+    agent, trained = load_agent(run), load_heads(run)
     clips = run.recipe.clips
-    dataset = evaluation_data(run, logs, stride_s)
+    dataset = evaluation_data(run, logs, stride_s, None if trained is None else trained.recipe.truth)
     prior, ego_mlp = run_baselines(run.folder, run.logs, run.recipe, run.cache_dir, clips.past_frames)
     steps, dt_s = clips.horizon_steps, clips.horizon_dt_s
     device = "cuda" if torch.cuda.is_available() else "cpu"
@@ -106,7 +118,13 @@ def evaluate_run(
     with Progress() as progress:
         task = progress.add_task("evaluate", total=len(dataset))
         result = evaluate(
-            AgentPredictor(agent, clips.future_frames, RENDER_STRIDE if views else 0, FUTURES),
+            AgentPredictor(
+                agent,
+                clips.future_frames,
+                RENDER_STRIDE if views else 0,
+                FUTURES,
+                None if trained is None else trained.heads.to(device),
+            ),
             _Batches(dataset, batch_size),
             frame_dt_s=clips.frame_dt_s,
             baselines={
@@ -115,6 +133,7 @@ def evaluate_run(
                 "ego_mlp": ego_mlp.to(device),
             },
             prior=prior,
+            task_priors=None if trained is None else trained.priors,
             command_source=dataset.command_source,
             device=device,
             on_items=lambda items: progress.advance(task, items),

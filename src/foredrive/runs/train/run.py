@@ -123,6 +123,23 @@ def train_run(
     return run
 
 
+def begin_run(
+    recipe: Recipe, logs: Sequence[LogPath], folder: Path, cache_dir: Path | None, start: Path
+) -> Run:
+    """Write the folder of a run without training it, unless the folder holds this run already.
+
+    Raises:
+        InputError: `folder` holds another run, or a log cannot be read.
+    """
+    logs = tuple(log.absolute() for log in logs)
+    run = Run(folder, recipe, logs, (cache_dir or folder / "cache").absolute(), start.absolute())
+    claim = _folder_of(run)
+    claim.check()
+    open_clips(run.logs, recipe.clips, run.cache_dir)
+    with claim.claimed():
+        return run
+
+
 def _train_stages(run: Run, dataset: ClipDataset, pretrained: Path | None, fabric: "Fabric") -> None:
     """Train the stages that are not finished yet, in order."""
     recipe, folder = run.recipe, run.folder

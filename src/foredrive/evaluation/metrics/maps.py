@@ -1,0 +1,107 @@
+"""Maps: polylines under the protocols of vectors, raster layers under UniAD's, beside the training set's."""
+
+import numpy as np
+from numpy import ndarray
+
+from foredrive.evaluation.metric import EvaluationContext, Figures
+from foredrive.evaluation.predictor import Part, Prediction
+from foredrive.metrics.maps.lines import CLASSES, LineSet
+from foredrive.metrics.maps.precision import mean_precision, score_maps
+from foredrive.metrics.maps.protocols import PROTOCOLS, Area
+from foredrive.metrics.maps.raster import RasterCounts, count_raster, raster_figures
+from foredrive.scene import Example
+from foredrive.scene.map_elements import ElementKind
+
+PRIOR = ".best_constant"
+AREA: Area = "60x30"
+"""Area in which lines are compared."""
+
+
+class MapLinesMetric:
+    """Keys: `maptr.map`, `maptr.ap_divider`, `streammapnet.map` and so on; `lines.frames_counted`.
+
+    Protocols that follow identities are left out. Frames without a map do not count.
+    """
+
+    name = "map"
+    needs: frozenset[Part] = frozenset({"map_lines"})
+
+    def __init__(self, context: EvaluationContext) -> None:
+        self._found: list[tuple[int, int, ndarray, float]] = []
+        self._true: list[tuple[int, int, ndarray, float]] = []
+        self._frames = 0
+
+    def update(self, prediction: Prediction, truth: Example) -> None:
+        """Add b clips."""
+        found, elements = prediction.map_lines, None if truth.truth is None else truth.truth.elements
+        if found is None or elements is None:
+            return
+        for item in elements.known.nonzero()[:, 0].tolist():
+            points, kinds = found.points[item].double().cpu().numpy(), found.kind[item].tolist()
+            scores = found.score[item].tolist()
+            rows = zip(kinds, points, scores, strict=True)
+            self._found += [(self._frames, kind, line, score) for kind, line, score in rows]
+            for number, kind in enumerate(elements.kind[item].tolist()):
+                if kind in CLASSES:
+                    line = elements.vertices[item, number, elements.valid[item, number]]
+                    self._true.append((self._frames, kind, line.double().cpu().numpy(), 1.0))
+            self._frames += 1
+
+    def result(self) -> Figures:
+        """Return the average precisions over all frames with a map."""
+        if not self._frames:
+            return {}
+        found, true = _line_set(self._found), _line_set(self._true)
+        out: Figures = {}
+        for name, protocol in PROTOCOLS.items():
+            if protocol.identity:
+                continue
+            scores = score_maps(found, true, protocol, AREA)
+            out[f"{name}.map"] = mean_precision(scores, protocol)
+            out[f"{name}.map.nothing_detected"] = 0.0
+            out |= {f"{name}.ap_{ElementKind(kind).name.lower()}": found.ap for kind, found in scores.items()}
+        return out | {"lines.frames_counted": self._frames}
+
+
+def _line_set(rows: list[tuple[int, int, ndarray, float]]) -> LineSet:
+    return LineSet(
+        frame=np.array([frame for frame, *_ in rows], dtype=np.int64),
+        kind=np.array([kind for _, kind, *_ in rows], dtype=np.int64),
+        lines=[line for _, _, line, _ in rows],
+        score=np.array([score for *_, score in rows], dtype=np.float64),
+    )
+
+
+class MapRasterMetric:
+    """Keys: `uniad.iou_lanes`, `uniad.iou_lanes.best_constant` and so on; `raster.frames_counted`.
+
+    The baseline is the mask that fits the maps of the training set best. Frames without a map do not count.
+    """
+
+    name = "map"
+    needs: frozenset[Part] = frozenset({"map_layers"})
+
+    def __init__(self, context: EvaluationContext) -> None:
+        self._prior = None if context.task_priors is None else context.task_priors.layers
+        self._counts: dict[str, RasterCounts] = {}
+
+    def update(self, prediction: Prediction, truth: Example) -> None:
+        """Add b clips."""
+        layers, raster = prediction.map_layers, None if truth.truth is None else truth.truth.raster
+        if layers is None or raster is None or not bool(raster.known.any()):
+            return
+        true = raster.layers[raster.known].cpu().numpy()
+        shown = {"": (layers[raster.known] > 0.5).cpu().numpy()}
+        if self._prior is not None:
+            shown[PRIOR] = self._prior.cpu().expand(len(true), -1, -1, -1).numpy()
+        for suffix, mask in shown.items():
+            counts = count_raster(mask, true)
+            self._counts[suffix] = self._counts[suffix] + counts if suffix in self._counts else counts
+
+    def result(self) -> Figures:
+        """Return the ratios of the sums."""
+        out: Figures = {}
+        for suffix, counts in self._counts.items():
+            out |= {f"uniad.{key}{suffix}": value for key, value in raster_figures(counts).items()}
+            out["raster.frames_counted"] = counts.frames
+        return out

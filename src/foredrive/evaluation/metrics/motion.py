@@ -1,0 +1,101 @@
+"""Forecasts of detected road users under every protocol, beside constant velocity."""
+
+import dataclasses
+
+import numpy as np
+import torch
+from numpy import ndarray
+
+from foredrive.evaluation.metric import EvaluationContext, Figures
+from foredrive.evaluation.predictor import Part, Prediction
+from foredrive.metrics.motion.agents import PredictedAgents, TrueAgents
+from foredrive.metrics.motion.protocols import PROTOCOLS, STEP_S
+from foredrive.metrics.motion.scores import score_motion
+from foredrive.scene import Example
+
+STEADY = ".constant_velocity"
+FIGURES = ("min_ade_m", "min_fde_m", "miss_rate", "epa")
+_PREDICTED = tuple(field.name for field in dataclasses.fields(PredictedAgents))
+_TRUE = tuple(field.name for field in dataclasses.fields(TrueAgents))
+
+
+class MotionMetric:
+    """Keys: `uniad.car.min_ade_m`, `uniad.car.min_ade_m.constant_velocity`, `uniad.car.matched` and so on.
+
+    The baseline moves the same detections by their predicted velocities. Frames without annotation do not
+    count, and neither do forecasts in other steps than 0.5 s.
+    """
+
+    name = "motion"
+    needs: frozenset[Part] = frozenset({"agents"})
+
+    def __init__(self, context: EvaluationContext) -> None:
+        self._predicted: list[dict[str, ndarray]] = []
+        self._true: list[dict[str, ndarray]] = []
+        self._steady: list[ndarray] = []
+
+    def update(self, prediction: Prediction, truth: Example) -> None:
+        """Add b clips; those without forecasts or without futures are left out."""
+        agents, clip = prediction.agents, truth.clip
+        if agents is None or agents.future_xy is None or truth.truth is None or truth.truth.futures is None:
+            return
+        if agents.dt_s != STEP_S or truth.truth.futures.dt_s != STEP_S:
+            return
+        for item in clip.boxes_valid[:, clip.now].nonzero()[:, 0].tolist():
+            found, frame = agents[item].to("cpu"), len(self._true)
+            assert found.future_xy is not None
+            assert found.log_prob is not None
+            t_s = STEP_S * torch.arange(1, found.future_xy.shape[-2] + 1)
+            steady = found.centre[:, None, :2] + found.velocity[:, None] * t_s[:, None]
+            self._steady.append(steady[:, None].double().numpy())
+            self._predicted.append(
+                {
+                    "frame": np.full(len(found.score), frame),
+                    "category": found.category.numpy(),
+                    "score": found.score.double().numpy(),
+                    "xy": found.centre[:, :2].double().numpy(),
+                    "future_xy": found.future_xy.double().numpy(),
+                    "probability": found.log_prob.double().exp().numpy(),
+                }
+            )
+            boxes, futures = clip.boxes[item, clip.now].to("cpu"), truth.truth.futures[item].to("cpu")
+            rows = min(len(boxes.valid), len(futures.valid))
+            valid = boxes.valid[:rows]
+            boxes, futures = boxes[:rows][valid], futures[:rows][valid]
+            self._true.append(
+                {
+                    "frame": np.full(len(boxes.valid), frame),
+                    "category": boxes.category.numpy(),
+                    "xy": boxes.centre[:, :2].double().numpy(),
+                    "future_xy": futures.xy.double().numpy(),
+                    "future_valid": futures.valid.numpy(),
+                    "seen": (boxes.num_points != 0).numpy(),
+                }
+            )
+
+    def result(self) -> Figures:
+        """Return the figures of every protocol that the horizon suffices for."""
+        if not self._true:
+            return {}
+        predicted = PredictedAgents(*(_column(self._predicted, name) for name in _PREDICTED))
+        true = TrueAgents(*(_column(self._true, name) for name in _TRUE))
+        steady = dataclasses.replace(
+            predicted,
+            future_xy=np.concatenate(self._steady),
+            probability=np.ones((len(predicted.frame), 1)),
+        )
+        horizon = min(predicted.future_xy.shape[2], true.future_xy.shape[1])
+        out: Figures = {"frames_counted": len(self._true)}
+        for name, protocol in PROTOCOLS.items():
+            if protocol.steps > horizon:
+                continue
+            for suffix, forecasts in (("", predicted), (STEADY, steady)):
+                for kind, scores in score_motion(forecasts, true, protocol).items():
+                    out |= {f"{name}.{kind}.{key}{suffix}": getattr(scores, key) for key in FIGURES}
+                    if not suffix:
+                        out[f"{name}.{kind}.matched"] = scores.matched
+        return out
+
+
+def _column(rows: list[dict[str, ndarray]], name: str) -> ndarray:
+    return np.concatenate([row[name] for row in rows])

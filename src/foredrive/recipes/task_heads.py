@@ -1,0 +1,103 @@
+"""Configurations of task heads that are trained on a frozen world model."""
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import get_args
+
+from foredrive.data.task_truth import TaskTruthConfig
+from foredrive.errors import InputError
+from foredrive.models.tasks.agents import AgentHeadConfig, MotionConfig
+from foredrive.models.tasks.decoder import DecoderConfig
+from foredrive.models.tasks.heads import TaskHeadsConfig
+from foredrive.models.tasks.maps import MapHeadConfig
+from foredrive.recipes.config import overridden, read_values, validated
+from foredrive.scene import Task
+from foredrive.training.loop import Schedule
+from foredrive.training.task_losses import TaskWeights
+
+HEADED: tuple[Task, ...] = ("detection", "map", "motion", "occupancy")
+"""Tasks that have a head."""
+
+
+@dataclass(frozen=True)
+class TaskHeadsRecipe:
+    """All settings of the heads and of their training."""
+
+    heads: TaskHeadsConfig
+    truth: TaskTruthConfig
+    schedule: Schedule
+    weights: TaskWeights = field(default_factory=TaskWeights)
+    now_stride_s: float = 1.0
+    """Time between the nows of successive training clips, s."""
+
+
+def town_heads(tasks: Sequence[str]) -> TaskHeadsRecipe:
+    """Return heads of the given tasks for towns on two cores. Motion needs detection and adds it.
+
+    Raises:
+        InputError: a task is unknown or has no head.
+    """
+    return _heads_of(tasks, TaskHeadsConfig(), Schedule(batch_size=8, lr=1e-3, steps=600, warmup_steps=30))
+
+
+def base_heads(tasks: Sequence[str]) -> TaskHeadsRecipe:
+    """Return heads of the given tasks in the size of published models, for a GPU.
+
+    Raises:
+        InputError: a task is unknown or has no head.
+    """
+    deep = DecoderConfig(layers=6, heads=8, feed_forward=4)
+    sizes = TaskHeadsConfig(
+        width=256,
+        max_cells=100,
+        agents=AgentHeadConfig(queries=300, decoder=deep, motion=MotionConfig()),
+        elements=MapHeadConfig(elements=50, points=20, decoder=deep),
+    )
+    return _heads_of(tasks, sizes, Schedule(batch_size=8, lr=2e-4, epochs=24, warmup_steps=500))
+
+
+def with_settings(recipe: TaskHeadsRecipe, settings: Sequence[str]) -> TaskHeadsRecipe:
+    """Return the recipe with some entries replaced, such as "schedule.steps=100".
+
+    Raises:
+        InputError: a setting has another form, an unknown key or an impossible value.
+    """
+    changed: TaskHeadsRecipe = validated(TaskHeadsRecipe, overridden(asdict(recipe), settings), "--set")
+    return changed
+
+
+def load_task_heads(path: Path) -> TaskHeadsRecipe:
+    """Read the YAML that `save_recipe` wrote.
+
+    Raises:
+        InputError: an entry is wrong, missing or unknown. The message names the file and the entry.
+    """
+    recipe: TaskHeadsRecipe = validated(TaskHeadsRecipe, read_values(path), str(path))
+    return recipe
+
+
+def _heads_of(tasks: Sequence[str], sizes: TaskHeadsConfig, schedule: Schedule) -> TaskHeadsRecipe:
+    """Leave out the heads of other tasks, and the truth that nobody needs."""
+    if not tasks:
+        raise InputError("name at least one task")
+    for task in tasks:
+        if task not in HEADED:
+            known = "has no head" if task in get_args(Task) else "is unknown"
+            raise InputError(f"the task {task!r} {known}; heads can be trained for {', '.join(HEADED)}")
+    agents = sizes.agents if {"detection", "motion"} & set(tasks) else None
+    if agents is not None and "motion" not in tasks:
+        agents = replace(agents, motion=None)
+    kept = replace(
+        sizes,
+        agents=agents,
+        elements=sizes.elements if "map" in tasks else None,
+        raster=sizes.raster if "map" in tasks else None,
+        voxels=sizes.voxels if "occupancy" in tasks else None,
+    )
+    truth = TaskTruthConfig(instances=None)
+    if "map" not in tasks:
+        truth = replace(truth, elements_lw_m=None, raster=None)
+    if "occupancy" not in tasks:
+        truth = replace(truth, semantics=None)
+    return TaskHeadsRecipe(kept, truth, schedule)

@@ -1,0 +1,134 @@
+"""Volumes of a frozen world model, kept on disk for the training of heads."""
+
+import dataclasses
+import hashlib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from rich.progress import track
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import Tensor
+from torch.utils.data import Dataset
+
+from foredrive.data import ClipConfig, ClipDataset, LogPath, collate
+from foredrive.data.batches import stack_records
+from foredrive.files import atomic_path
+from foredrive.models.agent import PlanningAgent
+from foredrive.runs.open_clips import open_clips
+from foredrive.scene import Boxes, Clip, Task
+from foredrive.scene.task_truth import TaskTruth
+from foredrive.training.task_probe import TaskExample, TaskVolumes, task_volumes
+
+BATCH_SIZE = 4
+
+
+class KeptVolumes(Dataset[TaskExample]):
+    """The volumes of all clips of some logs, with their truth. Truth stays in memory, volumes on disk.
+
+    Volumes are stored in half precision, one file for each clip. Runs with the same logs and the same weights
+    share the files.
+
+    Args:
+        agent: its world model is frozen.
+        logs: logs to read.
+        clips: clips with the truth of the tasks.
+        tasks: tasks whose volumes are kept.
+        cache_dir: folder of the files.
+
+    Raises:
+        InputError: a log cannot be read.
+    """
+
+    def __init__(
+        self,
+        agent: PlanningAgent[Any],
+        logs: Sequence[LogPath],
+        clips: ClipConfig,
+        tasks: tuple[Task, ...],
+        cache_dir: Path,
+    ) -> None:
+        dataset = open_clips(logs, dataclasses.replace(clips, future_images=False), cache_dir)
+        self.tasks = tasks
+        self._folder = cache_dir / "volumes" / _key(agent, logs, clips, tasks)
+        self._keep(agent, dataset)
+        without_images = dataclasses.replace(clips, cameras=(), future_images=False, tasks=None)
+        unseen = ClipDataset(logs, without_images, cache_dir)
+        numbers = track(range(len(unseen)), description="reading truth")
+        self.examples = [
+            _without_volumes(unseen.clip(number), dataset.truth(number), dataset.key(number))
+            for number in numbers
+        ]
+
+    def __len__(self) -> int:
+        return len(self.examples)
+
+    def __getitem__(self, index: int) -> TaskExample:
+        """Return one item, unbatched."""
+        with safe_open(self._file(index), framework="pt") as file:
+            volume: Tensor = file.get_tensor("volume").float()
+            order = tuple(file.get_tensor("index").tolist())
+        return dataclasses.replace(self.examples[index], volumes=TaskVolumes(volume, self.tasks, order))
+
+    def _file(self, index: int) -> Path:
+        return self._folder / f"{index:06d}.safetensors"
+
+    def _keep(self, agent: PlanningAgent[Any], dataset: ClipDataset) -> None:
+        """Write the volumes that are not there yet."""
+        missing = [index for index in range(len(dataset)) if not _is_whole(self._file(index))]
+        agent.eval()
+        device = agent.planner.plan.device
+        starts = range(0, len(missing), BATCH_SIZE)
+        for start in track(starts, description="keeping volumes", disable=not missing):
+            rows = missing[start : start + BATCH_SIZE]
+            clip = collate([dataset[row] for row in rows]).clip.to(device)
+            world = agent.world_model
+            with torch.no_grad():
+                found = task_volumes(world, world.observe(clip.observed()), self.tasks)
+            index = torch.tensor(found.index)
+            for row, volume in zip(rows, found.volume.half().cpu(), strict=True):
+                with atomic_path(self._file(row)) as temporary:
+                    save_file({"volume": volume.contiguous(), "index": index}, temporary)
+
+
+def collate_kept(examples: Sequence[TaskExample]) -> TaskExample:
+    """Collate items to a batch."""
+    keys = tuple(key for example in examples for key in example.key)
+    batch = stack_records([dataclasses.replace(example, key=()) for example in examples])
+    return dataclasses.replace(batch, key=keys)
+
+
+def boxes_now(clip: Clip) -> Boxes:
+    """Return the boxes at now, of an unbatched clip or of a batch."""
+    return clip.boxes.map_tensors(lambda tensor: tensor.select(clip.t_s.dim() - 1, clip.now))
+
+
+def _without_volumes(clip: Clip, truth: TaskTruth | None, key: str) -> TaskExample:
+    assert truth is not None
+    return TaskExample(
+        volumes=TaskVolumes(torch.zeros(0, 0, 0, 0, 0), (), ()),
+        boxes=boxes_now(clip),
+        boxes_valid=clip.boxes_valid[clip.now],
+        truth=truth,
+        key=(key,),
+    )
+
+
+def _is_whole(file: Path) -> bool:
+    try:
+        with safe_open(file, framework="pt") as stored:
+            return "volume" in stored.keys()  # noqa: SIM118 - not a mapping
+    except (OSError, SafetensorError):
+        return False
+
+
+def _key(agent: PlanningAgent[Any], logs: Sequence[LogPath], clips: ClipConfig, tasks: Sequence[str]) -> str:
+    digest = hashlib.blake2b(digest_size=16)
+    read = dataclasses.replace(clips, tasks=None)
+    digest.update(repr((str(logs), dataclasses.asdict(read), tuple(tasks))).encode())
+    for name, tensor in sorted(agent.world_model.state_dict().items()):
+        digest.update(name.encode())
+        digest.update(tensor.detach().cpu().contiguous().numpy().tobytes())
+    return digest.hexdigest()

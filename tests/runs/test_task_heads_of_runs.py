@@ -1,0 +1,103 @@
+"""Heads that are trained on the frozen world model of a run, and evaluated with it."""
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from miniature import miniature, miniature_driveworld
+from safetensors.torch import load_file
+
+from foredrive.data import LogPath
+from foredrive.errors import InputError
+from foredrive.models.tasks.agents import AgentHeadConfig, MotionConfig
+from foredrive.models.tasks.decoder import DecoderConfig
+from foredrive.models.tasks.maps import MapHeadConfig
+from foredrive.recipes.task_heads import TaskHeadsRecipe, base_heads, town_heads, with_settings
+from foredrive.runs import Run, evaluate_run
+from foredrive.runs.folder import WEIGHTS
+from foredrive.runs.train.tasks import TASKS, load_heads, probe_run, train_heads
+from foredrive.training import read_metrics
+
+
+def small_heads(tasks: tuple[str, ...], steps: int = 2) -> TaskHeadsRecipe:
+    recipe, decoder = town_heads(tasks), DecoderConfig(layers=1, heads=2)
+    sizes = dataclasses.replace(
+        recipe.heads,
+        width=16,
+        max_cells=8,
+        agents=AgentHeadConfig(queries=6, decoder=decoder, motion=MotionConfig(decoder=decoder)),
+        elements=recipe.heads.elements and MapHeadConfig(elements=3, points=4, decoder=decoder),
+    )
+    schedule = dataclasses.replace(recipe.schedule, steps=steps, batch_size=2, warmup_steps=0)
+    return dataclasses.replace(recipe, heads=sizes, schedule=schedule)
+
+
+def test_heads_of_a_run_are_trained_continued_and_evaluated(
+    trained: Run, log: LogPath, tmp_path: Path
+) -> None:
+    run = probe_run(trained.recipe, [log], tmp_path / "probe", trained.cache_dir, trained.folder)
+    before = load_file(run.weights)
+    found = train_heads(run, small_heads(("detection", "motion", "map", "occupancy")))
+    assert len(read_metrics(run.folder / TASKS / "metrics.jsonl")) == 2
+    assert all(torch.equal(value, before[name]) for name, value in load_file(run.weights).items())
+    assert run.start == trained.folder
+    result = evaluate_run(run, [log], tmp_path / "evaluated", views=False)
+    assert result.summary["detection.frames_counted"] == result.summary["items"]
+    assert result.summary["detection.nuscenes.map.nothing_detected"] == 0
+    again = train_heads(run, found.recipe)  # is finished
+    weights = zip(again.heads.parameters(), found.heads.parameters(), strict=True)
+    assert all(torch.equal(one, other) for one, other in weights)
+    with pytest.raises(InputError, match="holds other heads"):
+        train_heads(run, small_heads(("detection", "motion"), steps=3))
+
+
+def test_kept_volumes_are_shared_and_those_of_the_world_model(
+    trained: Run, log: LogPath, tmp_path: Path
+) -> None:
+    """A damaged file is made anew, and nothing else is."""
+    recipe = small_heads(("detection", "motion"))
+    run = probe_run(trained.recipe, [log], tmp_path / "one", tmp_path / "cache", trained.folder)
+    train_heads(run, recipe)
+    files = sorted((tmp_path / "cache" / "volumes").rglob("*.safetensors"))
+    times = [file.stat().st_mtime_ns for file in files]
+    files[0].write_bytes(b"damaged")
+    other = probe_run(trained.recipe, [log], tmp_path / "two", tmp_path / "cache", trained.folder)
+    train_heads(other, recipe)
+    after = [file.stat().st_mtime_ns for file in files]
+    assert after[1:] == times[1:]
+    assert load_file(files[0])["volume"].shape == (1, 8, 2, 16, 16)
+    one, two = (load_file(each.folder / TASKS / WEIGHTS) for each in (run, other))
+    assert all(torch.equal(value, two[name]) for name, value in one.items())
+
+
+def test_a_probe_keeps_the_recipe_of_its_world_model(trained: Run, log: LogPath, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"its recipe is not .*config.yaml"):
+        probe_run(miniature_driveworld(), [log], tmp_path / "probe", None, trained.folder)
+    assert not (tmp_path / "probe").exists()
+    assert load_heads(trained) is None
+    assert trained.recipe == miniature()
+
+
+@pytest.mark.parametrize("make", [town_heads, base_heads])
+def test_tasks_choose_heads_and_truth(make: Any) -> None:
+    alone = make(["map"])
+    assert alone.heads.tasks == ("map",)
+    assert alone.truth.semantics is None
+    assert make(["detection"]).heads.tasks == ("detection",)
+    assert make(["motion"]).heads.tasks == ("detection", "motion")
+    both = make(["occupancy", "motion"])
+    assert both.heads.tasks == ("detection", "motion", "occupancy")
+    assert both.truth.raster is None
+
+
+def test_wrong_tasks_and_settings_are_one_line() -> None:
+    with pytest.raises(InputError, match="the task 'planning' has no head; heads can be trained for det"):
+        town_heads(["planning"])
+    with pytest.raises(InputError, match="the task 'detect' is unknown"):
+        town_heads(["detect"])
+    recipe = with_settings(town_heads(["map"]), ["schedule.steps=7", "weights.map.points=2.0"])
+    assert (recipe.schedule.steps, recipe.weights.map.points) == (7, 2.0)
+    with pytest.raises(InputError, match="no entry 'stepz'"):
+        with_settings(town_heads(["map"]), ["schedule.stepz=7"])
