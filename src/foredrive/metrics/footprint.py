@@ -65,7 +65,7 @@ def grid_hits(
     The cells are those that public code draws into images, with its rounding. Instead of drawing, the ego
     vehicle's cells are tested against the boxes around them.
     """
-    quads = box_quads(boxes, grid)
+    quads = _box_quads(boxes, grid)
     path_rc = _to_row_column(path_xy, grid)
     first_m, last = _first_centre_m(grid), _cells(grid) - 1
 
@@ -102,14 +102,6 @@ def cells_in_quads(cells: Int[Tensor, "N P 2"], quads: Int[Tensor, "N 4 2"]) -> 
     return drawn.all(dim=-1) & ((cells >= low) & (cells <= high)).all(dim=-1)
 
 
-def box_quads(boxes: Boxes, grid: ObstacleGrid) -> Int[Tensor, "b T M 4 2"]:
-    """Return corners of boxes as grid indices (row, column). The grid lies around the boxes' origin."""
-    corners = _to_row_column(rectangle(*_seen_from_above(boxes)), grid)
-    if grid.corner == "nearest":
-        return ((corners + grid.reach_m) / grid.cell_m).round().long()
-    return ((corners - _first_centre_m(grid)) / grid.cell_m).floor().long()
-
-
 def _any_covered(
     cells: Int[Tensor, "b T P 2"], quads: Int[Tensor, "b T M 4 2"], valid: Bool[Tensor, "b T M"]
 ) -> Bool[Tensor, "b T"]:
@@ -124,6 +116,14 @@ def _any_covered(
     hit = torch.zeros(cells.shape[:2], dtype=torch.bool, device=cells.device)
     hit[item[covered], step[covered]] = True
     return hit
+
+
+def _box_quads(boxes: Boxes, grid: ObstacleGrid) -> Int[Tensor, "b T M 4 2"]:
+    """Return corners of boxes as grid indices (row, column)."""
+    corners = _to_row_column(rectangle(*_seen_from_above(boxes)), grid)
+    if grid.corner == "nearest":
+        return ((corners + grid.reach_m) / grid.cell_m).round().long()
+    return ((corners - _first_centre_m(grid)) / grid.cell_m).floor().long()
 
 
 def _ego_template(protocol: PlanningProtocol, grid: ObstacleGrid) -> Float[Tensor, "P 2"]:

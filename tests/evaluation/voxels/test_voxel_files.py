@@ -22,6 +22,7 @@ from evaluation.voxels.folders_of_voxels import (
 
 from foredrive.errors import InputError
 from foredrive.evaluation.voxels.files import VoxelFiles, find_voxels, read_frame
+from foredrive.evaluation.voxels.poses import LIDAR_POSITION_M, read_poses
 from foredrive.evaluation.voxels.score import score_voxels
 from foredrive.metrics.voxels.protocols import OCC3D_CLASSES, OPENOCC_CLASSES
 
@@ -57,6 +58,7 @@ def test_occ3d_by_hand(occ3d: tuple[Path, Path]) -> None:
     assert figures["occupancy.occ3d_both.iou_pct.manmade"] == pytest.approx(100 * 1 / 4)
     assert figures["occupancy.occ3d_lidar.miou_pct"] == figures["occupancy.occ3d_unmasked.miou_pct"]
     assert figures["occupancy.occ3d.miou_pct"] == pytest.approx((100 + 25) / 2)
+    assert figures["occupancy.occ3d.frames_counted"] == 2
     assert math.isnan(figures["occupancy.occ3d.iou_pct.car"])
     assert not [key for key in figures if "rayiou" in key]  # nothing tells where the lidar was
 
@@ -240,10 +242,18 @@ def test_infos_that_do_not_fit(
         find_voxels(*occ3d, poses)
 
 
+@pytest.mark.real
+def test_infos_of_the_newer_format(real_data: Path) -> None:
+    (file,) = (real_data / "nuscenes" / "keyframe").glob("*.pkl")
+    (pose,) = read_poses(file).values()
+    assert pose.T_ego_lidar[:3, 3] == pytest.approx(LIDAR_POSITION_M["n015"], abs=1e-5)
+    assert np.linalg.det(pose.T_world_ego[:3, :3]) == pytest.approx(1.0, abs=1e-5)
+
+
 def test_files_that_are_no_poses(occ3d: tuple[Path, Path], tmp_path: Path) -> None:
     odd = tmp_path / "odd.pkl"
     odd.write_bytes(pickle.dumps({"infos": "none"}))
-    with pytest.raises(InputError, match=r"odd.pkl: has no list of frames under 'infos'"):
+    with pytest.raises(InputError, match=r"odd.pkl: has no list of frames under 'infos' or 'data_list'"):
         find_voxels(*occ3d, odd)
     odd.write_bytes(pickle.dumps({"infos": []}))
     with pytest.raises(InputError, match=r"odd.pkl: holds no frames"):

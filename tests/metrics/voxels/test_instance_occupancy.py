@@ -11,10 +11,9 @@ from hypothesis import strategies as st
 from torchmetrics.detection import PanopticQuality
 
 from foredrive.errors import InputError
-from foredrive.metrics.voxels.instances import InstanceCounts, count_instances, draw_instances
+from foredrive.metrics.voxels.instances import InstanceCounts, count_instances, count_rasters
 from foredrive.metrics.voxels.protocols import UNIAD_INSTANCES, InstanceProtocol
-from foredrive.scene import Boxes, Category
-from foredrive.scene.boxes import unlabelled
+from foredrive.scene.map_elements import InstanceRaster, PlaneSpec
 
 UNIAD = UNIAD_INSTANCES
 
@@ -84,11 +83,7 @@ def test_other_shapes_and_negative_numbers_are_errors() -> None:
         count_instances(empty(), empty() - 20, UNIAD)
 
 
-SMALL = dataclasses.replace(
-    UNIAD,
-    grid=dataclasses.replace(UNIAD.grid, reach_m=6.0),
-    ranges={"near": (6, 18), "far": (0, 24)},
-)
+SMALL = dataclasses.replace(UNIAD, cells=24, ranges={"near": (6, 18), "far": (0, 24)})
 
 
 def random_sample(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
@@ -165,49 +160,19 @@ def test_torchmetrics_agrees_on_single_frames() -> None:
     assert ours.vpq == pytest.approx(of_vehicles, abs=1e-6)
 
 
-def some_boxes(rows: list[tuple[float, float, float, float, float, int, Category]]) -> Boxes:
-    """One step of boxes given as x, y, length, width, yaw, track, category."""
-    m = len(rows)
-    x, y, length, width, yaw = torch.tensor([row[:5] for row in rows]).T
-    boxes = Boxes(
-        centre=torch.stack([x, y, torch.zeros(m)], dim=-1),
-        size_lwh=torch.stack([length, width, torch.ones(m)], dim=-1),
-        yaw=yaw,
-        velocity=torch.zeros(m, 2),
-        track_id=torch.tensor([row[5] for row in rows]),
-        category=torch.tensor([int(row[6]) for row in rows]),
-        valid=torch.ones(m, dtype=torch.bool),
-        **unlabelled(m),
-    )
-    return boxes[None, None]
+def rasters(true: np.ndarray, valid: list[list[bool]], cell_m: float = 0.5) -> InstanceRaster:
+    spec = PlaneSpec((-50.0, -50.0), cell_m, (200, 200))
+    return InstanceRaster(spec, torch.from_numpy(true), torch.tensor(valid), 0.5)
 
 
-def test_boxes_become_cells_around_the_lidar() -> None:
-    """A car 10 m ahead of the lidar and 5 m to its right, 4 × 2 m, along x."""
-    ahead = 0.985793
-    boxes = some_boxes(
-        [
-            (ahead + 10.0, -5.0, 4.0, 2.0, 0.0, 41, Category.CAR),
-            (ahead + 20.0, 5.0, 1.0, 1.0, 0.0, 5, Category.PEDESTRIAN),
-            (ahead - 60.0, 0.0, 4.0, 2.0, 0.0, 6, Category.CAR),
-        ]
-    )
-    cells = draw_instances(boxes, UNIAD)
-    assert cells.shape == (1, 1, 200, 200)
-    rows, columns = (cells[0, 0] == 42).nonzero(as_tuple=True)
-    # Corners at 8 and 12 m forward are rounded to rows 116 and 124, those at 4 and 6 m right to 108 and 112.
-    assert (rows.min(), rows.max(), columns.min(), columns.max()) == (116, 124, 108, 112)
-    assert len(rows) == 9 * 5
-    assert set(cells.unique().tolist()) == {0, 42}
-
-
-def test_a_later_box_covers_an_earlier_one() -> None:
-    ahead = 0.985793
-    boxes = some_boxes(
-        [
-            (ahead, 0.0, 4.0, 2.0, 0.0, 0, Category.TRUCK),
-            (ahead + 2.0, 0.0, 4.0, 2.0, 0.0, 1, Category.BUS),
-        ]
-    )
-    cells = draw_instances(boxes, UNIAD)[0, 0]
-    assert ((cells == 1).sum(), (cells == 2).sum()) == (4 * 5, 9 * 5)
+def test_samples_without_their_whole_future_or_past_are_skipped() -> None:
+    true = np.stack([empty()] * 3)
+    true[:, :, 100:109, 100:104] = 7
+    predicted = torch.from_numpy(true.copy())
+    predicted[1] = 0  # the second prediction is wrong; its last step has no truth
+    truth = rasters(true, [[True] * 5, [True] * 4 + [False], [True] * 5])
+    counted = count_rasters(predicted, truth, 2, UNIAD)
+    assert (counted["near"].pairs, counted["near"].missed) == (10, 0)
+    assert count_rasters(predicted, truth, 1, UNIAD) == {}
+    with pytest.raises(InputError, match=r"UniAD counts cells of 0.5 m and steps of 0.5 s, .* has 1.0 m and"):
+        count_rasters(predicted, rasters(true, [[True] * 5] * 3, cell_m=1.0), 2, UNIAD)

@@ -8,7 +8,9 @@ import torch
 from torchmetrics.classification import MulticlassJaccardIndex
 
 from foredrive.metrics.voxels.protocols import OCC3D_CLASSES, VOXEL_PROTOCOLS, VoxelProtocol
-from foredrive.metrics.voxels.semantic import count_voxels, mean_iou, voxel_ious
+from foredrive.metrics.voxels.semantic import count_semantics, count_voxels, mean_iou, voxel_ious
+from foredrive.scene import VoxelSpec
+from foredrive.scene.semantics import SemanticVoxels
 
 C = len(OCC3D_CLASSES)
 CAR, ROAD, BUS, FREE = (OCC3D_CLASSES.index(name) for name in ("car", "driveable_surface", "bus", "free"))
@@ -61,6 +63,16 @@ def test_sums_over_frames_before_the_ratio() -> None:
         C,
     )
     assert voxel_ious(first + second, VOXEL_PROTOCOLS["occ3d"])[CAR] == pytest.approx(4 / 6)
+
+
+def test_voxels_without_truth_are_not_counted() -> None:
+    spec = VoxelSpec((0.0, 0.0, 0.0), 0.4, (1, 1, 4))
+    true, predicted = (torch.tensor(row(*v), dtype=torch.uint8) for v in ((CAR,) * 4, (CAR, CAR, FREE, FREE)))
+    known, camera = torch.tensor(row(1, 1, 1, 0) > 0), torch.tensor(row(1, 0, 1, 0) > 0)
+    counts = count_semantics(predicted, SemanticVoxels(spec, "occ3d", true, known, camera, known))
+    assert counts.sum() == 3
+    ious = [voxel_ious(counts, VOXEL_PROTOCOLS[name])[CAR] for name in ("occ3d_unmasked", "occ3d")]
+    assert ious == pytest.approx([2 / 3, 1 / 2])
 
 
 def voxel_by_voxel(

@@ -16,7 +16,7 @@ from numpy import ndarray
 from foredrive.errors import InputError
 from foredrive.evaluation.voxels.arrays import array_names, read_labels, read_mask, read_velocities
 from foredrive.evaluation.voxels.poses import FramePose, read_poses
-from foredrive.metrics.voxels.protocols import OCC3D_CLASSES, OPENOCC_CLASSES
+from foredrive.metrics.voxels.protocols import VOXEL_PROTOCOLS
 from foredrive.metrics.voxels.rays import ray_origins
 
 PREDICTED_NAMES = ("semantics", "pred", "arr_0")
@@ -53,7 +53,7 @@ class VoxelFiles:
     @property
     def classes(self) -> tuple[str, ...]:
         """Return the names of the data set's classes."""
-        return OCC3D_CLASSES if self.data_set == "occ3d" else OPENOCC_CLASSES
+        return VOXEL_PROTOCOLS[self.data_set].classes
 
 
 def find_voxels(results: Path, truth: Path, poses: Path | None = None) -> VoxelFiles:
@@ -74,11 +74,11 @@ def find_voxels(results: Path, truth: Path, poses: Path | None = None) -> VoxelF
             raise InputError(
                 f"{truth}: has no labels of frame {absent[0]}, which {poses} lists{_more(absent)}"
             )
-    if not set(predicted) & set(frames):
+    if predicted.keys().isdisjoint(frames):
         raise InputError(
             f"{results}: holds none of the {len(frames)} frames of {listed}: is it another split?"
         )
-    unknown = [token for token in predicted if token not in set(frames)]
+    unknown = sorted(predicted.keys() - set(frames))
     if unknown:
         raise InputError(f"{predicted[unknown[0]]}: {listed} has no frame {unknown[0]}{_more(unknown)}")
     missing = [token for token in frames if token not in predicted]

@@ -1,6 +1,5 @@
 """Where the lidar was in every key frame of a drive, from the files that come with nuScenes' occupancy."""
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from foredrive.data.safe_pickle import load_pickle
 from foredrive.errors import InputError
+from foredrive.evaluation.json_files import read_json
 
 
 @dataclass(frozen=True)
@@ -33,8 +33,8 @@ def read_poses(file: Path) -> dict[str, FramePose]:
     """Read the poses of key frames by token.
 
     Args:
-        file: `nuscenes_infos_val.pkl` and the like, as mmdetection3d and its kin make them, or Occ3D's
-            `annotations.json`, of which the frames of `val_split` are read.
+        file: `nuscenes_infos_val.pkl` and the like, as mmdetection3d (of either format) and its kin make
+            them, or Occ3D's `annotations.json`, of which the frames of `val_split` are read.
 
     Raises:
         InputError: the file is neither, or a pose cannot be read. The message names the frame.
@@ -47,30 +47,32 @@ def read_poses(file: Path) -> dict[str, FramePose]:
 
 def _from_infos(file: Path) -> dict[str, FramePose]:
     content = load_pickle(file)
-    infos = content.get("infos") if isinstance(content, dict) else content
-    if not isinstance(infos, list):
-        raise InputError(f"{file}: has no list of frames under 'infos'")
+    frames = content.get("infos", content.get("data_list")) if isinstance(content, dict) else content
+    if not isinstance(frames, list):
+        raise InputError(f"{file}: has no list of frames under 'infos' or 'data_list'")
     poses: dict[str, FramePose] = {}
-    for index, info in enumerate(infos):
+    for index, frame in enumerate(frames):
         try:
-            token = str(info["token"])
-            poses[token] = FramePose(
-                float(info["timestamp"]),
-                _transform(info["ego2global_translation"], info["ego2global_rotation"]),
-                _transform(info["lidar2ego_translation"], info["lidar2ego_rotation"]),
-            )
+            poses[str(frame["token"])] = _pose_of_info(frame)
         except (KeyError, TypeError, ValueError) as error:
             raise InputError(f"{file}: frame {index}: {_reason(error)}") from error
     return poses
 
 
+def _pose_of_info(frame: Mapping[str, Any]) -> FramePose:
+    """Return the pose of a frame: quaternions before mmdetection3d 1.1, matrices since."""
+    time = float(frame["timestamp"])
+    if "ego2global" in frame:
+        return FramePose(time, _matrix(frame["ego2global"]), _matrix(frame["lidar_points"]["lidar2ego"]))
+    ego, lidar = (
+        _transform(frame[f"{name}_translation"], frame[f"{name}_rotation"])
+        for name in ("ego2global", "lidar2ego")
+    )
+    return FramePose(time, ego, lidar)
+
+
 def _from_annotations(file: Path) -> dict[str, FramePose]:
-    try:
-        content = json.loads(file.read_text())
-    except OSError as error:
-        raise InputError(f"{file}: {error.strerror or error}") from error
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"{file}: not JSON that can be read") from error
+    content = read_json(file)
     try:
         scenes: Mapping[str, Mapping[str, Any]] = {
             name: content["scene_infos"][name] for name in content["val_split"]
@@ -109,6 +111,15 @@ def _transform(translation_m: Any, rotation_wxyz: Any) -> Float64[ndarray, "4 4"
     T = np.eye(4)
     T[:3, :3] = Rotation.from_quat(rotation, scalar_first=True).as_matrix()
     T[:3, 3] = translation
+    return T
+
+
+def _matrix(values: Any) -> Float64[ndarray, "4 4"]:
+    T = np.asarray(values, np.float64)
+    if T.shape != (4, 4):
+        raise ValueError("a pose is not a matrix of 4 x 4")
+    if not np.isfinite(T).all():
+        raise ValueError("a pose is not finite")
     return T
 
 

@@ -34,16 +34,19 @@ def score_voxels(files: VoxelFiles, on_frame: Callable[[], None] = lambda: None)
         if files.origins_m is not None:
             _add_rays(rays, frame, files.origins_m[token], ray_protocols)
         on_frame()
-    figures: Figures = {"data_set": files.data_set, "frames": len(files.truth)}
+    number = len(files.truth)
+    figures: Figures = {"data_set": files.data_set, "frames": number}
     if files.data_set == "openocc":
         figures["frames_without_velocity"] = without_velocity
     for name, protocol in VOXEL_PROTOCOLS.items():
         if protocol.classes == classes:
-            found = _voxel_figures(voxel_ious(voxels, protocol), classes)
+            found = {"frames_counted": number} | _voxel_figures(voxel_ious(voxels, protocol), classes)
             figures |= {f"occupancy.{name}.{key}": value for key, value in found.items()}
     for name, counts in rays.items():
         if counts:
-            found = _ray_figures(reduce(operator.add, counts), ray_protocols[name])
+            found = {"frames_counted": number} | _ray_figures(
+                reduce(operator.add, counts), ray_protocols[name]
+            )
             figures |= {f"occupancy.{name}.{key}": value for key, value in found.items()}
     return figures
 

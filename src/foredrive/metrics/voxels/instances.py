@@ -3,20 +3,16 @@
 Video panoptic quality is that of FIERY (Hu et al., ICCV 2021) and its public code.
 """
 
-import dataclasses
 from dataclasses import dataclass, fields
 
 import numpy as np
-import torch
-from jaxtyping import Bool, Float64, Int, Int64
+from jaxtyping import Float64, Int
 from numpy import ndarray
 from torch import Tensor
 
 from foredrive.errors import InputError
-from foredrive.metrics.footprint import box_quads, cells_in_quads
-from foredrive.metrics.obstacles import boxes_at_now, future_obstacles
 from foredrive.metrics.voxels.protocols import InstanceProtocol
-from foredrive.scene import Boxes, Clip
+from foredrive.scene.map_elements import InstanceRaster
 
 
 @dataclass(frozen=True)
@@ -62,13 +58,10 @@ def count_instances(
     Raises:
         InputError: negative numbers, other frames or cells than those of the protocol.
     """
-    cells = round(2 * protocol.grid.reach_m / protocol.grid.cell_m)
+    shape = (1 + protocol.future_frames, protocol.cells, protocol.cells)
     for name, instances in (("predicted", predicted), ("true", true)):
-        if instances.shape != (1 + protocol.future_frames, cells, cells):
-            raise InputError(
-                f"expected {name} instances of shape {(1 + protocol.future_frames, cells, cells)}, "
-                f"got {instances.shape}"
-            )
+        if instances.shape != shape:
+            raise InputError(f"expected {name} instances of shape {shape}, got {instances.shape}")
         if instances.min() < 0:
             raise InputError(f"{name} instances have numbers below 0: {int(instances.min())}")
     return {
@@ -77,6 +70,35 @@ def count_instances(
         )
         for name, (first, end) in protocol.ranges.items()
     }
+
+
+def count_rasters(
+    predicted: Int[Tensor, "b S Y X"], truth: InstanceRaster, past_frames: int, protocol: InstanceProtocol
+) -> dict[str, InstanceCounts]:
+    """Count the samples of a batch that the protocol counts, in each range; empty if it counts none.
+
+    Args:
+        predicted: as for `count_instances`, on the grid of the truth.
+        truth: vehicles [b S Y X] now and later.
+        past_frames: number of key frames of the drives before now.
+        protocol: of the truth's grid and steps.
+
+    Raises:
+        InputError: the truth has other steps or cells than those of the protocol.
+    """
+    if (truth.spec.cell_m, truth.dt_s) != (protocol.cell_m, protocol.step_s):
+        raise InputError(
+            f"{protocol.title} counts cells of {protocol.cell_m} m and steps of {protocol.step_s} s, "
+            f"the truth has {truth.spec.cell_m} m and {truth.dt_s} s"
+        )
+    total: dict[str, InstanceCounts] = {}
+    if past_frames < protocol.past_frames:
+        return total
+    for item in truth.valid.all(dim=1).nonzero().flatten().tolist():
+        found, true = (part[item].cpu().numpy() for part in (predicted, truth.track_id))
+        for name, counts in count_instances(found, true, protocol).items():
+            total[name] = total[name] + counts if name in total else counts
+    return total
 
 
 def _count_range(
@@ -127,43 +149,3 @@ def _ious(
         true_id[true_id > 0],
         (shared / either)[np.ix_(true_id > 0, predicted_id > 0)],
     )
-
-
-def true_instances(
-    clip: Clip, protocol: InstanceProtocol
-) -> tuple[Int64[Tensor, "b T R C"], Bool[Tensor, "b"]]:
-    """Return the instances of annotated boxes, now and at the protocol's future frames, and what counts.
-
-    An item counts if now and every future frame are annotated, and the clip shows as many key frames before
-    now as the protocol asks for.
-    """
-    future = future_obstacles(clip, protocol.future_frames, protocol.step_s)
-    now = boxes_at_now(clip)[:, clip.now : clip.now + 1]
-    now = dataclasses.replace(now, valid=now.valid & future.annotated_now[:, None, None])
-    cells = torch.cat([draw_instances(now, protocol), draw_instances(future.boxes, protocol)], dim=1)
-    counted = future.annotated_now & future.annotated.all(dim=1)
-    return cells, counted & (clip.now >= protocol.past_frames)
-
-
-def draw_instances(boxes: Boxes, protocol: InstanceProtocol) -> Int64[Tensor, "b T R C"]:
-    """Draw boxes [b T M], in the ego frame at now, as cells of their track number + 1; 0 is none.
-
-    Rows count forward, columns as the protocol's grid has them. The cells are those of OpenCV's `fillPoly`
-    with corners rounded to cells; a later box is drawn over an earlier one. Boxes of low visibility are drawn
-    too, as in UniAD.
-    """
-    ahead = torch.tensor([protocol.point_forward_m, 0.0, 0.0]).to(boxes.centre)
-    quads = box_quads(dataclasses.replace(boxes, centre=boxes.centre - ahead), protocol.grid)
-    wanted = torch.tensor(sorted(protocol.categories), device=boxes.category.device)
-    drawn = boxes.valid & torch.isin(boxes.category, wanted)
-    last = round(2 * protocol.grid.reach_m / protocol.grid.cell_m) - 1
-    out = torch.zeros((*boxes.valid.shape[:2], last + 1, last + 1), dtype=torch.int64, device=quads.device)
-    for item, step, box in drawn.nonzero().tolist():
-        quad = quads[item, step, box]
-        low, high = quad.amin(dim=0).clamp_min(0), quad.amax(dim=0).clamp_max(last)
-        if (low > high).any():
-            continue
-        cells = torch.cartesian_prod(*(torch.arange(a, b + 1) for a, b in zip(low, high, strict=True)))
-        cells = cells[cells_in_quads(cells.to(quad)[None], quad[None])[0].cpu()]
-        out[item, step, cells[:, 0], cells[:, 1]] = boxes.track_id[item, step, box] + 1
-    return out

@@ -19,16 +19,14 @@ are then never trained to be free. A figure says little without both masks.
 from dataclasses import dataclass
 from typing import Literal
 
-from foredrive.metrics.protocols import LIDAR_FORWARD_M, VEHICLES, ObstacleGrid
-from foredrive.scene import Category, VoxelSpec
+from foredrive.scene import VoxelSpec
 from foredrive.scene.semantics import VOXEL_CLASSES
 
 GRID = VoxelSpec(lower_m=(-40.0, -40.0, -1.0), voxel_m=0.4, shape_zyx=(16, 200, 200))
 """The grid of Occ3D and OpenOcc on nuScenes, in the ego frame."""
 
-FREE = "free"
-"""The last class of both data sets. It enters no mean."""
 OCC3D_CLASSES, OPENOCC_CLASSES = VOXEL_CLASSES["occ3d"], VOXEL_CLASSES["openocc"]
+"""The last class of both is free space, which enters no mean."""
 
 Mask = Literal["camera", "lidar"]
 
@@ -103,17 +101,16 @@ ORIGIN_REACH_M = 39.0
 
 @dataclass(frozen=True)
 class InstanceProtocol:
-    """The choices that define IoU and VPQ of instances over time, seen from above."""
+    """The choices that define IoU and VPQ of vehicles over time, seen from above."""
 
     title: str
-    categories: frozenset[Category]
-    grid: ObstacleGrid
-    point_forward_m: float
-    """The grid's centre, ahead of the rear axle."""
+    cells: int
+    """Rows and columns of the square grid around the ego vehicle."""
+    cell_m: float
     past_frames: int
-    """A frame counts only if it has so many key frames of its drive before it …"""
+    """A sample counts only if its drive has so many key frames before it …"""
     future_frames: int
-    """… and so many after it, which are scored with it."""
+    """… and so many annotated ones after it, which are scored with it."""
     step_s: float
     ranges: dict[str, tuple[int, int]]
     """First row and column, and those after the last, by name. Instances are cut before they are compared."""
@@ -123,12 +120,12 @@ class InstanceProtocol:
 
 UNIAD_INSTANCES = InstanceProtocol(
     title="UniAD",
-    categories=VEHICLES,
-    grid=ObstacleGrid(cell_m=0.5, reach_m=50.0, column_axis="right", row_step="down", corner="nearest"),
-    point_forward_m=LIDAR_FORWARD_M,
+    cells=200,
+    cell_m=0.5,
     past_frames=2,
     future_frames=4,
     step_s=0.5,
     ranges={"near": (70, 130), "far": (0, 200)},
     min_iou=0.5,
 )
+"""Its truth has the seven `scene.boxes.VEHICLES`, those included that no camera sees."""

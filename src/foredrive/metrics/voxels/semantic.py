@@ -3,25 +3,36 @@
 import numpy as np
 from jaxtyping import Bool, Float64, Int64, UInt8
 from numpy import ndarray
+from torch import Tensor
 
 from foredrive.metrics.detection import mean_of_valid
 from foredrive.metrics.voxels.protocols import VoxelProtocol
+from foredrive.scene.semantics import VOXEL_CLASSES, SemanticVoxels
 
 
 def count_voxels(
-    predicted: UInt8[ndarray, "Z Y X"],
-    true: UInt8[ndarray, "Z Y X"],
-    seen_by_camera: Bool[ndarray, "Z Y X"],
-    seen_by_lidar: Bool[ndarray, "Z Y X"],
+    predicted: UInt8[ndarray, "*voxels"],
+    true: UInt8[ndarray, "*voxels"],
+    seen_by_camera: Bool[ndarray, "*voxels"],
+    seen_by_lidar: Bool[ndarray, "*voxels"],
     classes: int,
 ) -> Int64[ndarray, "2 2 C C"]:
-    """Count the voxels of a frame by: seen by a camera, seen by the lidar, true class, predicted class.
+    """Count voxels by: seen by a camera, seen by the lidar, true class, predicted class.
 
     The counts of frames add up, and every protocol sums those of its masks.
     """
     cell = (seen_by_camera.astype(np.int64) * 2 + seen_by_lidar) * classes + true
     counts = np.bincount((cell * classes + predicted).ravel(), minlength=4 * classes * classes)
     return counts.astype(np.int64).reshape(2, 2, classes, classes)
+
+
+def count_semantics(predicted: UInt8[Tensor, "*b Z Y X"], truth: SemanticVoxels) -> Int64[ndarray, "2 2 C C"]:
+    """Count the known voxels of a batch likewise. Where there is no truth, no protocol can judge."""
+    known = truth.known.cpu().numpy()
+    labels, true, camera, lidar = (
+        part.cpu().numpy()[known] for part in (predicted, truth.index, truth.camera_mask, truth.lidar_mask)
+    )
+    return count_voxels(labels, true, camera, lidar, len(VOXEL_CLASSES[truth.taxonomy]))
 
 
 def voxel_ious(counts: Int64[ndarray, "2 2 C C"], protocol: VoxelProtocol) -> Float64[ndarray, "C"]:
