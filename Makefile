@@ -60,8 +60,8 @@ test-oracles: $(ORACLE_STAMP)
 	PYTHONPATH=src OMP_NUM_THREADS=1 .venv-oracles/bin/python -m pytest -m oracle tests/oracles
 
 golden: $(ORACLE_STAMP)
-	PYTHONPATH=src:tests .venv-oracles/bin/python tests/oracles/make_golden.py
-	PYTHONPATH=src:tests .venv-oracles/bin/python tests/oracles/av2_forecasting.py
+	PYTHONPATH=src:tests:. .venv-oracles/bin/python tests/oracles/make_golden.py
+	PYTHONPATH=src:tests:. .venv-oracles/bin/python tests/oracles/av2_forecasting.py
 
 clean:
 	rm -rf .venv .venv-oracles runs build dist

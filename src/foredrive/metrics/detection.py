@@ -64,20 +64,18 @@ def _match_greedily(order, closeness, min_closeness):
 def match_centres(
     found_frame: Int[ndarray, "m"],
     found_xy: Float[ndarray, "m 2"],
-    score: Float[ndarray, "m"],
     true_frame: Int[ndarray, "n"],
     true_xy: Float[ndarray, "n 2"],
     distances_m: Sequence[float] = NUSCENES_DISTANCES_M,
 ) -> Int[ndarray, "T m"]:
     """Match detections of one class with the nearest object of their frame that is left, as nuScenes does.
 
-    Detections take their turns by score (`descending`, ties reversed). Rows may be in any order.
+    Detections take their turns in the order of their rows. True rows may be in any order.
 
     Returns:
         The true row of each detection at each distance; -1: none is nearer than the distance.
     """
-    turn = descending(score, ties_reversed=True)
-    turn = turn[np.argsort(found_frame[turn], kind="stable")]
+    turn = np.argsort(found_frame, kind="stable")
     place = np.argsort(true_frame, kind="stable")
     frames, first = np.unique(found_frame[turn], return_index=True)
     bounds = (np.searchsorted(true_frame[place], frames, side=side) for side in ("left", "right"))
@@ -132,11 +130,16 @@ def average_precision_nuscenes(score: Float[ndarray, "n"], hit: Bool[ndarray, "n
 
     It is the mean, at recall 0.11, 0.12 … 1, of the precision above 0.1, divided by 0.9.
     """
+    return ranked_precision_nuscenes(hit[descending(score, ties_reversed=True)], objects)
+
+
+def ranked_precision_nuscenes(hit: Bool[ndarray, "n"], objects: int) -> float:
+    """Return `average_precision_nuscenes` of detections that are in order already."""
     if objects == 0:
         return float("nan")
     if not hit.any():
         return 0.0
-    precision, recall = precision_recall(hit[descending(score, ties_reversed=True)], objects)
+    precision, recall = precision_recall(hit, objects)
     at = np.interp(np.linspace(0, 1, 101), recall, precision, right=0.0)
     return float(np.clip(at[11:] - 0.1, 0.0, None).mean() / 0.9)
 

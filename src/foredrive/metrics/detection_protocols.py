@@ -20,10 +20,10 @@ from numpy import ndarray
 
 from foredrive.metrics.detection import (
     NUSCENES_DISTANCES_M,
-    average_precision_nuscenes,
     descending,
     match_centres,
     mean_of_valid,
+    ranked_precision_nuscenes,
 )
 from foredrive.metrics.object_rows import ObjectRows, Region, counted
 from foredrive.metrics.over_recall import error_over_recall
@@ -140,17 +140,17 @@ def evaluate_detections(
 def _class_figures(
     found: ObjectRows, true: ObjectRows, name: str, protocol: DetectionProtocol
 ) -> ClassFigures:
+    found = found[descending(found.score, ties_reversed=True)]
     partners = match_centres(
         found.frame,
         found.centre[:, :2],
-        found.score,
         true.frame,
         true.centre[:, :2],
         protocol.distances_m,
     )
     ap = {
         # A class without true boxes has average precision 0 in the devkit.
-        distance: average_precision_nuscenes(found.score, partner >= 0, len(true)) if len(true) else 0.0
+        distance: ranked_precision_nuscenes(partner >= 0, len(true)) if len(true) else 0.0
         for distance, partner in zip(protocol.distances_m, partners, strict=True)
     }
     partner = partners[protocol.distances_m.index(protocol.error_distance_m)]
@@ -162,9 +162,7 @@ def _class_figures(
 def _mean_errors(
     found: ObjectRows, true: ObjectRows, partner: Int[ndarray, "m"], name: str, protocol: DetectionProtocol
 ) -> dict[str, float]:
-    """Return each error of the hits, averaged over recall."""
-    order = descending(found.score, ties_reversed=True)
-    found, partner = found[order], partner[order]
+    """Return each error of the hits, averaged over recall. Detections are in order of falling score."""
     hit = partner >= 0
     errors = hit_errors(found[hit], true[partner[hit]], half_turn=name in protocol.half_turn)
     return {key: error_over_recall(found.score, hit, len(true), each) for key, each in errors.items()}
