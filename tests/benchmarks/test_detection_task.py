@@ -25,6 +25,7 @@ from foredrive.errors import InputError
 from foredrive.models.detection import DetectionHead
 from foredrive.runs.build import build_agent
 from foredrive.scene import Category, Example, LidarSweep, VoxelSpec
+from foredrive.scene.boxes import unlabelled
 from foredrive.sets import LabelledBoxes
 from foredrive.training.detection import fit_head, predict_sets
 from foredrive.training.detection_losses import matching_loss, set_loss
@@ -79,6 +80,7 @@ def test_objects_that_are_seen_of_known_classes(make_example: Callable[..., Exam
         track_id=torch.arange(4)[None],
         category=kinds[None],
         valid=torch.ones(1, 4, dtype=torch.bool),
+        **unlabelled(1, 4),
     )
     clip = dataclasses.replace(clip, sweeps=sweep.map_tensors(lambda tensor: tensor[None]), boxes=boxes)
     found = objects_of(clip, SPEC)

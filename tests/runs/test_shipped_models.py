@@ -13,7 +13,7 @@ from foredrive.data import LogPath
 from foredrive.errors import InputError
 from foredrive.evaluation.summary import read_summary
 from foredrive.runs import Run, evaluate_run, load_agent, open_run, shipped
-from foredrive.runs.ship import ship
+from foredrive.runs.ship import MAX_BYTES, ship
 from foredrive.runs.shipped import run_folder
 
 
@@ -100,3 +100,12 @@ def test_unknown_models_and_unevaluated_runs_are_one_line(
     bare = dataclasses.replace(trained, folder=tmp_path)
     with pytest.raises(InputError, match="evaluate the run first"):
         ship(bare, "other", [log], "", "", tmp_path / "models")
+
+
+@pytest.mark.parametrize("name", shipped.shipped_models())
+def test_the_models_of_the_package_open(name: str, tmp_path: Path) -> None:
+    run = open_run(run_folder(Path(f"embedded:{name}"), tmp_path))
+    assert run.weights.stat().st_size <= MAX_BYTES
+    assert (run.folder / "card.md").read_text().startswith(f"# {name}\n")
+    agent = load_agent(run)
+    assert all(tensor.isfinite().all() for tensor in agent.state_dict().values())

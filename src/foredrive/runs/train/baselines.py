@@ -1,6 +1,5 @@
 """Baselines of a trained model, fitted to the logs that the model was trained on."""
 
-import contextlib
 import dataclasses
 from collections.abc import Iterable, Iterator
 from functools import lru_cache
@@ -12,12 +11,11 @@ from torch.utils.data import DataLoader
 
 from foredrive.data import ClipDataset, LogPath, collate
 from foredrive.evaluation.metric import labels_from_now
-from foredrive.files import atomic_path
 from foredrive.metrics.occupancy import OccupancyPrior
 from foredrive.models.ego_mlp import EgoMLP, EgoMLPConfig
 from foredrive.recipes.config import Recipe
 from foredrive.scene import Clip, Example
-from foredrive.training import StatusDemonstrations, fit_ego_mlp, load_weights, read_status, save_weights
+from foredrive.training import StatusDemonstrations, fit_ego_mlp, load_weights, read_status
 
 
 @lru_cache(maxsize=1)  # training, evaluation and the next arm of a study use the same baselines
@@ -49,9 +47,9 @@ def fit_baselines(
 def run_baselines(
     folder: Path, logs: tuple[LogPath, ...], recipe: Recipe[Any, Any], cache_dir: Path, past_frames: int
 ) -> tuple[OccupancyPrior, EgoMLP]:
-    """Return the baselines of a run: those that are kept in its folder, or fitted ones, which are then kept.
+    """Return the baselines of a run: those in its folder, or fitted ones.
 
-    A run that was copied to another machine is so evaluated without its training logs.
+    Models that come with the package have them in their folder, because they come without training logs.
 
     Args:
         folder: folder of the run.
@@ -73,10 +71,7 @@ def run_baselines(
         )
         load_weights(Baselines(prior, mlp), file)
         return prior, mlp.eval()
-    prior, mlp = fit_baselines(logs, recipe, cache_dir, past_frames)
-    with contextlib.suppress(OSError), atomic_path(file) as temporary:  # the folder may be read-only
-        save_weights(Baselines(prior, mlp), temporary)
-    return prior, mlp
+    return fit_baselines(logs, recipe, cache_dir, past_frames)
 
 
 def baselines_file(past_frames: int) -> str:
