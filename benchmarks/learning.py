@@ -1,4 +1,4 @@
-"""What NeMo learns per CPU second: `foredrive bench learning`, many hours on two cores.
+"""Measure NeMo's learning per CPU second: `foredrive bench learning`, many hours on two cores.
 
 The recipe `nemo_town` and the one of commit 9544e57 are pre-trained for the same CPU time and judged on the
 test drives of `learning_towns.py`, which are recorded first. Drives, cache and run folders are kept in

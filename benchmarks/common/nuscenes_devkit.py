@@ -8,7 +8,7 @@ from benchmarks.common.object_drives import RACK, Drives, detection_boxes, track
 
 
 class FakeTables:
-    """What the devkit asks its tables for: scenes of the validation split, samples, bicycle racks."""
+    """Answer the devkit's requests to its tables: scenes of the validation split, samples, bicycle racks."""
 
     def __init__(self, drives: Drives) -> None:
         from nuscenes.utils.splits import val

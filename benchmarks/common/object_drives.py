@@ -42,7 +42,7 @@ class Size:
     false_frames: int = 1000
     """Frames in which a false track keeps its identity."""
     shares: bool = False
-    """Whether classes are as frequent as in nuScenes (`SHARES`), or all alike."""
+    """True: classes are as frequent as in nuScenes (`SHARES`). False: all alike."""
     reach_m: float = 60.0
     """Objects are at most this far from the start, along each axis."""
 

@@ -144,7 +144,7 @@ VALIDATION_TASKS: dict[str, Callable[[np.random.Generator], Callable[[], object]
     "tracking": _validation_tracking,
     "motion": _validation_motion,
 }
-"""What is prepared, and what is then measured, by task."""
+"""Preparation and measured function of each task."""
 
 
 def _validation_rows(

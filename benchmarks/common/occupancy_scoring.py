@@ -33,7 +33,7 @@ from foredrive.ops import voxel_rays
 FRAMES, PLAIN_FRAMES, TABLE_FRAMES, SAMPLES = 100, 1, 12, 40
 OBJECTS = 45
 FILLED_VOXELS = 4
-"""How far behind seen surfaces the second prediction is occupied."""
+"""Depth behind seen surfaces to which the second prediction is occupied."""
 CAMERA_M = np.array([1.0, 0.0, 1.6])
 LIDAR_M = np.array([0.943713, 0.0, 1.84023])
 

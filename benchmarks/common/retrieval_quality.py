@@ -49,7 +49,7 @@ class Ranking(NamedTuple):
 
     score: Float[np.ndarray, "S H"]
     true: Bool[np.ndarray, "S H"]
-    """Whether the hit fits the query."""
+    """True if the hit fits the query."""
     could: Int[np.ndarray, "S"]
     """Maximum number of true hits of a sequence."""
 

@@ -1,5 +1,6 @@
 """Ego motion of the next key frames from measured poses and speeds."""
 
+import dataclasses
 import math
 
 import pytest
@@ -73,3 +74,21 @@ def test_a_standing_vehicle_starts_straight_ahead() -> None:
         motion[:, :3, 3], torch.tensor([[0.5, 0.0, 0.0], [1.0, 0.0, 0.0]]), atol=3e-3, rtol=0
     )
     torch.testing.assert_close(motion[:, :3, :3], torch.eye(3).expand(2, 3, 3))
+
+
+def test_items_of_a_batch_do_not_mix() -> None:
+    turning = frames(exp_se3(torch.tensor([3.0, 0.0, 0.0, 0.0, 0.0, 0.3])), (8.0, 6.0))
+    standing = frames(torch.eye(4), (0.0, 1.0))
+    both = dataclasses.replace(
+        turning,
+        **{
+            name: torch.cat([getattr(turning, name), getattr(standing, name)])
+            for name in ("t_s", "T_now_ego", "speed_mps", "speed_valid")
+        },
+        images=turning.images.expand(2, -1, -1, -1, -1, -1),
+        image_valid=turning.image_valid.expand(2, -1, -1),
+        rig=turning.rig.map_tensors(lambda tensor: tensor.expand(2, *tensor.shape[1:])),
+    )
+    motion = continued_motion(both, 3)
+    torch.testing.assert_close(motion[:1], continued_motion(turning, 3))
+    torch.testing.assert_close(motion[1:], continued_motion(standing, 3))

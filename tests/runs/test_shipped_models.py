@@ -79,15 +79,18 @@ def test_the_card_has_both_figures(package: Path) -> None:
     assert "4 clips, 0 failed" in card
 
 
-def test_a_copy_is_kept_until_the_model_changes(package: Path, tmp_path: Path) -> None:
+def test_a_copy_is_kept_and_one_of_another_version_is_refused(package: Path, tmp_path: Path) -> None:
     folder = run_folder(Path("embedded:tiny"), tmp_path)
     (folder / "summary.json").write_text("{}")
     assert run_folder(Path("embedded:tiny"), tmp_path) == folder
     assert (folder / "summary.json").is_file()
     config = folder / "config.yaml"
     config.write_text(config.read_text() + "\n# of an earlier version\n")
-    run_folder(Path("embedded:tiny"), tmp_path)
-    assert not (folder / "summary.json").exists()
+    with pytest.raises(
+        InputError, match="embedded_tiny: not a copy of this version"
+    ):
+        run_folder(Path("embedded:tiny"), tmp_path)
+    assert (folder / "summary.json").is_file()
     assert json.loads((folder / "logs.json").read_text())["cache_dir"] == os.path.abspath(folder / "cache")
 
 

@@ -4,13 +4,14 @@ import dataclasses
 
 import numpy as np
 import torch
-from jaxtyping import Float64, UInt8
+from jaxtyping import UInt8
 
 from foredrive.data.beam_casting import FREE, OCCUPIED, UNKNOWN
 from foredrive.data.boxes import read_boxes
 from foredrive.data.labels import Beams, VoxelLabels, beams_of, nothing_known, observed_state, voxel_labels
 from foredrive.data.lidar import read_sweep
 from foredrive.data.logs import Log
+from foredrive.geometry.se3 import transform_points
 from foredrive.scene import VoxelSpec
 
 REACH_S = 3.0
@@ -64,10 +65,9 @@ def _state_from(log: Log, neighbour: int, frame: int, spec: VoxelSpec) -> UInt8[
         return np.full(spec.shape_zyx, UNKNOWN, dtype=np.uint8)
     T = np.linalg.inv(log.T_world_ego[frame]) @ log.T_world_ego[neighbour]
     beams = beams_of(read[0], log.ego_box)
-    moved = Beams(_moved(beams.origin, T), _moved(beams.ends, T), beams.range_m, beams.returned)
+    origin, ends = (
+        transform_points(torch.from_numpy(T), torch.from_numpy(points)).numpy()
+        for points in (beams.origin, beams.ends)
+    )
+    moved = Beams(origin, ends, beams.range_m, beams.returned)
     return observed_state(moved, spec)
-
-
-def _moved(points: Float64[np.ndarray, "N 3"], T: Float64[np.ndarray, "4 4"]) -> Float64[np.ndarray, "N 3"]:
-    moved: Float64[np.ndarray, "N 3"] = points @ T[:3, :3].T + T[:3, 3]
-    return moved

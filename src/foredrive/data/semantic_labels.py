@@ -54,7 +54,9 @@ the paved sides of roads are road or sidewalk."""
 _NEARLY_AT_TOP = 0.98
 """Height in a voxel at which a line of sight meets its top."""
 _RISING = ("terrain", "driveable_surface", "sidewalk", "vegetation", "manmade")
-"""Of several recorded voxels in one, the class that stands later here wins, and road users win over all."""
+"""Classes by precedence: a voxel that contains several recorded ones takes the last of them in this order.
+
+Road users win over all."""
 
 
 def read_semantics(

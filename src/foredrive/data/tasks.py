@@ -1,4 +1,4 @@
-"""What a log can judge: the six tasks, each with the reason why or why not."""
+"""Find the tasks that a log can judge, each with the reason why or why not."""
 
 from dataclasses import dataclass
 

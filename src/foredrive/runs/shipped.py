@@ -28,14 +28,14 @@ def run_folder(run: Path, copies: Path = COPIES) -> Path:
     """Return the folder of a run.
 
     A model that comes with the package is first copied to `copies`/embedded_NAME, where evaluations and
-    caches may then write. The copy of another version is replaced.
+    caches may then write. A copy that is there already is used as it is.
 
     Args:
         run: a run folder, or `embedded:NAME`.
         copies: folder of the copies.
 
     Raises:
-        InputError: there is no such model.
+        InputError: there is no such model, or the copy is of another version.
     """
     if not str(run).startswith(EMBEDDED):
         return run
@@ -43,8 +43,10 @@ def run_folder(run: Path, copies: Path = COPIES) -> Path:
     if name not in shipped_models():
         raise InputError(f"{run}: no such model; there are {', '.join(shipped_models()) or 'none'}")
     source, copy = MODELS / name, copies / f"embedded_{name}"
-    if _digest(source) != _digest(copy):
-        shutil.rmtree(copy, ignore_errors=True)
+    if copy.exists():
+        if _digest(source) != _digest(copy):
+            raise InputError(f"{copy}: not a copy of this version of {run}; move it away")
+    else:
         with atomic_path(copy) as temporary:
             shutil.copytree(source, temporary)
             logs = temporary / LOGS
