@@ -138,7 +138,9 @@ def judge(run: Run, logs: Sequence[LogPath], budget_name: str) -> dict[str, floa
     )
     found = result.summary
     above = "occupancy.above_ground.iou"
-    figures = {"iou": f"{above}_now", "car_recall_20m": "vehicles.car_recall_20m"}
+    figures = {"iou": f"{above}_now"} | {
+        name: f"vehicles.{name}" for name in ("car_recall_20m", "column_precision_20m")
+    }
     for when in ("future_500ms", "future_1s"):
         figures |= {
             f"iou_{when}": f"{above}_{when}",

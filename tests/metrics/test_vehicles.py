@@ -4,7 +4,7 @@ import math
 
 import torch
 
-from foredrive.metrics.vehicles import car_columns, count_car_columns
+from foredrive.metrics.vehicles import car_columns, count_car_columns, count_found_columns
 from foredrive.scene import Boxes, Category, VoxelGrid, VoxelSpec
 from foredrive.scene.boxes import unlabelled
 
@@ -73,3 +73,24 @@ def test_range_is_that_of_the_column_and_any_height_finds_it() -> None:
     hits, total = count_car_columns(predicted, truth, seen, torch.tensor([7.0, 20.0]))
     assert hits.tolist() == [1, 1]
     assert total.tolist() == [1, 2]
+
+
+def test_precision_counts_observed_columns_alone() -> None:
+    """Predicted: a true column at other height, a false one, a piece of road, one not observed."""
+    seen = grid((3.5, 0.5, 0.5))
+    seen.known[0, :, :, 19] = False
+    predicted = grid((3.5, 0.5, 1.5), (5.5, 0.5, 0.5), (6.5, 0.5, -0.5), (9.5, 0.5, 0.5)).values[:, 0] > 0.5
+    true, found = count_found_columns(predicted, seen, torch.tensor([4.0, 20.0]))
+    assert true.tolist() == [1, 1]
+    assert found.tolist() == [1, 2]
+
+
+def test_all_occupied_finds_every_car_at_the_precision_of_chance() -> None:
+    seen = grid((3.5, 0.5, 0.5), (4.5, 0.5, 0.5))
+    everything = torch.ones(1, *SPEC.shape_zyx, dtype=torch.bool)
+    hits, total = count_car_columns(
+        everything, boxes((4.0, 0.0, 0.0, Category.CAR)), seen, torch.tensor([20.0])
+    )
+    true, found = count_found_columns(everything, seen, torch.tensor([20.0]))
+    assert hits.tolist() == total.tolist() == [2]
+    assert (true.tolist(), found.tolist()) == ([2], [400])

@@ -86,9 +86,7 @@ def test_a_copy_is_kept_and_one_of_another_version_is_refused(package: Path, tmp
     assert (folder / "summary.json").is_file()
     config = folder / "config.yaml"
     config.write_text(config.read_text() + "\n# of an earlier version\n")
-    with pytest.raises(
-        InputError, match="embedded_tiny: not a copy of this version"
-    ):
+    with pytest.raises(InputError, match="embedded_tiny: not a copy of this version"):
         run_folder(Path("embedded:tiny"), tmp_path)
     assert (folder / "summary.json").is_file()
     assert json.loads((folder / "logs.json").read_text())["cache_dir"] == os.path.abspath(folder / "cache")

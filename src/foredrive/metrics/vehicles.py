@@ -1,6 +1,7 @@
 """Recall of vehicles in predicted occupancy: do the columns of the grid that hold a car look occupied?
 
-IoU hardly counts cars: they are few of the occupied voxels. A planner needs them most.
+IoU hardly counts cars: they are few of the occupied voxels. A planner needs them most. A model that predicts
+everything to be occupied has a recall of 1, so the precision of all predicted columns stands beside it.
 """
 
 import torch
@@ -56,3 +57,25 @@ def count_car_columns(
     truth = [car_columns(boxes, labels, float(limit)) for limit in range_m]
     hits = torch.stack([(found & columns).sum() for columns in truth])
     return hits.cpu(), torch.stack([columns.sum() for columns in truth]).cpu()
+
+
+def count_found_columns(
+    predicted: Bool[Tensor, "b Z Y X"], labels: VoxelGrid, range_m: Float[Tensor, "R"]
+) -> tuple[Int[Tensor, "R"], Int[Tensor, "R"]]:
+    """Return the numbers of truly occupied and of all predicted columns, within each range.
+
+    Only voxels count that were observed: a column is predicted if one of its known voxels above the ground
+    is, and truly occupied if one of them is occupied.
+
+    Args:
+        predicted: occupancy of one frame.
+        labels: ground truth of that frame, [b 1 Z Y X].
+        range_m: maximum distances of the columns' centres.
+    """
+    spec = labels.spec
+    found = found_columns(predicted & labels.known, spec)
+    true = found_columns((labels.values[:, 0] > 0.5) & labels.known, spec)
+    near = spec.centres_m()[0, ..., :2].norm(dim=-1)[None] <= range_m[:, None, None]  # [R, Y, X]
+    near = near.to(found.device)
+    hits = torch.stack([(found & true & within).sum() for within in near])
+    return hits.cpu(), torch.stack([(found & within).sum() for within in near]).cpu()

@@ -174,13 +174,18 @@ def flow_table(summary: Summary) -> Table | None:
 
 
 def vehicle_table(summary: Summary) -> Table | None:
-    """List the recall of the columns that hold a car, by range."""
+    """List the recall of the columns that hold a car and the precision of all columns, by range."""
     rows = [
-        (f"within {found[1]} m", value, summary.get(f"vehicles.car_columns_{found[1]}m"))
+        (
+            f"within {found[1]} m",
+            value,
+            summary.get(f"vehicles.car_columns_{found[1]}m"),
+            summary.get(f"vehicles.column_precision_{found[1]}m"),
+        )
         for key, value in summary.items()
         if (found := _VEHICLES.fullmatch(key))
     ]
-    columns = (Column(align="left"), Column("recall"), Column("columns", digits=0))
+    columns = (Column(align="left"), Column("recall"), Column("columns", digits=0), Column("precision, all"))
     return simple_table(columns, rows, "Columns of the grid that hold a car") if rows else None
 
 

@@ -4,14 +4,15 @@ import torch
 
 from foredrive.evaluation.metric import EvaluationContext, Figures, labels_from_now
 from foredrive.evaluation.predictor import Part, Prediction
-from foredrive.metrics.vehicles import count_car_columns
+from foredrive.metrics.vehicles import count_car_columns, count_found_columns
 from foredrive.scene import Example
 
 RANGES_M = (10.0, 20.0, 30.0)
 
 
 class VehicleMetric:
-    """Keys: `car_recall_20m` and so on, and `car_columns_20m`, the number of columns counted.
+    """Keys: `car_recall_20m` and so on; `car_columns_20m`, the number of columns counted; and
+    `column_precision_20m`, the share of truly occupied ones among all predicted columns.
 
     Clips whose present frame is not annotated are left out.
     """
@@ -22,6 +23,7 @@ class VehicleMetric:
     def __init__(self, context: EvaluationContext) -> None:
         self._hits = torch.zeros(len(RANGES_M), dtype=torch.long)
         self._columns = torch.zeros_like(self._hits)
+        self._true, self._found = torch.zeros_like(self._hits), torch.zeros_like(self._hits)
 
     def update(self, prediction: Prediction, truth: Example) -> None:
         """Count the columns of b clips."""
@@ -37,11 +39,17 @@ class VehicleMetric:
         )
         self._hits += hits
         self._columns += columns
+        true, found = count_found_columns(
+            prediction.occupancy_logit[annotated, 0] > 0, labels[annotated], torch.tensor(RANGES_M)
+        )
+        self._true += true
+        self._found += found
 
     def result(self) -> Figures:
-        """Return recall and number of columns by range; NaN where no column holds a car."""
+        """Return the figures by range; NaN where no column holds a car or is predicted."""
         out: Figures = {}
-        for limit_m, hits, columns in zip(RANGES_M, self._hits, self._columns, strict=True):
-            out[f"car_recall_{limit_m:.0f}m"] = float(hits / columns)
-            out[f"car_columns_{limit_m:.0f}m"] = int(columns)
+        for k, limit_m in enumerate(RANGES_M):
+            out[f"car_recall_{limit_m:.0f}m"] = float(self._hits[k] / self._columns[k])
+            out[f"car_columns_{limit_m:.0f}m"] = int(self._columns[k])
+            out[f"column_precision_{limit_m:.0f}m"] = float(self._true[k] / self._found[k])
         return out
