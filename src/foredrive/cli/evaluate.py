@@ -1,7 +1,7 @@
 """`foredrive evaluate`."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 
@@ -23,6 +23,7 @@ def evaluate(
     out: OptionalPath = None,
     examples: int = 4,
     batch_size: int = 4,
+    write_results: Literal["nuscenes"] | None = None,
     rebuilt: Annotated[OptionalPath, tyro.conf.arg(name="in", metavar="REBUILT")] = None,
 ) -> None:
     """Evaluate a trained run and its baselines; write summary.json and report.html.
@@ -37,6 +38,9 @@ def evaluate(
         out: Folder for summary.json and report.html; by default the folder of the run.
         examples: Number of examples that the report shows in pictures.
         batch_size: Number of clips in a batch.
+        write_results: Also write what the task heads predict to the folder "results" beside summary.json, in
+            the formats of nuScenes' code bases, which `foredrive score` reads: detection.json, tracking.json,
+            motion.json, map.json (docs/tasks.md).
         rebuilt: Folder of a reconstruction whose log still exists; writes gap.json.
     """
     run = check_run(run)
@@ -54,7 +58,7 @@ def evaluate(
     trained = open_run(run)
     chosen = named or trained.logs
     folder = out or run
-    result = evaluate_run(trained, chosen, folder, batch_size)
+    result = evaluate_run(trained, chosen, folder, batch_size, results_files=write_results is not None)
 
     from rich.console import Console
 
@@ -68,6 +72,10 @@ def evaluate(
     report = report_on_run(trained, chosen, summary, predictions, result.failures)
     write_run_report(folder / "report.html", report)
     print(f"wrote {folder / 'summary.json'} and {folder / 'report.html'}")
+    if write_results is not None:
+        print(
+            f"wrote {folder / 'results'}; next: foredrive score {folder / 'results'}/… --truth LOGS --task …"
+        )
 
 
 def _evaluate_gap(run: Path, rebuilt: Path, out: Path) -> None:

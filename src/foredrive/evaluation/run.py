@@ -21,6 +21,9 @@ from foredrive.metrics.protocols import STEPS
 from foredrive.scene import Agent, Example, Trajectory
 from foredrive.scene.record import Record
 
+OnPrediction = Callable[[Prediction, Example], None]
+"""Called with predictions and their truth."""
+
 
 @dataclass(frozen=True)
 class Failure:
@@ -52,6 +55,7 @@ def evaluate(
     command_source: Mapping[str, int] | None = None,
     device: torch.device | str = "cpu",
     on_items: Callable[[int], None] = lambda items: None,
+    on_prediction: OnPrediction = lambda prediction, truth: None,
 ) -> EvaluationResult:
     """Judge a model and its baselines on every item of a loader.
 
@@ -67,6 +71,8 @@ def evaluate(
         task_priors: of the training set of the heads; stand beside figures of maps and semantic voxels.
         command_source: how many commands came from a route, the driven future, nowhere.
         on_items: called with the number of items after each batch.
+        on_prediction: called with the model's predictions and their truth, batch by batch. Failed items are
+            left out.
 
     An item for which the predictor raises an error, or predicts a value that is not finite, counts as failed;
     its batch is then tried again item by item. Where the loader raises an InputError and can go on after it,
@@ -85,8 +91,9 @@ def evaluate(
     with torch.inference_mode():
         for loaded in _load(loader, model.failures, on_items):
             example = loaded.to(device)
-            for method in (model, *planners.values()):
-                method.add(example)
+            model.add(example, on_prediction)
+            for planner in planners.values():
+                planner.add(example)
             on_items(len(example.key))
     failed = len(model.failures)
     if model.items == 0:
@@ -125,7 +132,7 @@ class _EvaluatedMethod:
         self.items = 0
         """Number of clips that were predicted."""
 
-    def add(self, example: Example) -> None:
+    def add(self, example: Example, on_prediction: OnPrediction = lambda prediction, truth: None) -> None:
         """Predict and judge one batch."""
         for chosen, prediction in self._attempt(example):
             truth = _select(example, chosen)
@@ -134,6 +141,7 @@ class _EvaluatedMethod:
                 if all(getattr(prediction, part) is not None for part in metric.needs):
                     metric.update(prediction, truth)
                     self._has_figures[number] = True
+            on_prediction(prediction, truth)
 
     def figures(self, infix: str = "") -> Figures:
         """Return the figures of all metrics, `infix` standing between a metric's name and its keys."""

@@ -15,10 +15,10 @@ Figures = dict[str, Value]
 """A summary while it is put together."""
 
 
-def write_json(path: Path, content: object) -> None:
+def write_json(path: Path, content: object, indent: int | None = 2) -> None:
     """Write JSON whole or not at all; NaN and infinity, which JSON does not have, become null."""
     with atomic_path(path) as temporary:
-        temporary.write_text(json.dumps(_finite(content), indent=2, allow_nan=False) + "\n")
+        temporary.write_text(json.dumps(_finite(content), indent=indent, allow_nan=False) + "\n")
 
 
 def write_summary(path: Path, summary: Summary) -> None:

@@ -9,7 +9,8 @@ and `local_idx` where there is more than one drive. MapTracker stores these, and
 are never read here: the same content as JSON is.
 
 Coordinates are metres in the frame of the vehicle or its lidar, the same in both files. The truth may also be
-a folder of 123D logs: frames are named LOG@T_US then, and coordinates are in the ego frame.
+a folder of 123D logs: frames are named LOG@T_US then, and coordinates are in the ego frame. Results may state
+their area under `meta` as `area_m`, [60, 30] or [100, 50].
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -53,7 +54,8 @@ class MapFiles:
     drive: Int[ndarray, "F"]
     """Number of the drive of each frame."""
     area: Area
-    """The smaller area that holds the truth, or the predictions where the truth is of logs."""
+    """The smaller area that holds the truth. Where the truth is of logs: the area that the results state, or
+    else the smaller one that holds the predictions."""
     frames_without_results: int
     short: int
     """Number of predictions with fewer than two points, which all protocols leave out."""
@@ -81,10 +83,10 @@ def read_maps(results: Path, truth: Path) -> MapFiles:
     Raises:
         InputError: a file cannot be read, or an entry is wrong. The message names both.
     """
-    predicted = _read(results, predicted=True)
+    predicted, stated = _read(results, predicted=True)
     if truth.is_dir():
-        return _against_logs(predicted, results, truth)
-    true = _read(truth, predicted=False)
+        return _against_logs(predicted, results, truth, stated)
+    true, _ = _read(truth, predicted=False)
     check_known_frames(results, predicted, truth, list(true))
     if not true:
         raise InputError(f"{truth}: holds no frames")
@@ -109,11 +111,11 @@ def area_of(lines: LineSet) -> Area:
     return "60x30" if reach_m <= max(HALF_XY_M["60x30"]) + 1.0 else "100x50"
 
 
-def _against_logs(predicted: dict[str, _Frame], results: Path, truth: Path) -> MapFiles:
-    """Return predictions and the maps of logs at their frames."""
+def _against_logs(predicted: dict[str, _Frame], results: Path, truth: Path, stated: Area | None) -> MapFiles:
+    """Return predictions and the maps of logs at their frames, in the area that the results state, if any."""
     frames = list(log_frames(truth, predicted, results))
     lines, short = _line_set([predicted[each.name] for each in frames])
-    area = area_of(lines)
+    area = stated or area_of(lines)
     half_xy_m = HALF_XY_M[area]
     kinds, found, number = [], [], []
     for n, each in enumerate(frames):
@@ -155,12 +157,15 @@ def _line_set(frames: Sequence[_Frame | None]) -> tuple[LineSet, int]:
     )
 
 
-def _read(path: Path, *, predicted: bool) -> dict[str, _Frame]:
+def _read(path: Path, *, predicted: bool) -> tuple[dict[str, _Frame], Area | None]:
+    """Return the frames of a file by token, and the area that it states."""
     content = read_json(path)
-    if isinstance(content, dict):
-        content = content.get("results", content.get("GTs", content))
     frames: dict[str, _Frame] = {}
+    area: Area | None = None
     try:
+        if isinstance(content, dict):
+            area = _stated_area(content.get("meta"))
+            content = content.get("results", content.get("GTs", content))
         if isinstance(content, list):
             found: Iterator[tuple[str, _Frame]] = _of_maptr(content, predicted)
         elif isinstance(content, dict):
@@ -174,7 +179,17 @@ def _read(path: Path, *, predicted: bool) -> dict[str, _Frame]:
             frames[token] = frame
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
-    return frames
+    return frames, area
+
+
+def _stated_area(meta: Any) -> Area | None:
+    """Return the area that `meta` states as `area_m`: metres along x and y."""
+    if not isinstance(meta, dict) or "area_m" not in meta:
+        return None
+    for area, half_xy_m in HALF_XY_M.items():
+        if meta["area_m"] == [2 * half_m for half_m in half_xy_m]:
+            return area
+    raise InputError(f"meta: the area_m {meta['area_m']!r} is neither [60, 30] nor [100, 50]")
 
 
 def _of_maptr(content: Sequence[Any], predicted: bool) -> Iterator[tuple[str, _Frame]]:

@@ -4,9 +4,12 @@ import dataclasses
 
 import numpy as np
 import torch
+from jaxtyping import Float64
 from numpy import ndarray
+from torch import Tensor
 
 from foredrive.evaluation.metric import EvaluationContext, Figures
+from foredrive.evaluation.objects.in_world import futures_in_world, levelled
 from foredrive.evaluation.predictor import Part, Prediction
 from foredrive.metrics.motion.agents import PredictedAgents, TrueAgents
 from foredrive.metrics.motion.protocols import PROTOCOLS, STEP_S
@@ -47,14 +50,15 @@ class MotionMetric:
             assert found.log_prob is not None
             t_s = STEP_S * torch.arange(1, found.future_xy.shape[-2] + 1)
             steady = found.centre[:, None, :2] + found.velocity[:, None] * t_s[:, None]
-            self._steady.append(steady[:, None].double().numpy())
+            pose = clip.T_world_ego[item, clip.now].cpu().numpy()
+            self._steady.append(_placed(steady[:, None], found.centre, pose))
             self._predicted.append(
                 {
                     "frame": np.full(len(found.score), frame),
                     "category": found.category.numpy(),
                     "score": found.score.double().numpy(),
-                    "xy": found.centre[:, :2].double().numpy(),
-                    "future_xy": found.future_xy.double().numpy(),
+                    "xy": _placed(found.centre[:, :2], found.centre, pose),
+                    "future_xy": _placed(found.future_xy, found.centre, pose),
                     "probability": found.log_prob.double().exp().numpy(),
                 }
             )
@@ -66,8 +70,8 @@ class MotionMetric:
                 {
                     "frame": np.full(len(boxes.valid), frame),
                     "category": boxes.category.numpy(),
-                    "xy": boxes.centre[:, :2].double().numpy(),
-                    "future_xy": futures.xy.double().numpy(),
+                    "xy": _placed(boxes.centre[:, :2], boxes.centre, pose),
+                    "future_xy": _placed(futures.xy, boxes.centre, pose),
                     "future_valid": futures.valid.numpy(),
                     "seen": (boxes.num_points != 0).numpy(),
                 }
@@ -95,6 +99,12 @@ class MotionMetric:
                     if not suffix:
                         out[f"{name}.{kind}.matched"] = scores.matched
         return out
+
+
+def _placed(xy: Tensor, centre: Tensor, T_world_ego: ndarray) -> Float64[ndarray, "n *s 2"]:
+    """Return places of the ego frame over ground, as files state them: without pitch and roll of the ego."""
+    world = futures_in_world(xy.double().numpy(), centre.double().numpy(), T_world_ego)
+    return levelled(world, T_world_ego)
 
 
 def _column(rows: list[dict[str, ndarray]], name: str) -> ndarray:

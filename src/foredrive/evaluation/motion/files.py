@@ -32,6 +32,7 @@ from foredrive.data.boxes import read_boxes
 from foredrive.errors import InputError
 from foredrive.evaluation.detections.frames import read_number_rows, read_numbers
 from foredrive.evaluation.frames_of_results import check_known_frames, log_frames
+from foredrive.evaluation.objects.in_world import ego_yaw, futures_in_world, places_in_world
 from foredrive.evaluation.objects.nuscenes_json import read_object
 from foredrive.metrics.motion.agents import PredictedAgents, TrueAgents
 from foredrive.metrics.motion.protocols import STEP_S
@@ -136,7 +137,7 @@ def _in_ego_frame(
 def _against_logs(boxes: Mapping[str, Sequence[Box]], results: Path, truth: Path) -> AgentFiles:
     """Return predictions and the agents of logs at their frames."""
     frames = list(log_frames(truth, boxes, results))
-    agents, names, ego_xy, ego_yaw = [], [], [], []
+    agents, names, ego_xy, headings = [], [], [], []
     for number, each in enumerate(frames):
         found = read_boxes(each.log, each.frame)
         if found is None:
@@ -146,13 +147,13 @@ def _against_logs(boxes: Mapping[str, Sequence[Box]], results: Path, truth: Path
         agents.append(_agents_of_log(found, future, T_world_ego, number))
         names += [f"{truth}: frame {each.name}, box {n}" for n in range(len(agents[-1].frame))]
         ego_xy.append(T_world_ego[:2, 3])
-        ego_yaw.append(np.arctan2(T_world_ego[1, 0], T_world_ego[0, 0]))
+        headings.append(ego_yaw(T_world_ego))
     rows = _rows(boxes, [each.name for each in frames], results)
     if not agents:
         raise InputError(f"{results}: holds no frames")
     fields = [field.name for field in dataclasses.fields(TrueAgents)]
     true = TrueAgents(**{key: np.concatenate([getattr(a, key) for a in agents]) for key in fields})
-    return _in_ego_frame(rows, true, names, _Ego(np.array(ego_xy), np.array(ego_yaw)), 0)
+    return _in_ego_frame(rows, true, names, _Ego(np.array(ego_xy), np.array(headings)), 0)
 
 
 def _agents_of_log(
@@ -160,15 +161,11 @@ def _agents_of_log(
 ) -> TrueAgents:
     """Return the boxes of a frame with their futures, in the log's world frame."""
     centre = boxes.centre.double().numpy()
-    future = np.concatenate(
-        [futures.xy.double().numpy(), np.repeat(centre[:, None, 2:], futures.xy.shape[1], axis=1)], axis=-1
-    )
-    R, t = T_world_ego[:3, :3], T_world_ego[:3, 3]
     return TrueAgents(
         np.full(len(centre), frame),
         boxes.category.numpy().astype(np.int64),
-        (centre @ R.T + t)[:, :2],
-        (future @ R.T + t)[..., :2],
+        places_in_world(centre, T_world_ego)[:, :2],
+        futures_in_world(futures.xy.double().numpy(), centre, T_world_ego),
         futures.valid.numpy(),
         boxes.num_points.numpy() != 0,
     )

@@ -19,9 +19,9 @@ from foredrive.metrics.detection_protocols import (
     DETECTION_PROTOCOLS,
     ERRORS,
     DetectionFigures,
-    DetectionProtocol,
     evaluate_detections,
 )
+from foredrive.metrics.object_rows import ObjectRows
 from foredrive.metrics.tracking.protocols import TRACKING_PROTOCOLS, evaluate_tracking
 
 _NEEDED_BY = {"ave_mps": "velocity", "aae": "attribute"}
@@ -61,11 +61,25 @@ def score_detections(found: FoundObjects, truth: ObjectTruth) -> Figures:
 
     What the ground truth lacks is None: an error that it cannot judge, and with it NDS.
     """
-    figures = _counts(found, truth)
+    figures = detection_figures(found.boxes, truth.boxes, truth.racks, truth.lacks)
+    return _counts(found, truth) | {f"detection.{key}": value for key, value in figures.items()}
+
+
+def detection_figures(
+    found: ObjectRows, true: ObjectRows, racks: ObjectRows, lacks: frozenset[str]
+) -> Figures:
+    """Return `nuscenes.map`, `nuscenes.car.ap_2m`, `vad.nds`, … of detections.
+
+    Args:
+        found, true: labels are indices into nuScenes' ten classes.
+        racks: bicycle racks, in which bicycles do not count.
+        lacks: columns of `ObjectTruth.lacks`. The figures that need them are None.
+    """
+    figures: Figures = {}
     for name, protocol in DETECTION_PROTOCOLS.items():
-        scored = evaluate_detections(found.boxes, truth.boxes, truth.racks, protocol)
-        for key, value in _detection_figures(scored, protocol, truth).items():
-            figures[f"detection.{name}.{key}"] = value
+        scored = evaluate_detections(found, true, racks, protocol)
+        judged = _judged_figures(scored, lacks)
+        figures |= {f"{name}.{key}": value for key, value in judged.items()}
     return figures
 
 
@@ -92,10 +106,8 @@ def _counts(found: FoundObjects, truth: ObjectTruth) -> Figures:
     }
 
 
-def _detection_figures(
-    scored: DetectionFigures, protocol: DetectionProtocol, truth: ObjectTruth
-) -> Mapping[str, float | None]:
-    judged = {key: _NEEDED_BY.get(key) not in truth.lacks for key in ERRORS}
+def _judged_figures(scored: DetectionFigures, lacks: frozenset[str]) -> Mapping[str, float | None]:
+    judged = {key: _NEEDED_BY.get(key) not in lacks for key in ERRORS}
     figures: dict[str, float | None] = {
         "map": scored.mean_ap,
         "nds": scored.nds if all(judged.values()) else None,

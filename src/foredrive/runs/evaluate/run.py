@@ -15,6 +15,7 @@ from foredrive.data.task_truth import TaskTruthConfig
 from foredrive.errors import InputError
 from foredrive.evaluation.baselines import ConstantVelocity, StandStill
 from foredrive.evaluation.provenance import collect_provenance
+from foredrive.evaluation.results_files import ResultsFiles
 from foredrive.evaluation.run import EvaluationResult, evaluate
 from foredrive.evaluation.summary import write_summary
 from foredrive.metrics.protocols import STEP_S, STEPS
@@ -25,7 +26,7 @@ from foredrive.runs.train.run import Run, load_agent
 from foredrive.runs.train.tasks import load_heads
 from foredrive.scene import Example, Trajectory
 
-SUMMARY = "summary.json"
+SUMMARY, RESULTS = "summary.json", "results"
 RENDER_STRIDE = 2
 """One pixel in this many along rows and columns is rendered and compared."""
 FUTURES = 5
@@ -96,12 +97,14 @@ def evaluate_run(
     *,
     views: bool = True,
     stride_s: float | None = None,
+    results_files: bool = False,
 ) -> EvaluationResult:
     """Evaluate a trained run on logs and write `out/summary.json`. Clips that cannot be read count as failed.
 
     Args:
         views: whether to render the camera views and evaluate them too; this takes a quarter of the time.
         stride_s: time between the clips' nows, s; None: as in the recipe.
+        results_files: whether to write what the task heads predict to `out/results`, in public formats.
 
     Raises:
         InputError: the run has not finished a stage, or no clip can be read.
@@ -109,6 +112,9 @@ def evaluate_run(
     if batch_size < 1:
         raise InputError(f"the batch size must be at least 1, got {batch_size}")
     agent, trained = load_agent(run), load_heads(run)
+    if results_files and trained is None:
+        raise InputError(f"{run.folder}: has no task heads whose results could be written")
+    files = ResultsFiles(out / RESULTS)
     clips = run.recipe.clips
     dataset = evaluation_data(run, logs, stride_s, None if trained is None else trained.recipe.truth)
     prior, ego_mlp = run_baselines(run.folder, run.logs, run.recipe, run.cache_dir, clips.past_frames)
@@ -137,7 +143,10 @@ def evaluate_run(
             command_source=dataset.command_source,
             device=device,
             on_items=lambda items: progress.advance(task, items),
+            on_prediction=files.add if results_files else lambda prediction, truth: None,
         )
+    if results_files:
+        files.write()
     origin = {"recipe": run.recipe.name, "run": str(run.folder)}
     write_summary(out / SUMMARY, result.summary | collect_provenance() | run.conditions | origin)
     return result

@@ -1,0 +1,126 @@
+"""Files that an evaluation writes: scored, they give the figures that the evaluation printed."""
+
+import dataclasses
+import json
+from pathlib import Path
+
+import pytest
+import torch
+from recorded_street import near_truth, read_batch, record
+
+from foredrive.evaluation.maps.files import read_maps
+from foredrive.evaluation.maps.score import score_map_files
+from foredrive.evaluation.metric import EvaluationContext, Figures
+from foredrive.evaluation.metrics.detection import DetectionMetric
+from foredrive.evaluation.metrics.maps import MapLinesMetric
+from foredrive.evaluation.metrics.motion import MotionMetric
+from foredrive.evaluation.motion.files import read_agents
+from foredrive.evaluation.motion.score import score_agent_files
+from foredrive.evaluation.objects.score import read_objects, score_detections, score_tracks
+from foredrive.evaluation.predictor import Prediction
+from foredrive.evaluation.results_files import ResultsFiles
+from foredrive.scene import Example
+
+
+@pytest.fixture(scope="module")
+def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return record(tmp_path_factory.mktemp("street"))
+
+
+@pytest.fixture(scope="module")
+def example(logs: Path) -> Example:
+    return read_batch(logs)
+
+
+def write(folder: Path, prediction: Prediction, example: Example) -> ResultsFiles:
+    """Add the batch in two parts, as an evaluation does."""
+    files = ResultsFiles(folder)
+    for part in (slice(0, 2), slice(2, None)):
+        files.add(prediction[part], dataclasses.replace(example[part], key=example.key[part]))
+    files.write()
+    return files
+
+
+def evaluated(metric: type, prediction: Prediction, example: Example) -> Figures:
+    started = metric(EvaluationContext(0.5))
+    started.update(prediction, example)
+    return {f"{started.name}.{key}": value for key, value in started.result().items()}
+
+
+def assert_same_figures(printed: Figures, scored: Figures, at_least: int) -> None:
+    both = [key for key in printed if key in scored and "." in key and "frames" not in key]
+    assert len(both) >= at_least, both
+    for key in both:
+        assert scored[key] == pytest.approx(printed[key], rel=1e-6, abs=1e-6, nan_ok=True), key
+
+
+def test_detections(logs: Path, example: Example, tmp_path: Path) -> None:
+    prediction = near_truth(example)
+    write(tmp_path, prediction, example)
+    printed = evaluated(DetectionMetric, prediction, example)
+    assert 0.05 < float(printed["detection.nuscenes.map"]) < 0.3  # three of ten classes, with noise
+    scored = score_detections(*read_objects(tmp_path / "detection.json", logs, "detection"))
+    assert_same_figures(printed, scored, 30)
+    assert scored["frames_counted"] == len(example.key)
+
+
+def test_motion(logs: Path, example: Example, tmp_path: Path) -> None:
+    prediction = near_truth(example)
+    write(tmp_path, prediction, example)
+    printed = evaluated(MotionMetric, prediction, example)
+    assert 0.3 < float(printed["motion.sparsedrive.car.min_ade_m"]) < 5
+    assert_same_figures(printed, score_agent_files(read_agents(tmp_path / "motion.json", logs)), 30)
+
+
+def test_map_lines(logs: Path, example: Example, tmp_path: Path) -> None:
+    prediction = near_truth(example)
+    write(tmp_path, prediction, example)
+    printed = evaluated(MapLinesMetric, prediction, example)
+    assert 0.05 < float(printed["map.maptr.map"]) < 1
+    assert_same_figures(printed, score_map_files(read_maps(tmp_path / "map.json", logs)), 12)
+
+
+def test_lines_beyond_the_area_do_not_change_it(logs: Path, example: Example, tmp_path: Path) -> None:
+    """Predicted points 40 m ahead would be taken for those of the larger area, if the file did not tell."""
+    prediction = near_truth(example)
+    assert prediction.map_lines is not None
+    far = dataclasses.replace(prediction.map_lines, points=1.4 * prediction.map_lines.points)
+    prediction = dataclasses.replace(prediction, map_lines=far)
+    write(tmp_path, prediction, example)
+    assert float(far.points.abs().max()) > 31
+    printed = evaluated(MapLinesMetric, prediction, example)
+    assert_same_figures(printed, score_map_files(read_maps(tmp_path / "map.json", logs)), 12)
+
+
+def test_the_truth_as_tracks_is_perfect(logs: Path, example: Example, tmp_path: Path) -> None:
+    """Three of seven classes are there, with the identities of the log."""
+    prediction = near_truth(example)
+    boxes, agents = example.clip.boxes[:, example.clip.now], prediction.agents
+    assert agents is not None
+    names = ("centre", "size_lwh", "yaw", "velocity", "category", "attribute", "track_id")
+    perfect = {name: getattr(boxes, name) for name in names}
+    first = agents.map_tensors(lambda tensor: tensor[:, :4])
+    write(tmp_path, Prediction(agents=dataclasses.replace(first, **perfect)), example)
+    scored = score_tracks(*read_objects(tmp_path / "tracking.json", logs, "tracking"))
+    for name in ("car", "truck", "pedestrian"):
+        assert scored[f"tracking.nuscenes.{name}.amota"] == pytest.approx(1.0)
+        assert scored[f"tracking.nuscenes.{name}.ids"] == 0
+
+
+def test_agents_without_identity_are_no_tracks(example: Example, tmp_path: Path) -> None:
+    prediction = near_truth(example)
+    assert prediction.agents is not None
+    none = dataclasses.replace(prediction.agents, track_id=prediction.agents.track_id * 0 - 1)
+    write(tmp_path, dataclasses.replace(prediction, agents=none), example)
+    assert {path.name for path in tmp_path.iterdir()} >= {"detection.json", "motion.json", "map.json"}
+    assert not (tmp_path / "tracking.json").exists()
+
+
+def test_frames_without_annotation_are_left_out_unless_all_are(example: Example, tmp_path: Path) -> None:
+    clip = example.clip
+    some = clip.boxes_valid.clone()
+    some[1:] = False
+    for valid, expected in ((some, 1), (torch.zeros_like(some), len(example.key))):
+        truth = dataclasses.replace(example, clip=dataclasses.replace(clip, boxes_valid=valid))
+        write(tmp_path, near_truth(example), truth)
+        assert len(json.loads((tmp_path / "detection.json").read_text())["results"]) == expected
