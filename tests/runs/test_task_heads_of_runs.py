@@ -1,37 +1,21 @@
 """Heads that are trained on the frozen world model of a run, and evaluated with it."""
 
-import dataclasses
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
+from joint_heads import small_heads
 from miniature import miniature, miniature_driveworld
 from safetensors.torch import load_file
 
 from foredrive.data import LogPath
 from foredrive.errors import InputError
-from foredrive.models.tasks.agents import AgentHeadConfig, MotionConfig
-from foredrive.models.tasks.decoder import DecoderConfig
-from foredrive.models.tasks.maps import MapHeadConfig
-from foredrive.recipes.task_heads import TaskHeadsRecipe, base_heads, town_heads, with_settings
+from foredrive.recipes.task_heads import base_heads, town_heads, with_settings
 from foredrive.runs import Run, evaluate_run
 from foredrive.runs.folder import WEIGHTS
 from foredrive.runs.train.tasks import TASKS, load_heads, probe_run, train_heads
 from foredrive.training import read_metrics
-
-
-def small_heads(tasks: tuple[str, ...], steps: int = 2) -> TaskHeadsRecipe:
-    recipe, decoder = town_heads(tasks), DecoderConfig(layers=1, heads=2)
-    sizes = dataclasses.replace(
-        recipe.heads,
-        width=16,
-        max_cells=8,
-        agents=AgentHeadConfig(queries=6, decoder=decoder, motion=MotionConfig(decoder=decoder)),
-        elements=recipe.heads.elements and MapHeadConfig(elements=3, points=4, decoder=decoder),
-    )
-    schedule = dataclasses.replace(recipe.schedule, steps=steps, batch_size=2, warmup_steps=0)
-    return dataclasses.replace(recipe, heads=sizes, schedule=schedule)
 
 
 def test_heads_of_a_run_are_trained_continued_and_evaluated(

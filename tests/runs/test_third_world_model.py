@@ -28,6 +28,7 @@ from foredrive.scene import Belief, Clip, Decoded, Example, Frames, Task, VoxelS
 from foredrive.towns.map.town_map import load_town_map
 from foredrive.towns.traffic.lane_graph import build_lane_graph
 from foredrive.training import Schedule
+from foredrive.training.joint_tasks import TaskTerms
 from foredrive.view.log_frames import LogFrames
 from foredrive.view.viewer import Viewer
 
@@ -95,7 +96,9 @@ def build(config: FrozenConfig, clips: ClipConfig, fetch: bool) -> FrozenWorld:
     return FrozenWorld(config, clips)
 
 
-def objective(stage: FrozenStage, agent: PlanningAgent[Any], clips: ClipConfig) -> FrozenObjective:
+def objective(
+    stage: FrozenStage, agent: PlanningAgent[Any], clips: ClipConfig, tasks: TaskTerms | None
+) -> FrozenObjective:
     return FrozenObjective(agent)
 
 

@@ -124,6 +124,7 @@ def test_targets_are_the_boxes_that_nuscenes_counts() -> None:
     )
     assert targets.future_xy[0].tolist() == [[3, 1], [4, 1], [5, 1], [6, 1]]
     assert not agent_targets(given, None, SPEC, STEPS).future_valid.any()
+    assert agent_targets(given, futures(given), SPEC, 0).future_xy.shape == (2, 0, 2)  # detection alone
 
 
 def test_map_targets_have_points_at_equal_distances() -> None:

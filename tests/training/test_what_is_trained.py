@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from joint_heads import with_small_heads, with_truth
 from miniature import shrunk
 from torch import nn
 
@@ -38,6 +39,25 @@ def test_after_a_step_no_trainable_parameter_is_without_a_gradient(
     assert not lacking
     moved = [key for key, p in objective.named_parameters() if not p.requires_grad and p.grad is not None]
     assert not moved
+
+
+@pytest.mark.parametrize("name", ["nemo_town", "driveworld_tiny", "driveworld_town"])
+def test_with_heads_that_a_planner_attends_to_none_is_without_a_gradient(
+    name: str, make_example: Callable[..., Example]
+) -> None:
+    """Gradients of the plan reach the world model through the heads' queries too."""
+    recipe = with_small_heads(shrunk(RECIPES[name]), attends=("agents", "map"))
+    clips = recipe.clips
+    assert clips.tasks is not None
+    example = make_example(past=clips.past_frames, future=clips.future_frames, spec=clips.voxels)
+    torch.manual_seed(0)
+    objective = build_objective(recipe, recipe.finetune, build_agent(recipe, fetch=False)).train()
+    losses = objective(with_truth(example, clips.tasks), torch.Generator().manual_seed(0))
+    losses["loss"].backward()
+    lacking = [key for key, p in objective.named_parameters() if p.requires_grad and p.grad is None]
+    assert not lacking
+    with pytest.raises(InputError, match="the clip has no truth of their tasks"):
+        objective(example, torch.Generator().manual_seed(0))
 
 
 class EveryKind(nn.Module):

@@ -34,35 +34,42 @@ def train(
             that towns record, visible or not. A run with recorded labels is evaluated with them, others with
             those of the frame's sweep.
         start: Another run's folder: use its pre-trained weights and begin with fine-tuning. With --probe, use
-            its world model and planner as they are.
-        tasks: Tasks to train heads for, separated by commas: detection, map, motion, occupancy.
-        probe: Train the heads of --tasks on the frozen world model. Its volumes are computed once and kept.
+            its world model and planner as they are. With --set transfer=frozen, keep its world model and its
+            heads as they are and train the planner alone.
+        tasks: Tasks to train heads for, separated by commas: detection, map, motion, occupancy. Fine-tuning
+            trains them together with the world model.
+        probe: Train the heads of --tasks on the frozen world model instead. Its volumes are computed once and
+            kept.
         set: Entries of the recipe to replace, such as finetune.schedule.lr=1e-3; `foredrive recipes RECIPE`
-            prints all entries. With --probe, tasks.schedule.steps=100 and others for the heads
-            (tasks/config.yaml in the run's folder has all).
+            prints all entries. With --tasks, tasks.weights.detection=2 and others for the heads; with
+            --probe, tasks.schedule.steps=100 too (tasks/config.yaml in the run's folder has all).
     """
     check_out_folder(out)
     if start is not None:
         start = check_run(start)
-    if probe != bool(tasks):
-        raise InputError("--probe trains the heads of --tasks: give both, or neither")
+    if probe and not tasks:
+        raise InputError("--probe trains the heads of --tasks: name the tasks too")
     found = find_all_logs(logs)
 
     with importing():
         from foredrive.recipes import find_recipe, with_occupancy_source
-        from foredrive.recipes.task_heads import town_heads, with_settings
+        from foredrive.recipes.task_heads import heads_for, with_joint_heads, with_settings
         from foredrive.runs import train_run
         from foredrive.runs.train.tasks import TASKS, probe_run, train_heads
 
     of_heads = tuple(entry.removeprefix(TASKS + ".") for entry in set if entry.startswith(TASKS + "."))
-    heads = with_settings(town_heads(tasks.split(",")), of_heads) if probe else None
-    others = set if heads is None else tuple(entry for entry in set if not entry.startswith(TASKS + "."))
+    others = tuple(entry for entry in set if not entry.startswith(TASKS + ".")) if tasks else set
     chosen = with_occupancy_source(find_recipe(recipe, others), occupancy)
-    if heads is not None and start is not None:
+    heads = heads_for(chosen, tasks.split(",")) if tasks else None
+    if heads is not None and not probe:
+        chosen = with_joint_heads(chosen, heads, of_heads)
+    elif heads is not None:
+        heads = with_settings(heads, of_heads)
+    if probe and start is not None:
         run = probe_run(chosen, found, out, cache, start)
     else:
         run = train_run(chosen, found, out, cache, start)
-    if heads is not None:
+    if heads is not None and probe:
         train_heads(run, heads)
         print(f"trained heads of {tasks}: {out / TASKS}")
     print(f"trained {run.recipe.name}: {run.weights}")

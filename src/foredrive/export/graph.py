@@ -160,7 +160,15 @@ class AgentGraph(nn.Module):
         volume = self.agent.planner_volume
         future = volume(beliefs[1]) if planner.imagined_frames else None
         plan = planner(
-            volume(now), future, command, command_valid, speed_mps, speed_valid, past_motion, route_lead
+            volume(now),
+            future,
+            command,
+            command_valid,
+            speed_mps,
+            speed_valid,
+            past_motion,
+            route_lead,
+            self.agent.tokens(now),
         )
         beliefs = beliefs[: self.steps + 1]
         decoded = [model.decode(belief) for belief in beliefs]

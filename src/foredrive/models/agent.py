@@ -7,8 +7,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from foredrive.geometry.precision import full_precision
 from foredrive.models.ego_mlp import ego_motion, route_target
 from foredrive.models.planner import VolumePlanner
+from foredrive.models.tasks.heads import HeadOutput, TaskHeads
 from foredrive.scene import Belief, Clip, Decoded, Trajectory, WorldModel
 
 W = TypeVar("W", bound=WorldModel)
@@ -21,29 +23,73 @@ class AgentOutput(NamedTuple):
     """The belief about now, then those of the imagined key frames."""
     decoded: list[Decoded]
     plan: Trajectory
+    found: HeadOutput | None = None
+    """Output of the agent's own task heads."""
 
 
 class PlanningAgent(nn.Module, Generic[W]):
-    """An `Agent` over any world model. It plans from the volumes at now and at the next step (NeMo §3.3)."""
+    """An `Agent` over any world model. It plans from the volumes at now and at the next step (NeMo §3.3).
 
-    def __init__(self, world_model: W, planner: VolumePlanner) -> None:
+    Args:
+        world_model: any world model.
+        planner: reads its volumes and, if it attends to them, the output of `heads`.
+        heads: task heads that were trained with the agent, or that its planner attends to.
+    """
+
+    def __init__(self, world_model: W, planner: VolumePlanner, heads: TaskHeads | None = None) -> None:
         super().__init__()
         self.world_model: W = world_model
         self.planner = planner
+        self.heads = heads
 
     def forward(self, clip: Clip, steps: int) -> AgentOutput:
         """Observe the clip, imagine `steps` key frames (and those the planner needs), and plan."""
         beliefs = self.rollout(clip, max(steps, self.planner.imagined_frames))
         decoded = [self.world_model.decode(belief) for belief in beliefs[: steps + 1]]
-        return AgentOutput(beliefs[: steps + 1], decoded, self.plan(clip, beliefs))
+        found = self.perceive(beliefs[0])
+        return AgentOutput(beliefs[: steps + 1], decoded, self.plan(clip, beliefs, found), found)
 
     def rollout(self, clip: Clip, steps: int) -> list[Belief]:
         """Return the beliefs about now and about the next `steps` key frames."""
         now = self.world_model.observe(clip)
         return [now, *self.world_model.imagine(now, steps)] if steps else [now]
 
-    def plan(self, clip: Clip, beliefs: Sequence[Belief]) -> Trajectory:
-        """Plan from the belief about now and those next key frames that the planner uses."""
+    def perceive(self, now: Belief) -> HeadOutput | None:
+        """Return the output of the agent's task heads for a belief about now; None without heads.
+
+        Heads compute in 32 bits, because positions in 16 are off by tenths of a cell.
+        """
+        if self.heads is None:
+            return None
+        read = {task: self.world_model.volume_for(now, task) for task in self.heads.config.tasks}
+        distinct = {id(volume): volume for volume in read.values()}
+        with full_precision(*distinct.values()) as volumes:
+            cast = dict(zip(distinct, volumes, strict=True))
+            found: HeadOutput = self.heads({task: cast[id(volume)] for task, volume in read.items()})
+        return found
+
+    def tokens(self, now: Belief, found: HeadOutput | None = None) -> Float[Tensor, "b N C"] | None:
+        """Return what the planner attends to beside the volumes; None if it does not.
+
+        Args:
+            now: belief about now.
+            found: output of `perceive`, if it is known.
+        """
+        if self.planner.scene is None:
+            return None
+        found = found or self.perceive(now)
+        assert found is not None
+        tokens: Tensor = self.planner.scene(found)
+        return tokens
+
+    def plan(self, clip: Clip, beliefs: Sequence[Belief], found: HeadOutput | None = None) -> Trajectory:
+        """Plan from the belief about now and those next key frames that the planner uses.
+
+        Args:
+            clip: for the motion of the ego vehicle, the command and the route.
+            beliefs: about now and about the next key frames.
+            found: output of `perceive`, if it is known.
+        """
         now = clip.now
         poses, speeds = ego_motion(clip, self.planner.history)
         plan: Trajectory = self.planner(
@@ -55,6 +101,7 @@ class PlanningAgent(nn.Module, Generic[W]):
             clip.ego_speed_valid[:, now],
             torch.cat([poses, speeds[:, :-1, None]], dim=-1),
             route_target(clip) if self.planner.target else None,
+            self.tokens(beliefs[0], found),
         )
         return plan
 

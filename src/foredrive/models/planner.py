@@ -12,6 +12,8 @@ from torch import Tensor, nn
 from foredrive.geometry.precision import full_precision
 from foredrive.models.ego_mlp import EgoMLP, EgoMLPConfig, status_vector
 from foredrive.models.few_queries import FewQueriesDecoderLayer
+from foredrive.models.tasks.heads import TaskHeadsConfig
+from foredrive.models.tasks.scene_tokens import Attended, SceneTokens
 from foredrive.ops.volume import sample_volume
 from foredrive.scene import Command, Trajectory, VoxelSpec
 
@@ -57,6 +59,8 @@ class PlannerConfig:
     ego_mlp: EgoMLPConfig | None = None
     """MLP whose plan is corrected, fitted to the demonstrations before fine-tuning. None corrects the plan
     that goes straight on at the present speed."""
+    attends: tuple[Attended, ...] = ()
+    """Outputs of the task heads that the decoder attends to beside the plane, as in VAD and UniAD."""
     path: PathCorrectionConfig | None = None
     """Also sample the volume along the initial plan. Not in the paper."""
     feed_forward: float = 2.0
@@ -218,10 +222,21 @@ class VolumePlanner(nn.Module):
         channels: D.
         horizon_steps: steps of the plan.
         dt_s: time step of the plan, s.
+        heads: sizes of the task heads, if the planner attends to what they find.
+
+    Raises:
+        InputError: the planner attends to what no head finds.
     """
 
     def __init__(
-        self, config: PlannerConfig, spec: VoxelSpec, *, channels: int, horizon_steps: int, dt_s: float
+        self,
+        config: PlannerConfig,
+        spec: VoxelSpec,
+        *,
+        channels: int,
+        horizon_steps: int,
+        dt_s: float,
+        heads: TaskHeadsConfig | None = None,
     ) -> None:
         super().__init__()
         height, ny, nx = spec.shape_zyx
@@ -271,6 +286,9 @@ class VolumePlanner(nn.Module):
             self.path = PathCorrection(
                 config.path, spec, channels=channels, status=status, steps=horizon_steps
             )
+        self.scene: SceneTokens | None = None
+        if config.attends:  # built last, so that the other weights start as without it
+            self.scene = SceneTokens(config.attends, heads, spec, width)
 
     @property
     def imagined_frames(self) -> int:
@@ -287,6 +305,7 @@ class VolumePlanner(nn.Module):
         speed_valid: Bool[Tensor, "b"],
         past: Float[Tensor, "b P 4"],
         target: Float[Tensor, "b 3"] | None = None,
+        tokens: Float[Tensor, "b _N C"] | None = None,
     ) -> Trajectory:
         """Plan in the ego frame at now.
 
@@ -297,10 +316,15 @@ class VolumePlanner(nn.Module):
                 estimate is enough to begin with; the query is told that the speed is unknown.
             past: x, y (m), yaw (rad) in the ego frame at now and speed (m/s) of the last `history` frames.
             target: see `route_target`; required if the config's `target` is set.
+            tokens: output of `scene`; required if the config's `attends` is not empty.
         """
         fused = self._fuse(now, future)
         plane = self.fold(fused.permute(0, 3, 4, 2, 1).flatten(3))  # [b, Y, X, C]
         memory = (plane + self.row + self.column).flatten(1, 2)
+        if self.scene is not None:
+            if tokens is None:
+                raise ValueError("this planner needs tokens of agents or map elements")
+            memory = torch.cat([memory, tokens.to(memory)], dim=1)
         initial_xy, ego_status = self.initial_plan(command, command_valid, speed_mps, past, target)
         command = torch.where(command_valid, command, len(Command))
         sizes = self.config

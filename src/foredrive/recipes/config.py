@@ -16,6 +16,7 @@ from foredrive.models.planner import PlannerConfig
 from foredrive.recipes.old_formats import upgraded
 from foredrive.recipes.world_models import WORLD_MODELS
 from foredrive.training import EgoMLPFit, PathFit
+from foredrive.training.joint_tasks import JointTasks
 
 M = TypeVar("M")
 S = TypeVar("S")
@@ -38,9 +39,14 @@ class Recipe(Generic[M, S]):
     finetune: S
     pretrained_model: M | None = None
     """World model of pre-training if it is another than `model`. Both have the same encoder."""
-    transfer: Literal["world_model", "encoder"] = "world_model"
+    transfer: Literal["world_model", "encoder", "frozen"] = "world_model"
     """Part of the pre-trained weights that fine-tuning starts from: the whole world model, or its backbone
-    and encoder from images to a volume or plane. All other parts then start fresh, by the seed alone."""
+    and encoder from images to a volume or plane. All other parts then start fresh, by the seed alone. With
+    "frozen", the last world model and the task heads of another run are kept as they are, and fine-tuning
+    trains the planner alone."""
+    tasks: JointTasks | None = None
+    """Task heads that are part of the agent; fine-tuning trains them with the world model, unless that is
+    frozen. Their truth is `clips.tasks`."""
     path: PathFit | None = None
     """Separate fit of the planner's `PathCorrection` after fine-tuning, which then does not train it. None
     trains it in fine-tuning."""
@@ -52,8 +58,14 @@ class Recipe(Generic[M, S]):
 
     @property
     def of_pretraining(self) -> "Recipe[M, S]":
-        """Return the recipe with the world model of pre-training."""
-        return self if self.pretrained_model is None else replace(self, model=self.pretrained_model)
+        """Return the recipe with the world model of pre-training, without task heads."""
+        return replace(
+            self,
+            model=self.pretrained_model or self.model,
+            clips=replace(self.clips, tasks=None),
+            planner=replace(self.planner, attends=()),
+            tasks=None,
+        )
 
 
 def rescheduled(stage: S, **changes: Any) -> S:

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import get_args
+from typing import Any, TypeVar, get_args
 
 from foredrive.data.task_truth import TaskTruthConfig
 from foredrive.errors import InputError
@@ -11,11 +11,16 @@ from foredrive.models.tasks.agents import AgentHeadConfig, MotionConfig
 from foredrive.models.tasks.decoder import DecoderConfig
 from foredrive.models.tasks.heads import TaskHeadsConfig
 from foredrive.models.tasks.maps import MapHeadConfig
-from foredrive.recipes.config import overridden, read_values, validated
+from foredrive.recipes.config import Recipe, overridden, read_values, validated
 from foredrive.scene import Task
+from foredrive.training.joint_tasks import JointTasks
 from foredrive.training.loop import Schedule
 from foredrive.training.task_losses import TaskWeights
 
+R = TypeVar("R", bound="Recipe[Any, Any]")
+
+LARGE_CELLS = 100
+"""Grids with more cells along a side get heads of the published sizes."""
 HEADED: tuple[Task, ...] = ("detection", "map", "motion", "occupancy")
 """Tasks that have a head."""
 
@@ -55,6 +60,41 @@ def base_heads(tasks: Sequence[str]) -> TaskHeadsRecipe:
         elements=MapHeadConfig(elements=50, points=20, decoder=deep),
     )
     return _heads_of(tasks, sizes, Schedule(batch_size=8, lr=2e-4, epochs=24, warmup_steps=500))
+
+
+def heads_for(recipe: Recipe[Any, Any], tasks: Sequence[str]) -> TaskHeadsRecipe:
+    """Return heads in a size that fits a recipe: those of published models on grids of more than 100 cells.
+
+    Raises:
+        InputError: a task is unknown or has no head.
+    """
+    large = max(recipe.clips.voxels.shape_zyx[1:]) > LARGE_CELLS
+    return base_heads(tasks) if large else town_heads(tasks)
+
+
+def with_joint_heads(recipe: R, heads: TaskHeadsRecipe, settings: Sequence[str] = ()) -> R:
+    """Return a recipe that trains heads together with world model and planner, in fine-tuning.
+
+    Args:
+        recipe: without heads.
+        heads: heads and their truth. Their schedule is not used.
+        settings: entries of `Recipe.tasks` to replace, such as "weights.detection=2".
+
+    Raises:
+        InputError: the recipe keeps the heads of another run, or a setting does not fit.
+    """
+    if recipe.transfer == "frozen":
+        raise InputError(f"{recipe.name}: transfer is frozen, which keeps the heads of --start: no --tasks")
+    joint = JointTasks(heads.heads, heads.weights)
+    if settings:
+        joint = validated(JointTasks, overridden(asdict(joint), settings), "--set")
+    names = "+".join(joint.heads.tasks)
+    return replace(
+        recipe,
+        name=f"{recipe.name} ({names})",
+        clips=replace(recipe.clips, tasks=heads.truth),
+        tasks=joint,
+    )
 
 
 def with_settings(recipe: TaskHeadsRecipe, settings: Sequence[str]) -> TaskHeadsRecipe:

@@ -15,6 +15,7 @@ from foredrive.models.nemo import Nemo, NemoConfig
 from foredrive.models.vgg import Vgg16Features
 from foredrive.scene import WorldModel
 from foredrive.training import DriveWorldObjective, DriveWorldStage, NemoObjective, NemoStage
+from foredrive.training.joint_tasks import TaskTerms
 
 
 class WorldModelEntry(NamedTuple):
@@ -27,8 +28,9 @@ class WorldModelEntry(NamedTuple):
     build: Callable[[Any, ClipConfig, bool], WorldModel]
     """Builds the model from its config and that of its clips. If the last argument is true, fetches named
     weights."""
-    objective: Callable[[Any, PlanningAgent[Any], ClipConfig], nn.Module]
-    """Builds the module that maps an example to its losses, from a stage and the agent."""
+    objective: Callable[[Any, PlanningAgent[Any], ClipConfig, TaskTerms | None], nn.Module]
+    """Builds the module that maps an example to its losses, from a stage, the agent and, if its heads are
+    trained, their losses."""
 
 
 def build_nemo(config: NemoConfig, clips: ClipConfig, fetch: bool) -> Nemo:
@@ -43,7 +45,9 @@ def build_nemo(config: NemoConfig, clips: ClipConfig, fetch: bool) -> Nemo:
     )
 
 
-def nemo_objective(stage: NemoStage, agent: PlanningAgent[Nemo], clips: ClipConfig) -> NemoObjective:
+def nemo_objective(
+    stage: NemoStage, agent: PlanningAgent[Nemo], clips: ClipConfig, tasks: TaskTerms | None = None
+) -> NemoObjective:
     """Build NeMo's objective. Where VGG-16 cannot be downloaded, the perceptual loss has weight 0."""
     features: ImageFeatures | None = None
     if stage.perceptual == "tower":
@@ -57,7 +61,7 @@ def nemo_objective(stage: NemoStage, agent: PlanningAgent[Nemo], clips: ClipConf
             warnings.warn(f"the perceptual loss is OFF (weight 0): no VGG-16 weights ({error})", stacklevel=3)
     elif stage.perceptual is not None:
         features = Vgg16Features(stage.perceptual)
-    return NemoObjective(agent, stage, steps=clips.future_frames, image_features=features)
+    return NemoObjective(agent, stage, steps=clips.future_frames, image_features=features, tasks=tasks)
 
 
 def build_driveworld(config: DriveWorldConfig, clips: ClipConfig, fetch: bool) -> DriveWorld:
@@ -66,10 +70,13 @@ def build_driveworld(config: DriveWorldConfig, clips: ClipConfig, fetch: bool) -
 
 
 def driveworld_objective(
-    stage: DriveWorldStage, agent: PlanningAgent[DriveWorld], clips: ClipConfig
+    stage: DriveWorldStage,
+    agent: PlanningAgent[DriveWorld],
+    clips: ClipConfig,
+    tasks: TaskTerms | None = None,
 ) -> DriveWorldObjective:
     """Build DriveWorld's objective."""
-    return DriveWorldObjective(agent, stage, steps=clips.future_frames)
+    return DriveWorldObjective(agent, stage, steps=clips.future_frames, tasks=tasks)
 
 
 WORLD_MODELS: dict[str, WorldModelEntry] = {

@@ -2,12 +2,17 @@
 
 from typing import Any
 
-from torch import nn
+from jaxtyping import Float
+from torch import Tensor, nn
 
+from foredrive.errors import InputError
 from foredrive.models.agent import PlanningAgent
 from foredrive.models.planner import VolumePlanner
+from foredrive.models.tasks.heads import TaskHeads
 from foredrive.recipes.config import Recipe
 from foredrive.recipes.world_models import WORLD_MODELS
+from foredrive.training.joint_tasks import TaskTerms
+from foredrive.training.planner_objective import PlannerObjective
 
 
 def build_agent(recipe: Recipe[Any, Any], *, fetch: bool = True) -> PlanningAgent[Any]:
@@ -25,13 +30,38 @@ def build_agent(recipe: Recipe[Any, Any], *, fetch: bool = True) -> PlanningAgen
         channels=world_model.channels,
         horizon_steps=clips.horizon_steps,
         dt_s=clips.horizon_dt_s,
+        heads=None if recipe.tasks is None else recipe.tasks.heads,
     )
-    return PlanningAgent(world_model, planner)
+    return PlanningAgent(world_model, planner, _heads(recipe, world_model.channels))
 
 
-def build_objective(recipe: Recipe[Any, Any], stage: Any, agent: PlanningAgent[Any]) -> nn.Module:
-    """Build the module that maps an example to its losses in one stage of the recipe."""
-    objective = WORLD_MODELS[stage.kind].objective(stage, agent, recipe.clips)
+def _heads(recipe: Recipe[Any, Any], channels: int) -> TaskHeads | None:
+    if recipe.tasks is None:
+        return None
+    if recipe.clips.tasks is None:
+        raise InputError(f"{recipe.name}: it has task heads, but clips.tasks reads no truth for them")
+    return TaskHeads(
+        recipe.tasks.heads, recipe.clips.voxels, channels=channels, raster=recipe.clips.tasks.raster
+    )
+
+
+def build_objective(
+    recipe: Recipe[Any, Any],
+    stage: Any,
+    agent: PlanningAgent[Any],
+    class_weight: Float[Tensor, "C"] | None = None,
+) -> nn.Module:
+    """Build the module that maps an example to its losses in one stage of the recipe.
+
+    Args:
+        class_weight: weight of each class of semantic voxels, for the losses of the heads.
+    """
+    objective: nn.Module
+    if recipe.transfer == "frozen":
+        objective = PlannerObjective(agent)
+    else:
+        tasks = None if recipe.tasks is None else TaskTerms(recipe.tasks, recipe.clips.voxels, class_weight)
+        objective = WORLD_MODELS[stage.kind].objective(stage, agent, recipe.clips, tasks)
     if recipe.path is not None and agent.planner.path is not None:
         agent.planner.path.requires_grad_(False)  # it is fitted after the last stage
     return objective

@@ -13,6 +13,7 @@ from foredrive.losses import masked_mean, occupancy_loss, waypoint_loss
 from foredrive.models.agent import PlanningAgent
 from foredrive.models.driveworld import DriveWorld, Unrolled, actions_of, balanced_kl
 from foredrive.scene import Belief, Boxes, Clip, Example, last_frames
+from foredrive.training.joint_tasks import TaskTerms
 from foredrive.training.loop import Schedule
 from foredrive.training.objective import set_planner_trainable
 
@@ -68,11 +69,19 @@ class DriveWorldObjective(nn.Module):
         agent: a DriveWorld and its planner.
         stage: weights of the terms, and what is trained.
         steps: L, number of imagined key frames.
+        tasks: losses of the agent's heads, or None if they are not trained.
     """
 
-    def __init__(self, agent: PlanningAgent[DriveWorld], stage: DriveWorldStage, *, steps: int) -> None:
+    def __init__(
+        self,
+        agent: PlanningAgent[DriveWorld],
+        stage: DriveWorldStage,
+        *,
+        steps: int,
+        tasks: TaskTerms | None = None,
+    ) -> None:
         super().__init__()
-        self.agent, self.stage, self.steps = agent, stage, steps
+        self.agent, self.stage, self.steps, self.tasks = agent, stage, steps, tasks
         weights, world = stage.weights, agent.world_model
         set_planner_trainable(agent.planner, weights.wpts > 0)
         world.states.requires_grad_(stage.temporal)
@@ -92,13 +101,19 @@ class DriveWorldObjective(nn.Module):
             unrolled = world.unroll(lifted, self.steps, generator, stage.statics_of)
             losses |= self._latent_losses(unrolled, clip)
             losses |= self._volume_losses(unrolled.beliefs, example)
-        if stage.weights.wpts > 0:
+        terms: dict[str, Float[Tensor, ""]] = {}
+        if stage.weights.wpts > 0 or self.tasks is not None:
             now = world.belief_about_now(lifted)
-            future = world.imagine(now, 1) if self.agent.planner.imagined_frames else []
-            losses["wpts"] = waypoint_loss(self.agent.plan(observed, [now, *future]), clip.future)
+            found = None if self.tasks is None else self.agent.perceive(now)
+            if stage.weights.wpts > 0:
+                future = world.imagine(now, 1) if self.agent.planner.imagined_frames else []
+                plan = self.agent.plan(observed, [now, *future], found)
+                losses["wpts"] = waypoint_loss(plan, clip.future)
+            if self.tasks is not None and found is not None:
+                terms = self.tasks(found, example)
         weighted = [getattr(stage.weights, name) * value for name, value in losses.items()]
-        losses["loss"] = torch.stack(weighted).sum()
-        return losses
+        total = torch.stack(weighted).sum()
+        return losses | terms | {"loss": total + terms["tasks"] if terms else total}
 
     def _latent_losses(self, unrolled: Unrolled, clip: Clip) -> dict[str, Float[Tensor, ""]]:
         """Return the divergence of prior and posterior and the errors of the policy and the velocities."""

@@ -16,6 +16,7 @@ from foredrive.models.nemo import Nemo
 from foredrive.models.planner import VolumePlanner
 from foredrive.scene import Belief, Clip, Example, last_frames
 from foredrive.training.augmentation import AugmentConfig, augmented
+from foredrive.training.joint_tasks import TaskTerms
 from foredrive.training.loop import Schedule
 from foredrive.training.rays import averaged_rays, thinned_rays
 
@@ -77,6 +78,7 @@ class NemoObjective(nn.Module):
         stage: λ, and what is trained.
         steps: T_f, number of future key frames that are imagined and supervised, if the stage imagines.
         image_features: trained features for the perceptual loss, or None to disable it.
+        tasks: losses of the agent's heads, or None if they are not trained.
 
     Raises:
         InputError: `imagined_items` or `imagine_every` is below 1, or the planner reads imagined frames of
@@ -92,12 +94,13 @@ class NemoObjective(nn.Module):
         *,
         steps: int,
         image_features: ImageFeatures | None = None,
+        tasks: TaskTerms | None = None,
     ) -> None:
         super().__init__()
         self.agent, self.stage, self.weights = agent, stage, stage.weights
         self.rays = averaged_rays if stage.pixels == "averaged" else thinned_rays
         self.steps = steps if stage.imagine else 0
-        self.image_features = image_features
+        self.image_features, self.tasks = image_features, tasks
         world, weights = agent.world_model, stage.weights
         plans = weights.wpts > 0
         set_planner_trainable(agent.planner, plans)
@@ -127,7 +130,8 @@ class NemoObjective(nn.Module):
         needed = self.agent.planner.imagined_frames if weights.wpts > 0 else 0
         steps = self.steps if self._imagines_now() else 0
         beliefs = self._rollout(observed, max(steps, needed))
-        plan = self.agent.plan(observed, beliefs) if weights.wpts > 0 else None
+        found = None if self.tasks is None else self.agent.perceive(beliefs[0])
+        plan = self.agent.plan(observed, beliefs, found) if weights.wpts > 0 else None
         decoded = [world.decode(belief) for belief in beliefs[: steps + 1]]
 
         losses = {name: clip.t_s.new_zeros(()) for name in ("l1", "perc", "occ")}
@@ -166,6 +170,9 @@ class NemoObjective(nn.Module):
         if plan is not None:
             losses["wpts"] = waypoint_loss(plan, clip.future)
             losses["loss"] = losses["loss"] + weights.wpts * losses["wpts"]
+        if self.tasks is not None and found is not None:
+            losses |= self.tasks(found, example)
+            losses["loss"] = losses["loss"] + losses["tasks"]
         return losses
 
     def _imagines_now(self) -> bool:

@@ -59,7 +59,8 @@ def agent_targets(boxes: Boxes, futures: AgentFutures | None, spec: VoxelSpec, s
     if futures is not None:
         rows = kept[: len(futures.valid)]  # a batch may pad boxes and futures to different lengths
         found = int(rows.sum())
-        xy[:found], valid[:found] = futures.xy[: len(rows)][rows], futures.valid[: len(rows)][rows]
+        xy[:found] = futures.xy[: len(rows), :steps][rows]  # no steps for a head without forecasts
+        valid[:found] = futures.valid[: len(rows), :steps][rows]
     return AgentTargets(
         boxes=LabelledBoxes(label[kept], state[kept], boxes.yaw[kept]),
         velocity=boxes.velocity[kept],

@@ -1,7 +1,7 @@
 """The head of road users: a set of boxes with velocity, attribute and motion."""
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import torch
 from jaxtyping import Float, Int
@@ -64,6 +64,8 @@ class AgentSet(Record):
     """Box centres at the steps after now in each mode, m. None without forecasts."""
     log_prob: Float[Tensor, "*b Q M"] | None = None
     """Log-probability of each mode."""
+    query: Float[Tensor, "*b Q W"] | None = None
+    """Features of each query; those after the last layer alone."""
 
     def agents(self, dt_s: float) -> Agents:
         """Return the most probable class of each query, with its probability as the score.
@@ -137,6 +139,7 @@ class AgentHead(nn.Module):
             queries = layer(queries, self.place(plane.share(at_m)), cells, cell_place)
             found.append(self._agents(queries, at_m, plane.cell_m))
             at_m = found[-1].boxes.mean[..., :2].detach()
+        found[-1] = replace(found[-1], query=queries)
         if self.motion is not None and motion_plane is not None:
             found[-1] = self.motion(queries, found[-1], motion_plane, self.place)
         return found
@@ -196,12 +199,8 @@ class MotionModes(nn.Module):
         moved = torch.stack([cos * along - sin * across, sin * along + cos * across], dim=-1)
         t_s = config.dt_s * torch.arange(1, config.steps + 1, device=queries.device)
         steady = centre[:, :, None] + agents.velocity.detach()[:, :, None] * t_s[:, None]
-        return AgentSet(
-            boxes=agents.boxes,
-            velocity=agents.velocity,
-            attribute=agents.attribute,
-            future_xy=steady[:, :, None] + moved,
-            log_prob=out[..., -1].log_softmax(dim=-1),
+        return replace(
+            agents, future_xy=steady[:, :, None] + moved, log_prob=out[..., -1].log_softmax(dim=-1)
         )
 
 

@@ -35,6 +35,8 @@ class MapSet(Record):
     """Logit of each kind by itself. If all are low, there is no element."""
     points: Float[Tensor, "*b E P 2"]
     """Points in order along the element, m."""
+    query: Float[Tensor, "*b E W"] | None = None
+    """Features of each element: the mean of its points' queries."""
 
     def lines(self) -> MapLines:
         """Return the most probable kind of each element, with its probability as the score."""
@@ -85,7 +87,8 @@ class MapHead(nn.Module):
             place = self.place(plane.share(at_m)).flatten(1, 2)
             queries = layer(queries.flatten(1, 2), place, cells, cell_place).view_as(queries)
             points = at_m + plane.cell_m * self.shift(queries)
-            found.append(MapSet(self.kind(queries.mean(dim=2)), points))
+            features = queries.mean(dim=2)
+            found.append(MapSet(self.kind(features), points, features))
             at_m = points.detach()
         return found
 

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from foredrive.evaluation.predictor import Part, Prediction
-from foredrive.models.agent import PlanningAgent
+from foredrive.models.agent import AgentOutput, PlanningAgent
 from foredrive.models.tasks.heads import TaskHeads
 from foredrive.scene import Belief, Clip, Decoded, RayRenderer, WorldModel
 from foredrive.training import thinned_rays
@@ -57,7 +57,7 @@ class AgentPredictor:
                 for _ in range(self.futures)
             ]
             futures = torch.stack([_occupied(world, beliefs) for beliefs in drawn], dim=1)
-        tasks = Prediction() if self.heads is None else self._tasks(self.heads, output.beliefs[0])
+        tasks = Prediction() if self.heads is None else self._tasks(self.heads, output)
         return dataclasses.replace(
             tasks,
             occupancy_logit=torch.stack([frame.occupancy_logit for frame in decoded], dim=1),
@@ -68,9 +68,12 @@ class AgentPredictor:
             image_stride=max(self.ray_stride, 1),
         )
 
-    def _tasks(self, heads: TaskHeads, now: Belief) -> Prediction:
+    def _tasks(self, heads: TaskHeads, output: AgentOutput) -> Prediction:
         """Return the parts of a prediction that the heads give; those without a head are None."""
-        found = heads(task_volumes(self.agent.world_model, now, heads.config.tasks).by_task())
+        found = output.found
+        if heads is not self.agent.heads or found is None:
+            now, world = output.beliefs[0], self.agent.world_model
+            found = heads(task_volumes(world, now, heads.config.tasks).by_task())
         motion = None if heads.agents is None else heads.agents.motion
         dt_s = 0.5 if motion is None else motion.config.dt_s
         return Prediction(

@@ -129,7 +129,7 @@ def evaluate_run(
                 clips.future_frames,
                 RENDER_STRIDE if views else 0,
                 FUTURES,
-                None if trained is None else trained.heads.to(device),
+                agent.heads if trained is None or agent.heads is not None else trained.heads.to(device),
             ),
             _Batches(dataset, batch_size),
             frame_dt_s=clips.frame_dt_s,

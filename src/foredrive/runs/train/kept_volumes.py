@@ -18,8 +18,9 @@ from foredrive.data.batches import stack_records
 from foredrive.files import atomic_path
 from foredrive.models.agent import PlanningAgent
 from foredrive.runs.open_clips import open_clips
-from foredrive.scene import Boxes, Clip, Task
+from foredrive.scene import Clip, Task
 from foredrive.scene.task_truth import TaskTruth
+from foredrive.training.joint_tasks import boxes_now
 from foredrive.training.task_probe import TaskExample, TaskVolumes, task_volumes
 
 BATCH_SIZE = 4
@@ -98,11 +99,6 @@ def collate_kept(examples: Sequence[TaskExample]) -> TaskExample:
     keys = tuple(key for example in examples for key in example.key)
     batch = stack_records([dataclasses.replace(example, key=()) for example in examples])
     return dataclasses.replace(batch, key=keys)
-
-
-def boxes_now(clip: Clip) -> Boxes:
-    """Return the boxes at now, of an unbatched clip or of a batch."""
-    return clip.boxes.map_tensors(lambda tensor: tensor.select(clip.t_s.dim() - 1, clip.now))
 
 
 def _without_volumes(clip: Clip, truth: TaskTruth | None, key: str) -> TaskExample:

@@ -2,8 +2,8 @@
 
 import contextlib
 import json
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,6 +11,7 @@ import torch
 
 from foredrive.data import ClipDataset, LogPath, collate
 from foredrive.errors import InputError
+from foredrive.evaluation.task_priors import fit_task_priors
 from foredrive.files import atomic_path
 from foredrive.models.agent import PlanningAgent
 from foredrive.recipes.config import Recipe, load_recipe, save_recipe
@@ -18,7 +19,10 @@ from foredrive.runs.build import build_agent, build_objective
 from foredrive.runs.folder import CONFIG, LOGS, WEIGHTS, RunFolder
 from foredrive.runs.open_clips import open_clips
 from foredrive.runs.train.baselines import fit_baselines
+from foredrive.runs.train.kept_parts import load_kept, with_kept_heads
 from foredrive.runs.train.path_features import sample_paths
+from foredrive.runs.train.task_priors import PRIORS, TASKS, check_truth, save_priors, semantic_weights
+from foredrive.scene.task_truth import TaskTruth
 from foredrive.training import CONDITIONS, PathFit, fit_path, load_weights, save_weights, train
 
 if TYPE_CHECKING:
@@ -100,26 +104,34 @@ def train_run(
         cache_dir: folder for labels and shrunk images; by default in `folder`.
         start: a run folder. The part of its pre-trained world model that the recipe transfers is used, and
             this run skips that stage. It allows pre-training on many logs and fine-tuning on few, or with
-            another planner.
+            another planner. If the recipe's `transfer` is "frozen", its last world model and its heads are
+            used instead.
 
     Raises:
         InputError: `folder` holds a run of another recipe, other logs or another start; another process
-            trains it; a log cannot be read; `start` has not finished pre-training, or its world model has
-            other sizes.
+            trains it; a log cannot be read; no log has the truth of a task; `start` has not finished
+            pre-training, or its world model has other sizes.
     """
     from foredrive.training import make_fabric  # the import takes seconds; opening a run does without
 
     start = None if start is None else start.absolute()
+    kept: Run | None = None
+    if recipe.transfer == "frozen":
+        kept = _kept(recipe, start)
+        recipe = with_kept_heads(recipe, kept.recipe, kept.folder)
     logs = tuple(log.absolute() for log in logs)  # a run opens from any working directory
     run = Run(folder, recipe, logs, (cache_dir or folder / "cache").absolute(), start)
     claim = _folder_of(run)
     claim.check()
     dataset = open_clips(run.logs, recipe.clips, run.cache_dir)
-    pretrained = None if start is None else _pretrained(start)
+    check_truth(recipe, run.logs)
+    pretrained = None if start is None or kept is not None else _pretrained(start)
+    if recipe.planner.attends or recipe.tasks is not None:
+        build_agent(recipe, fetch=False)  # heads that do not fit the rest must not create a run
     with claim.claimed():  # only now: logs that cannot be read must not create a run
         fabric = make_fabric(recipe.precision)
         fabric.launch()
-        _train_stages(run, dataset, pretrained, fabric)
+        _train_stages(run, dataset, pretrained or kept, fabric)
     return run
 
 
@@ -140,24 +152,33 @@ def begin_run(
         return run
 
 
-def _train_stages(run: Run, dataset: ClipDataset, pretrained: Path | None, fabric: "Fabric") -> None:
-    """Train the stages that are not finished yet, in order."""
+def _train_stages(run: Run, dataset: ClipDataset, start: "Path | Run | None", fabric: "Fabric") -> None:
+    """Train the stages that are not finished yet, in order.
+
+    Args:
+        start: pre-trained weights, or the run whose world model and heads are kept. None: pre-train, if the
+            recipe says so.
+    """
     recipe, folder = run.recipe, run.folder
-    if pretrained is None and recipe.pretrain is not None:
-        pretrained = folder / "pretrain" / WEIGHTS
-        if not pretrained.is_file():
-            _train_stage(
-                run, "pretrain", recipe.pretrain, fresh_agent(recipe.of_pretraining), dataset, fabric
-            )
+    if start is None and recipe.pretrain is not None:
+        start = folder / "pretrain" / WEIGHTS
+        if not start.is_file():
+            first = recipe.of_pretraining
+            data = dataset if recipe.clips.tasks is None else open_clips(run.logs, first.clips, run.cache_dir)
+            _train_stage(replace(run, recipe=first), "pretrain", fresh_agent(first), data, fabric)
     agent = fresh_agent(recipe)
-    if pretrained is not None:
-        load_pretrained(agent, recipe, pretrained)
+    if isinstance(start, Run):
+        load_kept(agent, start.recipe, start.folder, start.weights)
+    elif start is not None:
+        load_pretrained(agent, recipe, start)
     if agent.planner.ego_mlp is not None and not (folder / "finetune" / WEIGHTS).is_file():
         # The base of the planner is the same MLP that is its baseline in the evaluation.
         base = agent.planner.ego_mlp
         _, fitted = fit_baselines(run.logs, recipe, run.cache_dir, base.past_frames)
         base.load_state_dict(fitted.state_dict())
-    _train_stage(run, "finetune", recipe.finetune, agent, dataset, fabric)
+    _train_stage(run, "finetune", agent, dataset, fabric)
+    if recipe.tasks is not None and fabric.is_global_zero and not (folder / TASKS / PRIORS).is_file():
+        save_priors(fit_task_priors(_truths(dataset)), folder / TASKS / PRIORS)
     if recipe.path is not None:
         _fit_path(run, recipe.path, agent, fabric)
 
@@ -201,17 +222,25 @@ def _pretrained(start: Path) -> Path:
     return weights
 
 
+def _kept(recipe: Recipe, start: Path | None) -> Run:
+    """Return the run whose world model and heads are kept."""
+    if start is None:
+        raise InputError(f"{recipe.name}: transfer is frozen; --start has to name a trained run")
+    found = open_run(start)
+    assert found.weights
+    return found
+
+
 def _train_stage(
-    run: Run,
-    name: str,
-    stage: Any,
-    agent: PlanningAgent[Any],
-    dataset: ClipDataset,
-    fabric: "Fabric",
+    run: Run, name: str, agent: PlanningAgent[Any], dataset: ClipDataset, fabric: "Fabric"
 ) -> None:
-    weights = run.folder / name / WEIGHTS
+    weights, stage = run.folder / name / WEIGHTS, getattr(run.recipe, name)
     if not weights.is_file():
-        objective = build_objective(run.recipe, stage, agent)
+        tasks = run.recipe.tasks
+        voxels = tasks is not None and tasks.heads.voxels is not None
+        objective = build_objective(
+            run.recipe, stage, agent, semantic_weights(_truths(dataset)) if voxels else None
+        )
         train(objective, dataset, collate, stage.schedule, run.folder / name, fabric)
         if fabric.is_global_zero:
             with atomic_path(weights) as temporary:
@@ -220,9 +249,17 @@ def _train_stage(
     load_weights(agent, weights)
 
 
+def _truths(dataset: ClipDataset) -> Iterator[TaskTruth]:
+    """Yield the truth of every clip."""
+    for index in range(len(dataset)):
+        if (truth := dataset.truth(index)) is not None:
+            yield truth
+
+
 def load_agent(run: Run) -> PlanningAgent[Any]:
-    """Return the trained agent in evaluation mode."""
-    agent = build_agent(run.recipe, fetch=False)
+    """Return the trained agent in evaluation mode. Heads that are not trained yet are left out."""
+    pretrained = run.weights.parent.name == "pretrain"
+    agent = build_agent(run.recipe.of_pretraining if pretrained else run.recipe, fetch=False)
     load_weights(agent, run.weights)
     return agent.eval()
 

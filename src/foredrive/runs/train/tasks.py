@@ -7,30 +7,20 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import torch
-from jaxtyping import Float
-from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
-from torch import Tensor
 
 from foredrive.data import LogPath
 from foredrive.errors import InputError
 from foredrive.evaluation.task_priors import TaskPriors, fit_task_priors
 from foredrive.files import atomic_path
-from foredrive.losses.semantics import class_weights
 from foredrive.models.tasks.heads import TaskHeads
 from foredrive.recipes.config import Recipe, save_recipe
 from foredrive.recipes.task_heads import TaskHeadsRecipe, load_task_heads
 from foredrive.runs.folder import CONFIG, WEIGHTS
 from foredrive.runs.train.kept_volumes import KeptVolumes, collate_kept
 from foredrive.runs.train.run import Run, begin_run, load_agent, open_run
-from foredrive.scene.semantics import VOXEL_CLASSES
+from foredrive.runs.train.task_priors import PRIORS, TASKS, load_priors, save_priors, semantic_weights
 from foredrive.training import load_weights, save_weights, train
 from foredrive.training.task_probe import ProbeObjective
-
-TASKS = "tasks"
-"""Folder of the heads in the folder of a run."""
-PRIORS = "priors.safetensors"
-"""File of the baselines beside the heads."""
 
 
 @dataclass(frozen=True)
@@ -52,6 +42,10 @@ def probe_run(
         InputError: `start` has not finished or is of another recipe; `folder` holds another run.
     """
     other = open_run(start)
+    if other.recipe.tasks is not None:
+        raise InputError(
+            f"{start}: its heads were trained with its world model, so there is nothing to probe"
+        )
     if dataclasses.replace(recipe, name=other.recipe.name) != other.recipe:
         raise InputError(
             f"{start}: its recipe is not {recipe.name}. A probe keeps the world model as it is: "
@@ -85,12 +79,13 @@ def train_heads(run: Run, heads: TaskHeadsRecipe) -> TrainedHeads:
             save_recipe(heads, folder / CONFIG)
         torch.manual_seed(heads.schedule.seed)
         fresh = _build(run, heads)
-        objective = ProbeObjective(fresh, run.recipe.clips.voxels, heads.weights, _class_weight(dataset))
+        class_weight = semantic_weights(example.truth for example in dataset.examples)
+        objective = ProbeObjective(fresh, run.recipe.clips.voxels, heads.weights, class_weight)
         fabric = make_fabric("32-true")
         fabric.launch()
         train(objective, dataset, collate_kept, heads.schedule, folder, fabric)
         if fabric.is_global_zero:
-            _save_priors(fit_task_priors(example.truth for example in dataset.examples), folder / PRIORS)
+            save_priors(fit_task_priors(example.truth for example in dataset.examples), folder / PRIORS)
             with atomic_path(folder / WEIGHTS) as temporary:
                 save_weights(fresh, temporary)
         fabric.barrier()
@@ -100,18 +95,30 @@ def train_heads(run: Run, heads: TaskHeadsRecipe) -> TrainedHeads:
 
 
 def load_heads(run: Run) -> TrainedHeads | None:
-    """Return the trained heads of a run, or None if it has none.
+    """Return the trained heads of a run, those of its agent or a probe's; None if it has none.
 
     Raises:
         InputError: they cannot be read.
     """
     folder = run.folder / TASKS
+    if run.recipe.tasks is not None:
+        return _heads_of_agent(run)
     if not (folder / WEIGHTS).is_file():
         return None
     recipe = load_task_heads(folder / CONFIG)
     heads = _build(run, recipe)
     load_weights(heads, folder / WEIGHTS)
-    return TrainedHeads(heads.eval(), recipe, _load_priors(folder / PRIORS))
+    return TrainedHeads(heads.eval(), recipe, load_priors(folder / PRIORS))
+
+
+def _heads_of_agent(run: Run) -> TrainedHeads | None:
+    recipe, heads = run.recipe, load_agent(run).heads
+    if heads is None or recipe.tasks is None or recipe.clips.tasks is None:
+        return None
+    settings = TaskHeadsRecipe(
+        recipe.tasks.heads, recipe.clips.tasks, recipe.finetune.schedule, recipe.tasks.weights
+    )
+    return TrainedHeads(heads, settings, load_priors(run.folder / TASKS / PRIORS))
 
 
 def _build(run: Run, recipe: TaskHeadsRecipe) -> TaskHeads:
@@ -121,27 +128,3 @@ def _build(run: Run, recipe: TaskHeadsRecipe) -> TaskHeads:
         channels=run.recipe.model.channels,
         raster=recipe.truth.raster,
     )
-
-
-def _save_priors(priors: TaskPriors, path: Path) -> None:
-    known = {name: value.contiguous() for name, value in vars(priors).items() if value is not None}
-    with atomic_path(path) as temporary:
-        save_file(known, temporary)
-
-
-def _load_priors(path: Path) -> TaskPriors:
-    try:
-        return TaskPriors(**load_file(path))
-    except (OSError, SafetensorError, TypeError) as error:
-        raise InputError(f"{path}: cannot be read as baselines: {error}") from error
-
-
-def _class_weight(dataset: KeptVolumes) -> Float[Tensor, "C"] | None:
-    """Return the weights of the semantic classes from their shares in the training set."""
-    truths = [example.truth.semantics for example in dataset.examples]
-    voxels = [truth for truth in truths if truth is not None]
-    if not voxels:
-        return None
-    classes = len(VOXEL_CLASSES[voxels[0].taxonomy])
-    counts = [torch.bincount(truth.index[truth.known].long(), minlength=classes) for truth in voxels]
-    return class_weights(torch.stack(counts).sum(dim=0))

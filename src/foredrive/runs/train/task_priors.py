@@ -1,0 +1,78 @@
+"""What the training set tells about the tasks of heads: baselines, and weights of semantic classes."""
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
+from torch import Tensor
+
+from foredrive.data import LogPath
+from foredrive.data.logs import Log
+from foredrive.data.tasks import tasks_of
+from foredrive.errors import InputError
+from foredrive.evaluation.task_priors import TaskPriors
+from foredrive.files import atomic_path
+from foredrive.losses.semantics import class_weights
+from foredrive.recipes.config import Recipe
+from foredrive.scene.semantics import VOXEL_CLASSES
+from foredrive.scene.task_truth import TaskTruth
+
+TASKS = "tasks"
+"""Folder of what belongs to the heads in the folder of a run."""
+PRIORS = "priors.safetensors"
+"""File of the baselines in it."""
+
+
+def save_priors(priors: TaskPriors, path: Path) -> None:
+    """Write the baselines that exist."""
+    known = {name: value.contiguous() for name, value in vars(priors).items() if value is not None}
+    with atomic_path(path) as temporary:
+        save_file(known, temporary)
+
+
+def load_priors(path: Path) -> TaskPriors:
+    """Read what `save_priors` wrote.
+
+    Raises:
+        InputError: the file cannot be read.
+    """
+    try:
+        return TaskPriors(**load_file(path))
+    except (OSError, SafetensorError, TypeError) as error:
+        raise InputError(f"{path}: cannot be read as baselines: {error}") from error
+
+
+def check_truth(recipe: Recipe[Any, Any], logs: Sequence[LogPath]) -> None:
+    """Check that at least one log has the truth of each task that the recipe trains a head for.
+
+    Raises:
+        InputError: none has. The message names the task and the reason.
+    """
+    if recipe.tasks is None or recipe.transfer == "frozen":
+        return
+    missing: dict[str, str] = dict.fromkeys(recipe.tasks.heads.tasks, "")
+    for log in logs:
+        if not missing:
+            return
+        for support in tasks_of(Log(log)):
+            if support.judged:
+                missing.pop(support.task, None)
+            elif support.task in missing:
+                missing[support.task] = support.reason
+    for task, reason in missing.items():
+        raise InputError(f"no log can train the task {task!r}; {logs[-1].name}: {reason}")
+
+
+def semantic_weights(truths: Iterable[TaskTruth | None]) -> Float[Tensor, "C"] | None:
+    """Return the weights of the semantic classes from their shares in a training set; None without voxels."""
+    counts: Tensor | None = None
+    for truth in truths:
+        if truth is not None and (voxels := truth.semantics) is not None:
+            classes = len(VOXEL_CLASSES[voxels.taxonomy])
+            found = torch.bincount(voxels.index[voxels.known].long(), minlength=classes)
+            counts = found if counts is None else counts + found
+    return None if counts is None else class_weights(counts)

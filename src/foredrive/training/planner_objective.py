@@ -1,0 +1,42 @@
+"""Training of a planner alone, on a world model and heads that stay as they are."""
+
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from foredrive.losses import waypoint_loss
+from foredrive.models.agent import PlanningAgent
+from foredrive.scene import Example
+from foredrive.training.objective import set_planner_trainable
+
+
+class PlannerObjective(nn.Module):
+    """The mapping from a batch to the waypoint loss. World model and heads are frozen, in evaluation mode.
+
+    Args:
+        agent: of any world model.
+    """
+
+    def __init__(self, agent: PlanningAgent[Any]) -> None:
+        super().__init__()
+        self.agent = agent.requires_grad_(False)
+        set_planner_trainable(agent.planner, trainable=True)
+
+    def train(self, mode: bool = True) -> "PlannerObjective":
+        """Set the mode of the planner alone, so that the statistics of norms do not move."""
+        super().train(mode)
+        for part in (self.agent.world_model, self.agent.heads):
+            if part is not None:
+                part.eval()
+        return self
+
+    def forward(self, example: Example, generator: torch.Generator) -> dict[str, Float[Tensor, ""]]:
+        """Return losses by name; "loss" is minimised. Nothing is drawn from the generator."""
+        observed, agent = example.clip.observed(), self.agent
+        with torch.no_grad():
+            beliefs = agent.rollout(observed, agent.planner.imagined_frames)
+            found = agent.perceive(beliefs[0])
+        loss = waypoint_loss(agent.plan(observed, beliefs, found), example.clip.future)
+        return {"wpts": loss, "loss": loss}

@@ -1,0 +1,158 @@
+"""Task heads that are trained with the world model, and planners that attend to what they find."""
+
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+from joint_heads import ALL, small_heads, with_small_heads
+from miniature import STEPS, miniature, miniature_driveworld, with_steps
+from safetensors.torch import load_file
+
+from foredrive.data import LogPath, collate
+from foredrive.errors import InputError
+from foredrive.export.graph import AgentGraph, GraphInputs
+from foredrive.recipes import Recipe
+from foredrive.recipes.config import load_recipe
+from foredrive.recipes.task_heads import base_heads, heads_for, with_joint_heads
+from foredrive.runs import Run, evaluate_run, load_agent, open_run, train_run
+from foredrive.runs.build import build_agent
+from foredrive.runs.export import export_run
+from foredrive.runs.open_clips import open_clips
+from foredrive.runs.train.tasks import load_heads, probe_run, train_heads
+from foredrive.training import read_metrics
+
+WITHOUT_MAP = ("detection", "motion", "occupancy")
+"""Tasks that the log has truth of."""
+WEIGHTS = {"detection": 1.0, "velocity": 0.2, "attribute": 0.2, "motion": 0.5, "voxels": 1.0}
+
+
+def test_a_joint_run_is_trained_end_to_end_and_evaluated(trained: Run, log: LogPath, tmp_path: Path) -> None:
+    """The losses of the heads reach the world model, whose weights differ from those without heads."""
+    recipe = with_small_heads(trained.recipe, WITHOUT_MAP, attends=("agents",))
+    run = train_run(recipe, [log], tmp_path / "run", trained.cache_dir, trained.folder)
+    assert load_recipe(run.folder / "config.yaml") == run.recipe
+    lines = read_metrics(run.folder / "finetune" / "metrics.jsonl")
+    weighted = sum(lines[0][f"task_{name}"] * weight for name, weight in WEIGHTS.items())
+    assert lines[0]["tasks"] == pytest.approx(0.5 * weighted, rel=1e-4)
+    alone = load_file(trained.weights)
+    joint = load_file(run.weights)
+    assert any(not torch.equal(value, joint[name]) for name, value in alone.items() if "encoder" in name)
+    summary = evaluate_run(run, [log], tmp_path / "evaluated", views=False).summary
+    assert summary["failed"] == 0
+    assert summary["detection.frames_counted"] == summary["items"]
+    assert "motion.uniad.car.min_ade_m" in summary
+
+
+@pytest.mark.parametrize("make", [miniature, miniature_driveworld])
+def test_an_interrupted_joint_run_goes_on_to_the_same_bits(
+    make: Callable[[], Recipe], log: LogPath, tmp_path: Path
+) -> None:
+    whole = with_small_heads(make(), WITHOUT_MAP, attends=("agents",))
+    first = train_run(whole, [log], tmp_path / "whole", tmp_path / "cache")
+    cut = tmp_path / "cut"
+    train_run(with_steps(whole, STEPS, 1), [log], cut, tmp_path / "cache", first.folder)
+    (cut / "finetune" / "model.safetensors").unlink()
+    (cut / "tasks" / "priors.safetensors").unlink()
+    config = cut / "config.yaml"
+    config.write_text((first.folder / "config.yaml").read_text())
+    again = train_run(whole, [log], cut, tmp_path / "cache", first.folder)
+    one, two = load_file(first.weights), load_file(again.weights)
+    assert [line["step"] for line in read_metrics(cut / "finetune" / "metrics.jsonl")] == [1, 2, 3]
+    assert all(torch.equal(value, two[name]) for name, value in one.items())
+
+
+def test_a_planner_attends_to_frozen_heads_of_a_probe(trained: Run, log: LogPath, tmp_path: Path) -> None:
+    """World model and heads stay as they are, statistics of norms too; the plan depends on what is found."""
+    probe = probe_run(trained.recipe, [log], tmp_path / "probe", trained.cache_dir, trained.folder)
+    heads = train_heads(probe, small_heads(("detection", "motion", "map")))
+    planner = dataclasses.replace(trained.recipe.planner, attends=("agents", "map"))
+    recipe = dataclasses.replace(trained.recipe, transfer="frozen", planner=planner)
+    run = train_run(recipe, [log], tmp_path / "run", trained.cache_dir, probe.folder)
+    again = train_run(recipe, [log], tmp_path / "run", trained.cache_dir, probe.folder)  # is finished
+    assert again.recipe == run.recipe == open_run(run.folder).recipe
+    before, after = load_file(trained.weights), load_file(run.weights)
+    for name, value in before.items():
+        if name.startswith("world_model."):
+            assert torch.equal(value, after[name]), name
+    for name, value in heads.heads.state_dict().items():
+        assert torch.equal(value, after[f"heads.{name}"]), name
+    assert (run.folder / "finetune" / "model.safetensors").is_file()
+    assert not (run.folder / "pretrain").exists()
+    agent = load_agent(run)
+    clip = collate([open_clips([log], run.recipe.clips, run.cache_dir)[k] for k in (0, 3)]).clip.observed()
+    with torch.no_grad():
+        plan = agent.act(clip)
+        agent.heads.agents.content += 1.0
+        assert (agent.act(clip).xy - plan.xy).abs().max() > 1e-5
+    summary = evaluate_run(run, [log], tmp_path / "evaluated", views=False).summary
+    assert summary["failed"] == 0
+    assert "detection.nuscenes.map" in summary
+
+
+def test_the_graph_of_an_agent_that_attends_is_the_agent(trained: Run, log: LogPath) -> None:
+    recipe = with_small_heads(trained.recipe, ("detection", "motion"), attends=("agents",))
+    torch.manual_seed(0)
+    agent = build_agent(recipe, fetch=False).eval()
+    data = open_clips([log], recipe.clips, trained.cache_dir)
+    observed = collate([data[0]]).clip.observed()
+    graph = AgentGraph(agent, data.camera_names, recipe.clips.image_hw, steps=1)
+    with torch.no_grad():
+        plan = agent.act(observed)
+        found = graph(*GraphInputs.from_clip(observed, agent))
+    torch.testing.assert_close(found["waypoints_xy"], plan.xy[:, 0])
+
+
+@pytest.mark.slow
+def test_an_agent_that_attends_is_exported(trained: Run, log: LogPath, tmp_path: Path) -> None:
+    recipe = with_small_heads(trained.recipe, ("detection", "motion"), attends=("agents",))
+    run = train_run(recipe, [log], tmp_path / "run", trained.cache_dir, trained.folder)
+    report = export_run(run, [log], tmp_path / "exported", clips=1)
+    for found in report["largest_difference"].values():
+        assert found["waypoints_xy"] < 1e-3
+
+
+def test_combinations_that_cannot_be_are_one_line(trained: Run, log: LogPath, tmp_path: Path) -> None:
+    joint = with_small_heads(trained.recipe, ("occupancy",))
+    wrong = dataclasses.replace(joint, planner=dataclasses.replace(joint.planner, attends=("agents",)))
+    with pytest.raises(InputError, match="attends names agents, but no head finds them: train with det"):
+        train_run(wrong, [log], tmp_path / "wrong", trained.cache_dir, trained.folder)
+    without = dataclasses.replace(wrong, tasks=None)
+    with pytest.raises(InputError, match="attends names agents, but no head finds them"):
+        train_run(without, [log], tmp_path / "wrong", trained.cache_dir)
+    frozen = dataclasses.replace(trained.recipe, transfer="frozen")
+    with pytest.raises(InputError, match="transfer is frozen; --start has to name a trained run"):
+        train_run(frozen, [log], tmp_path / "wrong", trained.cache_dir)
+    with pytest.raises(InputError, match="keeps the heads of --start: no --tasks"):
+        with_joint_heads(frozen, small_heads(("map",)))
+    unread = dataclasses.replace(joint, clips=dataclasses.replace(joint.clips, tasks=None))
+    with pytest.raises(InputError, match=r"clips\.tasks reads no truth"):
+        train_run(unread, [log], tmp_path / "wrong", trained.cache_dir, trained.folder)
+    mapped = with_small_heads(trained.recipe, ("map",))
+    with pytest.raises(InputError, match=r"no log can train the task 'map'; .*flat: it has no map"):
+        train_run(mapped, [log], tmp_path / "wrong", trained.cache_dir, trained.folder)
+    with pytest.raises(InputError, match="no entry 'detektion'"):
+        with_joint_heads(trained.recipe, small_heads(ALL), ["weights.detektion=2"])
+    assert not (tmp_path / "wrong").exists()
+    run = train_run(joint, [log], tmp_path / "joint", trained.cache_dir, trained.folder)
+    with pytest.raises(InputError, match="nothing to probe"):
+        probe_run(run.recipe, [log], tmp_path / "wrong", trained.cache_dir, run.folder)
+
+
+def test_large_grids_get_heads_of_the_published_sizes() -> None:
+    small = miniature()
+    large = dataclasses.replace(
+        small.clips, voxels=dataclasses.replace(small.clips.voxels, shape_zyx=(16, 200, 200))
+    )
+    base = heads_for(dataclasses.replace(small, clips=large), ["detection"])
+    assert base == base_heads(["detection"])
+    assert heads_for(small, ["detection"]).heads.width == 64
+
+
+def test_a_run_that_has_only_pre_trained_has_no_heads_yet(log: LogPath, tmp_path: Path) -> None:
+    recipe = with_small_heads(miniature(), ("detection",), attends=("agents",))
+    run = train_run(recipe, [log], tmp_path)
+    (tmp_path / "finetune" / "model.safetensors").unlink()
+    assert load_agent(run).heads is None
+    assert load_heads(run) is None
