@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from importlib import import_module
+from typing import Any
 
 import pytest
 import torch
@@ -47,8 +48,10 @@ def load_triton_op(module: str, name: str) -> Op:
     pytest.importorskip("triton", reason="Triton is not installed")
     op = getattr(import_module(f"foredrive.ops.{module}"), name)
 
-    def moved(x: Tensor | list[Tensor]) -> Tensor | list[Tensor]:
-        return x.to(DEVICE) if isinstance(x, Tensor) else [tensor.to(DEVICE) for tensor in x]
+    def moved(x: Any) -> Any:
+        if isinstance(x, list):
+            return [tensor.to(DEVICE) for tensor in x]
+        return x.to(DEVICE) if isinstance(x, Tensor) else x
 
     return lambda *inputs: op(*map(moved, inputs)).cpu()
 
