@@ -2,8 +2,8 @@
 
 `grid` reads a hash grid of eight levels with two features each, from 32 to 8192 cells along a side, with at
 most 2^17 rows a level. A million points lie on rays in patches of 32 × 32 pixels, 32 samples on each ray.
-Arm `proposal` has six levels of one feature. `…_mpoints_per_s` are millions of points forward and backward per
-CPU second; with `to_points`, the gradient reaches the points too. Plain PyTorch reads 65,536 of the points.
+Arm `proposal` has six levels of one feature. `…_mpoints_per_s` are millions of points forward and backward
+per CPU second; with `to_points`, the gradient reaches the points too. Plain PyTorch reads 65,536 of them.
 """
 
 import json
