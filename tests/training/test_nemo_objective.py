@@ -248,3 +248,29 @@ def test_examples_are_augmented_before_anything_is_read(example: Example) -> Non
     generator = torch.Generator().manual_seed(0)
     torch.rand(2, generator=generator)  # which items are mirrored
     torch.testing.assert_close(found, plain(across, generator))
+
+
+def test_the_ego_motion_learns_from_the_driven_path_of_imagined_items(example: Example) -> None:
+    """The weight is that of the displacement alone; other losses stay, and the rigid head gets a gradient."""
+    drive = torch.eye(4, dtype=torch.float64).repeat(*example.clip.T_world_ego.shape[:2], 1, 1)
+    drive[:, :, 0, 3] = 2.0 * torch.arange(drive.shape[1])
+    example = dataclasses.replace(example, clip=dataclasses.replace(example.clip, T_world_ego=drive))
+    torch.manual_seed(0)
+    agent = build_agent(RECIPE)
+    losses = {}
+    for weight in (0.0, 0.5):
+        weights = dataclasses.replace(RECIPE.pretrain.weights, ego=weight)
+        stage = dataclasses.replace(
+            RECIPE.pretrain, weights=weights, imagined_items=1, augment=AugmentConfig()
+        )
+        objective = build_objective(RECIPE, stage, agent).eval()
+        losses[weight] = objective(example, torch.Generator().manual_seed(1))
+    assert "ego" not in losses[0.0]
+    steps = RECIPE.clips.future_frames
+    expected_m = sum(2.0 * k for k in range(1, steps + 1)) / steps
+    torch.testing.assert_close(losses[0.5]["ego"], torch.tensor(expected_m))
+    torch.testing.assert_close(losses[0.5]["loss"], losses[0.0]["loss"] + 0.5 * losses[0.5]["ego"])
+    losses[0.5]["ego"].backward()
+    rigid = agent.world_model.motion.rigid[-1]
+    assert rigid.bias.grad is not None
+    assert rigid.bias.grad.abs().max() > 0

@@ -19,6 +19,7 @@ from foredrive.cli.drive import drive
 from foredrive.cli.evaluate import evaluate
 from foredrive.cli.export import export
 from foredrive.cli.imagine import imagine
+from foredrive.cli.memory import keep_freed_memory
 from foredrive.cli.recipes import recipes
 from foredrive.cli.reconstruct import reconstruct
 from foredrive.cli.record import record
@@ -93,6 +94,7 @@ def main(args: Sequence[str] | None = None) -> int:
         return 0
     if " ".join(args[:2]) in VERBS:  # such as `search index`
         args = [" ".join(args[:2]), *args[2:]]
+    keep_freed_memory()
     interrupt = LastingInterrupt()
     for verb in VERBS.values():
         verb.__doc__ = _reflowed(verb.__doc__ or "")

@@ -2,10 +2,11 @@
 
 from foredrive.losses.masked import masked_mean
 from foredrive.losses.occupancy import occupancy_bce, occupancy_loss, scene_class_affinity
-from foredrive.losses.planning import l1_waypoint_loss, waypoint_loss
+from foredrive.losses.planning import ego_motion_loss, l1_waypoint_loss, waypoint_loss
 from foredrive.losses.reconstruction import l1_loss, perceptual_loss
 
 __all__ = [
+    "ego_motion_loss",
     "l1_loss",
     "l1_waypoint_loss",
     "masked_mean",

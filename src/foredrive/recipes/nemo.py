@@ -111,7 +111,7 @@ def nemo_town() -> NemoRecipe:
         pretrain=rescheduled(
             dataclasses.replace(
                 tiny.pretrain,
-                weights=dataclasses.replace(tiny.pretrain.weights, future=0.5),
+                weights=dataclasses.replace(tiny.pretrain.weights, future=0.5, ego=1.0),
                 ray_stride=16,
                 imagine_every=2,
             ),

@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from foredrive.errors import InputError
-from foredrive.losses import l1_loss, occupancy_loss, perceptual_loss, waypoint_loss
+from foredrive.losses import ego_motion_loss, l1_loss, occupancy_loss, perceptual_loss, waypoint_loss
 from foredrive.losses.reconstruction import ImageFeatures
 from foredrive.models.agent import PlanningAgent
 from foredrive.models.lifting import lift_frames
@@ -38,6 +38,9 @@ class NemoWeights:
     """Weight of occupied voxels within the BCE. Above the road, only a few percent are occupied."""
     future: float = 1.0
     """Weight of each imagined key frame relative to now. The paper weighs all equally."""
+    ego: float = 0.0
+    """Weight of the error of the predicted ego motion against the driven path. The paper has no such loss:
+    its ego motion is learned through the imagined frames alone."""
     over_frames: Literal["mean", "sum"] = "mean"
     """Reduction of `recon` and `occ` over now and the imagined frames. Eq. 9 and 10 sum, so with T_f = 3 a
     mean has a quarter of their weight beside `wpts`. Over voxels and pixels both take the mean."""
@@ -165,6 +168,9 @@ class NemoObjective(nn.Module):
         losses["loss"] = weights.occ * losses["occ"] + weights.recon * (
             losses["l1"] + weights.perc * losses["perc"]
         )
+        if weights.ego > 0 and steps > 0:
+            losses["ego"] = self._ego_error(clip, beliefs[1 : steps + 1])
+            losses["loss"] = losses["loss"] + weights.ego * losses["ego"]
         if len(beliefs) == 1 and self.steps > 0:
             losses["loss"] = losses["loss"] + self._no_change()
         if plan is not None:
@@ -174,6 +180,16 @@ class NemoObjective(nn.Module):
             losses |= self.tasks(found, example)
             losses["loss"] = losses["loss"] + losses["tasks"]
         return losses
+
+    def _ego_error(self, clip: Clip, futures: list[Belief]) -> Float[Tensor, ""]:
+        """Return the mean error of the predicted ego motions, m."""
+        spec, driven = self.agent.world_model.spec, clip.T_world_ego[:, clip.now :]
+        errors = []
+        for k, future in enumerate(futures, start=1):
+            assert future.T_now_ego is not None
+            items = len(future.T_now_ego)
+            errors.append(ego_motion_loss(future.T_now_ego, driven[:items, 0], driven[:items, k], spec))
+        return torch.stack(errors).mean()
 
     def _imagines_now(self) -> bool:
         """Return whether this step imagines, and count it in training."""
