@@ -51,6 +51,8 @@ TASK_FIGURES = (
     ("detection.nuscenes.map", "nothing_detected"),
     ("detection.nuscenes.nds", "nothing_detected"),
     ("detection.car_ap_2m_30m", "nothing_detected"),
+    ("tracking.nuscenes.amota", "greedy_association"),
+    ("tracking.nuscenes.ids", "greedy_association"),
     ("motion.uniad.car.min_ade_m", "constant_velocity"),
     ("motion.uniad.car.epa", "constant_velocity"),
     ("motion.uniad.pedestrian.min_ade_m", "constant_velocity"),
@@ -203,9 +205,9 @@ def image_table(summary: Summary) -> Table | None:
 def task_table(summary: Summary) -> Table | None:
     """Compare the main figures of detection, motion, map and semantic occupancy with their baselines."""
     rows = [
-        (words(key), summary[key], words(baseline), summary.get(f"{key}.{baseline}"))
+        (words(key), summary.get(key), words(baseline), summary.get(f"{key}.{baseline}"))
         for key, baseline in TASK_FIGURES
-        if key in summary
+        if key in summary or f"{key}.{baseline}" in summary
     ]
     columns = (Column("figure", align="left"), Column(""), Column("baseline", align="left"), Column(""))
     return simple_table(columns, rows, "Tasks at now") if rows else None

@@ -10,6 +10,7 @@ from foredrive.evaluation.metrics.motion import MotionMetric
 from foredrive.evaluation.metrics.occupancy import OccupancyMetric
 from foredrive.evaluation.metrics.planning import PlanningMetric
 from foredrive.evaluation.metrics.semantics import SemanticVoxelMetric
+from foredrive.evaluation.metrics.tracking import TrackingMetric
 from foredrive.evaluation.metrics.vehicles import VehicleMetric
 
 METRICS: tuple[MetricFactory, ...] = (
@@ -20,6 +21,7 @@ METRICS: tuple[MetricFactory, ...] = (
     ImageMetric,
     PlanningMetric,
     DetectionMetric,
+    TrackingMetric,
     MotionMetric,
     MapRasterMetric,
     MapLinesMetric,

@@ -21,7 +21,7 @@ from foredrive.metrics.detection_protocols import (
     DetectionFigures,
     evaluate_detections,
 )
-from foredrive.metrics.object_rows import ObjectRows
+from foredrive.metrics.object_rows import Frames, ObjectRows
 from foredrive.metrics.tracking.protocols import TRACKING_PROTOCOLS, evaluate_tracking
 
 _NEEDED_BY = {"ave_mps": "velocity", "aae": "attribute"}
@@ -85,13 +85,25 @@ def detection_figures(
 
 def score_tracks(found: FoundObjects, truth: ObjectTruth) -> Figures:
     """Return the figures of tracks under every protocol; None where nothing can be counted."""
-    figures = _counts(found, truth)
+    figures = tracking_figures(found.boxes, truth.boxes, truth.racks, truth.frames)
+    return _counts(found, truth) | {f"tracking.{key}": value for key, value in figures.items()}
+
+
+def tracking_figures(found: ObjectRows, true: ObjectRows, racks: ObjectRows, frames: Frames) -> Figures:
+    """Return `nuscenes.amota`, `nuscenes.car.ids`, `uniad.amota`, … of tracks.
+
+    Args:
+        found, true: labels are indices into nuScenes' seven classes.
+        racks: bicycle racks, in which bicycles do not count.
+        frames: all frames, in the order of time within each scene.
+    """
+    figures: Figures = {}
     for name, protocol in TRACKING_PROTOCOLS.items():
-        scored = evaluate_tracking(found.boxes, truth.boxes, truth.racks, truth.frames, protocol)
-        figures |= _prefixed(f"tracking.{name}", scored.all_classes)
+        scored = evaluate_tracking(found, true, racks, frames, protocol)
+        figures |= _prefixed(name, scored.all_classes)
         for label, values in scored.by_class.items():
             if values["gt"] > 0:
-                figures |= _prefixed(f"tracking.{name}.{label}", values)
+                figures |= _prefixed(f"{name}.{label}", values)
     return figures
 
 

@@ -1,0 +1,117 @@
+"""Tracks from detections alone, by a simple tracker: the baseline beside learned identities."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float, Int64
+from numpy import ndarray
+
+from foredrive.metrics.object_rows import Frames, ObjectRows
+
+MAX_AGE_FRAMES = 3
+"""A track ends after so many frames without a detection."""
+MAX_DISTANCE_M = {
+    "car": 4.0,
+    "truck": 4.0,
+    "bus": 5.5,
+    "trailer": 3.0,
+    "pedestrian": 1.0,
+    "motorcycle": 13.0,
+    "bicycle": 3.0,
+}
+"""Maximum distance of a detection from a track, by class, for frames 0.5 s apart."""
+FRAME_S = 0.5
+
+
+@dataclass(frozen=True)
+class _Tracks:
+    """The tracks that may go on."""
+
+    xy: Float[ndarray, "t 2"]
+    """Last centre; moved on by the velocity while there is no detection."""
+    velocity: Float[ndarray, "t 2"]
+    label: Int64[ndarray, "t"]
+    number: Int64[ndarray, "t"]
+    age: Int64[ndarray, "t"]
+    """Frames since the last detection."""
+
+
+def greedy_tracks(found: ObjectRows, frames: Frames, classes: Sequence[str]) -> ObjectRows:
+    """Return the detections of the classes with identities by greedy association at constant velocity.
+
+    As in CenterPoint (Yin et al. 2021; tianweiy/CenterPoint, tools/nusc_tracking/pub_tracker.py): a detection
+    is moved back by its velocity and takes the nearest track of its class that is left, within a distance of
+    its class. Detections of high scores choose first; each that finds none begins a track. Every scene begins
+    anew.
+
+    Args:
+        found: the frames of each row are indices into `frames`.
+        frames: in the order of time within each scene.
+        classes: names of the labels. Detections of other classes are left out.
+    """
+    limit_m = np.array([MAX_DISTANCE_M.get(name, np.nan) for name in classes])
+    found = found[(found.label >= 0) & np.isfinite(limit_m)[found.label]]
+    number = np.full(len(found), -1, dtype=np.int64)
+    tracks, begun = _nothing(), 0
+    for frame, dt_s in _steps(frames):
+        tracks = _nothing() if dt_s is None else tracks
+        rows = np.flatnonzero(found.frame == frame)
+        rows = rows[np.argsort(-found.score[rows], kind="stable")]
+        here = found[rows]
+        dt_s = dt_s or FRAME_S
+        partner = _partners(here, tracks, limit_m * dt_s / FRAME_S, dt_s)
+        new = partner < 0
+        number[rows[~new]] = tracks.number[partner[~new]]
+        number[rows[new]] = begun + np.arange(new.sum())
+        begun += int(new.sum())
+        tracks = _next_tracks(here, number[rows], tracks, partner, dt_s)
+    return replace(found, track=number)
+
+
+def _steps(frames: Frames) -> Iterator[tuple[int, float | None]]:
+    """Yield each frame with the time since the one before it in its scene, s; None for the first."""
+    for frame in range(len(frames)):
+        first = frame == 0 or frames.scene[frame] != frames.scene[frame - 1]
+        yield frame, None if first else 1e-6 * float(frames.time_us[frame] - frames.time_us[frame - 1])
+
+
+def _partners(
+    here: ObjectRows, tracks: _Tracks, limit_m: Float[ndarray, "c"], dt_s: float
+) -> Int64[ndarray, "n"]:
+    """Return the track of each detection; -1: none."""
+    partner = np.full(len(here), -1, dtype=np.int64)
+    if len(tracks.number) == 0:
+        return partner
+    before = here.centre[:, :2] - np.nan_to_num(here.velocity) * dt_s
+    away_m = np.linalg.norm(before[:, None] - tracks.xy, axis=-1)
+    away_m[(here.label[:, None] != tracks.label) | (away_m > limit_m[here.label][:, None])] = np.inf
+    for row in range(len(here)):
+        nearest = int(away_m[row].argmin())
+        if np.isfinite(away_m[row, nearest]):
+            partner[row] = nearest
+            away_m[:, nearest] = np.inf
+    return partner
+
+
+def _next_tracks(
+    here: ObjectRows,
+    number: Int64[ndarray, "n"],
+    tracks: _Tracks,
+    partner: Int64[ndarray, "n"],
+    dt_s: float,
+) -> _Tracks:
+    left = np.setdiff1d(np.flatnonzero(tracks.age < MAX_AGE_FRAMES), partner)
+    velocity = np.nan_to_num(here.velocity)
+    return _Tracks(
+        xy=np.concatenate([here.centre[:, :2], tracks.xy[left] + dt_s * tracks.velocity[left]]),
+        velocity=np.concatenate([velocity, tracks.velocity[left]]),
+        label=np.concatenate([here.label, tracks.label[left]]),
+        number=np.concatenate([number, tracks.number[left]]),
+        age=np.concatenate([np.ones(len(here), dtype=np.int64), tracks.age[left] + 1]),
+    )
+
+
+def _nothing() -> _Tracks:
+    none, zero = np.zeros((0, 2)), np.zeros(0, dtype=np.int64)
+    return _Tracks(none, none, zero, zero, zero)
