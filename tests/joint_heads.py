@@ -6,9 +6,10 @@ from collections.abc import Sequence
 import torch
 
 from foredrive.data.task_truth import TaskTruthConfig
-from foredrive.models.tasks.agents import AgentHeadConfig, MotionConfig
+from foredrive.models.tasks.agents import AgentHeadConfig
 from foredrive.models.tasks.decoder import DecoderConfig
 from foredrive.models.tasks.maps import MapHeadConfig
+from foredrive.models.tasks.motion import MotionConfig
 from foredrive.recipes import Recipe
 from foredrive.recipes.task_heads import TaskHeadsRecipe, town_heads, with_joint_heads
 from foredrive.scene import Example

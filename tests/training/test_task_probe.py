@@ -8,10 +8,12 @@ import pytest
 import torch
 
 from foredrive.data.batches import stack_records
-from foredrive.models.tasks.agents import AGENT_CLASSES, AgentHeadConfig, MotionConfig
+from foredrive.geometry.se3 import matrix_from_yaw, transform_points
+from foredrive.models.tasks.agents import AGENT_CLASSES, AgentHeadConfig
 from foredrive.models.tasks.decoder import DecoderConfig
 from foredrive.models.tasks.heads import TaskHeads, TaskHeadsConfig
 from foredrive.models.tasks.maps import MapHeadConfig, RasterHeadConfig
+from foredrive.models.tasks.motion import MotionConfig
 from foredrive.models.tasks.voxels import VoxelHeadConfig
 from foredrive.scene import Boxes, Category, VoxelSpec
 from foredrive.scene.agent_futures import AgentFutures
@@ -21,7 +23,7 @@ from foredrive.scene.task_truth import TaskTruth
 from foredrive.training.mirrored_truth import mirrored_truth
 from foredrive.training.parameter_groups import parameter_groups
 from foredrive.training.task_losses import TaskWeights, task_losses
-from foredrive.training.task_probe import ProbeObjective, TaskExample, TaskVolumes
+from foredrive.training.task_probe import ProbeObjective, TaskExample, TaskVolumes, mirrored_item
 from foredrive.training.task_targets import agent_targets, map_targets
 
 SPEC = VoxelSpec(lower_m=(-8.0, -8.0, -1.0), voxel_m=1.0, shape_zyx=(2, 16, 16))
@@ -197,7 +199,7 @@ def test_what_a_log_lacks_trains_nothing() -> None:
     output = heads(item.volumes.by_task())
     losses = task_losses(output, item.boxes, torch.tensor([False]), truth, SPEC, None, TaskWeights())
     assert set(losses) == {
-        "detection", "velocity", "attribute", "motion", "elements", "raster", "loss"
+        "centres", "cells", "queries", "velocity", "attribute", "motion", "elements", "raster", "loss"
     }  # fmt: skip
     assert all(value.item() == 0 for value in losses.values())
     losses["loss"].backward()  # a step with such a batch is possible
@@ -234,3 +236,24 @@ def test_heads_learn_one_scene() -> None:
     lines = found.elements[-1][0]
     divider = lines.points[lines.logits[:, ElementKind.DIVIDER].argmax()]
     assert divider[:, 1].tolist() == pytest.approx([1] * 5, abs=1.0)
+
+
+def test_a_mirrored_item_has_mirrored_volumes_boxes_and_truth() -> None:
+    """A mark at a vehicle stays at the vehicle, also in the volume of the past; twice is as before."""
+    item = scene()
+    pose = matrix_from_yaw(torch.tensor(0.3), torch.tensor([2.0, 1.0, 0.0]))
+    volumes = dataclasses.replace(item.volumes, past=item.volumes.volume[0], T_past_now=pose)
+    batch = stack_records([dataclasses.replace(item, volumes=volumes)] * 2)
+    once = mirrored_item(batch, torch.tensor([True, False]))
+    assert once.boxes.centre[0, 0].tolist() == [3, -2, 0.5]
+    assert once.volumes.volume[0, 0, 0, 1, 5:7, 9:13].min() > 0.8
+    assert torch.equal(once.volumes.past, once.volumes.volume[:, 0])
+    ahead = torch.tensor([[[5.0, 2.0, 0.0]], [[5.0, -2.0, 0.0]]])
+    seen = transform_points(once.volumes.T_past_now, ahead)
+    other = transform_points(batch.volumes.T_past_now, ahead * torch.tensor([1.0, -1.0, 1.0]))
+    torch.testing.assert_close(seen[0], other[0] * torch.tensor([1.0, -1.0, 1.0]))
+    assert once.truth.elements.vertices[0, 0, 0].tolist() == [-6, -1]
+    assert torch.equal(once.volumes.volume[1], batch.volumes.volume[1])
+    twice = mirrored_item(once, torch.tensor([True, False]))
+    torch.testing.assert_close(twice.volumes.volume, batch.volumes.volume)
+    torch.testing.assert_close(twice.volumes.T_past_now, batch.volumes.T_past_now)

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from foredrive.geometry.precision import full_precision
 from foredrive.models.ego_mlp import ego_motion, route_target
 from foredrive.models.planner import VolumePlanner
-from foredrive.models.tasks.heads import HeadOutput, TaskHeads
+from foredrive.models.tasks.heads import HeadOutput, TaskHeads, volumes_of
 from foredrive.scene import Belief, Clip, Decoded, Trajectory, WorldModel
 
 W = TypeVar("W", bound=WorldModel)
@@ -61,10 +61,9 @@ class PlanningAgent(nn.Module, Generic[W]):
         """
         if self.heads is None:
             return None
-        read = {task: self.world_model.volume_for(now, task) for task in self.heads.config.tasks}
-        distinct = {id(volume): volume for volume in read.values()}
-        with full_precision(*distinct.values()) as volumes:
-            cast = dict(zip(distinct, volumes, strict=True))
+        read = volumes_of(self.world_model, now, self.heads.config.tasks)
+        with full_precision(now.volume):
+            cast = {id(volume): volume.map_tensors(Tensor.float) for volume in read.values()}
             found: HeadOutput = self.heads({task: cast[id(volume)] for task, volume in read.items()})
         return found
 

@@ -7,10 +7,11 @@ from typing import Any, TypeVar, get_args
 
 from foredrive.data.task_truth import TaskTruthConfig
 from foredrive.errors import InputError
-from foredrive.models.tasks.agents import AgentHeadConfig, MotionConfig
+from foredrive.models.tasks.agents import AgentHeadConfig
 from foredrive.models.tasks.decoder import DecoderConfig
 from foredrive.models.tasks.heads import TaskHeadsConfig
 from foredrive.models.tasks.maps import MapHeadConfig
+from foredrive.models.tasks.motion import MotionConfig
 from foredrive.recipes.config import Recipe, overridden, read_values, validated
 from foredrive.scene import Task
 from foredrive.training.joint_tasks import JointTasks
@@ -35,6 +36,8 @@ class TaskHeadsRecipe:
     weights: TaskWeights = field(default_factory=TaskWeights)
     now_stride_s: float = 1.0
     """Time between the nows of successive training clips, s."""
+    mirror: float = 0.5
+    """Probability that left and right of a training item are exchanged."""
 
 
 def town_heads(tasks: Sequence[str]) -> TaskHeadsRecipe:

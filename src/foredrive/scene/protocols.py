@@ -28,7 +28,9 @@ class Belief(Record):
     state: Float[Tensor, "b S"] | None = None
     """Latent state, for models with one."""
     history: Float[Tensor, "b T D Z Y X"] | None = None
-    """Volumes of the past frames, now last. Given if `imagine` needs them."""
+    """Volumes of the past frames, now last, each in its own ego frame. Given if `imagine` needs them."""
+    T_past_now: Float[Tensor, "b 4 4"] | None = None
+    """The ego frame at now -> that of the last volume before now. Given with a history of at least two."""
     statics: Float[Tensor, "b _C Y X"] | None = None
     """Features of the static scene in the plane, for models that pass them on without warping."""
     T_prev_next: Float[Tensor, "b F 4 4"] | None = None

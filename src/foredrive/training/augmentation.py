@@ -74,11 +74,11 @@ def _mirrored_clip(clip: Clip, chosen: Bool[Tensor, "b"]) -> Clip:
     turned = clip.command.where(clip.command == Command.STRAIGHT, Command.LEFT + Command.RIGHT - clip.command)
     return dataclasses.replace(
         clip,
-        T_world_ego=_mirrored_pose(clip.T_world_ego, chosen, axis=1),
+        T_world_ego=mirrored_pose(clip.T_world_ego, chosen, axis=1),
         images=_flipped(clip.images, chosen, dim=-1),
         rig=_mirrored_rig(clip.rig, chosen),
         sweeps=_mirrored_sweep(clip.sweeps, chosen),
-        boxes=_mirrored_boxes(clip.boxes, chosen),
+        boxes=mirrored_boxes(clip.boxes, chosen),
         command=_pick(chosen, turned, clip.command),
         target_xy=_negated(clip.target_xy, chosen, (1.0, -1.0)),
         future=dataclasses.replace(
@@ -100,7 +100,7 @@ def _mirrored_rig(rig: CameraRig, chosen: Bool[Tensor, "b"]) -> CameraRig:
     return dataclasses.replace(
         rig,
         K=_pick(chosen, K, rig.K),
-        T_ego_cam=_mirrored_pose(rig.T_ego_cam, chosen, axis=0),
+        T_ego_cam=mirrored_pose(rig.T_ego_cam, chosen, axis=0),
         dist=_negated(rig.dist, chosen, (1.0, 1.0, 1.0, -1.0, 1.0)),  # p2 is odd in x
     )
 
@@ -113,7 +113,8 @@ def _mirrored_sweep(sweep: LidarSweep, chosen: Bool[Tensor, "b"]) -> LidarSweep:
     )
 
 
-def _mirrored_boxes(boxes: Boxes, chosen: Bool[Tensor, "b"]) -> Boxes:
+def mirrored_boxes(boxes: Boxes, chosen: Bool[Tensor, "b"]) -> Boxes:
+    """Mirror the chosen items of a batch in the x-z plane."""
     return dataclasses.replace(
         boxes,
         centre=_negated(boxes.centre, chosen, (1.0, -1.0, 1.0)),
@@ -132,7 +133,7 @@ def _mirrored_grid(
     )
 
 
-def _mirrored_pose(pose: Float[Tensor, "b *n 4 4"], chosen: Bool[Tensor, "b"], axis: int) -> Tensor:
+def mirrored_pose(pose: Float[Tensor, "b *n 4 4"], chosen: Bool[Tensor, "b"], axis: int) -> Tensor:
     """Mirror poses from a frame with mirrored axis `axis` to a frame with mirrored y axis."""
     to, source = pose.new_ones(4), pose.new_ones(4)
     to[1], source[axis] = -1, -1

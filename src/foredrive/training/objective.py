@@ -210,16 +210,19 @@ class NemoObjective(nn.Module):
         stage, world = self.stage, self.agent.world_model
         if stage.imagined_items is None and stage.past_gradient:
             return self.agent.rollout(observed, steps)
-        items = slice(stage.imagined_items)
-        frames = last_frames(observed, world.past_frames if steps else 0)
+        looks_back = self.tasks is not None  # heads read the past of all items
+        items = slice(None if looks_back else stage.imagined_items)
+        frames = last_frames(observed, world.past_frames if steps or looks_back else 0)
         present = lift_frames(frames[:, -1:], world.backbone, world.encoder)
         now = Belief(volume=present[:, -1])
-        if steps == 0:
+        if steps == 0 and not looks_back:
             return [now]
         with torch.set_grad_enabled(stage.past_gradient and torch.is_grad_enabled()):
             past = lift_frames(frames[items, :-1], world.backbone, world.encoder)
         history = torch.cat([past, present[items]], dim=1)
-        return [now, *world.imagine(world.believe(frames[items], history), steps)]
+        believed = world.believe(frames[items], history)
+        imagined = world.imagine(believed, steps) if steps else []
+        return [believed if looks_back else now, *imagined]
 
 
 def set_planner_trainable(planner: VolumePlanner, trainable: bool) -> None:

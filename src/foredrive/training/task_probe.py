@@ -1,15 +1,17 @@
 """Training of task heads on kept volumes of a frozen world model."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from foredrive.models.tasks.heads import TaskHeads
+from foredrive.models.tasks.heads import TaskHeads, TaskVolume, volumes_of
 from foredrive.scene import Belief, Boxes, Task, VoxelSpec, WorldModel
 from foredrive.scene.record import Record
 from foredrive.scene.task_truth import TaskTruth
+from foredrive.training.augmentation import mirrored_boxes, mirrored_pose
+from foredrive.training.mirrored_truth import mirrored_truth
 from foredrive.training.task_losses import TaskWeights, task_losses
 
 
@@ -22,10 +24,14 @@ class TaskVolumes(Record):
     tasks: tuple[Task, ...]
     index: tuple[int, ...]
     """For each of `tasks`, its volume."""
+    past: Float[Tensor, "*b D Z Y X"] | None = None
+    """The volume one key frame earlier, in its own ego frame, of world models that keep it."""
+    T_past_now: Float[Tensor, "*b 4 4"] | None = None
+    """The ego frame at now -> the ego frame of `past`."""
 
-    def by_task(self) -> dict[Task, Float[Tensor, "b D Z Y X"]]:
-        """Return the volume of each task. Tasks that share a volume get the same tensor."""
-        distinct = self.volume.unbind(dim=1)
+    def by_task(self) -> dict[Task, TaskVolume]:
+        """Return the volume of each task. Tasks that share a volume get the same record."""
+        distinct = [TaskVolume(now, self.past, self.T_past_now) for now in self.volume.unbind(dim=1)]
         return {task: distinct[number] for task, number in zip(self.tasks, self.index, strict=True)}
 
 
@@ -42,15 +48,38 @@ class TaskExample(Record):
 
 
 def task_volumes(world: WorldModel, belief: Belief, tasks: tuple[Task, ...]) -> TaskVolumes:
-    """Return the volumes of a belief as the heads of some tasks read them."""
-    distinct: list[Tensor] = []
-    index = []
-    for task in tasks:
-        volume = world.volume_for(belief, task)
-        same = [number for number, other in enumerate(distinct) if other is volume]
-        index.append(same[0] if same else len(distinct))
-        distinct += [] if same else [volume]
-    return TaskVolumes(torch.stack(distinct, dim=1), tasks, tuple(index))
+    """Return the volumes of a belief about now as the heads of some tasks read them."""
+    read = volumes_of(world, belief, tasks)
+    distinct = list({id(volume): volume for volume in read.values()}.values())
+    index = tuple(next(n for n, other in enumerate(distinct) if other is read[task]) for task in tasks)
+    first = distinct[0]
+    return TaskVolumes(
+        torch.stack([volume.now for volume in distinct], dim=1), tasks, index, first.past, first.T_past_now
+    )
+
+
+def mirrored_item(example: TaskExample, chosen: Bool[Tensor, "b"]) -> TaskExample:
+    """Return a batch in which the chosen items are mirrored in the x-z plane of the ego vehicle.
+
+    Volumes are mirrored as they are: nearly what a world model sees that was trained on mirrored clips.
+    """
+    volumes = example.volumes
+    past, T_past_now = volumes.past, volumes.T_past_now
+    if past is not None and T_past_now is not None:
+        past, T_past_now = _flipped(past, chosen), mirrored_pose(T_past_now, chosen, axis=1)
+    volumes = replace(volumes, volume=_flipped(volumes.volume, chosen), past=past, T_past_now=T_past_now)
+    return replace(
+        example,
+        volumes=volumes,
+        boxes=mirrored_boxes(example.boxes, chosen),
+        truth=mirrored_truth(example.truth, chosen),
+    )
+
+
+def _flipped(volume: Float[Tensor, "b *n Y X"], chosen: Bool[Tensor, "b"]) -> Tensor:
+    flipped = volume.clone()
+    flipped[chosen] = volume[chosen].flip(-2)
+    return flipped
 
 
 class ProbeObjective(nn.Module):
@@ -61,6 +90,7 @@ class ProbeObjective(nn.Module):
         spec: grid of the volumes.
         weights: weights of the losses.
         class_weight: weight of each class of semantic voxels; None weighs all equally.
+        mirror: probability that left and right of an item are exchanged.
     """
 
     def __init__(
@@ -69,14 +99,18 @@ class ProbeObjective(nn.Module):
         spec: VoxelSpec,
         weights: TaskWeights,
         class_weight: Float[Tensor, "C"] | None = None,
+        mirror: float = 0.0,
     ) -> None:
         super().__init__()
-        self.heads, self.spec, self.weights = heads, spec, weights
+        self.heads, self.spec, self.weights, self.mirror = heads, spec, weights, mirror
         self.class_weight: Tensor | None
         self.register_buffer("class_weight", class_weight, persistent=False)
 
     def forward(self, example: TaskExample, generator: torch.Generator) -> dict[str, Float[Tensor, ""]]:
-        """Return losses by name; "loss" is minimised. Nothing is drawn from the generator."""
+        """Return losses by name; "loss" is minimised. The generator draws the items to mirror."""
+        if self.mirror > 0:
+            chosen = torch.rand(len(example.boxes_valid), generator=generator) < self.mirror
+            example = mirrored_item(example, chosen.to(example.boxes_valid.device))
         output = self.heads(example.volumes.by_task())
         return task_losses(
             output,

@@ -115,7 +115,8 @@ class Nemo(nn.Module):
     def believe(self, frames: Frames, volumes: Float[Tensor, "b T D Z Y X"]) -> Belief:
         """Return the belief about now from the volumes of T_p + 1 frames."""
         measured = continued_motion(frames, self.max_steps) if self.starts_from_measured else None
-        return Belief(volume=volumes[:, -1], history=volumes, T_prev_next=measured)
+        T_past_now = inverse_se3(frames.T_now_ego[:, -2]).float() if volumes.shape[1] > 1 else None
+        return Belief(volumes[:, -1], history=volumes, T_past_now=T_past_now, T_prev_next=measured)
 
     def imagine(
         self,

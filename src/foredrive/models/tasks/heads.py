@@ -1,6 +1,6 @@
 """All heads in parallel on one plane module; each can be left out (PARA-Drive, Weng et al. 2024)."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from jaxtyping import Float
@@ -8,10 +8,12 @@ from torch import Tensor, nn
 
 from foredrive.models.tasks.agents import AgentHead, AgentHeadConfig, AgentSet
 from foredrive.models.tasks.maps import MapHead, MapHeadConfig, MapSet, RasterHead, RasterHeadConfig
-from foredrive.models.tasks.plane import Plane, PlaneFeatures, halvings
+from foredrive.models.tasks.plane import PlanePyramid, Planes
+from foredrive.models.tasks.proposals import CentreMap
 from foredrive.models.tasks.voxels import VoxelHead, VoxelHeadConfig
-from foredrive.scene import Task, VoxelSpec
+from foredrive.scene import Belief, Task, VoxelSpec, WorldModel
 from foredrive.scene.map_elements import PlaneSpec
+from foredrive.scene.record import Record
 
 
 @dataclass(frozen=True)
@@ -20,7 +22,9 @@ class TaskHeadsConfig:
 
     width: int = 64
     max_cells: int = 32
-    """Maximum number of cells along a side of the plane, to which all queries attend."""
+    """Maximum number of cells along a side of the coarse plane, to which all queries attend."""
+    past: bool = True
+    """Read the volume of one key frame earlier too, where the world model keeps it."""
     agents: AgentHeadConfig | None = field(default_factory=AgentHeadConfig)
     elements: MapHeadConfig | None = field(default_factory=MapHeadConfig)
     raster: RasterHeadConfig | None = field(default_factory=RasterHeadConfig)
@@ -40,10 +44,34 @@ class TaskHeadsConfig:
 
 
 @dataclass(frozen=True)
+class TaskVolume(Record):
+    """The volume that the heads of a task read, and an earlier one where the world model keeps it."""
+
+    now: Float[Tensor, "b D Z Y X"]
+    past: Float[Tensor, "b D Z Y X"] | None = None
+    """In its own ego frame."""
+    T_past_now: Float[Tensor, "b 4 4"] | None = None
+    """The ego frame at now -> the ego frame of the past volume."""
+
+
+def volumes_of(world: WorldModel, belief: Belief, tasks: Sequence[Task]) -> dict[Task, TaskVolume]:
+    """Return what the heads of some tasks read of a belief about now. Equal volumes are the same record."""
+    past = None if belief.T_past_now is None or belief.history is None else belief.history[:, -2]
+    made: dict[int, TaskVolume] = {}
+    found: dict[Task, TaskVolume] = {}
+    for task in tasks:
+        volume = world.volume_for(belief, task)
+        found[task] = made.setdefault(id(volume), TaskVolume(volume, past, belief.T_past_now))
+    return found
+
+
+@dataclass(frozen=True)
 class HeadOutput:
     """The output of the heads. Lists hold one entry for each decoder layer, the last is the result."""
 
     agents: list[AgentSet] | None = None
+    centres: CentreMap | None = None
+    """The dense map that the agents' queries begin from."""
     elements: list[MapSet] | None = None
     raster: Float[Tensor, "b L _H _W"] | None = None
     """Logits."""
@@ -62,42 +90,50 @@ class TaskHeads(nn.Module):
     """
 
     def __init__(
-        self, config: TaskHeadsConfig, spec: VoxelSpec, *, channels: int, raster: PlaneSpec | None = None
+        self,
+        config: TaskHeadsConfig,
+        spec: VoxelSpec,
+        *,
+        channels: int,
+        raster: PlaneSpec | None = None,
     ) -> None:
         super().__init__()
         self.config = config
-        shrink = halvings(spec, config.max_cells)
-        self.plane = PlaneFeatures(spec, channels=channels, width=config.width, shrink=shrink)
-        self.agents = None if config.agents is None else AgentHead(self.plane, config.agents)
-        self.elements = None if config.elements is None else MapHead(self.plane, config.elements)
+        self.planes = planes = PlanePyramid(
+            spec, channels=channels, width=config.width, max_cells=config.max_cells, past=config.past
+        )
+        self.agents = None if config.agents is None else AgentHead(planes, config.agents)
+        self.elements = None if config.elements is None else MapHead(planes, config.elements)
         self.raster: RasterHead | None = None
         if config.raster is not None:
             assert raster is not None, "a raster head needs its grid"
-            self.raster = RasterHead(self.plane, raster, config.raster)
-        self.voxels = None if config.voxels is None else VoxelHead(channels, config.voxels)
+            self.raster = RasterHead(planes, raster, config.raster)
+        self.voxels: VoxelHead | None = None
+        if config.voxels is not None:
+            self.voxels = VoxelHead(planes, channels, spec.shape_zyx[0], config.voxels)
 
-    def forward(self, volumes: Mapping[Task, Float[Tensor, "b D Z Y X"]]) -> HeadOutput:
-        """Return the output of every head. Tasks that share one volume share its plane.
+    def forward(self, volumes: Mapping[Task, TaskVolume]) -> HeadOutput:
+        """Return the output of every head. Tasks that share one volume share its planes.
 
         Args:
             volumes: for each of `config.tasks`, the volume of `WorldModel.volume_for`.
         """
-        planes: dict[int, Plane] = {}
+        made: dict[int, Planes] = {}
 
-        def plane_of(task: Task) -> Plane:
+        def planes_of(task: Task) -> Planes:
             volume = volumes[task]
-            if id(volume) not in planes:
-                planes[id(volume)] = self.plane(volume)
-            return planes[id(volume)]
+            if id(volume) not in made:
+                made[id(volume)] = self.planes(volume.now, volume.past, volume.T_past_now)
+            return made[id(volume)]
 
-        agents = elements = raster = voxels = None
+        agents = centres = elements = raster = voxels = None
         if self.agents is not None:
-            motion = None if self.agents.motion is None else plane_of("motion")
-            agents = self.agents(plane_of("detection"), motion)
+            motion = None if self.agents.motion is None else planes_of("motion")
+            centres, agents = self.agents(planes_of("detection"), motion)
         if self.elements is not None:
-            elements = self.elements(plane_of("map"))
+            elements = self.elements(planes_of("map"))
         if self.raster is not None:
-            raster = self.raster(plane_of("map"))
+            raster = self.raster(planes_of("map"))
         if self.voxels is not None:
-            voxels = self.voxels(volumes["occupancy"])
-        return HeadOutput(agents, elements, raster, voxels)
+            voxels = self.voxels(volumes["occupancy"].now, planes_of("occupancy"))
+        return HeadOutput(agents, centres, elements, raster, voxels)

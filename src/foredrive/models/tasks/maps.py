@@ -1,5 +1,6 @@
 """The head of the map: polylines by queries, raster layers by convolutions."""
 
+import math
 from dataclasses import dataclass, field
 
 import torch
@@ -7,9 +8,8 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from foredrive.models.tasks.agents import spread_points
 from foredrive.models.tasks.decoder import DecoderConfig, PlaceEmbedding, QueryDecoderLayer
-from foredrive.models.tasks.plane import Plane, PlaneFeatures, cell_middles
+from foredrive.models.tasks.plane import Plane, PlanePyramid, Planes, cell_middles, spread_points
 from foredrive.scene.agents import MapLines
 from foredrive.scene.map_elements import PlaneSpec, RasterLayer
 from foredrive.scene.record import Record
@@ -50,20 +50,21 @@ class MapHead(nn.Module):
     As in MapTR (Liao et al. 2023), with plain attention. Each point refines its position from layer to layer.
 
     Args:
-        plane: the module that makes the planes.
+        planes: the module that makes the planes.
         config: sizes.
     """
 
-    def __init__(self, plane: PlaneFeatures, config: MapHeadConfig) -> None:
+    def __init__(self, planes: PlanePyramid, config: MapHeadConfig) -> None:
         super().__init__()
-        width = plane.width
+        width = planes.width
+        self.step_m = planes.coarse_m
         self.element = nn.Parameter(torch.randn(config.elements, 1, width))
         self.point = nn.Parameter(torch.randn(config.points, width))
-        middle = spread_points(plane, config.elements)[:, None]
-        line = torch.linspace(-1, 1, config.points)[:, None] * torch.tensor([2 * plane.cell_m, 0.0])
+        middle = spread_points(planes.lower_m, planes.cell_m, planes.shape_yx, config.elements)[:, None]
+        line = torch.linspace(-1, 1, config.points)[:, None] * torch.tensor([2 * planes.coarse_m, 0.0])
         self.start_m = nn.Parameter(middle + line)
         self.place = PlaceEmbedding(width)
-        self.read = nn.Linear(width, width)
+        self.read = nn.Linear(planes.fine_width, width)
         self.layers = nn.ModuleList(
             QueryDecoderLayer(width, config.decoder) for _ in range(config.decoder.layers)
         )
@@ -75,18 +76,19 @@ class MapHead(nn.Module):
         assert isinstance(final, nn.Linear)
         nn.init.constant_(final.bias, -2.0)  # most elements are empty
 
-    def forward(self, plane: Plane) -> list[MapSet]:
+    def forward(self, planes: Planes) -> list[MapSet]:
         """Return the elements after each layer."""
-        batch, cells = len(plane.features), plane.cells
-        cell_place = self.place(plane.share(plane.middle_m))[None]
+        fine, cells = planes.fine, planes.coarse.cells
+        batch = len(cells)
+        cell_place = self.place(planes.coarse.share(planes.coarse.middle_m))[None]
         queries = (self.element + self.point).expand(batch, -1, -1, -1)
         at_m = self.start_m.expand(batch, -1, -1, -1)
         found = []
         for layer in self.layers:
-            queries = queries + self.read(plane.at(at_m))
-            place = self.place(plane.share(at_m)).flatten(1, 2)
+            queries = queries + self.read(fine.at(at_m))
+            place = self.place(fine.share(at_m)).flatten(1, 2)
             queries = layer(queries.flatten(1, 2), place, cells, cell_place).view_as(queries)
-            points = at_m + plane.cell_m * self.shift(queries)
+            points = at_m + self.step_m * self.shift(queries)
             features = queries.mean(dim=2)
             found.append(MapSet(self.kind(features), points, features))
             at_m = points.detach()
@@ -98,38 +100,80 @@ class RasterHeadConfig:
     """Sizes of a `RasterHead`."""
 
     width: int = 16
+    """Channels of the fine part."""
 
 
 class RasterHead(nn.Module):
-    """Convolutions from the plane to the logits of each `RasterLayer` on the grid of the truth.
+    """Convolutions from the planes to the logits of each `RasterLayer` on the grid of the truth.
+
+    The truth may reach farther than the planes. So the coarse plane is first continued to the extent of the
+    truth, by convolutions with growing strides: roads go on. Inside, the fine plane is added. Each cell
+    then predicts 2 x 2 cells (sub-pixel convolution, Shi et al. 2016), which are read at the truth's.
 
     Args:
-        plane: the module that makes the planes.
+        planes: the module that makes the planes.
         spec: grid of the truth.
         config: sizes.
     """
 
     middle_m: Tensor
+    coarse_m: Tensor
+    fine_m: Tensor
 
-    def __init__(self, plane: PlaneFeatures, spec: PlaneSpec, config: RasterHeadConfig) -> None:
+    def __init__(self, planes: PlanePyramid, spec: PlaneSpec, config: RasterHeadConfig) -> None:
         super().__init__()
-        self.shape_yx = spec.shape_yx
-        self.narrow = nn.Conv2d(plane.width, config.width, 1)
-        self.refine = nn.Sequential(
-            nn.Conv2d(config.width, config.width, 3, padding=1),
+        wide, width = planes.width, config.width
+        self.spec = spec
+        self.continued = nn.Sequential(
+            nn.Conv2d(wide + 1, wide // 2, 1),
             nn.ReLU(),
-            nn.Conv2d(config.width, len(RasterLayer), 3, padding=1),
+            *(part for stride in (1, 2, 4, 8) for part in _dilated(wide // 2, stride)),
+            nn.Conv2d(wide // 2, width, 1),
         )
-        final = self.refine[-1]
-        assert isinstance(final, nn.Conv2d)
-        assert final.bias is not None
-        nn.init.constant_(final.bias, -2.0)  # lines cover little of the ground
-        middle = cell_middles(spec.lower_m, spec.cell_m, spec.shape_yx)
-        self.register_buffer("middle_m", middle, persistent=False)
+        self.narrow = nn.Conv2d(planes.fine_width + 1, width, 1)
+        self.refine = nn.Sequential(
+            nn.Conv2d(width, width, 3, padding=1), nn.ReLU(), nn.Conv2d(width, width, 3, padding=1), nn.ReLU()
+        )
+        self.out = nn.Conv2d(width, 4 * len(RasterLayer), 1)
+        assert self.out.bias is not None
+        nn.init.constant_(self.out.bias, -2.0)  # lines cover little of the ground
+        # Canvases of whole cells over the extent of the truth.
+        rows, columns = (math.ceil(size * spec.cell_m / planes.coarse_m) for size in spec.shape_yx)
+        times = round(planes.coarse_m / planes.cell_m)
+        self.fine_shape, self.coarse_shape = (times * rows, times * columns), (rows, columns)
+        self.cell_m = planes.cell_m
+        grids = {
+            "coarse_m": cell_middles(spec.lower_m, planes.coarse_m, self.coarse_shape),
+            "fine_m": cell_middles(spec.lower_m, planes.cell_m, self.fine_shape),
+            "middle_m": cell_middles(spec.lower_m, spec.cell_m, spec.shape_yx),
+        }
+        for name, grid in grids.items():
+            self.register_buffer(name, grid, persistent=False)
 
-    def forward(self, plane: Plane) -> Float[Tensor, "b L Y X"]:
-        """Return the logits. Outside of the plane, features are 0."""
-        small = Plane(F.relu(self.narrow(plane.features)), plane.lower_m, plane.cell_m)
-        fine = small.at(self.middle_m.expand(len(plane.features), -1, -1)).mT.unflatten(-1, self.shape_yx)
-        logits: Tensor = self.refine(fine)
-        return logits
+    def forward(self, planes: Planes) -> Float[Tensor, "b L Y X"]:
+        """Return the logits."""
+        far = self.continued(_on_canvas(planes.coarse, self.coarse_m, self.coarse_shape))
+        far = F.interpolate(far, size=self.fine_shape, mode="bilinear")
+        near = self.narrow(_on_canvas(planes.fine, self.fine_m, self.fine_shape))
+        logits = F.pixel_shuffle(self.out(self.refine(F.relu(far + near))), 2)
+        found = Plane(logits, self.spec.lower_m, self.cell_m / 2)
+        at = found.at(self.middle_m.expand(len(logits), -1, -1))
+        return at.mT.unflatten(-1, self.spec.shape_yx)
+
+
+def _dilated(width: int, stride: int) -> tuple[nn.Module, ...]:
+    return (
+        nn.Conv2d(width, width, 3, padding=stride, dilation=stride),
+        nn.GroupNorm(8, width),
+        nn.ReLU(),
+    )
+
+
+def _on_canvas(
+    plane: Plane, middle_m: Float[Tensor, "C 2"], shape_yx: tuple[int, int]
+) -> Float[Tensor, "b W_1 y x"]:
+    """Return features at cells of a larger grid, 0 outside of the plane; the last channel is 1 inside."""
+    inside = Plane(torch.ones_like(plane.features[:, :1]), plane.lower_m, plane.cell_m)
+    at = middle_m.expand(len(plane.features), -1, -1)
+    found = torch.cat([plane.at(at), inside.at(at)], dim=-1)
+    return found.mT.unflatten(-1, shape_yx)

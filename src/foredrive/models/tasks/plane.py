@@ -1,4 +1,4 @@
-"""The plane that the heads read: a volume with its height folded into the channels, shrunk."""
+"""The planes that the heads read: a volume with its height folded into the channels, at two resolutions."""
 
 import math
 from dataclasses import dataclass
@@ -45,6 +45,16 @@ class Plane(Record):
         return found[:, :, 0].mT.unflatten(1, points_m.shape[1:-1])
 
 
+@dataclass(frozen=True)
+class Planes(Record):
+    """Two planes of one volume."""
+
+    fine: Plane
+    """In the resolution of the volume, with few channels: read at single places."""
+    coarse: Plane
+    """Few enough cells for all queries to attend to all of them."""
+
+
 class PlaneFeatures(nn.Module):
     """Convolutions from a volume to a plane. Each halving doubles the edge of a cell.
 
@@ -77,6 +87,86 @@ class PlaneFeatures(nn.Module):
         return Plane(self.convolutions(volume.flatten(1, 2)), self.lower_m, self.cell_m)
 
 
+class PlanePyramid(nn.Module):
+    """A U-Net over the plane of a volume: columns, their surroundings, and the whole plane.
+
+    Height is folded into the channels by one linear layer for each column. A past volume is folded by the
+    same layer, moved by the ego motion and read beside the present one (BEVDet4D, Huang and Huang 2022), so
+    that what moves can be told from what stands.
+
+    Args:
+        spec: grid of the volume.
+        channels: D of the volume.
+        width: channels of the coarse plane, a multiple of 16; the fine one has half as many.
+        max_cells: maximum number of cells along a side of the coarse plane.
+        past: whether a past volume is read.
+    """
+
+    def __init__(self, spec: VoxelSpec, *, channels: int, width: int, max_cells: int, past: bool) -> None:
+        super().__init__()
+        self.width, self.fine_width, self.past = width, width // 2, past
+        self.halvings = max(1, halvings(spec, max_cells))
+        fine = self.fine_width
+        self.columns = nn.Conv2d(spec.shape_zyx[0] * channels, fine, 1)
+        self.join = _convolution(2 * fine if past else fine, fine)
+        depths = self.halvings + 1  # one level below the coarse plane sees most of the surroundings
+        widths = [fine] + depths * [width]
+        self.down = nn.ModuleList(
+            nn.Sequential(_convolution(widths[n], width, stride=2), _convolution(width, width))
+            for n in range(depths)
+        )
+        self.narrow = nn.ModuleList(nn.Conv2d(width, widths[n], 1) for n in range(depths))
+        self.up = nn.ModuleList(_convolution(widths[n], widths[n]) for n in range(depths))
+        self.lower_m, self.cell_m, self.shape_yx = spec.lower_m[:2], spec.voxel_m, spec.shape_zyx[1:]
+        self.coarse_m = spec.voxel_m * 2**self.halvings
+
+    def forward(
+        self,
+        volume: Float[Tensor, "b D Z Y X"],
+        past: Float[Tensor, "b D Z Y X"] | None = None,
+        T_past_now: Float[Tensor, "b 4 4"] | None = None,
+    ) -> Planes:
+        """Return the planes of a volume.
+
+        Args:
+            volume: of now.
+            past: an earlier one in its own ego frame; None counts as one of zeros.
+            T_past_now: the ego frame at now -> the ego frame of the past volume.
+        """
+        at = self.columns(volume.flatten(1, 2))
+        if self.past:
+            before = torch.zeros_like(at)
+            if past is not None and T_past_now is not None:
+                before = self._moved(self.columns(past.flatten(1, 2)), T_past_now)
+            at = torch.cat([at, before], dim=1)
+        levels = [self.join(at)]
+        for down in self.down:
+            levels.append(down(levels[-1]))
+        found = levels.pop()
+        for n in reversed(range(len(levels))):
+            narrowed = self.narrow[n](found)
+            found = self.up[n](
+                levels[n] + F.interpolate(narrowed, size=levels[n].shape[-2:], mode="bilinear")
+            )
+            if n == self.halvings:
+                coarse = found
+        return Planes(
+            fine=Plane(found, self.lower_m, self.cell_m), coarse=Plane(coarse, self.lower_m, self.coarse_m)
+        )
+
+    def _moved(self, past: Float[Tensor, "b W y x"], T_past_now: Float[Tensor, "b 4 4"]) -> Tensor:
+        """Read the plane of the past at the places of now's cells, 0 outside."""
+        middle = cell_middles(self.lower_m, self.cell_m, self.shape_yx).to(past)
+        there = middle @ T_past_now[:, :2, :2].mT.to(past) + T_past_now[:, None, :2, 3].to(past)
+        return Plane(past, self.lower_m, self.cell_m).at(there).mT.unflatten(-1, self.shape_yx)
+
+
+def _convolution(width_in: int, width: int, stride: int = 1) -> nn.Sequential:
+    return nn.Sequential(
+        nn.Conv2d(width_in, width, 3, stride=stride, padding=1), nn.GroupNorm(8, width), nn.ReLU()
+    )
+
+
 def cell_middles(
     lower_m: tuple[float, float], cell_m: float, shape_yx: tuple[int, int]
 ) -> Float[Tensor, "C 2"]:
@@ -84,6 +174,18 @@ def cell_middles(
     y = lower_m[1] + (torch.arange(shape_yx[0]) + 0.5) * cell_m
     x = lower_m[0] + (torch.arange(shape_yx[1]) + 0.5) * cell_m
     return torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1).flatten(0, 1)
+
+
+def spread_points(
+    lower_m: tuple[float, float], cell_m: float, shape_yx: tuple[int, int], count: int
+) -> Float[Tensor, "count 2"]:
+    """Return points at about equal distances over a plane, m."""
+    rows, columns = shape_yx
+    per_row = math.ceil(math.sqrt(count * columns / rows))
+    n_rows = math.ceil(count / per_row)
+    index = torch.arange(count)
+    share = torch.stack([(index % per_row + 0.5) / per_row, (index // per_row + 0.5) / n_rows], dim=-1)
+    return torch.tensor(lower_m) + share * cell_m * torch.tensor([columns, rows])
 
 
 def halvings(spec: VoxelSpec, max_cells: int) -> int:

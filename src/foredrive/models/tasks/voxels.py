@@ -1,10 +1,11 @@
-"""The head of semantic occupancy: an MLP for each voxel."""
+"""The head of semantic occupancy: an MLP for each voxel, which knows its surroundings in the plane."""
 
 from dataclasses import dataclass
 
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from foredrive.models.tasks.plane import PlanePyramid, Planes
 from foredrive.scene.semantics import VOXEL_CLASSES, Taxonomy
 
 
@@ -17,23 +18,28 @@ class VoxelHeadConfig:
 
 
 class VoxelHead(nn.Module):
-    """An MLP from the features of a voxel to the logits of its classes, as NeMo's occupancy MLP.
+    """An MLP from the features of a voxel and of its column to the logits of the voxel's classes.
+
+    The column's features come from the fine plane and become one vector for each height (FlashOcc, Yu et al.
+    2023).
 
     Args:
+        planes: the module that makes the planes.
         channels: D of the volume.
+        height: Z of the volume.
         config: sizes.
     """
 
-    def __init__(self, channels: int, config: VoxelHeadConfig) -> None:
+    def __init__(self, planes: PlanePyramid, channels: int, height: int, config: VoxelHeadConfig) -> None:
         super().__init__()
         self.taxonomy = config.taxonomy
-        self.mlp = nn.Sequential(
-            nn.Conv3d(channels, config.hidden, 1),
-            nn.ReLU(),
-            nn.Conv3d(config.hidden, len(VOXEL_CLASSES[config.taxonomy]), 1),
-        )
+        self.height = height
+        self.own = nn.Conv3d(channels, config.hidden, 1)
+        self.column = nn.Conv2d(planes.fine_width, height * config.hidden, 1)
+        self.out = nn.Conv3d(config.hidden, len(VOXEL_CLASSES[config.taxonomy]), 1)
 
-    def forward(self, volume: Float[Tensor, "b D Z Y X"]) -> Float[Tensor, "b C Z Y X"]:
+    def forward(self, volume: Float[Tensor, "b D Z Y X"], planes: Planes) -> Float[Tensor, "b C Z Y X"]:
         """Return the logits in the order of `VOXEL_CLASSES`."""
-        logits: Tensor = self.mlp(volume)
+        around = self.column(planes.fine.features).unflatten(1, (-1, self.height))
+        logits: Tensor = self.out((self.own(volume) + around).relu())
         return logits

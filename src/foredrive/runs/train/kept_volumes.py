@@ -24,6 +24,8 @@ from foredrive.training.joint_tasks import boxes_now
 from foredrive.training.task_probe import TaskExample, TaskVolumes, task_volumes
 
 BATCH_SIZE = 4
+VERSION = 2
+"""Version in the name of every folder of volumes. Increase it when their files change."""
 
 
 class KeptVolumes(Dataset[TaskExample]):
@@ -69,9 +71,15 @@ class KeptVolumes(Dataset[TaskExample]):
     def __getitem__(self, index: int) -> TaskExample:
         """Return one item, unbatched."""
         with safe_open(self._file(index), framework="pt") as file:
-            volume: Tensor = file.get_tensor("volume").float()
-            order = tuple(file.get_tensor("index").tolist())
-        return dataclasses.replace(self.examples[index], volumes=TaskVolumes(volume, self.tasks, order))
+            kept = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a mapping
+        volumes = TaskVolumes(
+            volume=kept["volume"].float(),
+            tasks=self.tasks,
+            index=tuple(kept["index"].tolist()),
+            past=kept["past"].float() if "past" in kept else None,
+            T_past_now=kept.get("T_past_now"),
+        )
+        return dataclasses.replace(self.examples[index], volumes=volumes)
 
     def _file(self, index: int) -> Path:
         return self._folder / f"{index:06d}.safetensors"
@@ -88,10 +96,17 @@ class KeptVolumes(Dataset[TaskExample]):
             world = agent.world_model
             with torch.no_grad():
                 found = task_volumes(world, world.observe(clip.observed()), self.tasks)
-            index = torch.tensor(found.index)
-            for row, volume in zip(rows, found.volume.half().cpu(), strict=True):
+            for item, row in enumerate(rows):
                 with atomic_path(self._file(row)) as temporary:
-                    save_file({"volume": volume.contiguous(), "index": index}, temporary)
+                    save_file(_tensors(found[item].to("cpu")), temporary)
+
+
+def _tensors(volumes: TaskVolumes) -> dict[str, Tensor]:
+    """Return what a file holds of one item."""
+    kept = {"volume": volumes.volume.half().contiguous(), "index": torch.tensor(volumes.index)}
+    if volumes.past is not None and volumes.T_past_now is not None:
+        kept |= {"past": volumes.past.half().contiguous(), "T_past_now": volumes.T_past_now.contiguous()}
+    return kept
 
 
 def collate_kept(examples: Sequence[TaskExample]) -> TaskExample:
@@ -115,7 +130,7 @@ def _without_volumes(clip: Clip, truth: TaskTruth | None, key: str) -> TaskExamp
 def _is_whole(file: Path) -> bool:
     try:
         with safe_open(file, framework="pt") as stored:
-            return "volume" in stored.keys()  # noqa: SIM118 - not a mapping
+            return "index" in stored.keys()  # noqa: SIM118 - not a mapping
     except (OSError, SafetensorError):
         return False
 
@@ -123,7 +138,7 @@ def _is_whole(file: Path) -> bool:
 def _key(agent: PlanningAgent[Any], logs: Sequence[LogPath], clips: ClipConfig, tasks: Sequence[str]) -> str:
     digest = hashlib.blake2b(digest_size=16)
     read = dataclasses.replace(clips, tasks=None)
-    digest.update(repr((str(logs), dataclasses.asdict(read), tuple(tasks))).encode())
+    digest.update(repr((VERSION, str(logs), dataclasses.asdict(read), tuple(tasks))).encode())
     for name, tensor in sorted(agent.world_model.state_dict().items()):
         digest.update(name.encode())
         digest.update(tensor.detach().cpu().contiguous().numpy().tobytes())

@@ -80,7 +80,8 @@ def train_heads(run: Run, heads: TaskHeadsRecipe) -> TrainedHeads:
         torch.manual_seed(heads.schedule.seed)
         fresh = _build(run, heads)
         class_weight = semantic_weights(example.truth for example in dataset.examples)
-        objective = ProbeObjective(fresh, run.recipe.clips.voxels, heads.weights, class_weight)
+        voxels = run.recipe.clips.voxels
+        objective = ProbeObjective(fresh, voxels, heads.weights, class_weight, heads.mirror)
         fabric = make_fabric("32-true")
         fabric.launch()
         train(objective, dataset, collate_kept, heads.schedule, folder, fabric)

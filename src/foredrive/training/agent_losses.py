@@ -1,0 +1,138 @@
+"""Losses of road users: of the dense map of centres, and of the queries by the best matching."""
+
+from dataclasses import dataclass, field
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from foredrive.losses.centres import centre_loss, centre_target
+from foredrive.losses.masked import masked_mean
+from foredrive.losses.motion import motion_losses
+from foredrive.models.tasks.agents import AGENT_CLASSES, AgentSet
+from foredrive.models.tasks.proposals import CentreMap
+from foredrive.scene import Boxes, VoxelSpec
+from foredrive.scene.task_truth import TaskTruth
+from foredrive.training.detection_losses import MatchingLossConfig, best_matching, matched_loss
+from foredrive.training.task_targets import AgentTargets, agent_targets
+
+SPREAD = 0.25
+"""Standard deviation of a centre's Gaussian as a share of the box's mean edge over ground."""
+VELOCITY_SCALE_MPS = 5.0
+"""An error of this size weighs as much as one of 1 m."""
+
+
+@dataclass(frozen=True)
+class AgentLossWeights:
+    """Weights of the terms of the agents' losses."""
+
+    centres: float = 1.0
+    """Of the dense map's focal loss."""
+    cells: float = 1.0
+    """Of the boxes of the cells at centres."""
+    queries: float = 0.5
+    velocity: float = 0.2
+    """Of the L1 error of a matched box, per m/s."""
+    attribute: float = 0.2
+    motion: float = 0.5
+    boxes: MatchingLossConfig = field(default_factory=MatchingLossConfig)
+
+
+def agent_losses(
+    centres: CentreMap,
+    layers: list[AgentSet],
+    boxes: Boxes,
+    boxes_valid: Bool[Tensor, "b"],
+    truth: TaskTruth,
+    spec: VoxelSpec,
+    weights: AgentLossWeights,
+) -> dict[str, Float[Tensor, ""]]:
+    """Return weighted losses, means over the annotated items (that of the queries over layers too).
+
+    Args:
+        centres: the dense map of b items.
+        layers: agents after each layer.
+        boxes: at now.
+        boxes_valid: whether an item is annotated at now. Others train nothing.
+        truth: of b items.
+        spec: grid of the volumes.
+        weights: weights of the terms.
+    """
+    last = layers[-1]
+    steps = 0 if last.future_xy is None else last.future_xy.shape[-2]
+    terms: dict[str, list[Tensor]] = {
+        name: [] for name in ("centres", "cells", "queries", "velocity", "attribute", "motion")
+    }
+    for item in boxes_valid.nonzero()[:, 0].tolist():
+        futures = None if truth.futures is None else truth.futures[item]
+        targets = agent_targets(boxes[item], futures, spec, steps)
+        for name, value in _cell_losses(centres[item], targets, spec).items():
+            terms[name].append(value)
+        for number, layer in enumerate(layers):
+            found = layer[item]
+            query, match = best_matching(found.boxes, targets.boxes, weights.boxes)
+            terms["queries"].append(matched_loss(found.boxes, targets.boxes, query, match, weights.boxes))
+            if number == len(layers) - 1:
+                for name, value in _matched_terms(found, targets, query, match).items():
+                    terms[name].append(value)
+    if last.future_xy is None:
+        del terms["motion"]
+    zero = last.velocity.sum() * 0 + centres.logits.sum() * 0
+    return {
+        name: getattr(weights, name) * torch.stack(values).mean() if values else zero
+        for name, values in terms.items()
+    }
+
+
+def _cell_losses(centres: CentreMap, targets: AgentTargets, spec: VoxelSpec) -> dict[str, Float[Tensor, ""]]:
+    """Return the losses of one item's dense map: of the centres, and of the boxes near them."""
+    rows, columns = centres.z.shape
+    lower = centres.xy.new_tensor(spec.lower_m[:2])
+    cell_m = spec.voxel_m
+    state, label = targets.boxes.state.to(centres.z), targets.boxes.label
+    y, x = (torch.arange(size, device=lower.device) + 0.5 for size in (rows, columns))
+    middle = lower + cell_m * torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1)
+    spread = (SPREAD * state[:, 3:5].exp().mean(-1)).clamp_min(0.7 * cell_m)
+    target = centre_target(state[:, :2], label, spread, middle, cell_m, len(AGENT_CLASSES))
+    # Each box trains the cell of its centre and the eight around it.
+    around = torch.tensor([[i, j] for j in (-1, 0, 1) for i in (-1, 0, 1)], device=lower.device)
+    cell = ((state[:, :2] - lower) / cell_m).floor().long()[:, None] + around
+    inside = ((cell >= 0) & (cell < cell.new_tensor([columns, rows]))).all(-1)
+    box, _ = inside.nonzero(as_tuple=True)
+    column, row = cell[inside].unbind(-1)
+    found = torch.cat(
+        [centres.xy[row, column], centres.z[row, column, None], centres.log_lwh[row, column]], dim=-1
+    )
+    assert targets.boxes.yaw is not None
+    yaw = targets.boxes.yaw.to(state)[box]
+    arrow = torch.stack([yaw.sin(), yaw.cos()], dim=-1)
+    off = (found - state[box]).abs().sum(-1) + (centres.heading[row, column] - arrow).abs().sum(-1)
+    velocity = targets.velocity[box]
+    known = velocity.isfinite().all(-1)
+    slip = centres.velocity[row, column] - torch.where(known[:, None], velocity, 0.0)
+    off = off + torch.where(known, slip.abs().sum(-1) / VELOCITY_SCALE_MPS, 0.0)
+    return {"centres": centre_loss(centres.logits, target), "cells": off.sum() / max(len(off), 1)}
+
+
+def _matched_terms(
+    found: AgentSet, targets: AgentTargets, query: Tensor, match: Tensor
+) -> dict[str, Float[Tensor, ""]]:
+    """Return the losses of velocity, attribute and motion of one item's matched queries."""
+    true_velocity = targets.velocity[match]
+    known = true_velocity.isfinite().all(-1)
+    off = (found.velocity[query] - torch.where(known[:, None], true_velocity, 0.0)).abs().sum(-1)
+    true_attribute = targets.attribute[match]
+    entropy = F.cross_entropy(
+        found.attribute[query], true_attribute.long(), ignore_index=-1, reduction="none"
+    )
+    terms = {"velocity": masked_mean(off, known), "attribute": masked_mean(entropy, true_attribute >= 0)}
+    if found.future_xy is None or found.log_prob is None:
+        return terms
+    motion = motion_losses(
+        found.future_xy[query],
+        found.log_prob[query],
+        targets.future_xy[match],
+        targets.future_valid[match],
+    )
+    return terms | {"motion": motion.distance + motion.mode}
