@@ -41,7 +41,7 @@ def train(
         probe: Train the heads of --tasks on the frozen world model instead. Its volumes are computed once and
             kept.
         set: Entries of the recipe to replace, such as finetune.schedule.lr=1e-3; `foredrive recipes RECIPE`
-            prints all entries. With --tasks, tasks.weights.detection=2 and others for the heads; with
+            prints all entries. With --tasks, tasks.weights.raster=2 and others for the heads; with
             --probe, tasks.schedule.steps=100 too (tasks/config.yaml in the run's folder has all).
     """
     check_out_folder(out)

@@ -81,7 +81,7 @@ def with_joint_heads(recipe: R, heads: TaskHeadsRecipe, settings: Sequence[str] 
     Args:
         recipe: without heads.
         heads: heads and their truth. Their schedule is not used.
-        settings: entries of `Recipe.tasks` to replace, such as "weights.detection=2".
+        settings: entries of `Recipe.tasks` to replace, such as "weights.raster=2".
 
     Raises:
         InputError: the recipe keeps the heads of another run, or a setting does not fit.
