@@ -8,38 +8,36 @@ in runs/rebuild/COMMIT, which continues where it stopped.
 import dataclasses
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 from benchmarks.common.study import pandaset_log, work_folder
 from foredrive.evaluation.bench import Benchmark
-from foredrive.recipes.gaussians import RebuildRecipe, gaussians_tiny
+from foredrive.recipes.rebuilding import RebuildRecipe, gaussians_tiny, rescheduled_recipe
 from foredrive.runs.rebuild.reconstruct import reconstruct
 
 WORK = work_folder(Path("runs/rebuild"))
 RECIPE = dataclasses.replace(gaussians_tiny(), cameras=("pcam_f0",))
-SHORTER = dataclasses.replace(
-    RECIPE,
-    schedule=dataclasses.replace(
-        RECIPE.schedule, steps=150, shrink_steps=(15,), grow_from=15, grow_until=120, grow_every=15
-    ),
+SHORTER = rescheduled_recipe(
+    RECIPE, steps=150, shrink_steps=(15,), grow_from=15, grow_until=120, grow_every=15
 )
 """Less than a third of the steps, with as much growth: the recipe that arms change in one thing each."""
-ARMS: dict[str, RebuildRecipe] = {
+ARMS: dict[str, RebuildRecipe[Any]] = {
     "gaussians_tiny": RECIPE,
     "shorter": SHORTER,
     "static_only": dataclasses.replace(SHORTER, actors=False),
     "no_rolling_shutter": dataclasses.replace(
-        SHORTER, scene=dataclasses.replace(SHORTER.scene, rolling=False)
-    ),
-    "no_drop": dataclasses.replace(
         SHORTER,
-        drop=False,
-        schedule=dataclasses.replace(
-            SHORTER.schedule, weights=dataclasses.replace(SHORTER.schedule.weights, drop=0.0)
+        representation=dataclasses.replace(
+            SHORTER.representation, scene=dataclasses.replace(SHORTER.representation.scene, rolling=False)
         ),
     ),
-    "published_lidar_losses": dataclasses.replace(
-        SHORTER, schedule=dataclasses.replace(SHORTER.schedule, lidar_losses="published")
+    "no_drop": dataclasses.replace(
+        rescheduled_recipe(
+            SHORTER, weights=dataclasses.replace(SHORTER.representation.schedule.weights, drop=0.0)
+        ),
+        drop=False,
     ),
+    "published_lidar_losses": rescheduled_recipe(SHORTER, lidar_losses="published"),
 }
 FIGURES = (
     *("psnr_db", "ssim", "depth_median_sq_m2", "intensity_rmse", "drop_accuracy", "chamfer_m2"),
@@ -53,8 +51,7 @@ ego vehicle drives.
 
 def rebuilt(arm: str) -> Callable[[int], dict[str, float]]:
     def measure(seed: int) -> dict[str, float]:
-        recipe = ARMS[arm]
-        recipe = dataclasses.replace(recipe, schedule=dataclasses.replace(recipe.schedule, seed=seed))
+        recipe = rescheduled_recipe(ARMS[arm], seed=seed)
         summary = reconstruct(
             recipe, pandaset_log(WORK / "pandaset"), WORK / f"{arm}_seed{seed}", WORK / "cache"
         ).summary

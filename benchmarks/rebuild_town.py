@@ -11,6 +11,7 @@ import functools
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from jaxtyping import Bool
 from torch import Tensor
@@ -19,7 +20,7 @@ from benchmarks.common.rebuilt_towns import TownDrive, TownTruth, TrueViews
 from benchmarks.common.study import work_folder
 from foredrive.evaluation.bench import Benchmark
 from foredrive.evaluation.rendering import evaluate_cameras, evaluate_sweeps
-from foredrive.recipes.gaussians import RebuildRecipe, gaussians_tiny
+from foredrive.recipes.rebuilding import RebuildRecipe, gaussians_tiny, rescheduled_recipe
 from foredrive.rendering.edits import Edit, Move, Remove, ShiftEgo, apply_edits
 from foredrive.rendering.scene_graph import SceneGraph
 from foredrive.rendering.views import CameraView, SweepView
@@ -43,7 +44,7 @@ FEWEST = 20
 OF_IMAGES = ("psnr_db", "ssim", "nearest.psnr_db", "nearest.ssim")
 OF_SWEEPS = ("depth_median_sq_m2", "intensity_rmse", "drop_accuracy", "chamfer_m2")
 RECIPE = dataclasses.replace(gaussians_tiny(), cameras=DRIVE.cameras)
-ARMS: dict[str, RebuildRecipe] = {
+ARMS: dict[str, RebuildRecipe[Any]] = {
     "gaussians": RECIPE,
     "static_only": dataclasses.replace(RECIPE, actors=False),
 }
@@ -100,7 +101,7 @@ def rebuilt(arm: str, seed: int) -> dict[str, float]:
     """Return the metrics of one run: "VIEWS.METRIC", and "VIEWS.changed.METRIC" where an edit changes the
     views.
     """
-    recipe = dataclasses.replace(ARMS[arm], schedule=dataclasses.replace(ARMS[arm].schedule, seed=seed))
+    recipe = rescheduled_recipe(ARMS[arm], seed=seed)
     run = reconstruct(recipe, DRIVE.recorded(WORK / "town"), WORK / f"{arm}_seed{seed}", WORK / "cache")
     figures = {name: float(run.summary[name] or 0.0) for name in ("minutes", "gaussians")}
     for name in NAMES:

@@ -11,7 +11,7 @@ import yaml
 from foredrive.errors import InputError
 from foredrive.recipes import RECIPES, find_recipe, with_occupancy_source
 from foredrive.recipes.config import load_recipe, save_recipe
-from foredrive.recipes.gaussians import find_rebuild_recipe, load_rebuild_recipe
+from foredrive.recipes.rebuilding import find_rebuild_recipe, load_rebuild_recipe
 
 
 @pytest.mark.parametrize("name", RECIPES)
@@ -126,8 +126,10 @@ def as_it_was(recipe: Any) -> Any:
 
 
 def test_a_reconstruction_in_an_earlier_format_opens_as_the_same_recipe() -> None:
-    file = WRITTEN_BEFORE / "reconstructions" / "gaussians_tiny.yaml"
-    assert load_rebuild_recipe(file) == find_rebuild_recipe("gaussians_tiny")
+    files = sorted((WRITTEN_BEFORE / "reconstructions").glob("*.yaml"))
+    assert len(files) == 2
+    for file in files:
+        assert load_rebuild_recipe(file) == find_rebuild_recipe(load_rebuild_recipe(file).name)
 
 
 def test_a_recipe_may_be_a_file_and_entries_may_be_set(tmp_path: Path) -> None:
@@ -169,8 +171,13 @@ def test_a_setting_that_does_not_fit_is_one_line(setting: str, said: str) -> Non
 def test_recipes_of_reconstructions_take_files_and_settings(tmp_path: Path) -> None:
     own = tmp_path / "own.yaml"
     save_recipe(find_rebuild_recipe("gaussians_tiny"), own)
-    chosen = find_rebuild_recipe(str(own), ("schedule.steps=7", "scene.rolling=false"))
-    assert (chosen.schedule.steps, chosen.scene.rolling) == (7, False)
-    assert chosen.initial == find_rebuild_recipe("gaussians_tiny").initial
+    chosen = find_rebuild_recipe(
+        str(own), ("representation.schedule.steps=7", "representation.scene.rolling=false")
+    )
+    gaussians = chosen.representation
+    assert (gaussians.schedule.steps, gaussians.scene.rolling) == (7, False)
+    assert gaussians.initial == find_rebuild_recipe("gaussians_tiny").representation.initial
+    with pytest.raises(InputError, match=r"no entry 'schedule'; did you mean representation\.schedule"):
+        find_rebuild_recipe("gaussians_tiny", ("schedule.steps=7",))
     with pytest.raises(InputError, match="near: gaussians_tiny"):
         find_rebuild_recipe("gaussian_tiny")

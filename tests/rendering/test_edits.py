@@ -20,7 +20,9 @@ from foredrive.rendering.edits import (
     load_edits,
     save_edits,
 )
-from foredrive.rendering.scene_graph import STATIC, SceneGraph, place_gaussians
+from foredrive.rendering.gaussians.content import gaussians_of
+from foredrive.rendering.gaussians.placing import place_gaussians
+from foredrive.rendering.scene_graph import STATIC, SceneGraph
 
 
 def scene() -> SceneGraph:
@@ -37,7 +39,7 @@ def test_moving_is_in_the_actors_own_frame() -> None:
 def test_removing_takes_the_gaussians_along() -> None:
     edited = apply_edits(scene(), [Remove(7)]).graph
     assert edited.tracks.track_id.tolist() == [11]
-    assert edited.actor.tolist() == [STATIC, 0]
+    assert gaussians_of(edited).actor.tolist() == [STATIC, 0]
     assert place_gaussians(edited, 0.0).source.tolist() == [0]
 
 
@@ -90,7 +92,7 @@ def test_edits_from_a_file_do_the_same(tmp_path: Path) -> None:
     assert again == edits
     first, second = apply_edits(scene(), edits).graph, apply_edits(scene(), again).graph
     assert torch.equal(first.tracks.T_scene_actor, second.tracks.T_scene_actor)
-    assert torch.equal(first.gaussians.mean_m, second.gaussians.mean_m)
+    assert torch.equal(gaussians_of(first).gaussians.mean_m, gaussians_of(second).gaussians.mean_m)
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ from foredrive.data import find_logs
 from foredrive.data.drives import read_drive
 from foredrive.errors import InputError
 from foredrive.rendering.gaussians import Gaussians
-from foredrive.rendering.initial import InitialGaussians, initial_scene
+from foredrive.rendering.gaussians.initial import InitialGaussians, initial_scene
 from foredrive.rendering.scene_graph import STATIC, SceneGraph
 from foredrive.rendering.seed_points import UNSEEN_RAD, SeedPoints, colour_from_neighbours
 from foredrive.rendering.tracks import read_tracks, states_at
@@ -79,7 +79,7 @@ def test_tracks_are_where_the_boxes_are(drive: Clip) -> None:
 
 
 def test_the_static_part_has_no_actors_in_it(graph: SceneGraph) -> None:
-    own = graph.gaussians[graph.actor == STATIC]
+    own = graph.content.preview(STATIC)
     lidar = own.mean_m[: SIZE.lidar_points]
     assert float(lidar[:, 2].abs().max()) < 0.02  # all of it is ground
     seen = own.feature[: SIZE.lidar_points, :3]
@@ -94,7 +94,7 @@ def unseen(own: Gaussians) -> torch.Tensor:
 
 
 def test_what_no_camera_saw_lies_flat_and_evenly(graph: SceneGraph, drive: Clip) -> None:
-    own = graph.gaussians[graph.actor == STATIC]
+    own = graph.content.preview(STATIC)
     patches = own[unseen(own)]
     assert 1000 < len(patches.opacity_logit) < SIZE.unseen_points
     way_m = float(torch.linalg.inv(drive.T_world_ego[0])[0] @ drive.T_world_ego[-1, :, 3])  # straight on
@@ -131,7 +131,7 @@ def test_what_no_camera_saw_is_coloured_like_what_is_near() -> None:
     ("track_id", "box", "rgb"), [(7, world.PARKED, world.PARKED_RGB), (11, world.MOVING, world.MOVING_RGB)]
 )
 def test_actors_have_their_own_points(graph: SceneGraph, track_id: int, box: dict, rgb: tuple) -> None:
-    own = graph.of_actor(graph.tracks.index_of(track_id))
+    own = graph.content.preview(graph.tracks.index_of(track_id))
     assert len(own.opacity_logit) >= SIZE.actor_points
     half_m = torch.tensor(box["size"]).float() / 2
     assert bool((own.mean_m.abs() <= half_m + 0.15).all())
@@ -145,7 +145,7 @@ def test_actors_have_their_own_points(graph: SceneGraph, track_id: int, box: dic
 
 def test_pixels_are_as_far_as_the_beams_beside_them(graph: SceneGraph) -> None:
     """Those of the ground lie on the ground, those of the sky far away; those of actors are left out."""
-    own = graph.gaussians[graph.actor == STATIC]
+    own = graph.content.preview(STATIC)
     along = own[~unseen(own)][slice(SIZE.lidar_points, -SIZE.near_points)]
     assert 0.5 * SIZE.pixel_points < len(along.opacity_logit) < SIZE.pixel_points
     rgb = along.feature[:, :3] * 255
@@ -167,4 +167,4 @@ def test_the_same_seed_gives_the_same_scene(drive: Clip, graph: SceneGraph) -> N
         SIZE,
         torch.Generator().manual_seed(0),
     )
-    assert torch.equal(again.gaussians.mean_m, graph.gaussians.mean_m)
+    assert torch.equal(again.content.preview(STATIC).mean_m, graph.content.preview(STATIC).mean_m)

@@ -18,7 +18,7 @@ NAMES = (
 
 
 def test_a_file_holds_what_viewers_look_for(tmp_path: Path) -> None:
-    gaussians = graph_of([[1.0, 2, 3], [4.0, 5, 6]], [STATIC, STATIC], two_actors()).gaussians
+    gaussians = graph_of([[1.0, 2, 3], [4.0, 5, 6]], [STATIC, STATIC], two_actors()).content.preview(STATIC)
     write_ply(gaussians, tmp_path / "scene.ply")
     content = (tmp_path / "scene.ply").read_bytes()
     header, data = content.split(b"end_header\n", 1)

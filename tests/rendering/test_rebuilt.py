@@ -9,8 +9,9 @@ import torch
 from foredrive.geometry.se3 import exp_se3, transform_points
 from foredrive.rendering.decoders import CameraDecoder, CameraDecoderConfig, LidarDecoder
 from foredrive.rendering.gaussians import Gaussians
-from foredrive.rendering.rebuilt import UNSEEN_RGB, RebuiltScene
-from foredrive.rendering.scene_config import SceneConfig
+from foredrive.rendering.gaussians.content import GaussianContent
+from foredrive.rendering.gaussians.scene import UNSEEN_RGB, GaussianScene
+from foredrive.rendering.gaussians.scene_config import GaussianSceneConfig
 from foredrive.rendering.scene_graph import STATIC, SceneGraph
 from foredrive.rendering.tracks import ActorTracks
 from foredrive.rendering.views import CameraView, SweepView
@@ -21,7 +22,9 @@ FORWARD = torch.tensor([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 
 """Camera (x right, y down, z forward) in a frame with x forward and z up."""
 
 
-def scene_of(mean_m: torch.Tensor, tracks: ActorTracks, config: SceneConfig | None = None) -> RebuiltScene:
+def scene_of(
+    mean_m: torch.Tensor, tracks: ActorTracks, config: GaussianSceneConfig | None = None
+) -> GaussianScene:
     """Small, hard, white Gaussians."""
     count = len(mean_m)
     gaussians = Gaussians(
@@ -32,8 +35,8 @@ def scene_of(mean_m: torch.Tensor, tracks: ActorTracks, config: SceneConfig | No
         feature=torch.tensor([[1.0, 1, 1, 0, 0]]).repeat(count, 1),
     )
     torch.manual_seed(0)
-    graph = SceneGraph(gaussians, torch.full((count,), STATIC), tracks)
-    return RebuiltScene(graph, 1, config, frames=2)
+    graph = SceneGraph(tracks, GaussianContent(gaussians, torch.full((count,), STATIC)))
+    return GaussianScene(graph, 1, config, frames=2)
 
 
 @pytest.fixture
@@ -63,9 +66,9 @@ def view(twist_cam: list[float], readout_s: float) -> CameraView:
 
 
 @torch.no_grad()
-def centre_px(scene: RebuiltScene, camera: CameraView, rows: slice) -> float:
+def centre_px(scene: GaussianScene, camera: CameraView, rows: slice) -> float:
     """Where along u the light of some rows lies."""
-    alpha = scene(scene.graph, camera).alpha[rows]
+    alpha = scene.camera(scene.graph, camera).alpha[rows]
     return float((alpha.sum(0) * (torch.arange(96) + 0.5)).sum() / alpha.sum())
 
 
@@ -75,7 +78,7 @@ def test_a_pole_leans_when_the_camera_passes_it(nobody: ActorTracks) -> None:
     camera = view([10.0, 0, 0, 0, 0, 0], readout_s=0.04)
     top, bottom = (centre_px(scene_of(pole, nobody), camera, rows) for rows in (slice(4, 12), slice(52, 60)))
     assert top - bottom == pytest.approx(10 * 0.04 * 48 / 64 * 60 / 6, abs=0.05)
-    still = scene_of(pole, nobody, SceneConfig(rolling=False))
+    still = scene_of(pole, nobody, GaussianSceneConfig(rolling=False))
     assert centre_px(still, camera, slice(4, 12)) == pytest.approx(48.0, abs=0.05)
 
 
@@ -93,17 +96,17 @@ def test_exposing_later_is_being_further(nobody: ActorTracks) -> None:
     scene = scene_of(torch.tensor([[6.0, 0.3, 0.2], [9.0, -1, 0]]), nobody)
     camera = view([1.0, 0.5, 8.0, 0.1, 0.3, 0], readout_s=0.02)
     scene.camera_late_s[0] = 0.05
-    late = scene(scene.graph, camera).alpha
+    late = scene.camera(scene.graph, camera).alpha
     scene.camera_late_s[0] = 0.0
     further = dataclasses.replace(camera, T_scene_cam=FORWARD @ exp_se3(0.05 * camera.twist_cam), t_s=0.55)
-    assert torch.allclose(late, scene(scene.graph, further).alpha, atol=1e-4)
-    assert float((late - scene(scene.graph, camera).alpha).abs().max()) > 0.1
+    assert torch.allclose(late, scene.camera(scene.graph, further).alpha, atol=1e-4)
+    assert float((late - scene.camera(scene.graph, camera).alpha).abs().max()) > 0.1
 
 
 def test_corrections_of_cameras_are_learned(nobody: ActorTracks) -> None:
     scene = scene_of(torch.tensor([[6.0, 0.3, 0.2]]), nobody)
     camera = view([1.0, 0, 8.0, 0, 0, 0], readout_s=0.04)
-    scene(scene.graph, camera).rgb[:, :, :48].sum().backward()
+    scene.camera(scene.graph, camera).rgb[:, :, :48].sum().backward()
     for parameter in (scene.camera_offset, scene.camera_twist, scene.camera_late_s):
         assert parameter.grad is not None
         assert float(parameter.grad.abs().max()) > 0
@@ -138,32 +141,36 @@ def test_a_moving_lidar_measures_from_where_each_beam_left(nobody: ActorTracks) 
     assert torch.allclose(seen.range_m, along.norm(dim=-1), atol=0.05)
     assert seen.alpha_before_hit is not None
     assert float(seen.alpha_before_hit.max()) < 1e-3
-    one_moment = scene_of(transform_points(T_scene_ego, targets), nobody, SceneConfig(rolling=False))
+    one_moment = scene_of(transform_points(T_scene_ego, targets), nobody, GaussianSceneConfig(rolling=False))
     missed = one_moment.sweep(one_moment.graph, one_moment.prepare_sweep(sweep), 0.5)
     assert float(missed.alpha[[1, 3]].max()) < 0.2  # those abeam
 
 
 def test_the_velocity_of_a_frame_is_used_for_that_frame_alone(nobody: ActorTracks) -> None:
     pole = torch.stack([torch.full((81,), 10.0), torch.zeros(81), torch.linspace(-4, 4, 81)], -1)
-    scene = scene_of(pole, nobody, SceneConfig(frame_velocities=True))
+    scene = scene_of(pole, nobody, GaussianSceneConfig(frame_velocities=True))
     assert scene.frame_velocity is not None
     assert scene.frame_turn is not None
     with torch.no_grad():
         scene.frame_turn.zero_()
         scene.frame_velocity.copy_(torch.tensor([[0.0, 0, 0], [6.0, 0, 0]]))
         still, passing = view([0.0] * 6, 0.05), view([6.0, 0, 0, 0, 0, 0], 0.05)
-        expected = scene(scene.graph, passing).rgb
-        torch.testing.assert_close(scene(scene.graph, still, frame=1).rgb, expected)
-        assert torch.equal(scene(scene.graph, still, frame=0).rgb, scene(scene.graph, still).rgb)
-        assert not torch.equal(scene(scene.graph, still).rgb, expected)
+        expected = scene.camera(scene.graph, passing).rgb
+        torch.testing.assert_close(scene.camera(scene.graph, still, frame=1).rgb, expected)
+        assert torch.equal(
+            scene.camera(scene.graph, still, frame=0).rgb, scene.camera(scene.graph, still).rgb
+        )
+        assert not torch.equal(scene.camera(scene.graph, still).rgb, expected)
 
 
 def test_a_background_after_the_decoder_fills_what_nothing_covers(nobody: ActorTracks) -> None:
-    scene = scene_of(torch.tensor([[2.0, 0, 0]]), nobody, SceneConfig(background="after_decoder"))
+    scene = scene_of(torch.tensor([[2.0, 0, 0]]), nobody, GaussianSceneConfig(background="after_decoder"))
     camera, red = view([0.0] * 6, 0.0), torch.tensor([1.0, 0.25, 0.0])
     with torch.no_grad():
-        black, coloured = (scene(scene.graph, camera, background_rgb=rgb) for rgb in (torch.zeros(3), red))
-        unseen = scene(scene.graph, camera)
+        black, coloured = (
+            scene.camera(scene.graph, camera, background_rgb=rgb) for rgb in (torch.zeros(3), red)
+        )
+        unseen = scene.camera(scene.graph, camera)
     assert float(black.alpha.max()) > 0.9
     torch.testing.assert_close(coloured.rgb - black.rgb, (1 - black.alpha) * red[:, None, None])
     torch.testing.assert_close(
@@ -174,9 +181,9 @@ def test_a_background_after_the_decoder_fills_what_nothing_covers(nobody: ActorT
 def test_what_is_nearer_than_the_near_plane_is_not_seen(nobody: ActorTracks) -> None:
     near, camera = torch.tensor([[0.4, 0.0, 0.0]]), view([0.0] * 6, 0.0)
     with torch.no_grad():
-        for config, seen in ((SceneConfig(), True), (SceneConfig(camera_near_m=0.5), False)):
+        for config, seen in ((GaussianSceneConfig(), True), (GaussianSceneConfig(camera_near_m=0.5), False)):
             scene = scene_of(near, nobody, config)
-            assert bool(scene(scene.graph, camera).alpha.max() > 0.5) is seen
+            assert bool(scene.camera(scene.graph, camera).alpha.max() > 0.5) is seen
 
 
 def test_the_network_alone_may_decide_which_beams_return(nobody: ActorTracks) -> None:

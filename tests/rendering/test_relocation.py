@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from foredrive.rendering.gaussians import Gaussians
-from foredrive.rendering.relocation import random_walk_m, split_evenly
+from foredrive.rendering.gaussians.relocation import random_walk_m, split_evenly
 
 
 def test_one_alone_stays_as_it_is() -> None:

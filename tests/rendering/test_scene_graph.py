@@ -11,7 +11,9 @@ from hypothesis import strategies as st
 from foredrive.errors import InputError
 from foredrive.geometry.se3 import exp_se3, matrix_from_yaw
 from foredrive.rendering.gaussians import Gaussians
-from foredrive.rendering.scene_graph import STATIC, SceneGraph, mirrored, place_gaussians
+from foredrive.rendering.gaussians.content import GaussianContent, gaussians_of
+from foredrive.rendering.gaussians.placing import mirrored, place_gaussians
+from foredrive.rendering.scene_graph import STATIC, SceneGraph
 from foredrive.rendering.tracks import ActorTracks, states_at
 from foredrive.scene import Category
 
@@ -39,7 +41,7 @@ def graph_of(mean_m: list[list[float]], actor: list[int], tracks: ActorTracks) -
         opacity_logit=torch.zeros(count),
         feature=torch.arange(count * 3.0).reshape(count, 3),
     )
-    return SceneGraph(gaussians, torch.tensor(actor), tracks)
+    return SceneGraph(tracks, GaussianContent(gaussians, torch.tensor(actor)))
 
 
 def covariance(gaussians: Gaussians) -> torch.Tensor:
@@ -108,7 +110,7 @@ def test_velocities_are_those_of_the_poses() -> None:
 @given(st.lists(st.floats(-1, 1), min_size=4, max_size=4).filter(lambda q: sum(x * x for x in q) > 0.1))
 def test_mirroring_is_a_reflection_of_place_and_shape(q: list[float]) -> None:
     graph = graph_of([[1.0, 0.5, 0.2]], [0], two_actors())
-    gaussians = dataclasses.replace(graph.gaussians, quaternion=torch.tensor([q]))
+    gaussians = dataclasses.replace(gaussians_of(graph).gaussians, quaternion=torch.tensor([q]))
     M = torch.diag(torch.tensor([1.0, -1, 1]))
     other = mirrored(gaussians)
     assert torch.allclose(other.mean_m, gaussians.mean_m @ M)

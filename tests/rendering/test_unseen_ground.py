@@ -10,7 +10,7 @@ from test_scene_graph import two_actors
 
 from foredrive.geometry.se3 import exp_se3
 from foredrive.rendering.gaussians import Gaussians
-from foredrive.rendering.unseen_ground import WITHIN_M, add_unseen_ground, extrapolated_ground
+from foredrive.rendering.gaussians.unseen_ground import WITHIN_M, add_unseen_ground, extrapolated_ground
 from foredrive.runs.rebuild.reconstruct import tracks_without_actors
 
 WAY = torch.eye(4).repeat(21, 1, 1)

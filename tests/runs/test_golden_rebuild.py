@@ -2,10 +2,10 @@
 
 After a change that is meant to change them, write them anew and look at the difference:
 
-    FOREDRIVE_WRITE_GOLDEN=1 .venv/bin/python -m pytest tests/runs/test_golden_rebuild.py && git diff tests/runs
+    FOREDRIVE_WRITE_GOLDEN=1 .venv/bin/python -m pytest tests/runs/test_golden_rebuild.py && git diff tests
 
-The log has a standing and a moving actor, two cameras and a lidar. Steps relocate and add Gaussians. The rates
-are low, so that Adam does not multiply the rounding of sums, the only part that differs between processors.
+The log has a standing and a moving actor, two cameras and a lidar. Steps relocate and add Gaussians. The
+rates are low, so that Adam does not multiply the rounding of sums, which differs between processors.
 """
 
 import dataclasses
@@ -20,16 +20,18 @@ import torch
 from torch.nn.functional import adaptive_avg_pool1d, adaptive_avg_pool2d
 
 from foredrive.data import LogPath, find_logs
-from foredrive.recipes.gaussians import RebuildRecipe, gaussians_published
+from foredrive.recipes.gaussians import GaussianRecipe, published_gaussians
+from foredrive.recipes.rebuilding import RebuildRecipe
 from foredrive.rendering.decoders import CameraDecoderConfig
 from foredrive.rendering.edits import DriveStraight, Duplicate, Edit, Move, Remove
-from foredrive.rendering.initial import InitialGaussians
-from foredrive.rendering.scene_config import SceneConfig
+from foredrive.rendering.gaussians.initial import InitialGaussians
+from foredrive.rendering.gaussians.scene_config import GaussianSceneConfig
 from foredrive.runs.rebuild.rebuilt_run import edited_scene, open_rebuilt
 from foredrive.runs.rebuild.reconstruct import reconstruct
-from foredrive.training.gaussian_rates import LearningRates, Rate
+from foredrive.training.gaussian_rates import LearningRates
+from foredrive.training.gaussian_training import GaussianSchedule
+from foredrive.training.learning_rates import Rate
 from foredrive.training.loop import read_metrics
-from foredrive.training.rebuilding import RebuildSchedule
 
 GOLDEN = Path(__file__).with_name("golden_rebuild.json")
 RTOL, ATOL = 2e-3, 2e-4
@@ -52,10 +54,8 @@ EDITS: list[Edit] = [
 ]
 
 
-def small() -> RebuildRecipe:
-    return RebuildRecipe(
-        name="golden",
-        image_hw=(24, 48),
+def small() -> GaussianRecipe:
+    return GaussianRecipe(
         initial=InitialGaussians(
             lidar_points=700,
             unseen_points=300,
@@ -66,7 +66,7 @@ def small() -> RebuildRecipe:
             features=3,
             scale=0.7,
         ),
-        schedule=RebuildSchedule(
+        schedule=GaussianSchedule(
             steps=18,
             max_gaussians=1500,
             rates=LOW,
@@ -77,12 +77,12 @@ def small() -> RebuildRecipe:
             grow_until=15,
             grow_every=5,
         ),
-        scene=SceneConfig(CameraDecoderConfig(width=8)),
+        scene=GaussianSceneConfig(CameraDecoderConfig(width=8)),
     )
 
 
-def published() -> RebuildRecipe:
-    chosen, like = gaussians_published(), small()
+def published() -> GaussianRecipe:
+    like = small()
     return dataclasses.replace(
         like,
         initial=dataclasses.replace(
@@ -93,11 +93,15 @@ def published() -> RebuildRecipe:
             lidar_losses="published",
             rates=dataclasses.replace(LOW, frame_velocity=Rate(1e-4), frame_turn=Rate(1e-4)),
         ),
-        scene=dataclasses.replace(chosen.scene, decoder=CameraDecoderConfig(8, "residual")),
+        scene=dataclasses.replace(published_gaussians().scene, decoder=CameraDecoderConfig(8, "residual")),
     )
 
 
-RECIPES = {"tiny": small, "published": published}
+GAUSSIANS = {"tiny": small, "published": published}
+
+
+def recipe(name: str) -> RebuildRecipe[GaussianRecipe]:
+    return RebuildRecipe("golden", image_hw=(24, 48), representation=GAUSSIANS[name]())
 
 
 @pytest.fixture(scope="module")
@@ -108,14 +112,14 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> LogPath:
 
 @torch.no_grad()
 def figures(folder: Path, held_out: Any) -> dict[str, Any]:
-    """Losses of every step, and means over blocks of pixels and of beams of the edited scene, opened again."""
+    """Losses of every step, and means over pixels and beams of the edited scene, opened again."""
     lines = read_metrics(folder / "metrics.jsonl")
     losses = [{key: value for key, value in line.items() if key not in TIMES} for line in lines]
     scene = open_rebuilt(folder).scene
     graph = edited_scene(scene, EDITS).graph
     images, sweeps = [], []
     for view in held_out.cameras[::2]:
-        picture = scene(graph, view)
+        picture = scene.camera(graph, view)
         layers = torch.cat([picture.rgb, picture.range_m.log1p()[None], picture.alpha[None]])
         images.append(adaptive_avg_pool2d(layers, (3, 4)).flatten().tolist())
     for sweep in held_out.sweeps[::2]:
@@ -125,9 +129,9 @@ def figures(folder: Path, held_out: Any) -> dict[str, Any]:
     return {"losses": losses, "images": images, "sweeps": sweeps, "actors": graph.tracks.track_id.tolist()}
 
 
-@pytest.mark.parametrize("name", RECIPES)
+@pytest.mark.parametrize("name", GAUSSIANS)
 def test_a_rebuilt_log_is_what_it_was(name: str, log: LogPath, tmp_path: Path) -> None:
-    run = reconstruct(RECIPES[name](), log, tmp_path / "run")
+    run = reconstruct(recipe(name), log, tmp_path / "run")
     found = figures(run.folder, run.held_out)
     if os.environ.get("FOREDRIVE_WRITE_GOLDEN"):
         written = json.loads(GOLDEN.read_text()) if GOLDEN.is_file() else {}

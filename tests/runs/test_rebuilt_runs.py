@@ -31,7 +31,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Reconstruction:
 def test_an_opened_scene_shows_the_same(run: Reconstruction) -> None:
     scene = open_rebuilt(run.folder).scene
     view = run.held_out.cameras[0]
-    assert torch.equal(scene(scene.graph, view).rgb, run.scene(run.scene.graph, view).rgb)
+    assert torch.equal(scene.camera(scene.graph, view).rgb, run.scene.camera(run.scene.graph, view).rgb)
 
 
 @torch.no_grad()
@@ -43,7 +43,7 @@ def test_a_view_that_is_asked_for_is_the_recorded_one(run: Reconstruction) -> No
     view = novel_camera_view(vehicle.rig, vehicle.camera("ahead"), vehicle.at(recorded.t_s))
     assert torch.allclose(view.T_scene_cam, recorded.T_scene_cam, atol=1e-4)
     assert torch.allclose(view.twist_cam, recorded.twist_cam, atol=1e-3)
-    asked, judged = (opened.scene(opened.scene.graph, v).rgb for v in (view, recorded))
+    asked, judged = (opened.scene.camera(opened.scene.graph, v).rgb for v in (view, recorded))
     assert torch.allclose(asked, judged, atol=2e-3)
     between = vehicle.at(0.13)
     assert torch.allclose(between.T_scene_ego[:3, 3], torch.tensor([0.65, 0, 0]), atol=1e-4)
@@ -94,7 +94,7 @@ def test_an_actor_of_another_run_is_where_one_of_this_was(run: Reconstruction) -
     edited = edited_scene(run.scene, edits)
     assert edited.graph.tracks.track_id.tolist() == [7, 70]
     view = run.held_out.cameras[0]
-    before, after = (run.scene(graph, view).rgb for graph in (run.scene.graph, edited.graph))
+    before, after = (run.scene.camera(graph, view).rgb for graph in (run.scene.graph, edited.graph))
     changed = (before - after).abs().amax(0) > 0.02
     assert 0 < float(changed.float().mean()) < 0.5  # the moving box, and nothing else
     assert float(changed[:, :24].float().mean()) < 0.02  # it is to the right

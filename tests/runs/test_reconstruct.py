@@ -21,15 +21,17 @@ from foredrive.evaluation.perceptual import PerceptualMetrics, PerceptualWeights
 from foredrive.evaluation.rendering import evaluate_cameras, evaluate_sweeps
 from foredrive.models.inception import InceptionFeatures
 from foredrive.recipes.config import save_recipe
-from foredrive.recipes.gaussians import (
+from foredrive.recipes.gaussians import GaussianRecipe
+from foredrive.recipes.rebuilding import (
     RebuildRecipe,
     find_rebuild_recipe,
     gaussians_base,
     gaussians_published,
     gaussians_tiny,
     load_rebuild_recipe,
+    rescheduled_recipe,
 )
-from foredrive.rendering.initial import InitialGaussians
+from foredrive.rendering.gaussians.initial import InitialGaussians
 from foredrive.rendering.scene_graph import STATIC
 from foredrive.runs.rebuild.rebuilt_run import open_rebuilt
 from foredrive.runs.rebuild.reconstruct import (
@@ -39,37 +41,40 @@ from foredrive.runs.rebuild.reconstruct import (
     reconstruct,
 )
 from foredrive.training import loop
-from foredrive.training.gaussian_rates import LearningRates, Rate
-from foredrive.training.rebuilding import RebuildSchedule
+from foredrive.training.gaussian_rates import LearningRates
+from foredrive.training.gaussian_training import GaussianSchedule
+from foredrive.training.learning_rates import Rate
 
 STEPS = 40
 
 
-def recipe(steps: int = STEPS) -> RebuildRecipe:
+def recipe(steps: int = STEPS) -> RebuildRecipe[GaussianRecipe]:
     return RebuildRecipe(
         name="smallest",
         image_hw=(24, 48),
-        initial=InitialGaussians(
-            lidar_points=1100,
-            unseen_points=400,
-            pixel_points=300,
-            near_points=0,
-            actor_points=50,
-            max_actor_points=100,
-            features=2,
-            scale=0.7,
-        ),
-        schedule=RebuildSchedule(
-            steps=steps,
-            max_gaussians=2200,
-            rates=LearningRates(mean_m=Rate(1e-3, final=0.01), albedo=Rate(1e-2)),
-            images_per_sweep=2,
-            beam_stride=2,
-            shrink_steps=(10,),
-            grow_from=10,
-            grow_until=30,
-            grow_every=10,
-            checkpoint_every=20,
+        representation=GaussianRecipe(
+            initial=InitialGaussians(
+                lidar_points=1100,
+                unseen_points=400,
+                pixel_points=300,
+                near_points=0,
+                actor_points=50,
+                max_actor_points=100,
+                features=2,
+                scale=0.7,
+            ),
+            schedule=GaussianSchedule(
+                steps=steps,
+                max_gaussians=2200,
+                rates=LearningRates(mean_m=Rate(1e-3, final=0.01), albedo=Rate(1e-2)),
+                images_per_sweep=2,
+                beam_stride=2,
+                shrink_steps=(10,),
+                grow_from=10,
+                grow_until=30,
+                grow_every=10,
+                checkpoint_every=20,
+            ),
         ),
         cameras=("ahead",),
     )
@@ -180,9 +185,7 @@ def test_what_a_log_lacks_is_said(log: LogPath, tmp_path: Path, caplog: pytest.L
 def test_too_little_memory_is_said_before(
     log: LogPath, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    huge = dataclasses.replace(
-        recipe(), schedule=dataclasses.replace(recipe().schedule, max_gaussians=10**12)
-    )
+    huge = rescheduled_recipe(recipe(), max_gaussians=10**12)
     with pytest.raises(InputError, match=r"smallest needs about \d+\.\d GiB .* GiB are free"):
         reconstruct(huge, log, tmp_path / "huge")
     assert not (tmp_path / "huge").exists()
@@ -213,7 +216,7 @@ def test_metrics_with_networks_are_added_to_a_finished_run(run: Path, log: LogPa
     cameras = found.held_out.cameras
     shown = []
     for camera in cameras:
-        rgb = found.scene(found.scene.graph, camera).rgb.detach().clamp(0, 1)
+        rgb = found.scene.camera(found.scene.graph, camera).rgb.detach().clamp(0, 1)
         shown.append(dataclasses.replace(camera, image=(255 * rgb).round().byte()))
     assert metrics.evaluate(found.scene, shown)["fid"] == pytest.approx(0.0, abs=1e-4)
 
@@ -221,7 +224,8 @@ def test_metrics_with_networks_are_added_to_a_finished_run(run: Path, log: LogPa
 def test_the_published_recipe_has_the_choices_of_the_reference() -> None:
     chosen = gaussians_published()
     assert memory_needed_gib(chosen, frames=80, cameras=6) < 40
-    initial, scene, rates = chosen.initial, chosen.scene, chosen.schedule.rates
+    gaussians = chosen.representation
+    initial, scene, rates = gaussians.initial, gaussians.scene, gaussians.schedule.rates
     assert (scene.decoder.blocks, scene.decoder.width, scene.background) == ("residual", 32, "after_decoder")
     assert initial.random_features
     assert initial.random_rotations
@@ -236,10 +240,10 @@ def test_the_published_recipe_has_the_choices_of_the_reference() -> None:
     assert scene.frame_velocities
     assert (rates.frame_velocity.first, rates.frame_turn.first) == (1e-3, 2e-4)
     assert (rates.camera_twist.first, rates.camera_offset.first, rates.camera_late_s.first) == (0, 0, 2e-4)
-    weights = chosen.schedule.weights
+    weights = gaussians.schedule.weights
     assert (weights.frame_velocity, weights.frame_turn) == (1e-6, 1e-5)
     assert (scene.camera_near_m, scene.lidar_reach_m, scene.drop_from_alpha) == (0.5, 300.0, False)
-    assert chosen.schedule.lidar_losses == "published"
+    assert gaussians.schedule.lidar_losses == "published"
 
 
 def test_the_published_recipe_learns_on_few_gaussians(log: LogPath, tmp_path: Path) -> None:
@@ -249,17 +253,25 @@ def test_the_published_recipe_learns_on_few_gaussians(log: LogPath, tmp_path: Pa
         published,
         image_hw=small.image_hw,
         cameras=small.cameras,
-        initial=dataclasses.replace(
-            published.initial,
-            lidar_points=1100,
-            unseen_points=400,
-            random_far_points=200,
-            random_near_points=100,
-            features=2,
-            max_actor_points=100,
-        ),
-        schedule=dataclasses.replace(
-            published.schedule, steps=12, max_gaussians=2200, beam_stride=2, grow_from=2, grow_every=5
+        representation=dataclasses.replace(
+            published.representation,
+            initial=dataclasses.replace(
+                published.representation.initial,
+                lidar_points=1100,
+                unseen_points=400,
+                random_far_points=200,
+                random_near_points=100,
+                features=2,
+                max_actor_points=100,
+            ),
+            schedule=dataclasses.replace(
+                published.representation.schedule,
+                steps=12,
+                max_gaussians=2200,
+                beam_stride=2,
+                grow_from=2,
+                grow_every=5,
+            ),
         ),
     )
     data = read_reconstruction_data(chosen, log, tmp_path / "cache")
@@ -268,7 +280,7 @@ def test_the_published_recipe_learns_on_few_gaussians(log: LogPath, tmp_path: Pa
     assert before.frame_velocity is not None
     assert before.frame_velocity.shape == (frames, 3)
     assert before.reach_m == 300.0
-    static = before.graph.of_actor(STATIC).map_tensors(torch.Tensor.detach)
+    static = before.content.preview(STATIC).map_tensors(torch.Tensor.detach)
     assert float(static.feature[:, 3:].std()) == pytest.approx(1.0, abs=0.1)
     assert float(static.quaternion.abs().mean(0).std()) < 0.05
     assert int((static.mean_m.norm(dim=-1) > 50).sum()) >= 200
@@ -280,7 +292,7 @@ def test_the_published_recipe_learns_on_few_gaussians(log: LogPath, tmp_path: Pa
     assert not torch.equal(weights["frame_velocity"], before.frame_velocity)
     opened, camera = open_rebuilt(tmp_path / "run").scene, data.held_out.cameras[0]
     with torch.no_grad():
-        shown, again = (scene(scene.graph, camera).rgb for scene in (opened, found.scene))
+        shown, again = (scene.camera(scene.graph, camera).rgb for scene in (opened, found.scene))
     torch.testing.assert_close(shown, again)
 
 

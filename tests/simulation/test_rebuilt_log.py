@@ -12,7 +12,8 @@ from foredrive.errors import InputError
 from foredrive.geometry.se3 import matrix_from_yaw
 from foredrive.rendering.edits import Edit, ShiftEgo, apply_edits
 from foredrive.rendering.gaussians import Gaussians
-from foredrive.rendering.rebuilt import RebuiltScene
+from foredrive.rendering.gaussians.content import GaussianContent
+from foredrive.rendering.gaussians.scene import GaussianScene
 from foredrive.rendering.renderer import RebuiltRenderer
 from foredrive.rendering.scene_graph import SceneGraph
 from foredrive.rendering.tracks import ActorTracks
@@ -64,13 +65,13 @@ def scene_with(tracks: ActorTracks) -> SceneGraph:
     one = Gaussians(
         torch.zeros(1, 3), torch.tensor([[1.0, 0, 0, 0]]), torch.zeros(1, 3), torch.zeros(1), torch.ones(1, 5)
     )
-    return SceneGraph(one, torch.zeros(1, dtype=torch.int64), tracks)
+    return SceneGraph(tracks, GaussianContent(one, torch.zeros(1, dtype=torch.int64)))
 
 
 def begun(graph: SceneGraph, edits: tuple[Edit, ...] = (), start_s: float = 1.0) -> RebuiltSimulator:
     edited = apply_edits(graph, edits)
     drive = LoggedDrive(vehicle(), edited.T_ego_shifted)
-    renderer = RebuiltRenderer(RebuiltScene(graph, cameras=1), edited.graph, vehicle())
+    renderer = RebuiltRenderer(GaussianScene(graph, cameras=1), edited.graph, vehicle())
     simulator = RebuiltSimulator(renderer, edited.graph.tracks, drive)
     simulator.reset(RebuiltScenario(start_s, sensors=False))
     return simulator
@@ -166,7 +167,7 @@ def test_the_way_outside_of_lanes_is_counted() -> None:
     T = vehicle().T_world_scene.numpy()
     outline = (T[:3, :2] @ np.stack([x_m, y_m])).T[:, :2] + T[:2, 3]
     drive = LoggedDrive(vehicle(), torch.eye(4))
-    renderer = RebuiltRenderer(RebuiltScene(scene_with(FAR), cameras=1), scene_with(FAR), vehicle())
+    renderer = RebuiltRenderer(GaussianScene(scene_with(FAR), cameras=1), scene_with(FAR), vehicle())
     simulator = RebuiltSimulator(renderer, FAR, drive, LoggedLanes([outline]))
     simulator.reset(RebuiltScenario(1.0, sensors=False))
     score = driven(simulator, replay(simulator)).score

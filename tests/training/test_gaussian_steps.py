@@ -4,14 +4,15 @@ import pytest
 import torch
 
 from foredrive.rendering.gaussians import Gaussians
-from foredrive.rendering.rebuilt import RebuiltScene
+from foredrive.rendering.gaussians.content import GaussianContent
+from foredrive.rendering.gaussians.scene import GaussianScene
 from foredrive.rendering.scene_graph import STATIC, SceneGraph
 from foredrive.rendering.tracks import ActorTracks
 from foredrive.training.gaussian_steps import grow, relocate
 
 
 @pytest.fixture
-def scene() -> RebuiltScene:
+def scene() -> GaussianScene:
     """Two dead Gaussians of an actor, a live one of it, and a live static one."""
     tracks = ActorTracks(
         torch.tensor([7]),
@@ -28,10 +29,10 @@ def scene() -> RebuiltScene:
         opacity_logit=torch.tensor([0.001, 0.001, 1e-2, 0.75]).logit(),
         feature=torch.rand(4, 5),
     )
-    return RebuiltScene(SceneGraph(gaussians, torch.tensor([0, 0, 0, STATIC]), tracks), 1)
+    return GaussianScene(SceneGraph(tracks, GaussianContent(gaussians, torch.tensor([0, 0, 0, STATIC]))), 1)
 
 
-def optimizer_of(scene: RebuiltScene) -> torch.optim.Optimizer:
+def optimizer_of(scene: GaussianScene) -> torch.optim.Optimizer:
     """After one step of rate 0, so that it has momentum everywhere."""
     optimizer = torch.optim.Adam([scene.mean_m, scene.opacity_logit], 0.0)
     (scene.mean_m.sum() + scene.opacity_logit.sum()).backward()
@@ -39,7 +40,7 @@ def optimizer_of(scene: RebuiltScene) -> torch.optim.Optimizer:
     return optimizer
 
 
-def test_the_dead_join_the_living_as_parts_of_what_those_belong_to(scene: RebuiltScene) -> None:
+def test_the_dead_join_the_living_as_parts_of_what_those_belong_to(scene: GaussianScene) -> None:
     optimizer = optimizer_of(scene)
     assert relocate(scene, optimizer, torch.Generator().manual_seed(0)) == 2
     # both go to the opaque one, which then has the opacity 1 - (1 - 0.75)^(1/3), as they have
@@ -52,7 +53,7 @@ def test_the_dead_join_the_living_as_parts_of_what_those_belong_to(scene: Rebuil
     assert relocate(scene, optimizer, torch.Generator().manual_seed(0)) == 0
 
 
-def test_new_ones_share_what_the_chosen_showed(scene: RebuiltScene) -> None:
+def test_new_ones_share_what_the_chosen_showed(scene: GaussianScene) -> None:
     optimizer = optimizer_of(scene)
     assert grow(scene, optimizer, 5, 0.5, torch.Generator().manual_seed(0)) == 1  # not beyond 5
     assert scene.actor.tolist() == [0, 0, 0, STATIC, STATIC]

@@ -9,9 +9,10 @@ import synthetic_log as world
 from PIL import Image
 
 from foredrive.cli.main import main
-from foredrive.recipes import gaussians
-from foredrive.rendering.initial import InitialGaussians
-from foredrive.training.rebuilding import RebuildSchedule
+from foredrive.recipes import rebuilding
+from foredrive.recipes.gaussians import GaussianRecipe
+from foredrive.rendering.gaussians.initial import InitialGaussians
+from foredrive.training.gaussian_training import GaussianSchedule
 
 
 def test_the_verb_writes_a_picture_and_says_how_good_it_is(
@@ -21,12 +22,11 @@ def test_the_verb_writes_a_picture_and_says_how_good_it_is(
         lidar_points=1100, unseen_points=400, pixel_points=1000, near_points=0, actor_points=20, features=2
     )
     smallest = dataclasses.replace(
-        gaussians.gaussians_tiny(),
+        rebuilding.gaussians_tiny(),
         image_hw=(24, 48),
-        initial=size,
-        schedule=RebuildSchedule(steps=3, max_gaussians=3000, beam_stride=4),
+        representation=GaussianRecipe(size, GaussianSchedule(steps=3, max_gaussians=3000, beam_stride=4)),
     )
-    monkeypatch.setitem(gaussians.REBUILD_RECIPES, "smallest", smallest)
+    monkeypatch.setitem(rebuilding.REBUILD_RECIPES, "smallest", smallest)
     log = world.write(tmp_path, frames=4)
     out = tmp_path / "run"
     args = ["reconstruct", str(log), "--out", str(out), "--recipe", "smallest", "--cameras", "pcam_f0"]

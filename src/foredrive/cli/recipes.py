@@ -17,8 +17,8 @@ def recipes(
     """
     with importing():
         from foredrive.recipes.config import recipe_yaml
-        from foredrive.recipes.gaussians import REBUILD_RECIPES, find_rebuild_recipe
         from foredrive.recipes.known import RECIPES, find_recipe
+        from foredrive.recipes.rebuilding import REBUILD_RECIPES, find_rebuild_recipe
 
     if name is not None:
         recipe = find_rebuild_recipe(name) if name in REBUILD_RECIPES else find_recipe(name)

@@ -42,8 +42,8 @@ def reconstruct(
         cache: Folder for shrunk images; by default "cache" in the run's folder.
         lpips_weights: Evaluate LPIPS too, with this file of torchvision's AlexNet (.pth or .safetensors).
         fid_weights: Evaluate FID too, with this file of the Inception of 2015 that pytorch-fid publishes.
-        set: Entries of the recipe to replace, such as schedule.steps=2000; `foredrive recipes RECIPE` prints
-            all entries.
+        set: Entries of the recipe to replace, such as representation.schedule.steps=2000; `foredrive recipes
+            RECIPE` prints all entries.
     """
     check_image_size(image_size)
     check_out_folder(out)
@@ -51,7 +51,7 @@ def reconstruct(
 
     with importing():
         from foredrive.evaluation.perceptual import PerceptualMetrics, PerceptualWeights
-        from foredrive.recipes.gaussians import find_rebuild_recipe
+        from foredrive.recipes.rebuilding import find_rebuild_recipe
         from foredrive.runs.rebuild.reconstruct import reconstruct as rebuild_log
 
     chosen = find_rebuild_recipe(recipe, set)
@@ -72,7 +72,7 @@ def reconstruct(
         print(f"{found.name} is too short: no frame was held out, so the scene is not evaluated")
     print(f"rebuilt {found.name} by {method}: {out}")
     for name in (
-        *("gaussians", "minutes", "psnr_db", "nearest.psnr_db", "ssim", "lpips", "fid"),
+        *(*run.scene.sizes, "minutes", "psnr_db", "nearest.psnr_db", "ssim", "lpips", "fid"),
         *("depth_median_sq_m2", "intensity_rmse", "drop_accuracy", "chamfer_m2"),
     ):
         if run.summary.get(name) is not None:

@@ -49,7 +49,7 @@ class PerceptualMetrics:
         for view in views:
             assert view.image is not None
             real = view.image[None].cpu()
-            rendered = scene(scene.graph, view.to(scene.actor.device))
+            rendered = scene.camera(scene.graph, view.to(scene.device))
             if self.lpips is not None:
                 distances.append(float(self.lpips(rendered.rgb.clamp(0, 1)[None].cpu(), real.float() / 255)))
             if fid is not None:

@@ -46,7 +46,7 @@ def evaluate_cameras(
     graph, took_s, pixels = graph or scene.graph, 0.0, 0
     for number, view in enumerate(views):
         started = time.perf_counter()
-        rgb = scene(graph, view.to(scene.actor.device)).rgb.clamp(0, 1)[None].cpu()
+        rgb = scene.camera(graph, view.to(scene.device)).rgb.clamp(0, 1)[None].cpu()
         took_s += time.perf_counter() - started
         pixels += view.size_hw[0] * view.size_hw[1]
         real = _image(view)

@@ -1,48 +1,71 @@
-"""Recipes for rebuilding logs from Gaussians."""
+"""Scenes of Gaussians as a representation that recipes can name."""
 
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Literal
 
-from foredrive.errors import InputError
-from foredrive.recipes.config import is_recipe_file, overridden, read_values, validated
-from foredrive.recipes.known import nearest_name
-from foredrive.recipes.old_formats import upgraded_reconstruction
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
 from foredrive.rendering.decoders import CameraDecoderConfig
-from foredrive.rendering.initial import InitialGaussians
-from foredrive.rendering.scene_config import SceneConfig
-from foredrive.training.gaussian_rates import LearningRates, Rate
-from foredrive.training.rebuilding import RebuildSchedule
+from foredrive.rendering.gaussians.initial import InitialGaussians, initial_scene
+from foredrive.rendering.gaussians.scene import GaussianScene, saved_scene
+from foredrive.rendering.gaussians.scene_config import GaussianSceneConfig
+from foredrive.rendering.gaussians.unseen_ground import add_unseen_ground
+from foredrive.rendering.tracks import ActorTracks
+from foredrive.training.gaussian_rates import LearningRates
+from foredrive.training.gaussian_training import GaussianSchedule, GaussianTraining
+from foredrive.training.learning_rates import Rate
+from foredrive.training.rebuilding import SensorViews
+
+_COPIES = 14
+"""Copies of each number of a Gaussian: the value, its gradient, two moments, and the tensors that autograd
+keeps in a step.
+"""
+_OF_A_PIXEL = 600
+"""Floats that autograd keeps for each pixel: features, the decoder's hidden layers, SSIM."""
 
 
 @dataclass(frozen=True)
-class RebuildRecipe:
-    """All settings of a reconstruction, except where the log is."""
+class GaussianRecipe:
+    """A scene of Gaussians (Kerbl et al., 2023; Hess et al., "SplatAD", 2025): a `Representation`."""
 
-    name: str
-    image_hw: tuple[int, int]
     initial: InitialGaussians
-    schedule: RebuildSchedule
-    cameras: tuple[str, ...] | None = None
-    """Names of cameras, their own or 123D's; None takes all."""
-    hold_out_every: int = 2
-    """The last frame of every group of this size is held out for evaluation; 0 holds out none."""
-    actors: bool = True
-    """Give moving actors their own Gaussians. If False, everything is static."""
-    scene: SceneConfig = field(default_factory=SceneConfig)
-    drop: bool = True
-    """Beams may fail to return. If False, all return."""
-    about: str = field(default="", compare=False)
-    """One line for lists of recipes."""
+    schedule: GaussianSchedule
+    scene: GaussianSceneConfig = field(default_factory=GaussianSceneConfig)
+    kind: Literal["gaussians"] = "gaussians"
+
+    def begin(self, views: SensorViews, tracks: ActorTracks, cameras: int, reach_m: float) -> GaussianScene:
+        """Return the scene before training: Gaussians at lidar points and along pixels."""
+        generator = torch.Generator().manual_seed(self.schedule.seed)
+        graph = initial_scene(list(views.cameras), list(views.sweeps), tracks, self.initial, generator)
+        torch.manual_seed(self.schedule.seed)  # the decoders' weights
+        frames = len(views.cameras) + len(views.sweeps)
+        return GaussianScene(graph, cameras, self.scene, reach_m, frames)
+
+    def open(self, weights: Path, reach_m: float) -> GaussianScene:
+        """Return a scene of the sizes of saved weights, which are to be loaded into it."""
+        return saved_scene(weights, self.scene, reach_m)
+
+    def training(self, scene: GaussianScene, views: SensorViews) -> GaussianTraining:
+        """Return the training of a scene on views."""
+        return GaussianTraining(scene, views, self.schedule)
+
+    def complete(self, scene: GaussianScene, T_scene_ego: Float[Tensor, "K 4 4"], views: SensorViews) -> None:
+        """Add ground that no sensor saw to a trained scene."""
+        add_unseen_ground(scene, T_scene_ego, views.cameras)
+
+    def learning_gib(self, pixels: int) -> float:
+        """Estimate the memory that training takes besides its data, GiB, with images of so many pixels."""
+        of_one = 3 + 4 + 3 + 1 + 3 + self.initial.features
+        return 4 * (self.schedule.max_gaussians * of_one * _COPIES + pixels * _OF_A_PIXEL) / 1024**3
 
 
-def gaussians_tiny() -> RebuildRecipe:
-    """Return a recipe for some minutes on two cores, with images of 480×270."""
+def tiny_gaussians() -> GaussianRecipe:
+    """Return Gaussians for some minutes on two cores, with images of 480×270."""
     steps = 500
-    return RebuildRecipe(
-        name="gaussians_tiny",
-        about="a log rebuilt from Gaussians in minutes on two CPU cores",
-        image_hw=(270, 480),
+    return GaussianRecipe(
         initial=InitialGaussians(
             lidar_points=45_000,
             unseen_points=30_000,
@@ -52,7 +75,7 @@ def gaussians_tiny() -> RebuildRecipe:
             max_actor_points=1000,
             features=8,
         ),
-        schedule=RebuildSchedule(
+        schedule=GaussianSchedule(
             steps=steps,
             max_gaussians=275_000,
             rates=LearningRates(
@@ -66,16 +89,13 @@ def gaussians_tiny() -> RebuildRecipe:
             grow_every=50,
             checkpoint_every=100,
         ),
-        scene=SceneConfig(CameraDecoderConfig(width=12)),
+        scene=GaussianSceneConfig(CameraDecoderConfig(width=12)),
     )
 
 
-def gaussians_base() -> RebuildRecipe:
-    """Return our version of SplatAD in its sizes, for a GPU. `gaussians_published` is nearer to it."""
-    return RebuildRecipe(
-        name="gaussians_base",
-        about="our version of SplatAD in its sizes, for a GPU",
-        image_hw=(1080, 1920),
+def base_gaussians() -> GaussianRecipe:
+    """Return our version of SplatAD in its sizes."""
+    return GaussianRecipe(
         initial=InitialGaussians(
             lidar_points=1_500_000,
             unseen_points=500_000,
@@ -86,21 +106,15 @@ def gaussians_base() -> RebuildRecipe:
             features=13,
             scale=0.2,
         ),
-        schedule=RebuildSchedule(
+        schedule=GaussianSchedule(
             steps=30_000, max_gaussians=5_000_000, shrink_steps=(3_000, 6_000), checkpoint_every=1_000
         ),
     )
 
 
-def gaussians_published() -> RebuildRecipe:
-    """Return SplatAD with the choices of its reference implementation, for a GPU.
-
-    docs/architecture.md lists what still differs.
-    """
-    return RebuildRecipe(
-        name="gaussians_published",
-        about="SplatAD with the choices of its reference implementation, for a GPU",
-        image_hw=(1080, 1920),
+def published_gaussians() -> GaussianRecipe:
+    """Return SplatAD with the choices of its reference implementation."""
+    return GaussianRecipe(
         initial=InitialGaussians(
             lidar_points=1_500_000,
             unseen_points=500_000,
@@ -116,7 +130,7 @@ def gaussians_published() -> RebuildRecipe:
             random_features=True,
             random_rotations=True,
         ),
-        schedule=RebuildSchedule(
+        schedule=GaussianSchedule(
             steps=30_000,
             max_gaussians=5_000_000,
             shrink_steps=(3_000, 6_000),
@@ -137,7 +151,7 @@ def gaussians_published() -> RebuildRecipe:
                 frame_turn=Rate(2e-4, final=5e-4, warmup_steps=1_000),
             ),
         ),
-        scene=SceneConfig(
+        scene=GaussianSceneConfig(
             decoder=CameraDecoderConfig(blocks="residual"),
             background="after_decoder",
             drop_from_alpha=False,
@@ -146,25 +160,3 @@ def gaussians_published() -> RebuildRecipe:
             frame_velocities=True,
         ),
     )
-
-
-REBUILD_RECIPES: dict[str, RebuildRecipe] = {
-    recipe.name: recipe for recipe in (gaussians_tiny(), gaussians_base(), gaussians_published())
-}
-
-
-def load_rebuild_recipe(path: Path) -> RebuildRecipe:
-    """Read a recipe from YAML, in today's format or an earlier one. Raises the errors of `load_recipe`."""
-    recipe: RebuildRecipe = validated(RebuildRecipe, upgraded_reconstruction(read_values(path)), str(path))
-    return recipe
-
-
-def find_rebuild_recipe(name: str, settings: Sequence[str] = ()) -> RebuildRecipe:
-    """Return a recipe by its name or from a YAML file. Arguments and errors are those of `find_recipe`."""
-    if is_recipe_file(name):
-        recipe = load_rebuild_recipe(Path(name))
-    elif name in REBUILD_RECIPES:
-        recipe = REBUILD_RECIPES[name]
-    else:
-        raise InputError(f"no recipe {name!r} to rebuild logs{nearest_name(name, REBUILD_RECIPES)}")
-    return validated(RebuildRecipe, overridden(asdict(recipe), settings), name) if settings else recipe

@@ -34,11 +34,20 @@ def upgraded_reconstruction(written: Any) -> Any:
     rates = schedule.get("rates") if isinstance(schedule, Mapping) else None
     if isinstance(schedule, Mapping) and isinstance(rates, Mapping):
         written = {**written, "schedule": {**schedule, "rates": _with_own_finals(rates)}}
-    if not isinstance(written, Mapping) or not written.keys() & {"decoder_width", "rolling"}:
+    if isinstance(written, Mapping) and written.keys() & {"decoder_width", "rolling"}:
+        decoder = {"width": written.get("decoder_width", 32)}
+        kept = {key: value for key, value in written.items() if key not in ("decoder_width", "rolling")}
+        written = {**kept, "scene": {"decoder": decoder, "rolling": written.get("rolling", True)}}
+    return _with_representation(written)
+
+
+def _with_representation(written: Any) -> Any:
+    """Convert a recipe from when the only representation was Gaussians, whose parts stood beside the rest."""
+    parts = ("initial", "schedule", "scene")
+    if not isinstance(written, Mapping) or "representation" in written or "schedule" not in written:
         return written
-    scene = {"decoder": {"width": written.get("decoder_width", 32)}, "rolling": written.get("rolling", True)}
-    kept = {key: value for key, value in written.items() if key not in ("decoder_width", "rolling")}
-    return {**kept, "scene": scene}
+    gaussians = {key: written[key] for key in parts if key in written} | {"kind": "gaussians"}
+    return {key: value for key, value in written.items() if key not in parts} | {"representation": gaussians}
 
 
 def _with_own_finals(rates: Mapping[str, Any]) -> dict[str, Any]:

@@ -16,7 +16,7 @@ from torch import Tensor
 from foredrive.errors import InputError
 from foredrive.files import atomic_path
 from foredrive.geometry.se3 import inverse_se3, matrix_from_yaw
-from foredrive.rendering.scene_graph import SceneGraph, joined
+from foredrive.rendering.scene_graph import SceneGraph
 from foredrive.rendering.tracks import ActorTracks
 
 Offset = tuple[float, float, float]
@@ -203,14 +203,11 @@ def _moved(tracks: ActorTracks, row: int, offset_m: Offset, yaw_rad: float) -> A
 
 
 def _without(graph: SceneGraph, row: int) -> SceneGraph:
-    kept = graph.actor != row
-    actor = graph.actor[kept]
     tracks, others = graph.tracks, torch.arange(len(graph.tracks)) != row
     names = ("track_id", "category", "size_lwh", "T_scene_actor", "present")
     return SceneGraph(
-        gaussians=graph.gaussians[kept],
-        actor=actor - (actor > row).to(actor),
         tracks=dataclasses.replace(tracks, **{name: getattr(tracks, name)[others] for name in names}),
+        content=graph.content.without(row),
     )
 
 
@@ -227,21 +224,17 @@ def _with_copy(
     row, way = source.tracks.index_of(actor), graph.tracks.index_of(follows)
     if copy in graph.tracks.track_id.tolist():
         raise InputError(f"there is an actor {copy} already: a copy needs an id of its own")
-    own = source.of_actor(row).to(graph.actor.device)
-    if own.feature.shape[1] != graph.gaussians.feature.shape[1]:
-        raise InputError(
-            f"actor {actor} has {own.feature.shape[1]} features, this scene's have another number"
-        )
     tracks = graph.tracks
+    try:
+        content = graph.content.with_copy(source.content, row, len(tracks))
+    except InputError as error:
+        raise InputError(f"actor {actor} cannot be copied here: {error}") from error
     lift_m = 0.5 * float(source.tracks.size_lwh[row, 2] - tracks.size_lwh[way, 2])
     forward_m, left_m, up_m = offset_m
     pose = tracks.T_scene_actor[way] @ _offset((forward_m, left_m, up_m + lift_m), yaw_rad).to(
         tracks.size_lwh
     )
-    added = torch.full((len(own.opacity_logit),), len(tracks)).to(graph.actor)
     return SceneGraph(
-        gaussians=joined([graph.gaussians, own]),
-        actor=torch.cat([graph.actor, added]),
         tracks=ActorTracks(
             track_id=torch.cat([tracks.track_id, tracks.track_id.new_tensor([copy])]),
             category=torch.cat([tracks.category, source.tracks.category[row : row + 1]]),
@@ -250,6 +243,7 @@ def _with_copy(
             T_scene_actor=torch.cat([tracks.T_scene_actor, pose[None]]),
             present=torch.cat([tracks.present, tracks.present[way : way + 1]]),
         ),
+        content=content,
     )
 
 

@@ -1,12 +1,10 @@
-"""Images and sweeps that a scene renders, and the beams that it renders them for."""
+"""Images and sweeps that a scene renders."""
 
 from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
-
-from foredrive.ops.splat_points import TiledPoints
 
 
 @dataclass(frozen=True)
@@ -54,19 +52,3 @@ class RenderedSweep:
     def returned(self) -> Bool[Tensor, "P"]:
         """Return which beams are more likely to return than not."""
         return self.drop_logit <= 0
-
-
-@dataclass(frozen=True)
-class PreparedSweep:
-    """The beams of a sweep in the form needed for compositing: prepared once, used in every step."""
-
-    tiles: TiledPoints
-    """Times are relative to the middle of the sweep."""
-    scan_s: Float[Tensor, "S"] | None
-    """Result of `scan_times`. None: all beams are simultaneous."""
-    dir_scene: Float[Tensor, "P 3"]
-    T_scene_lidar: Float[Tensor, "4 4"]
-    """Pose at the middle of the sweep."""
-    twist_lidar: Float[Tensor, "6"]
-    middle_s: float
-    """Middle of the firing times, relative to the time of the sweep."""

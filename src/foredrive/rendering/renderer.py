@@ -37,10 +37,11 @@ class RebuiltRenderer:
         """Render the cameras exposed at a time of the log and the lidar revolution that ends then."""
         T_scene_ego = (inverse_se3(self.vehicle.T_world_scene) @ T_world_ego).float()
         ego = EgoState(T_scene_ego, twist_ego, t_s)
-        device, rig = self.scene.actor.device, self.rig
+        device, rig = self.scene.device, self.rig
         images = torch.zeros(len(rig.names), 3, *rig.size_hw, dtype=torch.uint8)
         for camera in range(len(rig.names)):
-            images[camera] = self.scene(self.graph, novel_camera_view(rig, camera, ego).to(device)).rgb_8bit
+            view = novel_camera_view(rig, camera, ego).to(device)
+            images[camera] = self.scene.camera(self.graph, view).rgb_8bit
         lidar = self.vehicle.lidar
         return Rendered(images, None if lidar is None else render_sweep(self.scene, self.graph, lidar, ego))
 

@@ -1,102 +1,58 @@
-"""A scene graph: a static part and moving actors, each with its own Gaussians, composed for one time."""
+"""A scene graph: the tracks of actors, and what the static part and each actor look like.
 
-import dataclasses
+What they look like is the matter of a representation: `rendering.gaussians` keeps Gaussians. Everything else
+(edits, threats, films, drives, evaluation) knows `Content` alone.
+"""
+
 from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
 
 import torch
-from jaxtyping import Bool, Float, Int
-from torch import Tensor
 
-from foredrive.geometry.quaternions import multiply_quaternions, quaternion_from_matrix
-from foredrive.rendering.gaussians import Gaussians
-from foredrive.rendering.tracks import ActorTracks, states_at
+from foredrive.rendering.gaussians.gaussians import Gaussians
+from foredrive.rendering.tracks import ActorTracks
 from foredrive.scene.record import Record
 
 STATIC = -1
 """Row number of the static part, which belongs to no actor."""
-_MIRROR_XYZ = (1.0, -1.0, 1.0)
-_MIRROR_WXYZ = (1.0, -1.0, 1.0, -1.0)
-"""Mirroring y turns a rotation by θ about the axis a into one by θ about (-aₓ, a_y, -a_z)."""
+
+
+@runtime_checkable
+class Content(Protocol):
+    """The static part and A actors in the frames of their boxes, in the order of the rows of the tracks.
+
+    An implementation is a `Record`. No method changes it, or learned weights.
+    """
+
+    @property
+    def device(self) -> torch.device:
+        """Return the device of its tensors."""
+        ...
+
+    def without(self, row: int) -> "Content":
+        """Return the content without an actor. The rows behind it move up."""
+        ...
+
+    def with_copy(self, source: "Content", source_row: int, row: int) -> "Content":
+        """Return the content with one more actor in `row`, the next, which looks like one of `source`.
+
+        Raises:
+            InputError: `source` is of another representation, or of other sizes.
+        """
+        ...
+
+    def evidence(self, row: int) -> int:
+        """Return how much an actor was observed, to compare the actors of one scene."""
+        ...
+
+    def preview(self, row: int) -> Gaussians:
+        """Return an actor, or the static part for `STATIC`, as Gaussians for viewers, in its albedo."""
+        ...
 
 
 @dataclass(frozen=True)
 class SceneGraph(Record):
-    """N Gaussians of a static part and of A actors."""
+    """A static part and A actors."""
 
-    gaussians: Gaussians
-    """Static Gaussians are in the scene's frame, those of actors in the frame of their boxes."""
-    actor: Int[Tensor, "N"]
-    """Row in `tracks`, or `STATIC`."""
     tracks: ActorTracks
-
-    def of_actor(self, row: int) -> Gaussians:
-        """Return the Gaussians of an actor in its frame, or the static ones for `STATIC`."""
-        return self.gaussians[self.actor == row]
-
-
-@dataclass(frozen=True)
-class PlacedGaussians(Record):
-    """M of a scene's Gaussians, placed for one time."""
-
-    gaussians: Gaussians
-    """Gaussians in the scene's frame."""
-    velocity_mps: Float[Tensor, "M 3"]
-    """Velocities of the centres, in the scene's axes."""
-    source: Int[Tensor, "M"]
-    """Index of each one in the scene's Gaussians."""
-
-
-def place_gaussians(
-    graph: SceneGraph, t_s: float | Tensor, mirror: Bool[Tensor, "A"] | None = None
-) -> PlacedGaussians:
-    """Place the static part and every present actor at a time, with poses and velocities.
-
-    Args:
-        graph: the scene.
-        t_s: seconds since the start of the drive.
-        mirror: actors whose left and right sides are swapped; None: none.
-    """
-    states = states_at(graph.tracks, t_s)
-    shown = torch.cat([states.present, states.present.new_ones(1)])[graph.actor]  # STATIC, -1: last entry
-    moving = (shown & (graph.actor >= 0)).nonzero()[:, 0]
-    still = (graph.actor < 0).nonzero()[:, 0]
-    standing = graph.gaussians[still]
-    if len(moving) == 0:
-        return PlacedGaussians(standing, torch.zeros_like(standing.mean_m), still)
-    owner = graph.actor[moving]
-    own = graph.gaussians[moving]
-    if mirror is not None:
-        own = _mirrored(own, mirror[owner])
-    T = states.T_scene_actor
-    R = T[:, :3, :3]
-    arm = (R[owner] @ own.mean_m[..., None])[..., 0]
-    moved = dataclasses.replace(
-        own,
-        mean_m=T[owner, :3, 3] + arm,
-        quaternion=multiply_quaternions(quaternion_from_matrix(R)[owner], own.quaternion),
-    )
-    velocity = states.velocity_mps[owner] + torch.linalg.cross(states.turn_radps[owner], arm)
-    return PlacedGaussians(
-        gaussians=joined([standing, moved]),
-        velocity_mps=torch.cat([torch.zeros_like(standing.mean_m), velocity]),
-        source=torch.cat([still, moving]),
-    )
-
-
-def joined(parts: list[Gaussians]) -> Gaussians:
-    """Concatenate sets of Gaussians."""
-    names = [field.name for field in dataclasses.fields(Gaussians)]
-    return Gaussians(*(torch.cat([getattr(part, name) for part in parts]) for name in names))
-
-
-def mirrored(gaussians: Gaussians) -> Gaussians:
-    """Swap left and right: y to -y, in the frame of the box."""
-    return _mirrored(gaussians, torch.ones_like(gaussians.opacity_logit, dtype=torch.bool))
-
-
-def _mirrored(gaussians: Gaussians, which: Bool[Tensor, "M"]) -> Gaussians:
-    xyz = torch.where(which[:, None], gaussians.mean_m.new_tensor(_MIRROR_XYZ), 1.0)
-    wxyz = torch.where(which[:, None], gaussians.mean_m.new_tensor(_MIRROR_WXYZ), 1.0)
-    return dataclasses.replace(
-        gaussians, mean_m=gaussians.mean_m * xyz, quaternion=gaussians.quaternion * wxyz
-    )
+    content: Content

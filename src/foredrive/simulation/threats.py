@@ -51,7 +51,7 @@ def send_threat(threat: Threat, graph: SceneGraph, drive: LoggedDrive, start_s: 
         raise InputError(f"the log ends at {drive.end_s:.1f} s, too early for an impact at {at_s:.1f} s")
     if drive.state_at(at_s).speed_mps < MIN_MPS:
         raise InputError(f"the vehicle of the log hardly moves at {at_s:.1f} s, so no impact would follow")
-    row, tracks = _car_with_most_points(graph), graph.tracks
+    row, tracks = _most_observed_car(graph), graph.tracks
     length_m, _, height_m = tracks.size_lwh[row].tolist()
     bumper_m = EGO.axle_to_centre_m + 0.5 * EGO.length_m
     heading_rad, ahead_m = {
@@ -92,12 +92,12 @@ def threat_score(impact_mps: float | None, reference: float) -> float:
     return BEST if impact_mps is None else AFTER_COLLISION * max(0.0, 1.0 - impact_mps / reference)
 
 
-def _car_with_most_points(graph: SceneGraph) -> int:
-    """Return the row of the car with the most Gaussians."""
+def _most_observed_car(graph: SceneGraph) -> int:
+    """Return the row of the car that was observed most."""
     rows = (graph.tracks.category == Category.CAR).nonzero()[:, 0].tolist()
     if not rows:
         raise InputError("the scene has no car that could serve as the threat")
-    return max(rows, key=lambda row: int((graph.actor == row).sum()))
+    return max(rows, key=graph.content.evidence)
 
 
 def _offset(xyz: np.ndarray) -> Offset:

@@ -5,12 +5,12 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 from torch.optim import Optimizer
 
-from foredrive.rendering.rebuilt import GAUSSIAN_PARAMETERS, RebuiltScene
-from foredrive.rendering.relocation import MAX_COPIES, MIN_OPACITY, split_evenly
+from foredrive.rendering.gaussians.relocation import MAX_COPIES, MIN_OPACITY, split_evenly
+from foredrive.rendering.gaussians.scene import GAUSSIAN_PARAMETERS, GaussianScene
 
 
 @torch.no_grad()
-def relocate(scene: RebuiltScene, optimizer: Optimizer, generator: torch.Generator) -> int:
+def relocate(scene: GaussianScene, optimizer: Optimizer, generator: torch.Generator) -> int:
     """Move every dead Gaussian to a live one, drawn by opacity. Return how many were moved.
 
     Both then render together as the live one did, and start without momentum.
@@ -32,7 +32,7 @@ def relocate(scene: RebuiltScene, optimizer: Optimizer, generator: torch.Generat
 
 @torch.no_grad()
 def grow(
-    scene: RebuiltScene, optimizer: Optimizer, most: int, share: float, generator: torch.Generator
+    scene: GaussianScene, optimizer: Optimizer, most: int, share: float, generator: torch.Generator
 ) -> int:
     """Add a share of new Gaussians, up to `most` in total. Return how many were added.
 
@@ -60,7 +60,7 @@ def _drawn(weight: Float[Tensor, "N"], count: int, generator: torch.Generator) -
     return torch.searchsorted(total, at).clamp_max(len(total) - 1).to(weight.device)
 
 
-def _share(scene: RebuiltScene, chosen: Int[Tensor, "count"]) -> None:
+def _share(scene: GaussianScene, chosen: Int[Tensor, "count"]) -> None:
     """Lower opacity and scale of the chosen Gaussians, so that with their copies they render as before."""
     rows, copies = chosen.unique(return_counts=True)
     opacity, scale = split_evenly(scene.opacity_logit[rows].sigmoid(), (copies + 1).clamp_max(MAX_COPIES))

@@ -60,11 +60,13 @@ class RebuiltNodes:
         on_click: Callable[[int], None],
     ) -> None:
         self._scene, self._on_click = scene, on_click
-        self.share = min(1.0, MAX_SPLATS / max(len(graph.actor), 1))
-        """Share of all Gaussians that is drawn."""
+        static = graph.content.preview(STATIC)
+        actors = [graph.content.preview(row) for row in range(len(graph.tracks))]
+        self.share = min(1.0, MAX_SPLATS / max(sum(len(own.mean_m) for own in (static, *actors)), 1))
+        """Share of all splats that is drawn."""
         self.layers = {"splats": True, "boxes": True, "ids": True}
         self._root = scene.add_frame(ROOT, show_axes=False)
-        static = thin_out(graph.of_actor(STATIC), self.share, path_m[:: -(-len(path_m) // PATH_POINTS)])
+        static = thin_out(static, self.share, path_m[:: -(-len(path_m) // PATH_POINTS)])
         self._static = show_splats(scene, f"{ROOT}/static", static) if len(static.mean_m) else None
         self._actors: dict[int, _ActorNode] = {}
         self._chosen: int | None = None
@@ -77,7 +79,7 @@ class RebuiltNodes:
             self._actors.pop(gone).frame.remove()
         states = states_at(graph.tracks, t_s)
         for row, track_id in enumerate(ids):
-            there, own = bool(states.present[row]), graph.of_actor(row)
+            there, own = bool(states.present[row]), graph.content.preview(row)
             node = self._actors.get(track_id)
             if node is not None and not torch.equal(node.own.mean_m, own.mean_m):  # another actor, same id
                 self._actors.pop(track_id).frame.remove()

@@ -111,6 +111,6 @@ class RebuiltPictures:
         ego = self._run.vehicle.at(shown.t_s).shifted(shown.edited.T_ego_shifted.cpu())
         scene = self._run.scene
         with torch.no_grad():
-            view = novel_camera_view(rig, 0, ego, sensor=0).to(scene.actor.device)
-            rgb = to_image(scene(shown.edited.graph, view).rgb)
+            view = novel_camera_view(rig, 0, ego, sensor=0).to(scene.device)
+            rgb = to_image(scene.camera(shown.edited.graph, view).rgb)
         client.scene.set_background_image(rgb, format="jpeg", jpeg_quality=90)

@@ -44,7 +44,7 @@ def write_rebuilt_sheet(
     figure.suptitle(title)
     for row, view in zip(axes, chosen, strict=True):
         assert view.image is not None
-        picture = scene(graph or scene.graph, view.to(scene.actor.device))
+        picture = scene.camera(graph or scene.graph, view.to(scene.device))
         real, rgb = view.image.float() / 255, picture.rgb.clamp(0, 1).cpu()
         known = torch.ones(1, *view.size_hw, dtype=torch.bool)
         quality = float(psnr_db(rgb[None], real[None], known))

@@ -52,7 +52,7 @@ class RebuiltViewer(Page):
         self.jobs = JobRunner(self.tell)
         show_ego(self.server.scene)
         graph = run.scene.graph.map_tensors(lambda tensor: tensor.detach())
-        path_m = run.vehicle.T_scene_ego[:, :3, 3].to(graph.actor.device)
+        path_m = run.vehicle.T_scene_ego[:, :3, 3].to(graph.content.device)
         self.nodes = RebuiltNodes(
             self.server.scene, graph, path_m, lambda track_id: self.edits.choose(track_id)
         )
@@ -120,9 +120,9 @@ class RebuiltViewer(Page):
             box.on_update(lambda _: self._show_layers())
 
     def _count(self) -> str:
-        count, share = len(self.run.scene.actor), self.nodes.share
+        share = self.nodes.share
         drawn = "" if share == 1 else f"; the browser draws {share:.0%} of them, those that cover most"
-        return f"{count:,} Gaussians, {len(self.run.scene.track_id)} actors{drawn}"
+        return f"{self.run.scene.described}, {len(self.run.scene.track_id)} actors{drawn}"
 
     def _show_layers(self) -> None:
         for name in self.nodes.layers:

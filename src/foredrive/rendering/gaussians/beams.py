@@ -1,17 +1,67 @@
-"""Lidar beams as angles and firing times."""
+"""Lidar beams as angles and firing times, in the form that compositing needs."""
 
+import dataclasses
 import math
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from foredrive.geometry.se3 import exp_se3, rotate_vectors
+from foredrive.geometry.se3 import exp_se3, rotate_vectors, sensor_twist
 from foredrive.ops.splat_points import TiledPoints, beam_points
+from foredrive.rendering.views import SweepView
 from foredrive.sensors import TimedRays
 
 SECTORS = 720
 """Number of sectors of azimuth in `scan_times`: half a degree each, 0.14 ms of a spinning lidar."""
+
+
+@dataclass(frozen=True)
+class PreparedSweep:
+    """The beams of a sweep in the form that compositing needs: prepared once, used in every step."""
+
+    tiles: TiledPoints
+    """Times are relative to the middle of the sweep."""
+    scan_s: Float[Tensor, "S"] | None
+    """Result of `scan_times`. None: all beams are simultaneous."""
+    dir_scene: Float[Tensor, "P 3"]
+    T_scene_lidar: Float[Tensor, "4 4"]
+    """Pose at the middle of the sweep."""
+    twist_lidar: Float[Tensor, "6"]
+    middle_s: float
+    """Middle of the firing times, relative to the time of the sweep."""
+
+
+def prepared_sweep(view: SweepView, rolling: bool = True) -> PreparedSweep:
+    """Return the beams of a sweep in the lidar's frame: axes of the vehicle, origin at the lidar.
+
+    Time 0 of the beams is the middle of the sweep. The motion of each Gaussian is right at the time at which
+    its azimuth is scanned.
+
+    Args:
+        view: the sweep; its ranges are not read.
+        rolling: beams have their own times. If False, all are simultaneous.
+    """
+    beams = view.beams
+    rays = TimedRays(beams.origin_ego, beams.dir_ego, beams.dt_s)
+    T_ego_lidar = torch.eye(4).to(beams.origin_ego)
+    if len(beams.dt_s):
+        T_ego_lidar[:3, 3] = beams.origin_ego[beams.dt_s.abs().argmin()]
+    twist, middle_s = view.twist_ego, 0.0
+    if not rolling:
+        twist, rays = torch.zeros_like(twist), dataclasses.replace(rays, dt_s=torch.zeros_like(rays.dt_s))
+    elif len(rays.dt_s):
+        middle_s = float(rays.dt_s.min() + rays.dt_s.max()) / 2
+    tiles = tiled_lidar_beams(rays, T_ego_lidar, twist, middle_s)
+    return PreparedSweep(
+        tiles=tiles,
+        scan_s=scan_times(tiles) if bool(tiles.time_s.any()) else None,
+        dir_scene=rotate_vectors(view.T_scene_ego, beams.dir_ego),
+        T_scene_lidar=view.T_scene_ego @ exp_se3(middle_s * twist) @ T_ego_lidar,
+        twist_lidar=sensor_twist(T_ego_lidar, view.twist_ego),
+        middle_s=middle_s,
+    )
 
 
 def tiled_lidar_beams(

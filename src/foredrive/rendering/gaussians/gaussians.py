@@ -1,5 +1,6 @@
 """The 3-D Gaussians of a scene."""
 
+import dataclasses
 from dataclasses import dataclass
 
 import torch
@@ -38,3 +39,9 @@ class Gaussians(Record):
             *(xz - wy, yz + wx, 1 - xx - yy),
         ]
         return torch.stack(rotation).unflatten(0, (3, 3)) * self.log_scale.exp().T.contiguous()
+
+
+def joined(parts: list[Gaussians]) -> Gaussians:
+    """Concatenate sets of Gaussians."""
+    names = [field.name for field in dataclasses.fields(Gaussians)]
+    return Gaussians(*(torch.cat([getattr(part, name) for part in parts]) for name in names))

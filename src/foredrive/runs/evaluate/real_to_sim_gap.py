@@ -114,7 +114,7 @@ def rendered_images(
             view = min((v for v in views if v.sensor == camera), key=lambda v: abs(v.t_s - at_s))
             if abs(view.t_s - at_s) > _SAME_S:
                 raise InputError(f"no view of {clip.rig.names[place]} at {at_s:.3f} s of the log")
-            images[frame, place] = scene(graph, view.to(scene.actor.device)).rgb_8bit
+            images[frame, place] = scene.camera(graph, view.to(scene.device)).rgb_8bit
     return dataclasses.replace(clip, images=images)
 
 

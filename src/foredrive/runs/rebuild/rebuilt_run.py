@@ -4,18 +4,13 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-
-from safetensors import SafetensorError
-from safetensors.torch import load_file
+from typing import Any
 
 from foredrive.data import LogPath
 from foredrive.errors import InputError
-from foredrive.recipes.gaussians import RebuildRecipe, load_rebuild_recipe
+from foredrive.recipes.rebuilding import RebuildRecipe, load_rebuild_recipe
 from foredrive.rendering.edits import Edit, EditedScene, apply_edits
-from foredrive.rendering.gaussians import Gaussians
 from foredrive.rendering.rebuilt import RebuiltScene
-from foredrive.rendering.scene_graph import SceneGraph
-from foredrive.rendering.tracks import ActorTracks
 from foredrive.rendering.vehicle import LoggedVehicle, load_vehicle
 from foredrive.runs.folder import CONFIG, LOG, WEIGHTS
 from foredrive.runs.rebuild.reconstruct import VEHICLE
@@ -45,11 +40,7 @@ def open_rebuilt(folder: Path) -> OpenedReconstruction:
     if not (folder / VEHICLE).is_file():
         raise InputError(f"{folder}: made by an earlier version (no {VEHICLE}); reconstruct the log again")
     vehicle = load_vehicle(folder / VEHICLE)
-    try:
-        graph, cameras, frames = _read_graph(folder / WEIGHTS)
-    except (OSError, SafetensorError, KeyError) as error:
-        raise InputError(f"{folder / WEIGHTS}: not the weights of a scene: {error}") from error
-    scene = RebuiltScene(graph, cameras, recipe.scene, vehicle.reach_m, frames)
+    scene = recipe.representation.open(folder / WEIGHTS, vehicle.reach_m)
     load_weights(scene, folder / WEIGHTS)
     return OpenedReconstruction(folder, scene, vehicle)
 
@@ -59,30 +50,7 @@ def edited_scene(scene: RebuiltScene, edits: list[Edit]) -> EditedScene:
     return apply_edits(scene.graph, edits, lambda run: open_rebuilt(Path(run)).scene.graph)
 
 
-def _read_graph(weights: Path) -> tuple[SceneGraph, int, int]:
-    """Return a graph of the saved sizes, and the numbers of cameras and of frames with velocities."""
-    saved = load_file(weights)
-    features = saved["albedo"].shape[1] + saved["feature"].shape[1]
-    gaussians = Gaussians(
-        saved["mean_m"],
-        saved["quaternion"],
-        saved["log_scale"],
-        saved["opacity_logit"],
-        saved["albedo"].new_zeros(len(saved["albedo"]), features),
-    )
-    tracks = ActorTracks(
-        saved["track_id"],
-        saved["category"],
-        saved["size_lwh"],
-        saved["key_t_s"],
-        saved["T_scene_actor"],
-        saved["present"],
-    )
-    frames = len(saved.get("frame_velocity", ()))
-    return SceneGraph(gaussians, saved["actor"], tracks), len(saved["camera_late_s"]), frames
-
-
-def open_run_log(folder: Path) -> tuple[RebuildRecipe, LogPath]:
+def open_run_log(folder: Path) -> tuple[RebuildRecipe[Any], LogPath]:
     """Return the recipe of a reconstruction and the path of its log.
 
     Raises:

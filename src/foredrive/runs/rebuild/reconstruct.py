@@ -7,6 +7,7 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -21,13 +22,12 @@ from foredrive.evaluation.rendering import evaluate_cameras, evaluate_sweeps
 from foredrive.evaluation.summary import read_summary, write_summary
 from foredrive.files import atomic_path
 from foredrive.recipes.config import save_recipe
-from foredrive.recipes.gaussians import RebuildRecipe, load_rebuild_recipe
-from foredrive.rendering.initial import initial_scene
+from foredrive.recipes.rebuilding import RebuildRecipe, load_rebuild_recipe
+from foredrive.recipes.representation import Representation
 from foredrive.rendering.ply import write_ply
 from foredrive.rendering.rebuilt import RebuiltScene
 from foredrive.rendering.scene_graph import STATIC
 from foredrive.rendering.tracks import ActorTracks, read_tracks
-from foredrive.rendering.unseen_ground import add_unseen_ground
 from foredrive.rendering.vehicle import LoggedVehicle, read_vehicle, save_vehicle
 from foredrive.rendering.views import CameraView, SweepView, camera_views, sweep_views
 from foredrive.runs.folder import CONFIG, LOG, SUMMARY, WEIGHTS, RunFolder
@@ -40,16 +40,10 @@ from foredrive.training.rebuilding import SensorViews, rebuild
 
 VEHICLE = "vehicle.json"
 """File of the vehicle's path and sensors, which are needed to render a scene without its log."""
-GAUSSIANS = "static.ply"
-"""File of the static Gaussians, for viewers of 3-D Gaussians."""
+STATIC_PART = "static.ply"
+"""File of the static part, for viewers of splats."""
 _log = logging.getLogger(__name__)
 
-_COPIES = 14
-"""Copies of each number of a Gaussian: the value, its gradient, two moments, and the tensors that autograd
-keeps in a step.
-"""
-_OF_A_PIXEL = 600
-"""Floats that autograd keeps for each pixel: features, the decoder's hidden layers, SSIM."""
 _OF_A_BEAM = 120
 """Bytes kept for each beam of the log."""
 _BEAMS_A_SWEEP = 120_000
@@ -70,7 +64,7 @@ class Reconstruction:
     """A reconstruction on disk, and its scene."""
 
     folder: Path
-    recipe: RebuildRecipe
+    recipe: RebuildRecipe[Any]
     summary: dict[str, float | int | str | None]
     scene: RebuiltScene
     train: SensorViews
@@ -79,7 +73,7 @@ class Reconstruction:
 
 
 def reconstruct(
-    recipe: RebuildRecipe,
+    recipe: RebuildRecipe[Any],
     path: LogPath,
     folder: Path,
     cache_dir: Path | None = None,
@@ -109,7 +103,7 @@ def reconstruct(
 
 
 def _rebuild(
-    recipe: RebuildRecipe,
+    recipe: RebuildRecipe[Any],
     path: LogPath,
     folder: Path,
     data: ReconstructionData,
@@ -117,6 +111,7 @@ def _rebuild(
 ) -> Reconstruction:
     """Do the steps of a reconstruction that are not done yet."""
     save_vehicle(data.vehicle, folder / VEHICLE)
+    representation: Representation = recipe.representation
     scene = initial_model(recipe, data)
     scene.to("cuda" if torch.cuda.is_available() else "cpu")
     weights = folder / WEIGHTS
@@ -124,8 +119,8 @@ def _rebuild(
         train, names = data.train, data.vehicle.rig.names
         for finding in calibration_findings(names, train.cameras, train.sweeps, data.tracks):
             _log.warning("%s: the calibration may be wrong: %s", path.folder, finding)
-        rebuild(scene, data.train, recipe.schedule, folder)
-        add_unseen_ground(scene, data.vehicle.T_scene_ego, data.train.cameras)
+        rebuild(representation.training(scene, data.train), folder)
+        representation.complete(scene, data.vehicle.T_scene_ego, data.train)
         with atomic_path(weights) as temporary:
             save_weights(scene, temporary)
     scene.resize(weights)
@@ -135,12 +130,14 @@ def _rebuild(
     if perceptual is not None:
         more = perceptual.evaluate(scene, data.held_out.cameras)
         write_summary(folder / SUMMARY, read_summary(folder / SUMMARY) | more)
-    if not (folder / GAUSSIANS).is_file():
-        write_ply(scene.gaussians[scene.actor == STATIC], folder / GAUSSIANS)
+    if not (folder / STATIC_PART).is_file():
+        write_ply(scene.content.preview(STATIC), folder / STATIC_PART)
     return Reconstruction(folder, recipe, read_summary(folder / SUMMARY), scene, data.train, data.held_out)
 
 
-def read_reconstruction_data(recipe: RebuildRecipe, path: LogPath, cache_dir: Path) -> ReconstructionData:
+def read_reconstruction_data(
+    recipe: RebuildRecipe[Any], path: LogPath, cache_dir: Path
+) -> ReconstructionData:
     """Read a log's frames and split them into training and held-out frames; warn if sensors are missing."""
     drive = read_drive(path, recipe.image_hw, recipe.cameras, cache_dir)
     if not bool(drive.image_valid.any()) and not bool(drive.sweep_valid.any()):
@@ -171,24 +168,10 @@ def read_reconstruction_data(recipe: RebuildRecipe, path: LogPath, cache_dir: Pa
     )
 
 
-def initial_model(recipe: RebuildRecipe, data: ReconstructionData) -> RebuiltScene:
+def initial_model(recipe: RebuildRecipe[Any], data: ReconstructionData) -> RebuiltScene:
     """Return the scene before training."""
-    generator = torch.Generator().manual_seed(recipe.schedule.seed)
-    graph = initial_scene(
-        list(data.train.cameras),
-        list(data.train.sweeps),
-        data.tracks,
-        recipe.initial,
-        generator,
-    )
-    torch.manual_seed(recipe.schedule.seed)  # the decoders' weights
-    return RebuiltScene(
-        graph,
-        len(data.vehicle.rig.names),
-        recipe.scene,
-        data.vehicle.reach_m,
-        frames=len(data.train.cameras) + len(data.train.sweeps),
-    )
+    vehicle = data.vehicle
+    return recipe.representation.begin(data.train, data.tracks, len(vehicle.rig.names), vehicle.reach_m)
 
 
 def tracks_without_actors(tracks: ActorTracks) -> ActorTracks:
@@ -201,7 +184,7 @@ def tracks_without_actors(tracks: ActorTracks) -> ActorTracks:
     return dataclasses.replace(tracks, **empty)
 
 
-def check_memory(recipe: RebuildRecipe, path: LogPath) -> None:
+def check_memory(recipe: RebuildRecipe[Any], path: LogPath) -> None:
     """Check that the memory suffices before the reconstruction begins.
 
     Raises:
@@ -215,18 +198,15 @@ def check_memory(recipe: RebuildRecipe, path: LogPath) -> None:
     if needed_gib > free_gib:
         raise InputError(
             f"{recipe.name} needs about {needed_gib:.1f} GiB for {cameras} cameras of {pixels * 1e-6:.1f} MP "
-            f"and {len(log)} frames with {recipe.schedule.max_gaussians} Gaussians; "
-            f"{free_gib:.1f} GiB are free"
+            f"and {len(log)} frames; {free_gib:.1f} GiB are free"
         )
 
 
-def memory_needed_gib(recipe: RebuildRecipe, *, frames: int, cameras: int) -> float:
+def memory_needed_gib(recipe: RebuildRecipe[Any], *, frames: int, cameras: int) -> float:
     """Estimate the memory of a reconstruction, GiB."""
     pixels = recipe.image_hw[0] * recipe.image_hw[1]
-    of_one = 3 + 4 + 3 + 1 + 3 + recipe.initial.features
-    learning = 4 * (recipe.schedule.max_gaussians * of_one * _COPIES + pixels * _OF_A_PIXEL)
     kept = frames * (cameras * pixels * 3 + _BEAMS_A_SWEEP * _OF_A_BEAM)
-    return (learning + kept) / 1024**3
+    return recipe.representation.learning_gib(pixels) + kept / 1024**3
 
 
 def _free_memory_gib() -> float:
@@ -264,14 +244,14 @@ def _sensor_views(clip: Clip, T_world_scene: torch.Tensor) -> SensorViews:
 
 
 def _summary(
-    recipe: RebuildRecipe, path: LogPath, folder: Path, scene: RebuiltScene, data: ReconstructionData
+    recipe: RebuildRecipe[Any], path: LogPath, folder: Path, scene: RebuiltScene, data: ReconstructionData
 ) -> dict[str, float | int | str | None]:
     steps = read_metrics(folder / "metrics.jsonl")
     held = data.held_out
     return {
         "recipe": recipe.name,
         "log": path.name,
-        "gaussians": len(scene.actor),
+        **scene.sizes,
         "actors": len(data.tracks),
         "minutes": sum(float(line["step_s"]) for line in steps) / 60,
         "computing_minutes": sum(float(line["computing_s"]) for line in steps) / 60,
@@ -282,7 +262,7 @@ def _summary(
     }
 
 
-def _folder_of(recipe: RebuildRecipe, path: LogPath, folder: Path) -> RunFolder:
+def _folder_of(recipe: RebuildRecipe[Any], path: LogPath, folder: Path) -> RunFolder:
     other_recipe, other_log = "a run with another recipe", "a run of another log"
 
     def read() -> dict[str, object] | None:

@@ -116,8 +116,8 @@ def render_frame(
     assert rig.exposed_dt_s is not None
     for place, camera in enumerate(plan.cameras):
         ego = vehicle.at(t_s + float(rig.exposed_dt_s[camera])).shifted(edited.T_ego_shifted.cpu())
-        view = novel_camera_view(rig, camera, ego).to(scene.actor.device)
-        images[place] = scene(edited.graph, view).rgb_8bit
+        view = novel_camera_view(rig, camera, ego).to(scene.device)
+        images[place] = scene.camera(edited.graph, view).rgb_8bit
     ego, sweep = vehicle.at(t_s).shifted(edited.T_ego_shifted.cpu()), None
     if plan.lidar is not None:
         sweep = render_sweep(scene, edited.graph, plan.lidar, ego)

@@ -16,7 +16,7 @@ from torch import Tensor
 from foredrive.geometry.projection import project
 from foredrive.geometry.se3 import inverse_se3, transform_points
 from foredrive.rendering.gaussians import Gaussians
-from foredrive.rendering.rebuilt import RebuiltScene
+from foredrive.rendering.gaussians.scene import GaussianScene
 from foredrive.rendering.scene_graph import STATIC, SceneGraph
 from foredrive.rendering.views import CameraView
 
@@ -44,7 +44,7 @@ _OPAQUE, _MOST_M = 0.3, 0.5
 
 @torch.no_grad()
 def add_unseen_ground(
-    scene: RebuiltScene, T_scene_ego: Float[Tensor, "K 4 4"], views: Sequence[CameraView]
+    scene: GaussianScene, T_scene_ego: Float[Tensor, "K 4 4"], views: Sequence[CameraView]
 ) -> None:
     """Add the Gaussians of `extrapolated_ground` to a scene, except those that a camera would have seen.
 
@@ -54,7 +54,7 @@ def add_unseen_ground(
         views: training views; some of each camera are checked.
     """
     graph = scene.graph
-    ground = extrapolated_ground(graph.of_actor(STATIC), T_scene_ego)
+    ground = extrapolated_ground(scene.content.preview(STATIC), T_scene_ego)
     seen = torch.zeros_like(ground.opacity_logit, dtype=torch.bool)
     for view in _some_views(views):
         seen |= _seen(scene, graph, view.to(seen.device), ground.mean_m)
@@ -110,7 +110,7 @@ def _some_views(views: Sequence[CameraView]) -> list[CameraView]:
 
 
 def _seen(
-    scene: RebuiltScene, graph: SceneGraph, view: CameraView, xyz_m: Float[Tensor, "N 3"]
+    scene: GaussianScene, graph: SceneGraph, view: CameraView, xyz_m: Float[Tensor, "N 3"]
 ) -> Bool[Tensor, "N"]:
     """Return which points a view shows: inside the image and not hidden."""
     uv, depth_m, inside = project(
@@ -118,7 +118,7 @@ def _seen(
     )
     u, v = uv[inside].long().unbind(-1)
     seen = inside.clone()
-    picture = scene(graph, view)
+    picture = scene.camera(graph, view)
     stopped_m = torch.where(picture.alpha > 0.5, picture.range_m, torch.inf)[v, u]
     seen[inside] = depth_m[inside] < (1 + _BEHIND) * stopped_m + _BEHIND_M
     return seen

@@ -11,9 +11,11 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from foredrive.geometry.quaternions import quaternion_from_matrix
-from foredrive.rendering.gaussians import Gaussians
-from foredrive.rendering.random_points import drive_bounds, random_points
-from foredrive.rendering.scene_graph import STATIC, SceneGraph, joined, mirrored
+from foredrive.rendering.gaussians.content import GaussianContent
+from foredrive.rendering.gaussians.gaussians import Gaussians, joined
+from foredrive.rendering.gaussians.placing import mirrored
+from foredrive.rendering.gaussians.random_points import drive_bounds, random_points
+from foredrive.rendering.scene_graph import STATIC, SceneGraph
 from foredrive.rendering.seed_points import (
     GREY,
     SeedPoints,
@@ -128,7 +130,7 @@ def initial_scene(
         part = _actor(points, tracks.size_lwh[row], bool(tracks.mirrored[row]), size, generator)
         parts.append(part)
         actor.append(torch.full((len(part.opacity_logit),), row))
-    return SceneGraph(joined(parts), torch.cat(actor), tracks)
+    return SceneGraph(tracks, GaussianContent(joined(parts), torch.cat(actor)))
 
 
 def _actor(

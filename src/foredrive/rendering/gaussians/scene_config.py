@@ -1,4 +1,4 @@
-"""Settings of a rebuilt scene."""
+"""Settings of a rebuilt scene of Gaussians."""
 
 from dataclasses import dataclass, field
 from typing import Literal
@@ -8,8 +8,8 @@ from foredrive.rendering.gaussians.camera import NEAR_M
 
 
 @dataclass(frozen=True)
-class SceneConfig:
-    """Parts of a `RebuiltScene`."""
+class GaussianSceneConfig:
+    """Parts of a `GaussianScene`."""
 
     decoder: CameraDecoderConfig = field(default_factory=CameraDecoderConfig)
     rolling: bool = True

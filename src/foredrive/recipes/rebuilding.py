@@ -1,0 +1,113 @@
+"""Recipes for rebuilding logs: what is common to all representations of a scene."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any, Generic, TypeVar
+
+from foredrive.errors import InputError
+from foredrive.recipes.config import is_recipe_file, overridden, read_values, rescheduled, validated
+from foredrive.recipes.gaussians import (
+    GaussianRecipe,
+    base_gaussians,
+    published_gaussians,
+    tiny_gaussians,
+)
+from foredrive.recipes.known import nearest_name
+from foredrive.recipes.old_formats import upgraded_reconstruction
+from foredrive.recipes.representation import Representation
+
+R = TypeVar("R", bound=Representation)
+
+REPRESENTATIONS: dict[str, type[Representation]] = {"gaussians": GaussianRecipe}
+"""The representations by their `kind`: frozen dataclasses of plain values."""
+
+
+@dataclass(frozen=True)
+class RebuildRecipe(Generic[R]):
+    """All settings of a reconstruction, except where the log is."""
+
+    name: str
+    image_hw: tuple[int, int]
+    representation: R
+    """What the scene is made of, and how it is trained: a row of `REPRESENTATIONS`."""
+    cameras: tuple[str, ...] | None = None
+    """Names of cameras, their own or 123D's; None takes all."""
+    hold_out_every: int = 2
+    """The last frame of every group of this size is held out for evaluation; 0 holds out none."""
+    actors: bool = True
+    """Moving actors are parts of their own. If False, everything is static."""
+    drop: bool = True
+    """Beams may fail to return. If False, all return."""
+    about: str = field(default="", compare=False)
+    """One line for lists of recipes."""
+
+
+def gaussians_tiny() -> RebuildRecipe[GaussianRecipe]:
+    """Return a recipe for some minutes on two cores, with images of 480×270."""
+    return RebuildRecipe(
+        name="gaussians_tiny",
+        about="a log rebuilt from Gaussians in minutes on two CPU cores",
+        image_hw=(270, 480),
+        representation=tiny_gaussians(),
+    )
+
+
+def gaussians_base() -> RebuildRecipe[GaussianRecipe]:
+    """Return our version of SplatAD in its sizes, for a GPU. `gaussians_published` is nearer to it."""
+    return RebuildRecipe(
+        name="gaussians_base",
+        about="our version of SplatAD in its sizes, for a GPU",
+        image_hw=(1080, 1920),
+        representation=base_gaussians(),
+    )
+
+
+def gaussians_published() -> RebuildRecipe[GaussianRecipe]:
+    """Return SplatAD with the choices of its reference implementation, for a GPU.
+
+    docs/architecture.md lists what still differs.
+    """
+    return RebuildRecipe(
+        name="gaussians_published",
+        about="SplatAD with the choices of its reference implementation, for a GPU",
+        image_hw=(1080, 1920),
+        representation=published_gaussians(),
+    )
+
+
+def rescheduled_recipe(recipe: RebuildRecipe[R], **changes: Any) -> RebuildRecipe[R]:
+    """Return the recipe with changed entries of the schedule of its representation, such as `seed`."""
+    return replace(recipe, representation=rescheduled(recipe.representation, **changes))
+
+
+REBUILD_RECIPES: dict[str, RebuildRecipe[Any]] = {
+    recipe.name: recipe for recipe in (gaussians_tiny(), gaussians_base(), gaussians_published())
+}
+
+
+def load_rebuild_recipe(path: Path) -> RebuildRecipe[Any]:
+    """Read a recipe from YAML, in today's format or an earlier one. Raises the errors of `load_recipe`."""
+    return _recipe_from(upgraded_reconstruction(read_values(path)), str(path))
+
+
+def _recipe_from(written: Any, source: str) -> RebuildRecipe[Any]:
+    representation = written.get("representation") if isinstance(written, Mapping) else None
+    kind = representation.get("kind") if isinstance(representation, Mapping) else None
+    if kind not in REPRESENTATIONS:
+        known = ", ".join(REPRESENTATIONS)
+        raise InputError(f"{source}: not a recipe: representation.kind: {kind!r} is none of {known}")
+    row = REPRESENTATIONS[kind]
+    recipe: RebuildRecipe[Any] = validated(RebuildRecipe[row], written, source)  # type: ignore[valid-type]
+    return recipe
+
+
+def find_rebuild_recipe(name: str, settings: Sequence[str] = ()) -> RebuildRecipe[Any]:
+    """Return a recipe by its name or from a YAML file. Arguments and errors are those of `find_recipe`."""
+    if is_recipe_file(name):
+        recipe = load_rebuild_recipe(Path(name))
+    elif name in REBUILD_RECIPES:
+        recipe = REBUILD_RECIPES[name]
+    else:
+        raise InputError(f"no recipe {name!r} to rebuild logs{nearest_name(name, REBUILD_RECIPES)}")
+    return _recipe_from(overridden(asdict(recipe), settings), name) if settings else recipe

@@ -1,0 +1,81 @@
+"""Gaussians of a scene graph, placed for one time."""
+
+import dataclasses
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from foredrive.geometry.quaternions import multiply_quaternions, quaternion_from_matrix
+from foredrive.rendering.gaussians.content import gaussians_of
+from foredrive.rendering.gaussians.gaussians import Gaussians, joined
+from foredrive.rendering.scene_graph import SceneGraph
+from foredrive.rendering.tracks import states_at
+from foredrive.scene.record import Record
+
+_MIRROR_XYZ = (1.0, -1.0, 1.0)
+_MIRROR_WXYZ = (1.0, -1.0, 1.0, -1.0)
+"""Mirroring y turns a rotation by θ about the axis a into one by θ about (-aₓ, a_y, -a_z)."""
+
+
+@dataclass(frozen=True)
+class PlacedGaussians(Record):
+    """M of a scene's Gaussians, placed for one time."""
+
+    gaussians: Gaussians
+    """Gaussians in the scene's frame."""
+    velocity_mps: Float[Tensor, "M 3"]
+    """Velocities of the centres, in the scene's axes."""
+    source: Int[Tensor, "M"]
+    """Index of each one in the scene's Gaussians."""
+
+
+def place_gaussians(
+    graph: SceneGraph, t_s: float | Tensor, mirror: Bool[Tensor, "A"] | None = None
+) -> PlacedGaussians:
+    """Place the static part and every present actor at a time, with poses and velocities.
+
+    Args:
+        graph: a scene of Gaussians.
+        t_s: seconds since the start of the drive.
+        mirror: actors whose left and right sides are swapped; None: none.
+    """
+    content, states = gaussians_of(graph), states_at(graph.tracks, t_s)
+    shown = torch.cat([states.present, states.present.new_ones(1)])[content.actor]  # STATIC, -1: last entry
+    moving = (shown & (content.actor >= 0)).nonzero()[:, 0]
+    still = (content.actor < 0).nonzero()[:, 0]
+    standing = content.gaussians[still]
+    if len(moving) == 0:
+        return PlacedGaussians(standing, torch.zeros_like(standing.mean_m), still)
+    owner = content.actor[moving]
+    own = content.gaussians[moving]
+    if mirror is not None:
+        own = _mirrored(own, mirror[owner])
+    T = states.T_scene_actor
+    R = T[:, :3, :3]
+    arm = (R[owner] @ own.mean_m[..., None])[..., 0]
+    moved = dataclasses.replace(
+        own,
+        mean_m=T[owner, :3, 3] + arm,
+        quaternion=multiply_quaternions(quaternion_from_matrix(R)[owner], own.quaternion),
+    )
+    velocity = states.velocity_mps[owner] + torch.linalg.cross(states.turn_radps[owner], arm)
+    return PlacedGaussians(
+        gaussians=joined([standing, moved]),
+        velocity_mps=torch.cat([torch.zeros_like(standing.mean_m), velocity]),
+        source=torch.cat([still, moving]),
+    )
+
+
+def mirrored(gaussians: Gaussians) -> Gaussians:
+    """Swap left and right: y to -y, in the frame of the box."""
+    return _mirrored(gaussians, torch.ones_like(gaussians.opacity_logit, dtype=torch.bool))
+
+
+def _mirrored(gaussians: Gaussians, which: Bool[Tensor, "M"]) -> Gaussians:
+    xyz = torch.where(which[:, None], gaussians.mean_m.new_tensor(_MIRROR_XYZ), 1.0)
+    wxyz = torch.where(which[:, None], gaussians.mean_m.new_tensor(_MIRROR_WXYZ), 1.0)
+    return dataclasses.replace(
+        gaussians, mean_m=gaussians.mean_m * xyz, quaternion=gaussians.quaternion * wxyz
+    )

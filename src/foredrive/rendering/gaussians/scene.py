@@ -1,0 +1,249 @@
+"""A rebuilt scene of Gaussians, with decoders of their features."""
+
+import functools
+import math
+from pathlib import Path
+
+import torch
+from jaxtyping import Bool, Float
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import load_file
+from torch import Tensor, nn
+
+from foredrive.errors import InputError
+from foredrive.geometry.projection import pixel_centres, pixels_to_rays
+from foredrive.geometry.se3 import exp_se3, inverse_se3, rotate_vectors
+from foredrive.ops.splat_points import TiledPoints, pixel_points
+from foredrive.ops.splatting import BeforeHit, composite_splats
+from foredrive.rendering.decoders import ALBEDO, CameraDecoder, LidarDecoder
+from foredrive.rendering.gaussians.beams import PreparedSweep, prepared_sweep
+from foredrive.rendering.gaussians.camera import project_camera
+from foredrive.rendering.gaussians.content import GaussianContent, gaussians_of
+from foredrive.rendering.gaussians.gaussians import Gaussians
+from foredrive.rendering.gaussians.lidar import project_lidar
+from foredrive.rendering.gaussians.placing import place_gaussians
+from foredrive.rendering.gaussians.scene_config import GaussianSceneConfig
+from foredrive.rendering.rebuilt import RebuiltScene, saved_tracks
+from foredrive.rendering.rendered import RenderedImage, RenderedSweep
+from foredrive.rendering.scene_graph import STATIC, SceneGraph
+from foredrive.rendering.views import CameraView, SweepView
+
+BACKGROUND = 0.5
+"""Albedo of the background, where no Gaussian covers a pixel."""
+UNSEEN_RGB = (0.149, 0.1647, 0.2157)
+"""Colour of the background "after_decoder" outside of training, as in SplatAD's reference implementation."""
+GAUSSIAN_PARAMETERS = ("mean_m", "quaternion", "log_scale", "opacity_logit", "albedo", "feature")
+"""Parameters with one row per Gaussian."""
+_LEAST_ALPHA = 1e-6
+
+
+class GaussianScene(RebuiltScene):
+    """A `RebuiltScene` of Gaussians (Kerbl et al., 2023), rendered as in SplatAD (Hess et al., 2025).
+
+    Args:
+        graph: initial scene of Gaussians.
+        cameras: number of cameras in the rig.
+        config: parts of the scene.
+        reach_m: reach of the log's lidar.
+        frames: number of training images and sweeps, in this order, with velocities of their own.
+    """
+
+    actor: Tensor
+
+    def __init__(
+        self,
+        graph: SceneGraph,
+        cameras: int,
+        config: GaussianSceneConfig | None = None,
+        reach_m: float = math.inf,
+        frames: int = 0,
+    ) -> None:
+        config = config or GaussianSceneConfig()
+        content = gaussians_of(graph)
+        own, features = content.gaussians, content.gaussians.feature.shape[1] - ALBEDO
+        camera_decoder = CameraDecoder(
+            features, cameras, config.decoder
+        )  # drawn before the frames' velocities
+        lidar_decoder = LidarDecoder(features, config.drop_from_alpha)
+        reach_m = reach_m if config.lidar_reach_m is None else config.lidar_reach_m
+        super().__init__(graph.tracks, cameras, reach_m, frames, config.frame_velocities)
+        self.config = config
+        self.mean_m = nn.Parameter(own.mean_m)
+        self.quaternion = nn.Parameter(own.quaternion)
+        self.log_scale = nn.Parameter(own.log_scale)
+        self.opacity_logit = nn.Parameter(own.opacity_logit)
+        self.albedo = nn.Parameter(own.feature[:, :ALBEDO])
+        self.feature = nn.Parameter(own.feature[:, ALBEDO:])
+        self.register_buffer("actor", content.actor)
+        self.camera_decoder, self.lidar_decoder = camera_decoder, lidar_decoder
+
+    @property
+    def gaussians(self) -> Gaussians:
+        """All Gaussians; those of actors are in their own frames."""
+        feature = torch.cat([self.albedo, self.feature], dim=-1)
+        return Gaussians(self.mean_m, self.quaternion, self.log_scale, self.opacity_logit, feature)
+
+    @property
+    def content(self) -> GaussianContent:
+        """The Gaussians, and what each belongs to."""
+        return GaussianContent(self.gaussians, self.actor)
+
+    @property
+    def sizes(self) -> dict[str, int]:
+        """The number of Gaussians."""
+        return {"gaussians": len(self.actor)}
+
+    def resize(self, file: Path) -> None:
+        """Resize the parameters for the weights in a file, which may hold another number of Gaussians.
+
+        Raises:
+            InputError: the file cannot be read or holds no weights of a scene.
+        """
+        try:
+            with safe_open(file, "pt") as saved:
+                count = saved.get_slice("actor").get_shape()[0]
+        except (OSError, SafetensorError) as error:
+            raise InputError(f"{file}: weights of a scene cannot be read: {error}") from error
+        self.actor = self.actor.new_zeros(count)
+        for name in GAUSSIAN_PARAMETERS:
+            old = getattr(self, name)
+            setattr(self, name, nn.Parameter(old.new_zeros(count, *old.shape[1:])))
+
+    def add_static(self, gaussians: Gaussians) -> None:
+        """Add Gaussians to the static part."""
+        added = {
+            name: getattr(gaussians, name) for name in ("mean_m", "quaternion", "log_scale", "opacity_logit")
+        }
+        added |= {"albedo": gaussians.feature[:, :ALBEDO], "feature": gaussians.feature[:, ALBEDO:]}
+        for name in GAUSSIAN_PARAMETERS:
+            setattr(self, name, nn.Parameter(torch.cat([getattr(self, name).detach(), added[name].detach()])))
+        none = self.actor.new_full((len(gaussians.opacity_logit),), STATIC)
+        self.actor = torch.cat([self.actor, none])
+
+    def camera(
+        self,
+        graph: SceneGraph,
+        view: CameraView,
+        mirror: Bool[Tensor, "A"] | None = None,
+        frame: int | None = None,
+        background_rgb: Float[Tensor, "3"] | None = None,
+    ) -> RenderedImage:
+        """Render an image.
+
+        Args:
+            graph: this scene, or an edited version of it.
+            view: the camera; its image is not read.
+            mirror: see `place_gaussians`.
+            frame: index of a training image, for `frame_twist`.
+            background_rgb: colour of the background "after_decoder"; None: `UNSEEN_RGB`.
+        """
+        exposed = self.corrected_camera(view, frame)
+        placed = place_gaussians(graph, exposed.t_s, mirror)
+        splats = project_camera(
+            placed.gaussians,
+            inverse_se3(exposed.T_scene_cam),
+            view.K,
+            view.dist,
+            view.size_hw,
+            velocity_mps=placed.velocity_mps,
+            twist_cam=exposed.twist_cam,
+            near_m=self.config.camera_near_m,
+        )
+        seen = composite_splats(splats, _pixels(view.size_hw, view.readout_s if self.config.rolling else 0.0))
+        feature = seen.feature
+        if self.config.background == "albedo":
+            grey = BACKGROUND * (1 - seen.alpha)[:, None]
+            feature = torch.cat([feature[:, :ALBEDO] + grey, feature[:, ALBEDO:]], dim=-1)
+        rays = pixels_to_rays(pixel_centres(view.size_hw).to(view.K).flatten(0, 1), view.K, view.dist)
+        direction = rotate_vectors(view.T_scene_cam, rays)
+        alpha = seen.alpha.unflatten(0, view.size_hw)
+        rgb = self.camera_decoder(
+            feature.unflatten(0, view.size_hw), direction.unflatten(0, view.size_hw), view.sensor
+        )
+        if self.config.background == "after_decoder":
+            colour = rgb.new_tensor(UNSEEN_RGB) if background_rgb is None else background_rgb.to(rgb)
+            rgb = rgb + (1 - alpha) * colour[:, None, None]
+        return RenderedImage(
+            rgb=rgb,
+            range_m=seen.expected_range_m.unflatten(0, view.size_hw) / alpha.clamp_min(_LEAST_ALPHA),
+            alpha=alpha,
+        )
+
+    def prepare_sweep(self, view: SweepView) -> PreparedSweep:
+        """Return the beams of a sweep for `sweep`, see `prepared_sweep`."""
+        return prepared_sweep(view, self.config.rolling)
+
+    def sweep(
+        self,
+        graph: SceneGraph,
+        points: PreparedSweep,
+        t_s: float,
+        hit_range_m: Float[Tensor, "P"] | None = None,
+        mirror: Bool[Tensor, "A"] | None = None,
+        before_hit: BeforeHit = "weights",
+        frame: int | None = None,
+    ) -> RenderedSweep:
+        """Render a sweep.
+
+        Args:
+            graph: this scene, or an edited version of it.
+            points: result of `prepare_sweep`.
+            t_s: time of the sweep.
+            hit_range_m, before_hit: see `composite_splats`.
+            mirror: see `place_gaussians`.
+            frame: index of a training sweep, counted after the images, for `frame_twist`.
+        """
+        placed = place_gaussians(graph, t_s + points.middle_s, mirror)
+        T_scene_lidar = points.T_scene_lidar.to(placed.velocity_mps)
+        twist = points.twist_lidar.to(placed.velocity_mps)
+        if frame is not None:
+            more = self.frame_twist(frame)
+            T_scene_lidar, twist = T_scene_lidar @ exp_se3(points.middle_s * more), twist + more
+        splats = project_lidar(
+            placed.gaussians,
+            inverse_se3(T_scene_lidar),
+            velocity_mps=placed.velocity_mps,
+            twist_lidar=twist,
+            reach_m=self.reach_m,
+            scan_s=None if points.scan_s is None else points.scan_s.to(placed.velocity_mps),
+        )
+        seen = composite_splats(splats, points.tiles, hit_range_m, before_hit=before_hit)
+        intensity, drop_logit = self.lidar_decoder(
+            seen.feature, seen.alpha, points.dir_scene.to(seen.feature)
+        )
+        return RenderedSweep(
+            range_m=seen.expected_range_m / seen.alpha.clamp_min(_LEAST_ALPHA),
+            median_range_m=seen.median_range_m,
+            intensity=intensity,
+            drop_logit=drop_logit,
+            alpha=seen.alpha,
+            alpha_before_hit=seen.alpha_before_hit,
+        )
+
+
+def saved_scene(weights: Path, config: GaussianSceneConfig, reach_m: float) -> GaussianScene:
+    """Return a scene of the sizes of saved weights, which are to be loaded into it.
+
+    Raises:
+        InputError: the file cannot be read or holds no weights of a scene of Gaussians.
+    """
+    try:
+        saved = load_file(weights)
+        features = saved["albedo"].shape[1] + saved["feature"].shape[1]
+        gaussians = Gaussians(
+            saved["mean_m"],
+            saved["quaternion"],
+            saved["log_scale"],
+            saved["opacity_logit"],
+            saved["albedo"].new_zeros(len(saved["albedo"]), features),
+        )
+        graph = SceneGraph(saved_tracks(saved), GaussianContent(gaussians, saved["actor"]))
+        cameras, frames = len(saved["camera_late_s"]), len(saved.get("frame_velocity", ()))
+    except (OSError, SafetensorError, KeyError) as error:
+        raise InputError(f"{weights}: not the weights of a scene: {error}") from error
+    return GaussianScene(graph, cameras, config, reach_m, frames)
+
+
+@functools.lru_cache(maxsize=16)
+def _pixels(size_hw: tuple[int, int], readout_s: float) -> TiledPoints:
+    return pixel_points(size_hw, readout_s)

@@ -1,0 +1,208 @@
+"""Training of a scene of Gaussians: one whole image or sweep per step, relocation and growth."""
+
+import dataclasses
+from dataclasses import dataclass, field
+from typing import Literal
+
+import torch
+from torch import Tensor
+from torch.optim import Optimizer
+
+from foredrive.losses.rendering import (
+    drop_loss,
+    intensity_loss,
+    line_of_sight_loss,
+    photometric_loss,
+    published_lidar_losses,
+    range_loss,
+)
+from foredrive.rendering.gaussians.beams import PreparedSweep
+from foredrive.rendering.gaussians.relocation import random_walk_m
+from foredrive.rendering.gaussians.scene import GaussianScene
+from foredrive.rendering.rendered import RenderedSweep
+from foredrive.rendering.views import SweepView
+from foredrive.scene import LidarSweep
+from foredrive.training.gaussian_rates import LearningRates
+from foredrive.training.gaussian_steps import grow, relocate
+from foredrive.training.rebuilding import ParameterGroup, SensorViews, StepLosses, ViewOrder
+
+
+@dataclass(frozen=True)
+class GaussianWeights:
+    """Weights of the losses (Hess et al., "SplatAD", 2025, §3.5 and supplement)."""
+
+    ssim: float = 0.2
+    """Weight of 1 - SSIM; L1 has the rest."""
+    depth: float = 0.1
+    intensity: float = 1.0
+    drop: float = 0.1
+    line_of_sight: float = 0.1
+    depth_quantile: float = 0.95
+    """Share of the returned beams that count for `depth`. The worst hit something thin or moving."""
+    scale: float = 1e-3
+    opacity: float = 5e-3
+    frame_velocity: float = 1e-6
+    frame_turn: float = 1e-5
+    """Weights of the mean length of the corrections of the frames' velocities, if they are learned."""
+
+
+@dataclass(frozen=True)
+class GaussianSchedule:
+    """Length of the training of a scene of Gaussians, and its growth."""
+
+    steps: int
+    max_gaussians: int
+    rates: LearningRates = field(default_factory=LearningRates)
+    weights: GaussianWeights = field(default_factory=GaussianWeights)
+    images_per_sweep: int = 1
+    beam_stride: int = 1
+    """Stride of the beams used from a sweep."""
+    shrink_steps: tuple[int, ...] = ()
+    """Steps until which images are shrunk. With two entries: by 4 until the first step, by 2 until the
+    second."""
+    grow_from: int = 500
+    grow_until: int = 15_000
+    grow_every: int = 100
+    growth: float = 0.05
+    walk: float = 5e5
+    """λ_noise: noise of the centres in units of their learning rate."""
+    mirror_share: float = 0.5
+    """Probability that a left-right symmetric actor is mirrored in a step."""
+    before_hit_m: float = 0.8
+    """Light that is stopped more than this distance before a lidar return is penalised, m."""
+    lidar_losses: Literal["ours", "published"] = "ours"
+    """"published": those of SplatAD's reference implementation, see `published_lidar_losses`."""
+    checkpoint_every: int = 500
+    seed: int = 0
+
+    def shrink_at(self, step: int) -> int:
+        """Return the factor by which images are shrunk at a step."""
+        return int(2 ** sum(step < end for end in self.shrink_steps))
+
+
+class GaussianTraining:
+    """The `SceneTraining` of a scene of Gaussians.
+
+    Args:
+        scene: trained in place.
+        views: training data.
+        schedule: length, rates, losses and growth.
+
+    Raises:
+        InputError: there are neither images nor sweeps.
+    """
+
+    def __init__(self, scene: GaussianScene, views: SensorViews, schedule: GaussianSchedule) -> None:
+        self.scene, self.views, self.schedule = scene, views, schedule
+        self.steps, self.checkpoint_every, self.seed = (
+            schedule.steps,
+            schedule.checkpoint_every,
+            schedule.seed,
+        )
+        self._order = ViewOrder(
+            len(views.cameras), len(views.sweeps), schedule.images_per_sweep, schedule.seed
+        )
+        self._sweeps: dict[int, tuple[SweepView, PreparedSweep]] = {}
+
+    def parameter_groups(self) -> list[ParameterGroup]:
+        """Return one group per kind of parameter, named as in `LearningRates`."""
+        groups, scene, rates = [], self.scene, self.schedule.rates
+        for rate in dataclasses.fields(rates):
+            if rate.name == "decoders":
+                parameters = [*scene.camera_decoder.parameters(), *scene.lidar_decoder.parameters()]
+            elif getattr(scene, rate.name) is None:
+                continue
+            else:
+                parameters = [getattr(scene, rate.name)]
+            groups.append(ParameterGroup(rate.name, parameters, getattr(rates, rate.name)))
+        return groups
+
+    def losses(self, step: int, generator: torch.Generator) -> StepLosses:
+        """Return the losses of an image or a sweep, some actors mirrored, and of the regularisers."""
+        kind, number = self._order.at(step)
+        drawn = torch.rand(len(self.scene.track_id), generator=generator) < self.schedule.mirror_share
+        mirror = drawn.to(self.scene.device) & self.scene.tracks.mirrored
+        if kind == "image":
+            random = self.scene.config.background == "after_decoder"
+            background_rgb = torch.rand(3, generator=generator) if random else None
+            losses = self._image(number, self.schedule.shrink_at(step), mirror, background_rgb)
+        else:
+            losses = self._sweep(number, mirror)
+        losses["loss"] = losses["loss"] + self._regularisers()
+        return StepLosses(f"{kind} {number}", losses)
+
+    @torch.no_grad()
+    def evolve(self, step: int, optimizer: Optimizer, generator: torch.Generator) -> None:
+        """Relocate, grow and walk."""
+        schedule, scene = self.schedule, self.scene
+        if schedule.grow_from < step + 1 <= schedule.grow_until and (step + 1) % schedule.grow_every == 0:
+            relocate(scene, optimizer, generator)
+            grow(scene, optimizer, schedule.max_gaussians, schedule.growth, generator)
+        rate = schedule.rates.mean_m.at(step, schedule.steps)
+        scene.mean_m.add_(random_walk_m(scene.gaussians, schedule.walk * rate, generator))
+
+    def _image(
+        self, number: int, shrink: int, mirror: Tensor, background_rgb: Tensor | None
+    ) -> dict[str, Tensor]:
+        view = self.views.cameras[number].shrunk(shrink).to(self.scene.device)
+        assert view.image is not None
+        real = view.image.float() / 255
+        rgb = self.scene.camera(self.scene.graph, view, mirror, number, background_rgb).rgb
+        loss = photometric_loss(rgb, real, self.schedule.weights.ssim)
+        psnr = -10 * ((rgb.detach().clamp(0, 1) - real) ** 2).mean().log10()
+        return {"loss": loss, "photometric": loss, "psnr_db": psnr}
+
+    def _sweep(self, number: int, mirror: Tensor) -> dict[str, Tensor]:
+        if number not in self._sweeps:
+            stride = self.schedule.beam_stride
+            view = self.views.sweeps[number]
+            view = dataclasses.replace(view, beams=view.beams[number % stride :: stride])
+            self._sweeps[number] = (view, self.scene.prepare_sweep(view))
+        view, points = self._sweeps[number]
+        beams = view.beams.to(self.scene.device)
+        hit_m = torch.where(beams.returned, beams.range_m - self.schedule.before_hit_m, torch.inf)
+        published = self.schedule.lidar_losses == "published"
+        rendered = self.scene.sweep(
+            self.scene.graph,
+            points,
+            view.t_s,
+            hit_m,
+            mirror,
+            "opacities" if published else "weights",
+            len(self.views.cameras) + number,
+        )
+        losses = self._published_losses(rendered, beams) if published else self._our_losses(rendered, beams)
+        if view.misses_known:
+            losses["drop"] = drop_loss(rendered.drop_logit, beams.returned)
+        loss = torch.stack([getattr(self.schedule.weights, name) * value for name, value in losses.items()])
+        return {"loss": loss.sum(), **losses}
+
+    def _our_losses(self, rendered: RenderedSweep, beams: LidarSweep) -> dict[str, Tensor]:
+        assert rendered.alpha_before_hit is not None
+        quantile = self.schedule.weights.depth_quantile
+        return {
+            "depth": range_loss(rendered.range_m, beams.range_m, beams.returned, quantile),
+            "intensity": intensity_loss(rendered.intensity, beams.intensity, beams.returned),
+            "line_of_sight": line_of_sight_loss(rendered.alpha_before_hit, beams.returned),
+        }
+
+    def _published_losses(self, rendered: RenderedSweep, beams: LidarSweep) -> dict[str, Tensor]:
+        assert rendered.alpha_before_hit is not None
+        return published_lidar_losses(
+            rendered.weighted_range_m,
+            rendered.intensity,
+            rendered.alpha_before_hit,
+            beams.range_m,
+            beams.intensity,
+            beams.returned,
+            self.schedule.weights.depth_quantile,
+        )
+
+    def _regularisers(self) -> Tensor:
+        weights = self.schedule.weights
+        small = self.scene.log_scale.exp().mean()
+        loss = weights.scale * small + weights.opacity * self.scene.opacity_logit.sigmoid().mean()
+        for name in ("frame_velocity", "frame_turn"):
+            if (correction := getattr(self.scene, name)) is not None:
+                loss = loss + getattr(weights, name) * correction.norm(dim=-1).mean()
+        return loss

@@ -1,0 +1,24 @@
+"""Learning rates of a scene's parameters over the steps of its training."""
+
+import math
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Rate:
+    """A learning rate that rises as the first quarter of a sine, then decays exponentially."""
+
+    first: float
+    """Rate after the warm-up; 0 keeps the parameters as they are."""
+    final: float = 0.1
+    """Rate at the end, as a fraction of `first`."""
+    warmup_steps: int = 0
+    until_step: int | None = None
+    """Step of the final rate, which stays until the end; None: the last step of the training."""
+
+    def at(self, step: int, steps: int) -> float:
+        """Return the rate at a step of a training of `steps` steps."""
+        if step < self.warmup_steps:
+            return self.first * math.sin(0.5 * math.pi * step / self.warmup_steps)
+        decaying = max((self.until_step or steps) - self.warmup_steps, 1)
+        return self.first * float(self.final ** min((step - self.warmup_steps) / decaying, 1.0))
