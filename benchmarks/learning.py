@@ -75,7 +75,8 @@ class Budget:
 
 BUDGETS = {
     "10min": Budget(1200.0, 56, {"nemo_town": 3200, "nemo_town_9544e57": 600}),
-    "1h": Budget(7200.0, 98, {"nemo_town": 19200, "nemo_town_9544e57": 3600}),
+    "30min": Budget(3600.0, 98, {"nemo_town": 9600, "nemo_town_9544e57": 1800}),
+    "1h": Budget(7200.0, 252, {"nemo_town": 19200, "nemo_town_9544e57": 3600}),
     "best": Budget(28800.0, 252, {"nemo_town": 76800}),
 }
 """Minutes and hours of two cores."""
