@@ -164,6 +164,22 @@ def test_maps_count_where_a_log_has_one(example: Example) -> None:
     assert masks["raster.frames_counted"] == 1
 
 
+def test_maps_above_the_voxels_are_counted_alone_too(example: Example) -> None:
+    """Voxels lie above the columns 2 to 4: what is wrong elsewhere does not count there."""
+    assert example.truth is not None
+    assert example.truth.raster is not None
+    spec = VoxelSpec(lower_m=(-2.0, -4.0, -1.0), voxel_m=1.0, shape_zyx=(2, 8, 3))
+    small = dataclasses.replace(example, occupancy=dataclasses.replace(example.occupancy, spec=spec))
+    shown = example.truth.raster.layers.float()
+    shown[:, 3, :, 5:] = 0
+    masks = figures(MapRasterMetric, Prediction(map_layers=shown), small)
+    assert masks["uniad.iou_drivable"] == pytest.approx(5 / 8)
+    assert masks["uniad_covered.iou_drivable"] == 1
+    shown[:, 3, :, 4] = 0
+    masks = figures(MapRasterMetric, Prediction(map_layers=shown), small)
+    assert masks["uniad_covered.iou_drivable"] == pytest.approx(2 / 3)
+
+
 def test_semantic_voxels_beside_the_commonest_class(example: Example) -> None:
     """The prior knows the road but not the vehicles: IoU 1 and 0."""
     assert example.truth is not None

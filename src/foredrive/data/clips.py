@@ -123,9 +123,13 @@ class ClipDataset(Dataset[Example]):
         number, frames = self._clips[index]
         return int(self._logs[number].t_us[frames[self.config.past_frames]])
 
+    def log_path(self, index: int) -> LogPath:
+        """Return the log of a clip."""
+        return self._logs[self._clips[index][0]].path
+
     def key(self, index: int) -> str:
         """Return the name of the log and the time of the now of a clip, for messages."""
-        return f"{self._logs[self._clips[index][0]].path.name}@{self.now_us(index)}"
+        return f"{self.log_path(index).name}@{self.now_us(index)}"
 
     def __getitem__(self, index: int) -> Example:
         """Read one clip with its labels.

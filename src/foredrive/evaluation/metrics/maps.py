@@ -1,6 +1,7 @@
 """Maps: polylines under the protocols of vectors, raster layers under UniAD's, beside the training set's."""
 
 import numpy as np
+from jaxtyping import Bool
 from numpy import ndarray
 
 from foredrive.evaluation.metric import EvaluationContext, Figures
@@ -9,8 +10,8 @@ from foredrive.metrics.maps.lines import CLASSES, LineSet
 from foredrive.metrics.maps.precision import mean_precision, score_maps
 from foredrive.metrics.maps.protocols import PROTOCOLS, Area
 from foredrive.metrics.maps.raster import RasterCounts, count_raster, raster_figures
-from foredrive.scene import Example
-from foredrive.scene.map_elements import ElementKind
+from foredrive.scene import Example, VoxelSpec
+from foredrive.scene.map_elements import ElementKind, PlaneSpec
 
 PRIOR = ".best_constant"
 AREA: Area = "60x30"
@@ -75,6 +76,7 @@ def _line_set(rows: list[tuple[int, int, ndarray, float]]) -> LineSet:
 class MapRasterMetric:
     """Keys: `uniad.iou_lanes`, `uniad.iou_lanes.best_constant` and so on; `raster.frames_counted`.
 
+    `uniad_covered.iou_lanes` counts only cells above the clips' voxels: a small model cannot see the others.
     The baseline is the mask that fits the maps of the training set best. Frames without a map do not count.
     """
 
@@ -83,7 +85,8 @@ class MapRasterMetric:
 
     def __init__(self, context: EvaluationContext) -> None:
         self._prior = None if context.task_priors is None else context.task_priors.layers
-        self._counts: dict[str, RasterCounts] = {}
+        self._counts: dict[tuple[str, str], RasterCounts] = {}
+        """By area and suffix of the figures."""
 
     def update(self, prediction: Prediction, truth: Example) -> None:
         """Add b clips."""
@@ -94,14 +97,25 @@ class MapRasterMetric:
         shown = {"": (layers[raster.known] > 0.5).cpu().numpy()}
         if self._prior is not None:
             shown[PRIOR] = self._prior.cpu().expand(len(true), -1, -1, -1).numpy()
+        areas = {"uniad": np.array(True), "uniad_covered": _covered(raster.spec, truth.occupancy.spec)}
         for suffix, mask in shown.items():
-            counts = count_raster(mask, true)
-            self._counts[suffix] = self._counts[suffix] + counts if suffix in self._counts else counts
+            for area, cells in areas.items():
+                counts, key = count_raster(mask & cells, true & cells), (area, suffix)
+                self._counts[key] = self._counts[key] + counts if key in self._counts else counts
 
     def result(self) -> Figures:
         """Return the ratios of the sums."""
         out: Figures = {}
-        for suffix, counts in self._counts.items():
-            out |= {f"uniad.{key}{suffix}": value for key, value in raster_figures(counts).items()}
+        for (area, suffix), counts in self._counts.items():
+            out |= {f"{area}.{key}{suffix}": value for key, value in raster_figures(counts).items()}
             out["raster.frames_counted"] = counts.frames
         return out
+
+
+def _covered(raster: PlaneSpec, voxels: VoxelSpec) -> Bool[ndarray, "H W"]:
+    """Return the cells of a raster whose middles lie above a voxel grid."""
+    inside = []
+    for axis, (lower_m, size) in enumerate(zip(raster.lower_m, raster.shape_yx[::-1], strict=True)):
+        middle_m = lower_m + (np.arange(size) + 0.5) * raster.cell_m
+        inside.append((middle_m >= voxels.lower_m[axis]) & (middle_m < voxels.upper_m[axis]))
+    return inside[1][:, None] & inside[0]

@@ -13,7 +13,7 @@ from safetensors.torch import save_file
 from torch import Tensor
 from torch.utils.data import Dataset
 
-from foredrive.data import ClipConfig, ClipDataset, LogPath, collate
+from foredrive.data import ClipConfig, ClipDataset, LogPath
 from foredrive.data.batches import stack_records
 from foredrive.files import atomic_path
 from foredrive.models.agent import PlanningAgent
@@ -31,8 +31,8 @@ VERSION = 2
 class KeptVolumes(Dataset[TaskExample]):
     """The volumes of all clips of some logs, with their truth. Truth stays in memory, volumes on disk.
 
-    Volumes are stored in half precision, one file for each clip. Runs with the same logs and the same weights
-    share the files.
+    Volumes are stored in half precision, one file for each clip. Runs with the same weights share the files
+    of the logs that they have in common.
 
     Args:
         agent: its world model is frozen.
@@ -55,7 +55,8 @@ class KeptVolumes(Dataset[TaskExample]):
     ) -> None:
         dataset = open_clips(logs, dataclasses.replace(clips, future_images=False), cache_dir)
         self.tasks = tasks
-        self._folder = cache_dir / "volumes" / _key(agent, logs, clips, tasks)
+        folder = cache_dir / "volumes" / _key(agent, clips, tasks)
+        self._files = [folder / f"{_name(dataset, index)}.safetensors" for index in range(len(dataset))]
         self._keep(agent, dataset)
         without_images = dataclasses.replace(clips, cameras=(), future_images=False, tasks=None)
         unseen = ClipDataset(logs, without_images, cache_dir)
@@ -70,7 +71,7 @@ class KeptVolumes(Dataset[TaskExample]):
 
     def __getitem__(self, index: int) -> TaskExample:
         """Return one item, unbatched."""
-        with safe_open(self._file(index), framework="pt") as file:
+        with safe_open(self._files[index], framework="pt") as file:
             kept = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a mapping
         volumes = TaskVolumes(
             volume=kept["volume"].float(),
@@ -81,23 +82,20 @@ class KeptVolumes(Dataset[TaskExample]):
         )
         return dataclasses.replace(self.examples[index], volumes=volumes)
 
-    def _file(self, index: int) -> Path:
-        return self._folder / f"{index:06d}.safetensors"
-
     def _keep(self, agent: PlanningAgent[Any], dataset: ClipDataset) -> None:
         """Write the volumes that are not there yet."""
-        missing = [index for index in range(len(dataset)) if not _is_whole(self._file(index))]
+        missing = [index for index in range(len(dataset)) if not _is_whole(self._files[index])]
         agent.eval()
         device = agent.planner.plan.device
         starts = range(0, len(missing), BATCH_SIZE)
         for start in track(starts, description="keeping volumes", disable=not missing):
             rows = missing[start : start + BATCH_SIZE]
-            clip = collate([dataset[row] for row in rows]).clip.to(device)
+            clip = stack_records([dataset.clip(row) for row in rows]).to(device)
             world = agent.world_model
             with torch.no_grad():
                 found = task_volumes(world, world.observe(clip.observed()), self.tasks)
             for item, row in enumerate(rows):
-                with atomic_path(self._file(row)) as temporary:
+                with atomic_path(self._files[row]) as temporary:
                     save_file(_tensors(found[item].to("cpu")), temporary)
 
 
@@ -135,10 +133,17 @@ def _is_whole(file: Path) -> bool:
         return False
 
 
-def _key(agent: PlanningAgent[Any], logs: Sequence[LogPath], clips: ClipConfig, tasks: Sequence[str]) -> str:
+def _name(dataset: ClipDataset, index: int) -> str:
+    """Return the name of a clip's file, the same in every set of logs."""
+    log = dataset.log_path(index)
+    text = repr((str(log.folder), str(log.maps_dir), dataset.key(index)))
+    return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
+
+
+def _key(agent: PlanningAgent[Any], clips: ClipConfig, tasks: Sequence[str]) -> str:
     digest = hashlib.blake2b(digest_size=16)
     read = dataclasses.replace(clips, tasks=None)
-    digest.update(repr((VERSION, str(logs), dataclasses.asdict(read), tuple(tasks))).encode())
+    digest.update(repr((VERSION, dataclasses.asdict(read), tuple(tasks))).encode())
     for name, tensor in sorted(agent.world_model.state_dict().items()):
         digest.update(name.encode())
         digest.update(tensor.detach().cpu().contiguous().numpy().tobytes())

@@ -1,0 +1,169 @@
+"""Probe frozen world models with task heads: `foredrive bench task-probes`, hours on two cores.
+
+An arm is a world model. Its weights stay as they are, its volumes are computed once and kept, and the same
+heads are trained on them with the same data, steps and seeds. Heads of an arm without any training show what
+the heads learn from places and shapes alone. Drives are those of `learning`, which are recorded first.
+
+`nemo_town` is the model that comes with the package. The rows of DriveWorld's Table 1 are pre-trained here,
+or taken from the run folders runs/task_probes/RECIPE_seedN if they are there. Each row's own world model is
+probed, not its encoder in a fresh model. Volumes and runs are kept in runs/task_probes, where an interrupted
+study continues.
+"""
+
+import dataclasses
+import math
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch.utils.data import DataLoader
+
+from benchmarks.common.study import seeded
+from benchmarks.learning import logs_of
+from benchmarks.learning_towns import learning_digest
+from foredrive.data import ClipDataset, collate
+from foredrive.evaluation.bench import Benchmark, study_identity
+from foredrive.evaluation.metrics import METRICS
+from foredrive.evaluation.run import evaluate
+from foredrive.recipes import Recipe, find_recipe
+from foredrive.recipes.config import rescheduled
+from foredrive.recipes.task_heads import HEADED, TaskHeadsRecipe, town_heads
+from foredrive.runs.evaluate.predict import AgentPredictor
+from foredrive.runs.shipped import run_folder
+from foredrive.runs.train.run import Run, load_agent, open_run, train_run
+from foredrive.runs.train.tasks import probe_run, train_heads
+
+ROOT = Path("runs/task_probes")
+DRIVES = 28
+"""Training drives: four of each town."""
+TRAINED_EVERY_S, JUDGED_EVERY_S = 1.0, 2.0
+HEAD_STEPS = 1500
+NEMO, DRIVEWORLD = "nemo_town", "driveworld_town"
+ROWS = ("occupancy", "rssm", "ssp", "dmb", "mln", "prompts")
+"""Rows of Table 1 that pre-train: single frames (3-D), then one part of DriveWorld after the other (4-D)."""
+JUDGED_PARTS = frozenset({"agents", "map_lines", "map_layers", "semantics"})
+KEPT = (
+    "detection.car_ap", "detection.nuscenes.", "tracking.nuscenes.", "motion.uniad.", "motion.sparsedrive.",
+    "map.uniad", "map.maptr.", "map.streammapnet.", "occupancy.",
+)  # fmt: skip
+"""Beginnings of the keys of a summary that are kept."""
+DECIDED_BY = (
+    "foredrive.data.accumulated_labels",
+    "foredrive.data.agent_futures",
+    "foredrive.data.clips",
+    "foredrive.data.map_elements",
+    "foredrive.data.semantic_labels",
+    "foredrive.geometry",
+    "foredrive.losses",
+    "foredrive.metrics",
+    "foredrive.models.backbone",
+    "foredrive.models.driveworld",
+    "foredrive.models.lifting",
+    "foredrive.models.nemo",
+    "foredrive.models.tasks",
+    "foredrive.training.agent_losses",
+    "foredrive.training.loop",
+    "foredrive.training.task_losses",
+    "foredrive.training.task_probe",
+    "foredrive.training.task_targets",
+)
+
+
+def heads_recipe(seed: int = 0) -> TaskHeadsRecipe:
+    """Return the heads of every arm."""
+    recipe = town_heads(HEADED)
+    schedule = dataclasses.replace(recipe.schedule, steps=HEAD_STEPS, seed=seed)
+    return dataclasses.replace(recipe, schedule=schedule, now_stride_s=TRAINED_EVERY_S)
+
+
+def world_model_alone(recipe: Recipe[Any, Any]) -> Recipe[Any, Any]:
+    """Return the recipe of the world model that a recipe pre-trains, as it is, without fine-tuning."""
+    return dataclasses.replace(
+        recipe,
+        model=recipe.pretrained_model or recipe.model,
+        pretrained_model=None,
+        transfer="world_model",
+        planner=dataclasses.replace(recipe.planner, ego_mlp=None, path=None),
+        path=None,
+        pretrain=None if recipe.pretrain is None else rescheduled(recipe.pretrain, workers=0),
+        finetune=rescheduled(recipe.finetune, steps=0, workers=0),
+    )
+
+
+def shipped(seed: int) -> Run:
+    """Return the run of the model that comes with the package; seeds differ in the heads alone."""
+    return open_run(run_folder(Path(f"embedded:{NEMO}"), ROOT))
+
+
+def trained(name: str, *, pretrained: bool = True) -> Callable[[int], Run]:
+    """Return a function that pre-trains the world model of a recipe, or opens the run that is there."""
+
+    def begin(seed: int) -> Run:
+        recipe = find_recipe(name)
+        recipe = recipe if pretrained else dataclasses.replace(recipe, pretrain=None)
+        folder = ROOT / f"{name}_seed{seed}" if pretrained else ROOT / f"{name}_untrained_seed{seed}"
+        if (folder / "finetune" / "model.safetensors").is_file():
+            return open_run(folder)
+        logs, _ = logs_of(DRIVES)
+        return train_run(seeded(world_model_alone(recipe), seed), logs, folder, ROOT / "cache")
+
+    return begin
+
+
+def probed(name: str, world_of: Callable[[int], Run]) -> Callable[[int], dict[str, float]]:
+    """Return an arm that trains heads on a frozen world model and judges them in the test town."""
+
+    def measure(seed: int) -> dict[str, float]:
+        torch.set_num_threads(1)
+        train_logs, test_logs = logs_of(DRIVES)
+        world = world_of(seed)
+        folder = ROOT / IDENTITY / f"{name}_seed{seed}"
+        run = probe_run(world.recipe, train_logs, folder, ROOT / "cache", world.folder)
+        found = train_heads(run, heads_recipe(seed))
+        clips = run.recipe.clips
+        read = dataclasses.replace(
+            clips.judged, future_images=False, now_stride_s=JUDGED_EVERY_S, tasks=found.recipe.truth
+        )
+        result = evaluate(
+            AgentPredictor(load_agent(run), clips.future_frames, ray_stride=0, heads=found.heads),
+            DataLoader(ClipDataset(test_logs, read, run.cache_dir), batch_size=4, collate_fn=collate),
+            frame_dt_s=clips.frame_dt_s,
+            metrics=[metric for metric in METRICS if metric.needs & JUDGED_PARTS],
+            task_priors=found.priors,
+        )
+        return kept_figures(result.summary) | {
+            "clips": float(result.summary["items"]),
+            "failed": float(result.summary["failed"]),
+        }
+
+    return measure
+
+
+def kept_figures(summary: Mapping[str, Any]) -> dict[str, float]:
+    """Return the figures of the tasks, and the baselines' beside them; those that are known."""
+    chosen = {key: value for key, value in summary.items() if key.startswith(KEPT) and value is not None}
+    return {key: float(value) for key, value in chosen.items() if math.isfinite(value)}
+
+
+WORLDS: Mapping[str, Callable[[int], Run]] = {
+    NEMO: shipped,
+    f"{NEMO}_untrained": trained(NEMO, pretrained=False),
+    DRIVEWORLD: trained(DRIVEWORLD),
+    f"{DRIVEWORLD}_untrained": trained(DRIVEWORLD, pretrained=False),
+    **{f"{DRIVEWORLD}_{row}": trained(f"{DRIVEWORLD}_{row}") for row in ROWS},
+}
+CONFIG = {
+    "heads": dataclasses.asdict(heads_recipe()),
+    "recipes": {name: dataclasses.asdict(find_recipe(name)) for name in (NEMO, DRIVEWORLD)},
+    "training_drives": DRIVES,
+    "drives": learning_digest(),
+    "judged_every_s": JUDGED_EVERY_S,
+}
+IDENTITY = study_identity(CONFIG, DECIDED_BY)
+BENCHMARK = Benchmark(
+    question="What do heads of the six tasks learn on a frozen world model, and what does its training add?",
+    arms={name: probed(name, world) for name, world in WORLDS.items()},
+    config=CONFIG,
+    decided_by=DECIDED_BY,
+)
