@@ -88,10 +88,16 @@ def record(root: Path) -> Path:
     return root / "logs"
 
 
-def read_batch(logs: Path, tasks: TaskTruthConfig | None = None, spec: VoxelSpec = GRID) -> Example:
+def read_batch(
+    logs: Path,
+    tasks: TaskTruthConfig | None = None,
+    spec: VoxelSpec = GRID,
+    cameras: tuple[str, ...] | None = None,
+) -> Example:
     """Return all clips with one frame, 0.5 s apart, as one batch."""
     truth = TaskTruthConfig() if tasks is None else tasks
-    clips = ClipDataset(find_logs(logs), ClipConfig(2, 0, (12, 24), spec, tasks=truth), None)
+    config = ClipConfig(2, 0, (12, 24), spec, cameras=cameras, tasks=truth)
+    clips = ClipDataset(find_logs(logs), config, None)
     return collate([clips[number] for number in range(len(clips))])
 
 

@@ -8,18 +8,21 @@ import pytest
 import torch
 from recorded_street import near_truth, read_batch, record
 
+from foredrive.data.task_truth import TaskTruthConfig
 from foredrive.evaluation.maps.files import read_maps
 from foredrive.evaluation.maps.score import score_map_files
 from foredrive.evaluation.metric import EvaluationContext, Figures
 from foredrive.evaluation.metrics.detection import DetectionMetric
 from foredrive.evaluation.metrics.maps import MapLinesMetric
 from foredrive.evaluation.metrics.motion import MotionMetric
+from foredrive.evaluation.metrics.semantics import SemanticVoxelMetric
 from foredrive.evaluation.motion.files import read_agents
 from foredrive.evaluation.motion.score import score_agent_files
 from foredrive.evaluation.objects.score import read_objects, score_detections, score_tracks
 from foredrive.evaluation.predictor import Prediction
 from foredrive.evaluation.results_files import ResultsFiles
-from foredrive.scene import Example
+from foredrive.evaluation.voxels.log_results import score_against_logs
+from foredrive.scene import Example, VoxelSpec
 
 
 @pytest.fixture(scope="module")
@@ -105,6 +108,27 @@ def test_the_truth_as_tracks_is_perfect(logs: Path, example: Example, tmp_path: 
     for name in ("car", "truck", "pedestrian"):
         assert scored[f"tracking.nuscenes.{name}.amota"] == pytest.approx(1.0)
         assert scored[f"tracking.nuscenes.{name}.ids"] == 0
+
+
+@pytest.mark.parametrize("flow", [False, True])
+def test_voxels(logs: Path, tmp_path: Path, flow: bool) -> None:
+    """On a grid of 1 m, with the rays, velocities and masks of the log; also with one camera alone."""
+    spec = VoxelSpec((-6.0, -8.0, -1.0), 1.0, (3, 16, 12))
+    cameras = ("ahead",) if flow else None
+    example = read_batch(logs, TaskTruthConfig(rays=True), spec, cameras)
+    prediction = near_truth(example)
+    if flow:
+        rng = torch.Generator().manual_seed(1)
+        speed = torch.randn(len(example.key), 1, 3, *spec.shape_zyx, generator=rng)
+        prediction = dataclasses.replace(prediction, flow_mps=speed)
+    write(tmp_path, prediction, example)
+    printed = evaluated(SemanticVoxelMetric, prediction, example)
+    assert 20 < float(printed["occupancy.occ3d.miou_pct"]) < 90
+    assert 20 < float(printed["occupancy.occ3d.rayiou_1m_pct"]) < 90
+    assert 0.1 < float(printed["occupancy.openocc.occ_score"]) < 0.9
+    scored = score_against_logs(tmp_path / "occupancy", logs)
+    assert_same_figures(printed, scored, 60)
+    assert scored["frames_without_velocity"] == (0 if flow else len(example.key))
 
 
 def test_agents_without_identity_are_no_tracks(example: Example, tmp_path: Path) -> None:

@@ -193,7 +193,10 @@ def test_semantic_voxels_beside_the_commonest_class(example: Example) -> None:
     assert found["occ3d.miou_pct"] == found["occ3d_unmasked.miou_pct"] == 100
     assert found["occ3d.miou_pct.best_constant"] == 50
     assert found["occ3d.frames_counted"] == 2
-    assert not any(key.startswith("openocc") for key in found)
+    assert found["openocc.miou_pct"] == 100
+    assert found["openocc.iou_pct.car"] == found["occ3d.iou_pct.car"] == 100
+    assert not any(key.startswith("occ3d_unmasked.iou_pct.") for key in found)
+    assert not any("rayiou" in key or "occ_score" in key for key in found)  # no places of the lidar
 
 
 def test_the_best_constant_mask_is_the_best_of_all() -> None:

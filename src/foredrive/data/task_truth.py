@@ -20,6 +20,7 @@ from foredrive.data.logs import Log
 from foredrive.data.map_elements import read_map_elements, read_map_raster
 from foredrive.data.maps import map_file
 from foredrive.data.modalities import expand_array, squeeze_array
+from foredrive.data.ray_truth import read_rays
 from foredrive.data.semantic_labels import read_semantics
 from foredrive.files import atomic_path
 from foredrive.scene import VoxelSpec
@@ -58,10 +59,12 @@ class TaskTruthConfig:
     instance_steps: int = 4
     """Number of steps after now."""
     instance_dt_s: float = 0.5
+    rays: bool = False
+    """Read the lidar's places and the velocities of voxels, which metrics of rays need."""
 
 
 class TaskTruthStore:
-    """A reader of task truth with a disk cache of all parts but the futures, which are faster to read anew.
+    """A reader of task truth with a disk cache of most parts. Futures and rays are faster to read anew.
 
     The name of an entry is a hash of everything that it depends on: the log's files and its map (name, size,
     modification time), the frame's time, the cameras, the configuration, the voxel grid and `TRUTH_VERSION`.
@@ -87,7 +90,8 @@ class TaskTruthStore:
                 with atomic_path(file) as temporary:
                     temporary.write_bytes(_encode(truth))
         futures = read_futures(log, frame, self.config.future_steps, self.config.future_dt_s)
-        return dataclasses.replace(truth, futures=futures)
+        rays = read_rays(log, frame, self.voxels) if self.config.rays else None
+        return dataclasses.replace(truth, futures=futures, rays=rays)
 
     def _make(self, log: Log, frame: int, cameras: Sequence[PinholeCameraMetadata]) -> TaskTruth:
         made, config = TaskTruth(), self.config
@@ -114,7 +118,8 @@ class TaskTruthStore:
         stat = None if shared is None else (str(shared), shared.stat().st_size, shared.stat().st_mtime_ns)
         names = [camera.modality_key for camera in cameras]
         now_us = int(log.t_us[frame])
-        key = (TRUTH_VERSION, log.fingerprint, stat, now_us, names, self.config, self.voxels)
+        kept = {name: value for name, value in vars(self.config).items() if name != "rays"}
+        key = (TRUTH_VERSION, log.fingerprint, stat, now_us, names, kept, self.voxels)
         name = hashlib.blake2b(repr(key).encode(), digest_size=16).hexdigest()
         return self._folder / name[:2] / f"{name}.truth"
 

@@ -4,6 +4,8 @@
 - `tracking.json`: nuScenes' submissions (tracking_name, tracking_score, tracking_id); with identities only
 - `motion.json`: boxes with futures as UniAD writes them (predict_traj, predict_traj_score), in world frame
 - `map.json`: MapTR's results, in the ego frame
+- `occupancy/LOG@T_US.npz`: `semantics`, as Occ3D's, and `flow`, as OpenOcc's, X Y Z; `occupancy/grid.json`
+  states classes, grid and the cameras of the camera mask
 Frames are named LOG@T_US, and the world frame is that of the log.
 """
 
@@ -26,12 +28,14 @@ from foredrive.evaluation.objects.in_world import (
 )
 from foredrive.evaluation.predictor import Prediction
 from foredrive.evaluation.summary import write_json
+from foredrive.evaluation.voxels.log_results import VoxelGridOfResults, write_grid, write_voxels
 from foredrive.metrics.detection_protocols import CLASSES
 from foredrive.metrics.maps.protocols import HALF_XY_M
 from foredrive.metrics.tracking.protocols import TRACKING_PROTOCOLS
 from foredrive.scene import Attribute, Category, Example
 from foredrive.scene.agents import Agents, MapLines
 from foredrive.scene.map_elements import ElementKind
+from foredrive.scene.semantics import SemanticVoxels
 
 MAPTR_NAMES = {
     ElementKind.DIVIDER: "divider",
@@ -47,6 +51,9 @@ META = {"use_camera": True, "use_lidar": False, "use_radar": False, "use_map": F
 DIGITS = 6
 """Digits after the point of futures and polylines, m: most of the numbers in the files."""
 
+OCCUPANCY = "occupancy"
+"""Folder of semantic voxels in the folder of the files."""
+
 Record = dict[str, Any]
 
 
@@ -57,12 +64,13 @@ class ResultsFiles:
     else then.
 
     Args:
-        folder: folder of the files.
+        folder: folder of the files. Voxels are written to it at once.
     """
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self._frames: dict[str, dict[str, tuple[bool, list[Record]]]] = {}
+        self._voxels: dict[Path, bool] = {}
 
     def add(self, prediction: Prediction, truth: Example) -> None:
         """Add a batch of b predictions with their truth."""
@@ -79,6 +87,22 @@ class ResultsFiles:
                 known = elements is not None and bool(elements.known[item])
                 vectors = _vectors(prediction.map_lines[item].to("cpu"))
                 self._frames.setdefault("map", {})[token] = (known, vectors)
+            semantics = None if truth.truth is None else truth.truth.semantics
+            if prediction.semantics is not None and semantics is not None:
+                self._add_voxels(token, prediction[item], semantics[item], clip.rig.names)
+
+    def _add_voxels(
+        self, token: str, prediction: Prediction, truth: SemanticVoxels, cameras: tuple[str, ...]
+    ) -> None:
+        """Write the voxels of one frame."""
+        assert prediction.semantics is not None
+        folder = self.folder / OCCUPANCY
+        if not self._voxels:
+            write_grid(folder, VoxelGridOfResults(truth.taxonomy, truth.spec, cameras))
+        path = folder / f"{token}.npz"
+        flow = None if prediction.flow_mps is None else prediction.flow_mps[0, :2].cpu().numpy()
+        write_voxels(path, prediction.semantics.cpu().numpy(), flow, truth.taxonomy)
+        self._voxels[path] = bool(truth.known.any())
 
     def write(self) -> list[Path]:
         """Write the files of the tasks that the model predicts, and return their paths."""
@@ -94,7 +118,10 @@ class ResultsFiles:
                 content = {"meta": meta | {"area_m": area_m}, "results": vectors}
             written.append(self.folder / f"{task}.json")
             write_json(written[-1], content, indent=None)
-        return written
+        if any(self._voxels.values()):
+            for path in (path for path, known in self._voxels.items() if not known):
+                path.unlink()
+        return written + ([self.folder / OCCUPANCY] if self._voxels else [])
 
 
 def _judged(frames: Mapping[str, tuple[bool, list[Record]]]) -> dict[str, list[Record]]:

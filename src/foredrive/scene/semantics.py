@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Literal
 
-from jaxtyping import Bool, UInt8
+from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from foredrive.scene.record import Record
@@ -73,3 +73,15 @@ class SemanticVoxels(Record):
     """Voxels on a line of sight of a camera, up to the first occupied one."""
     lidar_mask: Bool[Tensor, "*b Z Y X"]
     """Voxels that a beam has crossed or hit."""
+
+
+@dataclass(frozen=True)
+class RayTruth(Record):
+    """What metrics of rays judge by beside the semantic voxels."""
+
+    origin_m: Float[Tensor, "*b O 3"]
+    """Places of the drive's lidar from which this frame is looked at, in the ego frame at now."""
+    origin_valid: Bool[Tensor, "*b O"]
+    """False in padding, and everywhere in logs without lidar."""
+    velocity_mps: Float[Tensor, "*b 2 Z Y X"]
+    """True velocity over ground of the content of each voxel, in the ego axes. 0 where it is free."""

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from foredrive.scene.agent_futures import AgentFutures
 from foredrive.scene.map_elements import InstanceRaster, MapElements, MapRaster
 from foredrive.scene.record import Record
-from foredrive.scene.semantics import SemanticVoxels
+from foredrive.scene.semantics import RayTruth, SemanticVoxels
 
 
 @dataclass(frozen=True)
@@ -17,3 +17,4 @@ class TaskTruth(Record):
     raster: MapRaster | None = None
     semantics: SemanticVoxels | None = None
     instances: InstanceRaster | None = None
+    rays: RayTruth | None = None

@@ -19,10 +19,10 @@ from foredrive.metrics.voxels.rays import (
     cast_rays,
     count_rays,
     lidar_rays,
-    ray_origins,
     score_rays,
 )
 from foredrive.ops.voxel_rays import first_hits_reference
+from foredrive.sensors.ray_origins import ray_origins
 
 OPENOCC, SERVER = (RAY_PROTOCOLS[name] for name in ("openocc", "openocc_server"))
 CAR, TRUCK, BUILDING = (OPENOCC_CLASSES.index(name) for name in ("car", "truck", "manmade"))

@@ -1,67 +1,52 @@
-"""Semantic voxels under the masks of Occ3D or OpenOcc, beside the commonest class of each voxel."""
-
-import numpy as np
-from numpy import ndarray
+"""Semantic voxels under the protocols of Occ3D and OpenOcc, beside the commonest class of each voxel."""
 
 from foredrive.evaluation.metric import EvaluationContext, Figures
 from foredrive.evaluation.predictor import Part, Prediction
-from foredrive.metrics.voxels.protocols import VOXEL_PROTOCOLS
-from foredrive.metrics.voxels.semantic import count_voxels, mean_iou, voxel_ious
+from foredrive.evaluation.voxels.of_logs import LogVoxelCounts
 from foredrive.scene import Example
-from foredrive.scene.semantics import VOXEL_CLASSES
 
 PRIOR = ".best_constant"
+BESIDE_PRIOR = ("miou_pct", "rayiou_pct", "rayiou_1m_pct", "rayiou_2m_pct", "rayiou_4m_pct", "occ_score")
+"""Figures that the prior has, too."""
 
 
 class SemanticVoxelMetric:
-    """Keys: `occ3d.miou_pct`, `occ3d_unmasked.miou_pct`, `….miou_pct.best_constant`, `….frames_counted`.
+    """Keys: `occ3d.miou_pct`, `occ3d.rayiou_1m_pct`, `openocc.occ_score`, `….best_constant`, and so on.
 
     The grid is that of the clips, not Occ3D's, so figures compare only models on the same grid. Voxels
-    without truth do not count, neither do frames without any.
+    without truth do not count, neither do frames without any. Velocities are the model's flow at now; a
+    model without flow, and the prior, stand still.
     """
 
     name = "occupancy"
     needs: frozenset[Part] = frozenset({"semantics"})
 
     def __init__(self, context: EvaluationContext) -> None:
-        self._prior = None if context.task_priors is None else context.task_priors.semantics
-        self._counts: dict[str, ndarray] = {}
-        self._classes: tuple[str, ...] = ()
-        self._frames = 0
+        prior = None if context.task_priors is None else context.task_priors.semantics
+        self._prior = None if prior is None else prior.cpu().numpy()
+        self._counts: dict[str, LogVoxelCounts] = {}
 
     def update(self, prediction: Prediction, truth: Example) -> None:
         """Add b clips."""
         found, semantics = prediction.semantics, None if truth.truth is None else truth.truth.semantics
-        if found is None or semantics is None:
+        if found is None or semantics is None or truth.truth is None:
             return
-        self._classes = VOXEL_CLASSES[semantics.taxonomy]
         for item in semantics.known.flatten(1).any(dim=1).nonzero()[:, 0].tolist():
             true = semantics[item].to("cpu")
-            shown = {"": found[item].cpu().numpy()}
+            rays = None if truth.truth.rays is None else truth.truth.rays[item].to("cpu")
+            flow = None if prediction.flow_mps is None else prediction.flow_mps[item, 0, :2].cpu().numpy()
+            shown = {"": (found[item].cpu().numpy(), flow)}
             if self._prior is not None:
-                shown[PRIOR] = self._prior.cpu().numpy()
-            known = true.known.numpy()
-            index, camera, lidar = (
-                _as_grid(grid.numpy()[known]) for grid in (true.index, true.camera_mask, true.lidar_mask)
-            )
-            for suffix, voxels in shown.items():
-                predicted = _as_grid(voxels[known])
-                counts = count_voxels(predicted, index, camera, lidar, len(self._classes))
-                self._counts[suffix] = self._counts.get(suffix, np.zeros_like(counts)) + counts
-            self._frames += 1
+                shown[PRIOR] = (self._prior, None)
+            for suffix, (voxels, velocity_mps) in shown.items():
+                counts = self._counts.setdefault(suffix, LogVoxelCounts(true.taxonomy, true.spec))
+                counts.add(voxels, velocity_mps, true, rays)
 
     def result(self) -> Figures:
-        """Return the mean IoU over all frames under every mask, percent."""
+        """Return the figures over all frames."""
         out: Figures = {}
-        for name, protocol in VOXEL_PROTOCOLS.items():
-            if protocol.classes != self._classes:
-                continue
-            for suffix, counts in self._counts.items():
-                out[f"{name}.miou_pct{suffix}"] = 100 * mean_iou(voxel_ious(counts, protocol))
-            out[f"{name}.frames_counted"] = self._frames
+        for suffix, counts in self._counts.items():
+            for key, value in counts.figures().items():
+                if not suffix or key.split(".")[-1] in BESIDE_PRIOR:
+                    out[f"{key}{suffix}"] = value
         return out
-
-
-def _as_grid(voxels: ndarray) -> ndarray:
-    """Return a list of voxels as a grid of one row."""
-    return voxels[None, None]

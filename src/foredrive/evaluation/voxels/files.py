@@ -17,7 +17,7 @@ from foredrive.errors import InputError
 from foredrive.evaluation.voxels.arrays import array_names, read_labels, read_mask, read_velocities
 from foredrive.evaluation.voxels.poses import FramePose, read_poses
 from foredrive.metrics.voxels.protocols import VOXEL_PROTOCOLS
-from foredrive.metrics.voxels.rays import ray_origins
+from foredrive.sensors.ray_origins import ray_origins
 
 PREDICTED_NAMES = ("semantics", "pred", "arr_0")
 MASKS = ("mask_camera", "mask_lidar")
@@ -37,6 +37,8 @@ class VoxelFrame:
     true_mps: Float32[ndarray, "Z Y X 2"] | None
     states_velocity: bool
     """Whether the prediction has velocities."""
+    known: Bool[ndarray, "Z Y X"] | None = None
+    """Voxels with truth. None: all of them."""
 
 
 @dataclass(frozen=True)

@@ -93,11 +93,6 @@ RAY_PROTOCOLS: dict[str, RayProtocol] = {
     ),
 }
 
-MAX_ORIGINS = 8
-"""Number of lidar positions of a drive from which a frame is looked at."""
-ORIGIN_REACH_M = 39.0
-"""They lie nearer than this to the ego vehicle, forward and sideways."""
-
 
 @dataclass(frozen=True)
 class InstanceProtocol:

@@ -14,7 +14,7 @@ from numpy import ndarray
 
 from foredrive.errors import InputError
 from foredrive.metrics.detection import mean_of_valid
-from foredrive.metrics.voxels.protocols import GRID, MAX_ORIGINS, ORIGIN_REACH_M, RayProtocol
+from foredrive.metrics.voxels.protocols import GRID, RayProtocol
 from foredrive.metrics.voxels.semantic import mean_iou
 from foredrive.ops.voxel_rays import RayEnds, first_hits
 from foredrive.scene import VoxelSpec
@@ -37,24 +37,6 @@ def lidar_rays() -> Float32[ndarray, "14040 3"]:
     rays = rays.reshape(-1, 3).astype(np.float32)
     rays.flags.writeable = False
     return rays
-
-
-def ray_origins(
-    T_world_ego: Float64[ndarray, "F 4 4"], T_ego_lidar: Float64[ndarray, "F 4 4"], frame: int
-) -> Float64[ndarray, "O 3"]:
-    """Return the places from which one frame of a drive is looked at, in its ego frame, m.
-
-    They are the positions of the lidar in all key frames of the drive less than 39 m away, forward and
-    sideways. Of more than 8, 8 evenly spaced ones are taken.
-    """
-    T_world_lidar = T_world_ego @ T_ego_lidar
-    position = (np.linalg.inv(T_world_lidar[frame]) @ T_world_lidar)[:, :3, 3].astype(np.float32)
-    position[frame] = 0.0
-    in_ego = position.astype(np.float64) @ T_ego_lidar[frame, :3, :3].T + T_ego_lidar[frame, :3, 3]
-    near = in_ego[(np.abs(in_ego[:, :2]) < ORIGIN_REACH_M).all(axis=1)]
-    if len(near) > MAX_ORIGINS:
-        near = near[np.round(np.linspace(0, len(near) - 1, MAX_ORIGINS)).astype(np.int64)]
-    return near
 
 
 class Seen(NamedTuple):

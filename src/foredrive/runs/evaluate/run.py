@@ -62,12 +62,15 @@ def evaluation_data(
     clips = run.recipe.clips
     frames = max(clips.future_frames, round(STEPS * STEP_S / clips.frame_dt_s))
     stride_s = stride_s or clips.now_stride_s
+    tasks = truth or clips.tasks
+    if tasks is not None and tasks.semantics is not None:
+        tasks = dataclasses.replace(tasks, rays=True)
     config = dataclasses.replace(
         clips.judged,
         future_frames=frames,
         future_images=False,
         now_stride_s=stride_s,
-        tasks=truth or clips.tasks,
+        tasks=tasks,
     )
     return open_clips(logs, config, run.cache_dir)
 

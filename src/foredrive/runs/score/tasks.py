@@ -16,12 +16,18 @@ from foredrive.evaluation.objects.score import read_objects, score_detections, s
 from foredrive.evaluation.provenance import collect_provenance, peak_rss_gib
 from foredrive.evaluation.summary import Figures, write_summary
 from foredrive.evaluation.voxels.files import find_voxels
+from foredrive.evaluation.voxels.log_results import holds_logs, score_against_logs
 from foredrive.evaluation.voxels.score import score_voxels
 from foredrive.runs.score.run import SUMMARY
 
 
 def score_occupancy(results: Path, truth: Path, poses: Path | None) -> Figures:
-    """Return the figures of folders of semantic voxels, see `evaluation.voxels`."""
+    """Return the figures of folders of semantic voxels, see `evaluation.voxels`. The truth may be of logs."""
+    if holds_logs(truth):
+        _check_no_poses("occupancy and a truth of logs", poses)
+        with Progress(transient=True) as progress:
+            bar = progress.add_task(results.name, total=None)
+            return score_against_logs(results, truth, on_frame=lambda: progress.advance(bar))
     files = find_voxels(results, truth, poses)
     with Progress(transient=True) as progress:
         bar = progress.add_task(results.name, total=len(files.truth))
