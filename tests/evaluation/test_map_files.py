@@ -1,6 +1,7 @@
 """Files of vector maps: both formats give the same figures, and wrong entries are named."""
 
 import json
+import pickle
 from pathlib import Path
 from typing import Any
 
@@ -180,8 +181,27 @@ def test_wrong_entries_are_named(name: str, tmp_path: Path) -> None:
     assert "\n" not in str(caught.value)
 
 
-def test_pickles_are_never_opened(tmp_path: Path) -> None:
+def test_a_pickle_of_plain_data_is_the_same_as_json(tmp_path: Path) -> None:
+    """MapTracker stores arrays in pickles. What asks for code is refused, and not run."""
+    frame = {
+        "vectors": [np.array([[-20.0, 3.0], [20.0, 3.0]]), np.array([[-20.0, -9.0], [20.0, -9.0]])],
+        "labels": np.array([1, 2]),
+        "scores": np.array([0.9, 0.8], np.float32),
+        "global_ids": (np.int64(4), 7),
+        "scene_name": "a",
+        "local_idx": np.int64(0),
+    }
     pickled = tmp_path / "pos_predictions.pkl"
-    pickled.write_bytes(b"cos\nsystem\n(S'false'\ntR.")
-    with pytest.raises(InputError, match=r"pos_predictions\.pkl: pickles are never read"):
-        read_maps(pickled, write(tmp_path / "t.json", maptr(TRUE, truth=True)))
+    pickled.write_bytes(pickle.dumps({"t": frame}))
+    as_lists = {
+        name: np.asarray(value).tolist() if name != "scene_name" else value for name, value in frame.items()
+    }
+    written = write(tmp_path / "pos_predictions.json", {"t": as_lists})
+    one, other = (score_map_files(read_maps(path, written)) for path in (pickled, written))
+    assert one == other
+    assert one["map.maptracker.c_map"] == pytest.approx(2 / 3)  # of three classes, which count 0 if absent
+    ran = tmp_path / "ran"
+    pickled.write_bytes(f"cos\nsystem\n(S'touch {ran}'\ntR.".encode())
+    with pytest.raises(InputError, match=r"pos_predictions\.pkl: .* asks for os.system, which plain data"):
+        read_maps(pickled, written)
+    assert not ran.exists()

@@ -16,6 +16,7 @@ from foredrive.evaluation.metrics.detection import DetectionMetric
 from foredrive.evaluation.metrics.maps import MapLinesMetric
 from foredrive.evaluation.metrics.motion import MotionMetric
 from foredrive.evaluation.metrics.semantics import SemanticVoxelMetric
+from foredrive.evaluation.metrics.tracking import TrackingMetric
 from foredrive.evaluation.motion.files import read_agents
 from foredrive.evaluation.motion.score import score_agent_files
 from foredrive.evaluation.objects.score import read_objects, score_detections, score_tracks
@@ -93,6 +94,15 @@ def test_lines_beyond_the_area_do_not_change_it(logs: Path, example: Example, tm
     assert float(far.points.abs().max()) > 31
     printed = evaluated(MapLinesMetric, prediction, example)
     assert_same_figures(printed, score_map_files(read_maps(tmp_path / "map.json", logs)), 12)
+
+
+def test_tracks(logs: Path, example: Example, tmp_path: Path) -> None:
+    prediction = near_truth(example)
+    write(tmp_path, prediction, example)
+    printed = evaluated(TrackingMetric, prediction, example)
+    assert float(printed["tracking.nuscenes.ids"]) > 0
+    scored = score_tracks(*read_objects(tmp_path / "tracking.json", logs, "tracking"))
+    assert_same_figures(printed, scored, 40)
 
 
 def test_the_truth_as_tracks_is_perfect(logs: Path, example: Example, tmp_path: Path) -> None:

@@ -40,7 +40,7 @@ def evaluate(
         batch_size: Number of clips in a batch.
         write_results: Also write what the task heads predict to the folder "results" beside summary.json, in
             the formats of nuScenes' code bases, which `foredrive score` reads: detection.json, tracking.json,
-            motion.json, map.json (docs/tasks.md).
+            motion.json, map.json and the folder occupancy (docs/tasks.md).
         rebuilt: Folder of a reconstruction whose log still exists; writes gap.json.
     """
     run = check_run(run)

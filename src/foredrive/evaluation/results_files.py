@@ -14,8 +14,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 from numpy import ndarray
+from torch import Tensor
 
 from foredrive.evaluation.metrics.maps import AREA
 from foredrive.evaluation.objects.in_world import (
@@ -89,19 +90,24 @@ class ResultsFiles:
                 self._frames.setdefault("map", {})[token] = (known, vectors)
             semantics = None if truth.truth is None else truth.truth.semantics
             if prediction.semantics is not None and semantics is not None:
-                self._add_voxels(token, prediction[item], semantics[item], clip.rig.names)
+                flow = None if prediction.flow_mps is None else prediction.flow_mps[item, 0, :2]
+                self._add_voxels(token, prediction.semantics[item], flow, semantics[item], clip.rig.names)
 
     def _add_voxels(
-        self, token: str, prediction: Prediction, truth: SemanticVoxels, cameras: tuple[str, ...]
+        self,
+        token: str,
+        labels: UInt8[Tensor, "Z Y X"],
+        flow_mps: Float[Tensor, "2 Z Y X"] | None,
+        truth: SemanticVoxels,
+        cameras: tuple[str, ...],
     ) -> None:
         """Write the voxels of one frame."""
-        assert prediction.semantics is not None
         folder = self.folder / OCCUPANCY
         if not self._voxels:
             write_grid(folder, VoxelGridOfResults(truth.taxonomy, truth.spec, cameras))
         path = folder / f"{token}.npz"
-        flow = None if prediction.flow_mps is None else prediction.flow_mps[0, :2].cpu().numpy()
-        write_voxels(path, prediction.semantics.cpu().numpy(), flow, truth.taxonomy)
+        flow = None if flow_mps is None else flow_mps.cpu().numpy()
+        write_voxels(path, labels.cpu().numpy(), flow, truth.taxonomy)
         self._voxels[path] = bool(truth.known.any())
 
     def write(self) -> list[Path]:

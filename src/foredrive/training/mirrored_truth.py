@@ -13,6 +13,8 @@ from foredrive.scene.task_truth import TaskTruth
 def mirrored_truth(truth: TaskTruth, chosen: Bool[Tensor, "b"]) -> TaskTruth:
     """Return the truth of a batch in which the chosen items are mirrored. Centrelines keep their direction.
 
+    Rays are left out: nothing is trained on them.
+
     Raises:
         InputError: a raster is not symmetric about y = 0.
     """

@@ -11,7 +11,7 @@ from foredrive.evaluation.detections.frames import DetectionSet
 from foredrive.evaluation.detections.kitti_labels import read_kitti
 from foredrive.evaluation.detections.nuscenes_results import read_nuscenes
 from foredrive.evaluation.detections.score import FrameScore
-from foredrive.evaluation.json_files import read_json
+from foredrive.evaluation.plain_files import read_plain
 from foredrive.files import atomic_path
 from foredrive.sets import Family
 
@@ -27,7 +27,7 @@ def read_detections(results: Path, truth: Path, family: Family = "gaussian") -> 
     if results.is_dir() and truth.is_dir():
         read = read_kitti(results, truth, family)
     else:
-        predicted, true = read_json(results), read_json(truth)
+        predicted, true = read_plain(results), read_plain(truth)
         if not isinstance(true, dict):
             raise InputError(f"{truth}: neither an object of boxes by sample (nuScenes) nor of images (COCO)")
         if isinstance(predicted, dict):

@@ -40,6 +40,22 @@ class KittiLine(NamedTuple):
     values: Float[ndarray, "_"]
 
 
+KITTI_TYPES = (
+    "car", "van", "truck", "pedestrian", "person", "person_sitting", "cyclist", "tram", "misc", "dontcare",
+)  # fmt: skip
+"""Types of objects in KITTI's labels of objects and tracks, in lower case."""
+
+
+def check_type(kind: str, where: str) -> None:
+    """Refuse a type that KITTI does not have.
+
+    Raises:
+        InputError: the message begins with `where` and names the types.
+    """
+    if kind.lower() not in KITTI_TYPES:
+        raise InputError(f"{where} has the unknown class {kind!r}; there are: {', '.join(KITTI_TYPES)}")
+
+
 def read_kitti(folder: Path, truth: Path, family: Family) -> DetectionSet:
     """Return the frames of the truth, by name.
 

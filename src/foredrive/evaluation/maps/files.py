@@ -5,8 +5,7 @@ MapTR lists frames, under `results` or for the truth `GTs`: `sample_token` and `
 
 StreamMapNet's files have frames by token, under `results` or alone: `vectors`, `labels` (0 crossing, 1
 divider, 2 boundary) and, if predicted, `scores`. MapTracker's C-mAP also needs `global_ids`, and `scene_name`
-and `local_idx` where there is more than one drive. MapTracker stores these, and its truth, in pickles, which
-are never read here: the same content as JSON is.
+and `local_idx` where there is more than one drive. MapTracker stores these, and its truth, in pickles.
 
 Coordinates are metres in the frame of the vehicle or its lidar, the same in both files. The truth may also be
 a folder of 123D logs: frames are named LOG@T_US then, and coordinates are in the ego frame. Results may state
@@ -25,7 +24,7 @@ from numpy import ndarray
 from foredrive.data.map_elements import read_map_elements
 from foredrive.errors import InputError
 from foredrive.evaluation.frames_of_results import check_known_frames, log_frames
-from foredrive.evaluation.json_files import read_json
+from foredrive.evaluation.plain_files import read_plain
 from foredrive.metrics.maps.lines import LineSet
 from foredrive.metrics.maps.protocols import HALF_XY_M, Area
 from foredrive.scene.map_elements import ElementKind
@@ -159,7 +158,7 @@ def _line_set(frames: Sequence[_Frame | None]) -> tuple[LineSet, int]:
 
 def _read(path: Path, *, predicted: bool) -> tuple[dict[str, _Frame], Area | None]:
     """Return the frames of a file by token, and the area that it states."""
-    content = read_json(path)
+    content = read_plain(path)
     frames: dict[str, _Frame] = {}
     area: Area | None = None
     try:

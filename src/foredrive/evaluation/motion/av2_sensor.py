@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from foredrive.errors import InputError
 from foredrive.evaluation.arrow_tables import read_table
 from foredrive.evaluation.detections.frames import read_number_rows
-from foredrive.evaluation.json_files import read_json
+from foredrive.evaluation.plain_files import read_plain
 from foredrive.metrics.motion.agents import PredictedAgents, TrueAgents
 from foredrive.metrics.motion.argoverse import FUTURES, MEAN_SPEED_MPS, STEPS
 from foredrive.metrics.motion.protocols import STEP_S
@@ -54,7 +54,7 @@ def read_end_to_end(results: Path, truth: Path) -> SensorForecasts:
     Raises:
         InputError: a file cannot be read, or an entry is wrong. The message names it.
     """
-    content = read_json(results)
+    content = read_plain(results)
     if not isinstance(content, dict) or not all(isinstance(frames, dict) for frames in content.values()):
         raise InputError(f"{results}: there must be frames by time (ns), by log")
     files = {path.parent.name: path for path in _annotations(truth)}

@@ -9,7 +9,12 @@ from pathlib import Path
 import numpy as np
 
 from foredrive.errors import InputError
-from foredrive.evaluation.detections.kitti_labels import KittiLine, box_states, read_frames
+from foredrive.evaluation.detections.kitti_labels import (
+    KittiLine,
+    box_states,
+    check_type,
+    read_frames,
+)
 from foredrive.evaluation.summary import Figures
 from foredrive.metrics.detection_protocols import DETECTION_PROTOCOLS, evaluate_detections
 from foredrive.metrics.object_rows import ObjectRows, Region, make_rows
@@ -25,6 +30,9 @@ def score_kitti_boxes(folder: Path, truth: Path) -> Figures:
         InputError: a file or a line is wrong. The message names the first.
     """
     true, found, classes, true_classes = read_frames(folder, truth)
+    for lines in (*true.values(), *found.values()):
+        for line in lines:
+            check_type(line.kind, line.name)
     protocol = dataclasses.replace(
         DETECTION_PROTOCOLS["nuscenes"],
         title="KITTI, by distance",

@@ -19,6 +19,7 @@ from scipy.optimize import linear_sum_assignment
 
 from foredrive.errors import InputError
 from foredrive.evaluation.detections.frames import MAX_NUMBER
+from foredrive.evaluation.detections.kitti_labels import check_type
 from foredrive.evaluation.summary import Figures
 from foredrive.metrics.detection import overlaps
 from foredrive.metrics.tracking.clear import Candidates, TrackRows, clear_mot
@@ -101,6 +102,7 @@ def read_sequence(path: Path, fields: int) -> KittiBoxes:
             raise InputError(f"{path}: line {n} has something that is not a number") from error
         if not all(abs(value) <= MAX_NUMBER for value in values):
             raise InputError(f"{path}: line {n} has a number that is not finite, or beyond {MAX_NUMBER:g}")
+        check_type(words[2], f"{path}: line {n}")
         kind = words[2].lower()
         if kind != "dontcare" and (kind, *values[:2]) in known:
             raise InputError(f"{path}: line {n} has the track {words[1]} a second time in frame {words[0]}")

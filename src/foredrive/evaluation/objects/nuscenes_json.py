@@ -25,7 +25,6 @@ from foredrive.errors import InputError
 from foredrive.evaluation.detections.frames import read_numbers
 from foredrive.evaluation.detections.nuscenes_results import read_geometry
 from foredrive.evaluation.frames_of_results import check_known_frames
-from foredrive.evaluation.json_files import read_json
 from foredrive.evaluation.objects.nuscenes_columns import (
     Box,
     read_attributes,
@@ -44,6 +43,7 @@ from foredrive.evaluation.objects.truth import (
     lacking,
     number_names,
 )
+from foredrive.evaluation.plain_files import read_plain
 from foredrive.metrics.detection_protocols import CLASSES
 from foredrive.metrics.object_rows import Frames, ObjectRows, make_rows
 
@@ -168,7 +168,7 @@ def read_object(path: Path) -> Mapping[str, Any]:
     Raises:
         InputError: the file has none.
     """
-    content = read_json(path)
+    content = read_plain(path)
     if not isinstance(content, dict):
         raise InputError(f"{path}: not an object of boxes by sample token")
     return content

@@ -20,7 +20,7 @@ from foredrive.data.ray_truth import read_rays
 from foredrive.data.semantic_labels import read_semantics
 from foredrive.errors import InputError
 from foredrive.evaluation.frames_of_results import log_frames
-from foredrive.evaluation.json_files import read_json
+from foredrive.evaluation.plain_files import read_plain
 from foredrive.evaluation.summary import Figures, write_json
 from foredrive.evaluation.voxels.arrays import array_names, read_labels, read_velocities
 from foredrive.evaluation.voxels.files import PREDICTED_NAMES
@@ -55,7 +55,7 @@ def write_voxels(
     flow_mps: Float[ndarray, "2 Z Y X"] | None,
     taxonomy: Taxonomy,
 ) -> None:
-    """Write the voxels of one frame. Velocities of free voxels are written as 0; no metric reads them."""
+    """Write the voxels of one frame. Free voxels stand still, as in figures."""
     semantics = np.ascontiguousarray(labels.T)
     with atomic_path(path) as temporary, temporary.open("wb") as file:
         if flow_mps is None:
@@ -110,7 +110,7 @@ def read_grid(folder: Path) -> VoxelGridOfResults:
     path = folder / GRID_FILE
     if not path.is_file():
         return VoxelGridOfResults("occ3d", GRID, None)
-    stated = read_json(path)
+    stated = read_plain(path)
     if not isinstance(stated, dict):
         raise InputError(f"{path}: not an object")
     if stated.get("classes") not in VOXEL_CLASSES:

@@ -10,7 +10,7 @@ from foredrive.evaluation.voxels.files import VoxelFrame
 from foredrive.evaluation.voxels.score import VoxelCounts
 from foredrive.metrics.voxels.protocols import OCC3D_CLASSES, OPENOCC_CLASSES
 from foredrive.scene import VoxelSpec
-from foredrive.scene.semantics import RayTruth, SemanticVoxels, Taxonomy
+from foredrive.scene.semantics import VOXEL_CLASSES, RayTruth, SemanticVoxels, Taxonomy
 
 _OCC3D_OTHERS, _OPENOCC_FREE = OCC3D_CLASSES.index("others"), len(OPENOCC_CLASSES) - 1
 _AS_OPENOCC = np.array(
@@ -41,7 +41,7 @@ class LogVoxelCounts:
         truth: SemanticVoxels,
         rays: RayTruth | None,
     ) -> None:
-        """Add an unbatched frame. A prediction without velocities stands still."""
+        """Add an unbatched frame. Predictions without velocities stand still, and so does free space."""
         frame = _frame(predicted, velocity_mps, truth, rays)
         origins_m = None if rays is None else rays.origin_m[rays.origin_valid].double().numpy()
         self._own.add(frame, origins_m)
@@ -64,7 +64,9 @@ def _frame(
     true_mps = None if rays is None else _last(rays.velocity_mps)
     predicted_mps = None
     if true_mps is not None:
-        predicted_mps = np.zeros_like(true_mps) if velocity_mps is None else _last(velocity_mps)
+        occupied = predicted[..., None] != len(VOXEL_CLASSES[truth.taxonomy]) - 1
+        stated = np.zeros_like(true_mps) if velocity_mps is None else _last(velocity_mps)
+        predicted_mps = np.where(occupied, stated, np.float32(0.0))
     return VoxelFrame(
         predicted,
         truth.index.numpy(),

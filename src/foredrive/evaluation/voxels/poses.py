@@ -10,9 +10,8 @@ from jaxtyping import Float64
 from numpy import ndarray
 from scipy.spatial.transform import Rotation
 
-from foredrive.data.safe_pickle import load_pickle
 from foredrive.errors import InputError
-from foredrive.evaluation.json_files import read_json
+from foredrive.evaluation.plain_files import read_plain
 
 
 @dataclass(frozen=True)
@@ -39,14 +38,14 @@ def read_poses(file: Path) -> dict[str, FramePose]:
     Raises:
         InputError: the file is neither, or a pose cannot be read. The message names the frame.
     """
-    poses = _from_annotations(file) if file.suffix == ".json" else _from_infos(file)
+    content = read_plain(file, arrays=True)
+    poses = _from_annotations(content, file) if file.suffix == ".json" else _from_infos(content, file)
     if not poses:
         raise InputError(f"{file}: holds no frames")
     return poses
 
 
-def _from_infos(file: Path) -> dict[str, FramePose]:
-    content = load_pickle(file)
+def _from_infos(content: Any, file: Path) -> dict[str, FramePose]:
     frames = content.get("infos", content.get("data_list")) if isinstance(content, dict) else content
     if not isinstance(frames, list):
         raise InputError(f"{file}: has no list of frames under 'infos' or 'data_list'")
@@ -71,8 +70,7 @@ def _pose_of_info(frame: Mapping[str, Any]) -> FramePose:
     return FramePose(time, ego, lidar)
 
 
-def _from_annotations(file: Path) -> dict[str, FramePose]:
-    content = read_json(file)
+def _from_annotations(content: Any, file: Path) -> dict[str, FramePose]:
     try:
         scenes: Mapping[str, Mapping[str, Any]] = {
             name: content["scene_infos"][name] for name in content["val_split"]
