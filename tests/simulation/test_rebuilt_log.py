@@ -23,10 +23,11 @@ from foredrive.simulation.drive import Drive, drive_route
 from foredrive.simulation.dynamics import EGO
 from foredrive.simulation.logged_drive import LoggedDrive
 from foredrive.simulation.logged_lanes import LoggedLanes
+from foredrive.simulation.ncap.outcome import Outcome, judge, threat_score
 from foredrive.simulation.rebuilt import STRUCK, RebuiltScenario, RebuiltSimulator
 from foredrive.simulation.scores import Ending
 from foredrive.simulation.simple_agents import ReplayAgent, StraightAgent
-from foredrive.simulation.threats import AFTER_S, Threat, reference_mps, send_threat, threat_score
+from foredrive.simulation.threats import AFTER_S, Threat, reference_mps, send_threat
 
 SPEED_MPS, PERIOD_S, END_S = 8.0, 0.1, 10.0
 WORLD_YAW = 0.7
@@ -201,7 +202,34 @@ def test_a_threat_hits_who_goes_on_as_the_log_did(threat: Threat) -> None:
     reference = reference_mps(threat, drive, 1.0)
     assert first.severity == pytest.approx(reference, rel=0.05)
     assert threat_score(first.severity, reference) < 0.3
-    assert threat_score(0.5 * reference, reference) == pytest.approx(2.0)
+
+
+def test_a_safety_test_ends_at_the_first_collision() -> None:
+    graph = scene_with(actor(-50.0, 0.0))
+    drive = LoggedDrive(vehicle(), torch.eye(4))
+    simulator = begun(graph, (send_threat(Threat.STATIONARY, graph, drive, 1.0),))
+    scenario = dataclasses.replace(simulator.scenario, ends_on_collision=True)
+    went_on = drive_route(simulator, scenario, replay(simulator), route="log")
+    result = judge(Threat.STATIONARY, went_on, SPEED_MPS)
+    assert went_on.score.ending is Ending.COLLISION
+    assert result.outcome is Outcome.COLLIDED
+    assert result.impact_s == went_on.score.duration_s == pytest.approx(AFTER_S, abs=0.3)
+    assert result.progress == pytest.approx(SPEED_MPS * AFTER_S / simulator.length_m, abs=0.05)
+
+
+def test_an_agent_that_breaks_off_is_not_scored() -> None:
+    graph = scene_with(actor(-50.0, 0.0))
+    drive = LoggedDrive(vehicle(), torch.eye(4))
+    simulator = begun(graph, (send_threat(Threat.SIDE, graph, drive, 1.0),))
+
+    class Lost:
+        def act(self, observation):  # type: ignore[no-untyped-def]
+            return dataclasses.replace(
+                StraightAgent(SPEED_MPS).act(observation), xy=torch.full((1, 1, 6, 2), torch.nan)
+            )
+
+    result = judge(Threat.SIDE, driven(simulator, Lost()), SPEED_MPS)
+    assert (result.outcome, result.score) == (Outcome.FAILED, None)
 
 
 def test_who_brakes_in_time_is_not_hit_by_what_stands() -> None:
@@ -210,7 +238,9 @@ def test_who_brakes_in_time_is_not_hit_by_what_stands() -> None:
     simulator = begun(graph, (send_threat(Threat.STATIONARY, graph, drive, 1.0),))
     braked = driven(simulator, StraightAgent(0.0))
     assert braked.score.infractions == ()
-    assert threat_score(None, 8.0) == 5.0
+    result = judge(Threat.STATIONARY, braked, SPEED_MPS)
+    assert (result.outcome, result.score) == (Outcome.STOPPED_SHORT, 5.0)
+    assert result.progress < 0.5
 
 
 def test_threats_need_a_car_and_a_moving_log() -> None:

@@ -66,7 +66,7 @@ def _tell(driven: "SuiteResult") -> None:
     from rich.console import Console
 
     from foredrive.runs.drive.records import summarise
-    from foredrive.view.drive_report import score_table
+    from foredrive.view.drive_report import score_table, threat_text
     from foredrive.view.table import print_table
 
     if driven.broken:
@@ -80,7 +80,7 @@ def _tell(driven: "SuiteResult") -> None:
         print(f"{driven.skipped} of {len(driven.drives)} drives had been driven before")
     print_table(score_table(summarise(list(driven.drives.values()))), Console())
     for met in (drive.threat for drive in driven.drives.values() if drive.threat):
-        print(f"{met.kind} threat: {met.score:.1f} of 5")
+        print(f"{met.kind} threat: {threat_text(met)}")
 
 
 class _Progress:

@@ -9,8 +9,8 @@ from foredrive.scene import Event
 from foredrive.simulation.comfort import Comfort
 from foredrive.simulation.drive import Drive
 from foredrive.simulation.dynamics import STEP_S
+from foredrive.simulation.ncap.outcome import SafetyResult
 from foredrive.simulation.scores import RouteScore
-from foredrive.simulation.threats import Threat
 
 TRACK_EVERY = 5
 """One in this many states of a drive is kept: four per second."""
@@ -26,18 +26,6 @@ class DrivenTrack:
     xy: tuple[Point, ...]
     yaw_rad: tuple[float, ...]
     speed_mps: tuple[float, ...]
-
-
-@dataclass(frozen=True)
-class ThreatResult:
-    """Result of a drive through a threat."""
-
-    kind: Threat
-    impact_mps: float | None
-    """Impact speed, m/s. None without a collision."""
-    reference_mps: float
-    """Impact speed of a vehicle that drives on as in the log, m/s."""
-    score: float
 
 
 @dataclass(frozen=True)
@@ -65,7 +53,7 @@ class DriveRecord:
     wall_s: float
     log: str
     """Path of the drive's log inside the suite's folder."""
-    threat: ThreatResult | None = None
+    threat: SafetyResult | None = None
     lanes_known: bool = True
     """False if departures from the lanes cannot be detected."""
 
@@ -83,7 +71,7 @@ def record_of(
     town: str | None,
     log: str,
     wall_s: float,
-    threat: ThreatResult | None = None,
+    threat: SafetyResult | None = None,
     lanes_known: bool = True,
 ) -> DriveRecord:
     """Build the record of a drive. The arguments are fields of `DriveRecord`."""

@@ -23,6 +23,8 @@ from foredrive.simulation.route_progress import RouteLine, RouteProgress
 REACH_M = 6.0
 """Maximum distance from the logged path, m. Further away, sensors would mostly show unobserved space, so
 the drive ends."""
+COLLISION = "collision"
+"""Kind of the event in which the first collision ends a drive."""
 STRUCK = "struck"
 """Kind of the event in which a replayed actor hits the ego vehicle from behind. The actor replays
 its track and cannot brake, so this is no collision of the ego vehicle."""
@@ -38,6 +40,8 @@ class RebuiltScenario:
     """If False, key frames have only boxes."""
     past_frames: int = 1
     """Number of key frames before now in an observation. They are rendered along the logged path."""
+    ends_on_collision: bool = False
+    """Whether the first collision of the ego vehicle ends the drive, as in a safety test."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,12 +159,12 @@ class RebuiltSimulator:
         before = users.without(users.track_id[behind])
         events, met = collide(box, moved, before, state.contacts.users, t_s)
         struck, met = collide(box, moved, users.without(users.track_id[~behind]), met, t_s)
-        events += [dataclasses.replace(event, kind=STRUCK) for event in struck]
         if blocked(box, before):
             moved = dataclasses.replace(state.ego, speed_mps=0.0, acceleration_mps2=0.0)
         xy = np.array([moved.x_m, moved.y_m])
         progress = self._route.advance(state.progress, xy, moved.speed_mps, t_s)
-        ended = self._end_of(progress, t_s)
+        ended = COLLISION if events and self._scenario.ends_on_collision else self._end_of(progress, t_s)
+        events += [dataclasses.replace(event, kind=STRUCK) for event in struck]
         if ended is not None:
             events.append(self._route.end_event(ended, progress, moved, t_s))
         way_m = float(np.hypot(moved.x_m - state.ego.x_m, moved.y_m - state.ego.y_m))

@@ -40,6 +40,8 @@ class Ending(enum.StrEnum):
     """Slower than 0.1 m/s for 180 s (ActorSpeedAboveThresholdTest)."""
     TIMEOUT = "timeout"
     """Time limit reached, see `timeout_s`."""
+    COLLISION = "collision"
+    """The first collision, in safety tests alone."""
     CRASHED = "crashed"
     """The agent raised an error or returned no plan. The drive is scored up to that point and counts as
     failed."""

@@ -1,4 +1,4 @@
-"""Safety-critical situations in rebuilt logs, and the score of a drive through one.
+"""Safety-critical situations in rebuilt logs.
 
 After NeuroNCAP (Ljungbergh et al., "NeuroNCAP: Photorealistic Closed-loop Safety Testing for Autonomous
 Driving", 2024): a vehicle stands in the lane, comes head-on or crosses. An ego vehicle that drives on as in
@@ -26,7 +26,6 @@ THREAT_MPS = 5.0
 """Speed of the other vehicle, m/s."""
 MIN_MPS = 2.0
 """If the log is slower than this at the time of impact, m/s, there is nothing to avoid."""
-BEST, AFTER_COLLISION = 5.0, 4.0
 
 
 class Threat(enum.StrEnum):
@@ -85,11 +84,6 @@ def reference_mps(threat: Threat, drive: LoggedDrive, start_s: float) -> float:
         Threat.FRONTAL: speed + THREAT_MPS,
         Threat.SIDE: math.hypot(speed, THREAT_MPS),
     }[threat]
-
-
-def threat_score(impact_mps: float | None, reference: float) -> float:
-    """Return NeuroNCAP's score: 5 without a collision (None), else 4 · max(0, 1 - v_impact / v_reference)."""
-    return BEST if impact_mps is None else AFTER_COLLISION * max(0.0, 1.0 - impact_mps / reference)
 
 
 def _most_observed_car(graph: SceneGraph) -> int:

@@ -12,7 +12,8 @@ from foredrive.errors import InputError
 from foredrive.evaluation.summary import Summary, read_summary
 from foredrive.runs.drive.records import read_drive, suite_title
 from foredrive.runs.folder import DRIVES, SUMMARY
-from foredrive.simulation.drive_record import DriveRecord, ThreatResult
+from foredrive.simulation.drive_record import DriveRecord
+from foredrive.simulation.ncap.outcome import SafetyResult
 from foredrive.simulation.scenarios.scenario import ScenarioKind
 from foredrive.simulation.scores import Ending, Infraction, InfractionKind
 from foredrive.simulation.time_to_collision import NEAR_COLLISION_S
@@ -223,7 +224,7 @@ def _show_drive(name: str, drive: DriveRecord) -> ShownDrive:
     ]
     events.sort(key=lambda each: each.t_s or 0.0)
     if drive.threat is not None:
-        events.append(_threat(drive.threat))
+        events.append(DriveEvent(None, f"{words(drive.threat.kind)} threat", threat_text(drive.threat)))
     return ShownDrive(
         name=name,
         score=number(score.driving_score_1_0, 1),
@@ -236,11 +237,17 @@ def _show_drive(name: str, drive: DriveRecord) -> ShownDrive:
     )
 
 
-def _threat(met: ThreatResult) -> DriveEvent:
-    """Return the outcome of a threat as one entry of the list."""
-    hit = "not hit" if met.impact_mps is None else f"hit at {met.impact_mps:.1f} m/s"
-    text = f"{hit} ({met.reference_mps:.1f} m/s if driven as logged), score {met.score:.1f} of 5"
-    return DriveEvent(None, f"{words(met.kind)} threat", text)
+def threat_text(met: SafetyResult) -> str:
+    """Return the outcome of a threat, its score and the progress in one line."""
+    outcome = words(met.outcome)
+    if met.impact_mps is not None:
+        outcome += f" at {met.impact_mps:.1f} m/s ({met.reference_mps:.1f} m/s without any action)"
+    if met.score is None or met.score_progress is None:
+        return f"{outcome}: not scored"
+    return (
+        f"{outcome}: score {met.score:.1f} of 5, progress {met.progress:.2f}, "
+        f"score times progress {met.score_progress:.1f}"
+    )
 
 
 def _order(path: Path) -> tuple[list[int], str]:

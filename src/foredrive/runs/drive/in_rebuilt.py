@@ -22,16 +22,15 @@ from foredrive.runs.rebuild.rebuilt_run import (
     open_run_log,
 )
 from foredrive.scene import Agent, Clip, Trajectory
-from foredrive.simulation.drive import Drive
 from foredrive.simulation.drive_log import drive_log, log_frame
-from foredrive.simulation.drive_record import ThreatResult
 from foredrive.simulation.logged_drive import LoggedDrive
 from foredrive.simulation.logged_lanes import LoggedLanes
+from foredrive.simulation.ncap.outcome import judge
 from foredrive.simulation.observation import FRAME_DT_S
 from foredrive.simulation.rebuilt import RebuiltScenario, RebuiltSimulator
 from foredrive.simulation.route_progress import RouteLine
 from foredrive.simulation.simple_agents import ReplayAgent
-from foredrive.simulation.threats import Threat, reference_mps, send_threat, threat_score
+from foredrive.simulation.threats import Threat, reference_mps, send_threat
 
 REPLAY = "log"
 """The agent that repeats the logged drive (log replay)."""
@@ -93,7 +92,7 @@ class RebuiltRoutes:
         with drive_log(out, job.name, route_xyz, rig) as log:
             yield DriveSetup(
                 simulator,
-                RebuiltScenario(start_s, sensors, past_frames),
+                RebuiltScenario(start_s, sensors, past_frames, ends_on_collision=threat is not None),
                 agent,
                 route_xyz,
                 RouteLine(route_xyz).length_m,
@@ -101,9 +100,7 @@ class RebuiltRoutes:
                 lambda: log_frame(simulator.state.frames[-1], simulator.state.ego, rig),
                 lanes_known=lanes is not None,
                 judge=lambda driven: (
-                    None
-                    if threat is None
-                    else _under_threat(driven, threat, reference_mps(threat, drive, start_s))
+                    None if threat is None else judge(threat, driven, reference_mps(threat, drive, start_s))
                 ),
             )
 
@@ -149,10 +146,3 @@ def _agent(name: str, simulator: RebuiltSimulator) -> Agent:
     there = [camera.lower() for camera in simulator.renderer.rig.names]
     wanted = [camera.lower() for camera in inputs_of(name).camera_names or there]
     return _SelectedCameras(agent, camera_indices(there, wanted)) if wanted != there else agent
-
-
-def _under_threat(driven: Drive, threat: Threat, reference: float) -> ThreatResult:
-    """Score a drive against a threat by the severity of its first collision."""
-    hits = [event.severity for event in driven.events if event.kind.startswith("collision")]
-    impact_mps = hits[0] if hits else None
-    return ThreatResult(threat, impact_mps, reference, threat_score(impact_mps, reference))

@@ -13,6 +13,7 @@ from foredrive.evaluation.provenance import collect_provenance
 from foredrive.evaluation.summary import write_json
 from foredrive.runs.folder import SUITE
 from foredrive.simulation.drive_record import DriveRecord
+from foredrive.simulation.ncap.outcome import Outcome
 from foredrive.simulation.scenarios.scenario import ScenarioKind
 from foredrive.simulation.scores import score_suite
 from foredrive.simulation.threats import Threat
@@ -107,12 +108,19 @@ def summarise(drives: Sequence[DriveRecord]) -> Figures:
 
 
 def _threat_figures(drives: Sequence[DriveRecord]) -> Figures:
-    """Return the mean score and the share of drives with a collision, for each kind of threat met."""
+    """Return the figures of each kind of threat met: means over the drives that did not fail, and counts."""
     out: Figures = {}
     for threat in Threat:
         met = [drive.threat for drive in drives if drive.threat and drive.threat.kind == threat]
-        if met:
-            out[f"threats.{threat}.score"] = statistics.fmean(each.score for each in met)
-            hit = [each.impact_mps is not None for each in met]
-            out[f"threats.{threat}.collision_share"] = sum(hit) / len(met)
+        if not met:
+            continue
+        scored = [each for each in met if each.score is not None]
+        values = {
+            "score": [each.score for each in scored],
+            "collision_share": [each.outcome is Outcome.COLLIDED for each in scored],
+            "progress": [each.progress for each in scored],
+            "score_progress": [each.score_progress for each in scored],
+        }
+        out |= {f"threats.{threat}.{key}": statistics.fmean(of) if of else None for key, of in values.items()}
+        out |= {f"threats.{threat}.{each}": sum(one.outcome is each for one in met) for each in Outcome}
     return out

@@ -28,7 +28,8 @@ from foredrive.runs.fan_out import fan_out, reason
 from foredrive.runs.folder import DRIVES, SUITE, SUMMARY, RunFolder
 from foredrive.scene import Agent, Simulator
 from foredrive.simulation.drive import Drive, PlanningTiming, drive_route
-from foredrive.simulation.drive_record import DriveRecord, ThreatResult, record_of
+from foredrive.simulation.drive_record import DriveRecord, record_of
+from foredrive.simulation.ncap.outcome import SafetyResult
 from foredrive.training.interrupts import start_fork_server
 
 
@@ -59,7 +60,7 @@ class DriveSetup:
     town: str | None = None
     """The town whose map is used; None: there is no map."""
     lanes_known: bool = True
-    judge: Callable[[Drive], ThreatResult | None] = lambda drive: None
+    judge: Callable[[Drive], SafetyResult | None] = lambda drive: None
     """Scores the drive against a threat; None: there is no threat."""
 
 

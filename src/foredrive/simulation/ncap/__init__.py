@@ -1,0 +1,1 @@
+"""Safety tests in rebuilt logs after NeuroNCAP: scenarios, rules, drives and scores."""
