@@ -115,11 +115,11 @@ def _threat_figures(drives: Sequence[DriveRecord]) -> Figures:
         if not met:
             continue
         scored = [each for each in met if each.score is not None]
-        values = {
-            "score": [each.score for each in scored],
-            "collision_share": [each.outcome is Outcome.COLLIDED for each in scored],
+        values: dict[str, list[float]] = {
+            "score": [each.score or 0.0 for each in scored],
+            "collision_share": [float(each.outcome is Outcome.COLLIDED) for each in scored],
             "progress": [each.progress for each in scored],
-            "score_progress": [each.score_progress for each in scored],
+            "score_progress": [each.score_progress or 0.0 for each in scored],
         }
         out |= {f"threats.{threat}.{key}": statistics.fmean(of) if of else None for key, of in values.items()}
         out |= {f"threats.{threat}.{each}": sum(one.outcome is each for one in met) for each in Outcome}
