@@ -1,0 +1,123 @@
+"""Losses of neural fields: where along a ray its weight should lie (Tonderski et al., "NeuRAD", 2024, §3.5).
+
+A ray has S intervals between positions `border`, with the probabilities `weight` that the ray ends in each.
+"""
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+_LEAST_WEIGHT = 1e-5
+
+
+def interlevel_loss(
+    border: Float[Tensor, "R S1"],
+    weight: Float[Tensor, "R S"],
+    proposal_border: Float[Tensor, "R P1"],
+    proposal_weight: Float[Tensor, "R P"],
+    pulse: float,
+) -> Float[Tensor, ""]:
+    """Return by how much a proposal's weights are less than the field's (Barron et al., "Zip-NeRF", §3.1).
+
+    The field's histogram is blurred by a box of half width `pulse` and compared on the proposal's intervals:
+    Σ max(0, w - ŵ)² / ŵ. Only the proposal gets a gradient.
+
+    Args:
+        border, weight: intervals of the field. What is left of a ray is given to its last interval.
+        proposal_border, proposal_weight: intervals of the proposal.
+        pulse: half width of the box, in units of `border`.
+    """
+    with torch.no_grad():
+        rest = 1 - weight.sum(-1, keepdim=True)
+        full = torch.cat([weight[:, :-1], weight[:, -1:] + rest], dim=-1)
+        at, passed, slope = _blurred(border, full, pulse)
+        share = _quadratic(proposal_border, at, passed, slope).diff(dim=-1)
+    missing = (share - proposal_weight).clamp_min(0)
+    return (missing**2 / (proposal_weight + _LEAST_WEIGHT)).sum(-1).mean()
+
+
+def _blurred(
+    border: Float[Tensor, "R S1"], weight: Float[Tensor, "R S"], pulse: float
+) -> tuple[Float[Tensor, "R K"], Float[Tensor, "R K"], Float[Tensor, "R K"]]:
+    """Return knots, integral and density of a histogram that is blurred by a box (Zip-NeRF, supplement)."""
+    density = weight / border.diff(dim=-1).clamp_min(1e-7)
+    step = torch.nn.functional.pad(density, (0, 1)) - torch.nn.functional.pad(density, (1, 0))
+    at, order = torch.cat([border - pulse, border + pulse], dim=-1).sort(dim=-1)
+    bend = (torch.cat([step, -step], dim=-1) / (2 * pulse)).gather(1, order)
+    gap = at.diff(dim=-1)
+    height = torch.nn.functional.pad((gap * bend.cumsum(-1)[:, :-1]).cumsum(-1), (1, 0)).clamp_min(0)
+    passed = torch.nn.functional.pad((0.5 * (height[:, 1:] + height[:, :-1]) * gap).cumsum(-1), (1, 0))
+    return at, passed, height
+
+
+def _quadratic(
+    x: Float[Tensor, "R P"],
+    at: Float[Tensor, "R K"],
+    passed: Float[Tensor, "R K"],
+    height: Float[Tensor, "R K"],
+) -> Float[Tensor, "R P"]:
+    """Return the integral at x of a density that is linear between knots, 0 before and 1 after them."""
+    right = torch.searchsorted(at, x.contiguous()).clamp(1, at.shape[1] - 1)
+    left = right - 1
+    x0, x1 = at.gather(1, left), at.gather(1, right)
+    h0, h1 = height.gather(1, left), height.gather(1, right)
+    way = torch.minimum(torch.maximum(x, x0), x1) - x0
+    part = way / (x1 - x0).clamp_min(1e-7)
+    return passed.gather(1, left) + way * (h0 + 0.5 * part * (h1 - h0))
+
+
+def distortion_loss(border: Float[Tensor, "R S1"], weight: Float[Tensor, "R S"]) -> Float[Tensor, ""]:
+    """Return how far apart the weights of a ray are (Barron et al., "Mip-NeRF 360", 2022, eq. 15).
+
+    Σ w_i w_j |m_i - m_j| + ⅓ Σ w_i² δ_i for middles m and lengths δ. The double sum is taken in one pass,
+    because the middles ascend.
+    """
+    middle = 0.5 * (border[:, 1:] + border[:, :-1])
+    moment = weight * middle
+    before = weight.cumsum(-1) - weight
+    moment_before = moment.cumsum(-1) - moment
+    between = 2 * (moment * before - weight * moment_before).sum(-1)
+    within = (weight**2 * border.diff(dim=-1)).sum(-1) / 3
+    return (between + within).mean()
+
+
+def carving_loss(
+    middle_m: Float[Tensor, "R S"],
+    weight: Float[Tensor, "R S"],
+    range_m: Float[Tensor, "R"],
+    returned: Bool[Tensor, "R"],
+    margin_m: float,
+    free_m: float,
+) -> Float[Tensor, ""]:
+    """Return Σ w² over the samples of beams where nothing should be, mean over the beams (NeuRAD, eq. 9).
+
+    Args:
+        middle_m, weight: the samples without the sky.
+        range_m: distance of the returns.
+        returned: whether the beams returned.
+        margin_m: samples of returned beams within this distance of the return count as surface.
+        free_m: beams that did not return are free up to this distance.
+    """
+    near = (middle_m - range_m[:, None]).abs() < margin_m
+    wrong = torch.where(returned[:, None], ~near, middle_m < free_m)
+    return (weight**2 * wrong).sum(-1).mean()
+
+
+def beam_depth_loss(
+    depth_m: Float[Tensor, "R"],
+    range_m: Float[Tensor, "R"],
+    returned: Bool[Tensor, "R"],
+    free_m: float,
+    lost_weight: float,
+    quantile: float = 1.0,
+) -> Float[Tensor, ""]:
+    """Return the mean absolute error of expected distances, beams that did not return included.
+
+    A lost beam should end at `free_m` or beyond. The worst errors, above a quantile, are left out.
+    """
+    target = torch.where(returned, range_m, depth_m.detach().clamp_min(free_m))
+    error = (depth_m - target).abs() * torch.where(returned, 1.0, lost_weight)
+    if quantile < 1 and len(error):
+        limit = error.detach().kthvalue(max(int(quantile * len(error)), 1)).values
+        error = error[error <= limit]
+    return error.mean()

@@ -1,0 +1,77 @@
+"""Settings of a neural field."""
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+
+@dataclass(frozen=True)
+class GridConfig:
+    """A hash grid (see `ops.hash_grid.grid_levels`)."""
+
+    levels: int
+    features: int
+    coarsest: int
+    finest: int
+    log2_rows: int
+
+
+@dataclass(frozen=True)
+class GridsConfig:
+    """The grid of what stands and the grid that all actors share. Levels of actors are the first levels."""
+
+    static: GridConfig
+    actors: GridConfig
+
+    def __post_init__(self) -> None:
+        """Check that actors have no more features than what stands."""
+        sizes = [grid.levels * grid.features for grid in (self.static, self.actors)]
+        if sizes[1] > sizes[0]:
+            raise ValueError(f"actors have {sizes[1]} features, more than the static part's {sizes[0]}")
+
+
+@dataclass(frozen=True)
+class FieldConfig:
+    """Parts of a `NeuralField`. The defaults are those of NeuRAD's paper and reference implementation."""
+
+    grids: GridsConfig = field(
+        default_factory=lambda: GridsConfig(
+            static=GridConfig(levels=8, features=4, coarsest=32, finest=8192, log2_rows=22),
+            actors=GridConfig(levels=4, features=4, coarsest=64, finest=1024, log2_rows=17),
+        )
+    )
+    proposals: tuple[GridsConfig, ...] = field(
+        default_factory=lambda: (
+            (
+                GridsConfig(
+                    static=GridConfig(levels=6, features=1, coarsest=128, finest=4096, log2_rows=20),
+                    actors=GridConfig(levels=4, features=1, coarsest=64, finest=1024, log2_rows=15),
+                ),
+            )
+            * 2
+        )
+    )
+    """Grids of the proposal densities, in the order of sampling."""
+    proposal_samples: tuple[int, ...] = (128, 64)
+    """Samples on a ray in each round of proposals."""
+    samples: int = 32
+    """Samples on a ray at which the field is evaluated."""
+    spacing_m: float = 20.0
+    """The first samples are uniform in t / (t + spacing): the power spacing of Zip-NeRF with λ = -1."""
+    sky_m: float = 20_000.0
+    """End of every ray. What the ray has left there is given to its last sample."""
+    scale_m: float = 50.0
+    """Half side of the cube about the path's middle that is not contracted."""
+    actor_scale_m: float = 10.0
+    """The same for the boxes of actors, about the box' centre."""
+    actor_margin_m: tuple[float, float, float] = (0.25, 0.25, 0.1)
+    """The boxes are this much larger at each end: along, across, up."""
+    surface: Literal["sdf", "density"] = "sdf"
+    """The field's geometry: a signed distance, with opacity 1 / (1 + exp(β s)), or a density."""
+    beta: float = 20.0
+    """Initial slope β of the opacity."""
+    width: int = 32
+    """Channels of hidden layers and of the field's features."""
+    geometry_layers: int = 2
+    feature_layers: int = 3
+    appearance: int = 16
+    """Size of a sensor's appearance code."""

@@ -1,0 +1,94 @@
+"""Decoders of a field's features: images from patches of rays, intensity and ray drop from beams."""
+
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor, nn
+
+UPSAMPLING = 3
+"""Pixels along a side for which one ray stands (NeuRAD, §3.1)."""
+
+
+@dataclass(frozen=True)
+class PatchDecoderConfig:
+    """Sizes of a `PatchDecoder`. The defaults are those of NeuRAD's reference implementation."""
+
+    width: int = 32
+    """Channels before the image is enlarged."""
+    fine_width: int = 32
+    """Channels after it."""
+    kernel: int = 7
+    coarse_blocks: int = 2
+    fine_blocks: int = 2
+    batch_norm: bool = True
+
+
+class PatchDecoder(nn.Module):
+    """A CNN from the features of a patch of rays to an image with three times as many pixels a side.
+
+    Args:
+        features: number of the field's features.
+        cameras: number of cameras, each with an appearance code.
+        appearance: size of a code.
+        config: sizes of the layers.
+    """
+
+    def __init__(self, features: int, cameras: int, appearance: int, config: PatchDecoderConfig) -> None:
+        super().__init__()
+        self.appearance = nn.Parameter(torch.randn(cameras, appearance))
+        width, fine = config.width, config.fine_width
+        self.first = nn.Conv2d(features + appearance, width, 1)
+        self.coarse = nn.Sequential(*(_Block(width, config) for _ in range(config.coarse_blocks)))
+        # As a transposed convolution of kernel and stride 3: each ray gives the channels of nine pixels.
+        self.enlarge = nn.Conv2d(width, fine * UPSAMPLING**2, 1)
+        self.fine = nn.Sequential(*(_Block(fine, config) for _ in range(config.fine_blocks)))
+        self.last = nn.Conv2d(fine, 3, 1)
+
+    def forward(self, feature: Float[Tensor, "n H W D"], camera: int) -> Float[Tensor, "n 3 H3 W3"]:
+        """Return patches of an image, RGB from 0 to 1."""
+        code = self.appearance[camera].expand(*feature.shape[:3], -1)
+        seen = torch.cat([feature, code], dim=-1).permute(0, 3, 1, 2)
+        coarse = self.coarse(F.relu(self.first(seen)))
+        fine = F.pixel_shuffle(self.enlarge(coarse), UPSAMPLING)
+        image: Tensor = self.last(self.fine(fine)).sigmoid()
+        return image
+
+
+class _Block(nn.Module):
+    """Two convolutions and a shortcut."""
+
+    def __init__(self, width: int, config: PatchDecoderConfig) -> None:
+        super().__init__()
+
+        def convolution() -> list[nn.Module]:
+            padded = nn.Conv2d(width, width, config.kernel, padding=config.kernel // 2)
+            return [padded, nn.BatchNorm2d(width)] if config.batch_norm else [padded]
+
+        self.net = nn.Sequential(*convolution(), nn.ReLU(), *convolution())
+
+    def forward(self, x: Float[Tensor, "n C H W"]) -> Float[Tensor, "n C H W"]:
+        """Return features of the same size."""
+        return F.relu(x + self.net(x))
+
+
+class BeamDecoder(nn.Module):
+    """An MLP from a beam's feature to intensity and ray drop (NeuRAD, §3.3)."""
+
+    def __init__(self, features: int, appearance: int, width: int = 32) -> None:
+        super().__init__()
+        self.appearance = nn.Parameter(torch.randn(appearance))
+        self.net = nn.Sequential(
+            nn.Linear(features + appearance, width),
+            nn.ReLU(),
+            nn.Linear(width, width),
+            nn.ReLU(),
+            nn.Linear(width, 2),
+        )
+
+    def forward(self, feature: Float[Tensor, "P D"]) -> tuple[Float[Tensor, "P"], Float[Tensor, "P"]]:
+        """Return intensity from 0 to 1, and the logit of the probability that the beam does not return."""
+        code = self.appearance.expand(len(feature), -1)
+        intensity, drop_logit = self.net(torch.cat([feature, code], dim=-1)).unbind(-1)
+        return intensity.sigmoid(), drop_logit

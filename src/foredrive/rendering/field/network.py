@@ -1,0 +1,222 @@
+"""Networks of a neural field: grids, layers and the density that proposes samples.
+
+Values of N samples are kept with the samples last, [C N], as `ops.hash_grid` gives them: layers multiply from
+the left, and nothing is transposed.
+"""
+
+import math
+from itertools import pairwise
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+
+from foredrive.ops.hash_grid import grid_levels, read_hash_grid
+from foredrive.rendering.field.config import FieldConfig, GridConfig, GridsConfig
+from foredrive.rendering.field.contraction import contract
+
+_FIRST_FEATURE = 1e-3
+"""Bound of the initial features of a grid (Müller et al. 2022, §4); NeuRAD's is the same."""
+_MAX_LOG_DENSITY = 15.0
+_FIRST_LOG_DENSITY = math.log(0.02)
+"""Initial logarithm of a density, 1/m: a ray passes through tens of metres."""
+_FIRST_DISTANCE = 0.1
+"""Initial signed distance: with β = 20, a sample stops an eighth of the light."""
+HARMONICS = 16
+"""Number of spherical harmonics up to degree 3."""
+
+
+class ActorSamples(NamedTuple):
+    """The samples that lie in boxes of actors: M of the N samples."""
+
+    sample: Int[Tensor, "M"]
+    """Index of the sample."""
+    slot: Int[Tensor, "M"]
+    """The actor's place in the grid of actors."""
+    point_m: Float[Tensor, "M 3"]
+    """Position in the frame of the box."""
+    direction: Float[Tensor, "M 3"]
+    """Direction of the ray in that frame."""
+    footprint_m: Float[Tensor, "M"]
+
+
+class HashGrid(nn.Module):
+    """A hash grid with its table."""
+
+    def __init__(self, config: GridConfig, actors: int = 1) -> None:
+        super().__init__()
+        self.levels = grid_levels(
+            config.levels, config.coarsest, config.finest, config.log2_rows, max(actors, 1)
+        )
+        rows = self.levels[-1].first_row + self.levels[-1].rows
+        self.table = nn.Parameter(_FIRST_FEATURE * (2 * torch.rand(rows, config.features) - 1))
+
+    def forward(
+        self, points: Float[Tensor, "N 3"], footprint: Float[Tensor, "N"], slot: Int[Tensor, "N"] | None
+    ) -> Float[Tensor, "C N"]:
+        """Return the features at points of the unit cube."""
+        return read_hash_grid(self.table, points, self.levels, footprint, slot)
+
+
+class Grids(nn.Module):
+    """The grid of what stands, and a grid that all actors share (NeuRAD, §3.2)."""
+
+    def __init__(self, config: GridsConfig, field: FieldConfig, actors: int) -> None:
+        super().__init__()
+        self.scale_m, self.actor_scale_m = field.scale_m, field.actor_scale_m
+        self.static = HashGrid(config.static)
+        self.actors = HashGrid(config.actors, actors)
+        self.features = config.static.levels * config.static.features
+
+    def forward(
+        self,
+        points_m: Float[Tensor, "N 3"],
+        footprint_m: Float[Tensor, "N"],
+        moving: ActorSamples | None,
+    ) -> Float[Tensor, "C N"]:
+        """Return the features at samples: those of actors where a sample is in an actor's box.
+
+        Args:
+            points_m: positions relative to the middle of the scene.
+            footprint_m: side of the volume that each sample stands for.
+            moving: samples in boxes.
+        """
+        standing = self.static(*contract(points_m, footprint_m, self.scale_m), None)
+        if moving is None or len(moving.sample) == 0:
+            return standing
+        own = self.actors(*contract(moving.point_m, moving.footprint_m, self.actor_scale_m), moving.slot)
+        missing = self.features - len(own)
+        own = torch.cat([own, own.new_zeros(missing, own.shape[1])]) if missing else own
+        return standing.index_copy(1, moving.sample, own)
+
+
+class Layers(nn.Module):
+    """A perceptron for values with the samples last: ReLU between the layers."""
+
+    def __init__(self, *sizes: int) -> None:
+        super().__init__()
+        self.linear = nn.ModuleList(nn.Linear(a, b) for a, b in pairwise(sizes))
+
+    def forward(self, x: Float[Tensor, "C N"]) -> Float[Tensor, "D N"]:
+        """Return the last layer's output."""
+        for i, layer in enumerate(self.linear):
+            x = affine(layer, x if i == 0 else x.relu_())
+        return x
+
+
+def affine(layer: nn.Module, x: Float[Tensor, "C N"]) -> Float[Tensor, "D N"]:
+    """Apply a linear layer from the left."""
+    assert isinstance(layer, nn.Linear)
+    return torch.addmm(layer.bias[:, None], layer.weight, x)
+
+
+class FieldLayers(nn.Module):
+    """The layers of the field: geometry and features from a grid's features and directions (NeuRAD, §3.1)."""
+
+    def __init__(self, config: FieldConfig, features: int) -> None:
+        super().__init__()
+        width = config.width
+        self.geometry = Layers(features, *[width] * (config.geometry_layers - 1), width + 1)
+        self.first = nn.Linear(width, width)
+        self.first_direction = nn.Linear(HARMONICS, width, bias=False)
+        self.rest = Layers(*[width] * config.feature_layers)
+        self.beta = nn.Parameter(torch.tensor(config.beta)) if config.surface == "sdf" else None
+        with torch.no_grad():
+            last = self.geometry.linear[-1]
+            assert isinstance(last, nn.Linear)
+            last.weight[0] *= _FIRST_DISTANCE
+            last.bias[0] = _FIRST_DISTANCE if self.beta is not None else 0.0
+
+    def forward(
+        self,
+        grid: Float[Tensor, "C N"],
+        direction: Float[Tensor, "R 3"],
+        moving: ActorSamples | None,
+        length_m: Float[Tensor, "R S"],
+    ) -> tuple[Float[Tensor, "R S"], Float[Tensor, "D R S"]]:
+        """Return the opacity and the features of S samples on each of R rays (N = R · S).
+
+        Args:
+            grid: features of the grids.
+            direction: directions of the rays.
+            moving: samples in boxes; their directions are those in the box' frame.
+            length_m: lengths of the samples' intervals.
+        """
+        shape = length_m.shape
+        out = self.geometry(grid)
+        geometry, embedding = out[0].view(shape), out[1:]
+        turned = affine_direction(self.first_direction, direction)  # [D R]
+        hidden = (affine(self.first, embedding).unflatten(1, shape) + turned[..., None]).flatten(1)
+        if moving is not None and len(moving.sample):
+            ray = moving.sample // shape[1]
+            own = affine_direction(self.first_direction, moving.direction)
+            hidden = hidden.index_add(1, moving.sample, own - turned[:, ray])
+        feature = embedding + self.rest(hidden.relu_())
+        return self._opacity(geometry, length_m), feature.unflatten(1, shape)
+
+    def _opacity(
+        self, geometry: Float[Tensor, "R S"], length_m: Float[Tensor, "R S"]
+    ) -> Float[Tensor, "R S"]:
+        if self.beta is not None:
+            return torch.sigmoid(-(self.beta.abs() + 1e-4) * geometry)
+        return opacity_of_density(geometry, length_m)
+
+
+def affine_direction(layer: nn.Linear, direction: Float[Tensor, "R 3"]) -> Float[Tensor, "D R"]:
+    """Return a linear layer of the spherical harmonics of directions."""
+    return layer.weight @ harmonics(direction)
+
+
+def opacity_of_density(
+    log_density: Float[Tensor, "R S"], length_m: Float[Tensor, "R S"]
+) -> Float[Tensor, "R S"]:
+    """Return 1 - exp(-σ δ) for log σ - log σ₀ with the initial density σ₀, and lengths δ."""
+    density = (log_density + _FIRST_LOG_DENSITY).clamp_max(_MAX_LOG_DENSITY).exp()
+    return -torch.expm1(-density * length_m)
+
+
+class ProposalDensity(nn.Module):
+    """A density from a small grid, which only says where to sample the field."""
+
+    def __init__(self, config: GridsConfig, field: FieldConfig, actors: int) -> None:
+        super().__init__()
+        self.grids = Grids(config, field, actors)
+        self.decoder = nn.Linear(self.grids.features, 1, bias=False)
+
+    def forward(
+        self,
+        points_m: Float[Tensor, "N 3"],
+        footprint_m: Float[Tensor, "N"],
+        moving: ActorSamples | None,
+        length_m: Float[Tensor, "R S"],
+    ) -> Float[Tensor, "R S"]:
+        """Return the opacity of samples."""
+        log_density = self.decoder.weight @ self.grids(points_m, footprint_m, moving)
+        return opacity_of_density(log_density.view(length_m.shape), length_m)
+
+
+def harmonics(direction: Float[Tensor, "R 3"]) -> Float[Tensor, "16 R"]:
+    """Return the real spherical harmonics up to degree 3 of unit vectors."""
+    x, y, z = direction.unbind(-1)
+    xx, yy, zz = x * x, y * y, z * z
+    return torch.stack(
+        [
+            torch.full_like(x, 0.28209479),
+            -0.48860251 * y,
+            0.48860251 * z,
+            -0.48860251 * x,
+            1.09254843 * x * y,
+            -1.09254843 * y * z,
+            0.31539157 * (3 * zz - 1),
+            -1.09254843 * x * z,
+            0.54627422 * (xx - yy),
+            -0.59004359 * y * (3 * xx - yy),
+            2.89061144 * x * y * z,
+            -0.45704580 * y * (5 * zz - 1),
+            0.37317633 * z * (5 * zz - 3),
+            -0.45704580 * x * (5 * zz - 1),
+            1.44530572 * z * (xx - yy),
+            -0.59004359 * x * (xx - 3 * yy),
+        ]
+    )

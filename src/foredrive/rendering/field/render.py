@@ -1,0 +1,183 @@
+"""Rendering of features, distances and opacities along rays from a neural field."""
+
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor, nn
+
+from foredrive.ops.compositing import composite
+from foredrive.ops.ray_boxes import Crossings, MovingBoxes, cross_boxes
+from foredrive.rendering.field.config import FieldConfig
+from foredrive.rendering.field.network import ActorSamples, FieldLayers, Grids, ProposalDensity
+from foredrive.rendering.field.rays import FieldRays
+from foredrive.rendering.field.sampling import first_borders, resampled_borders, to_distance
+from foredrive.rendering.tracks import ActorTracks
+
+
+class FieldActors(NamedTuple):
+    """The actors of a scene, and where each one is found in the grid of actors."""
+
+    tracks: ActorTracks
+    slot: Int[Tensor, "A"]
+    """Place of each actor in the grid. A copy has the place of its original."""
+    mirror: Bool[Tensor, "A"] | None = None
+    """Actors whose left and right sides are swapped; None: none."""
+
+
+class Intervals(NamedTuple):
+    """The intervals of S samples on each ray, with their weights."""
+
+    border: Float[Tensor, "R S1"]
+    """Positions from 0 to 1 (see `sampling`)."""
+    border_m: Float[Tensor, "R S1"]
+    """Distances along the ray."""
+    weight: Float[Tensor, "R S"]
+    """Probability that the ray ends in the interval; what is left at the end is not included."""
+
+    @property
+    def middle_m(self) -> Float[Tensor, "R S"]:
+        """Return the distances of the samples: the middles of the intervals."""
+        return 0.5 * (self.border_m[:, 1:] + self.border_m[:, :-1])
+
+    @property
+    def depth_m(self) -> Float[Tensor, "R"]:
+        """Return the expected distance, to which the last interval (the sky) adds nothing."""
+        return (self.weight * self.middle_m)[:, :-1].sum(-1)
+
+
+class SeenAlongRays(NamedTuple):
+    """What R rays see."""
+
+    feature: Float[Tensor, "R D"]
+    depth_m: Float[Tensor, "R"]
+    """Expected distance; the sky adds nothing."""
+    alpha: Float[Tensor, "R"]
+    """Probability that the ray ends before the sky."""
+    median_m: Float[Tensor, "R"]
+    """Distance by which half of the rays that end have ended; infinite where alpha is below 0.5."""
+    intervals: Intervals
+    proposals: list[Intervals]
+
+
+class NeuralField(nn.Module):
+    """A field of features in space, with a grid for what stands and one for all actors.
+
+    Args:
+        config: parts of the field.
+        actors: number of places in the grid of actors.
+        middle_m: the middle of the part of the scene that is not contracted.
+    """
+
+    middle_m: Tensor
+
+    def __init__(self, config: FieldConfig, actors: int, middle_m: Float[Tensor, "3"]) -> None:
+        super().__init__()
+        self.config = config
+        self.register_buffer("middle_m", middle_m)
+        self.grids = Grids(config.grids, config, actors)
+        self.layers = FieldLayers(config, self.grids.features)
+        self.proposals = nn.ModuleList(ProposalDensity(grids, config, actors) for grids in config.proposals)
+
+    def forward(
+        self, rays: FieldRays, actors: FieldActors, generator: torch.Generator | None = None
+    ) -> SeenAlongRays:
+        """Render rays.
+
+        Args:
+            rays: in the scene's frame.
+            actors: the actors of the scene.
+            generator: for the random places of samples in training; None takes their middles.
+        """
+        config = self.config
+        crossings = self._crossings(rays, actors)
+        border = first_borders(len(rays.origin), config.proposal_samples[0], generator, rays.origin)
+        proposals: list[Intervals] = []
+        for i, proposal in enumerate(self.proposals):
+            border_m = to_distance(border, config.spacing_m, config.sky_m)
+            points, footprint, moving = self._samples(rays, border_m, crossings, actors, learn_poses=False)
+            opacity = proposal(points, footprint, moving, border_m.diff(dim=-1))
+            weight = composite(opacity, opacity.detach()).weights
+            proposals.append(Intervals(border, border_m, weight))
+            last = i + 1 == len(self.proposals)
+            count = config.samples if last else config.proposal_samples[i + 1]
+            border = resampled_borders(border, weight, count, generator)
+        border_m = to_distance(border, config.spacing_m, config.sky_m)
+        points, footprint, moving = self._samples(rays, border_m, crossings, actors, learn_poses=True)
+        grid = self.grids(points, footprint, moving)
+        opacity, feature = self.layers(grid, rays.direction, moving, border_m.diff(dim=-1))
+        seen = composite(opacity, opacity.detach())
+        intervals = Intervals(border, border_m, seen.weights)
+        # What is left of a ray sees its last sample, the sky.
+        weight = torch.cat(
+            [seen.weights[:, :-1], (seen.weights[:, -1] + seen.transmittance)[:, None]], dim=-1
+        )
+        return SeenAlongRays(
+            feature=(feature * weight).sum(-1).T,
+            depth_m=intervals.depth_m,
+            alpha=seen.weights[:, :-1].sum(-1),
+            median_m=_median(intervals),
+            intervals=intervals,
+            proposals=proposals,
+        )
+
+    def _crossings(self, rays: FieldRays, actors: FieldActors) -> Crossings:
+        tracks = actors.tracks
+        half = 0.5 * tracks.size_lwh + tracks.size_lwh.new_tensor(self.config.actor_margin_m)
+        boxes = MovingBoxes(tracks.t_s, tracks.T_scene_actor, half, tracks.present)
+        return cross_boxes(rays.origin, rays.direction, rays.t_s, boxes)
+
+    def _samples(
+        self,
+        rays: FieldRays,
+        border_m: Float[Tensor, "R S1"],
+        crossings: Crossings,
+        actors: FieldActors,
+        learn_poses: bool,
+    ) -> tuple[Float[Tensor, "N 3"], Float[Tensor, "N"], ActorSamples | None]:
+        """Return the samples' positions and footprints, and which of them lie in boxes."""
+        with torch.set_grad_enabled(learn_poses and torch.is_grad_enabled()):
+            middle_m = 0.5 * (border_m[:, 1:] + border_m[:, :-1])
+            origin = rays.origin - self.middle_m
+            points = origin[:, None] + rays.direction[:, None] * middle_m[..., None]
+            # Half of the interval, as in the reference implementation.
+            volume = rays.area[:, None] * middle_m**2 * (0.5 * border_m.diff(dim=-1))
+            footprint = volume.detach().pow(1 / 3).flatten()
+            moving = _in_boxes(crossings, middle_m, footprint, actors) if len(crossings.ray) else None
+            return points.flatten(0, 1), footprint, moving
+
+
+def _in_boxes(
+    crossings: Crossings, middle_m: Float[Tensor, "R S"], footprint: Float[Tensor, "N"], actors: FieldActors
+) -> ActorSamples:
+    """Return the samples inside boxes. Where boxes overlap, a sample belongs to the one entered last."""
+    samples = middle_m.shape[1]
+    along = middle_m[crossings.ray]
+    inside = (along > crossings.enter_m.detach()[:, None]) & (along < crossings.leave_m.detach()[:, None])
+    pair, place = inside.nonzero(as_tuple=True)
+    sample = crossings.ray[pair] * samples + place
+    owner = torch.full((middle_m.numel(),), -1, device=sample.device)
+    owner = owner.scatter_reduce(0, sample, pair, "amax")
+    mine = owner[sample] == pair
+    pair, place, sample = pair[mine], place[mine], sample[mine]
+    box = crossings.box[pair]
+    direction = crossings.direction_box[pair]
+    point = crossings.origin_box[pair] + direction * along[pair, place][:, None]
+    if actors.mirror is not None:
+        sign = torch.ones_like(point)
+        sign[:, 1] = torch.where(actors.mirror[box], -1.0, 1.0)
+        point, direction = point * sign, direction * sign
+    return ActorSamples(sample, actors.slot[box], point, direction, footprint[sample])
+
+
+@torch.no_grad()
+def _median(intervals: Intervals) -> Float[Tensor, "R"]:
+    """Return the distance at which half of each ray's weight is reached, linear within an interval."""
+    passed = intervals.weight[:, :-1].cumsum(-1)
+    index = torch.searchsorted(passed.contiguous(), torch.full_like(passed[:, :1], 0.5))
+    reached = index[:, 0] < passed.shape[1]
+    index = index.clamp_max(passed.shape[1] - 1)
+    weight = intervals.weight.gather(1, index)
+    part = 1 - (passed.gather(1, index) - 0.5) / weight.clamp_min(1e-9)
+    low, high = intervals.border_m.gather(1, index), intervals.border_m.gather(1, index + 1)
+    return torch.where(reached, (low + part.clamp(0, 1) * (high - low))[:, 0], torch.inf)

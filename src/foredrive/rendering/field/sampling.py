@@ -1,0 +1,78 @@
+"""Where along their rays a field is sampled.
+
+Positions on a ray are s in 0 to 1, with t = spacing · s / (1 - s): uniform near the sensor, and uniform in
+inverse distance far away. This is the power spacing of Barron et al., "Zip-NeRF", 2023, eq. 29, with λ = -1.
+"""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+_LEAST_SHARE = 0.01
+"""Added to the weight of each interval, so that no interval is never sampled."""
+
+
+def to_distance(s: Float[Tensor, "*b"], spacing_m: float, far_m: float) -> Float[Tensor, "*b"]:
+    """Return distances of positions; s = 1 is `far_m`."""
+    s = s * (far_m / (far_m + spacing_m))
+    return spacing_m * s / (1 - s)
+
+
+def to_position(distance_m: Float[Tensor, "*b"], spacing_m: float, far_m: float) -> Float[Tensor, "*b"]:
+    """Return the positions of distances up to `far_m`."""
+    return distance_m / (distance_m + spacing_m) * ((far_m + spacing_m) / far_m)
+
+
+def first_borders(
+    rays: int, samples: int, generator: torch.Generator | None, like: Tensor
+) -> Float[Tensor, "R N1"]:
+    """Return the borders of equal intervals from 0 to 1.
+
+    Args:
+        rays: number of rays.
+        samples: number of intervals.
+        generator: moves the inner borders of each ray by up to half an interval, all together. None: no move.
+        like: a tensor with the type and the device of the result.
+    """
+    borders = torch.linspace(0, 1, samples + 1, device=like.device, dtype=like.dtype).expand(rays, -1)
+    if generator is None:
+        return borders
+    move = (_random(rays, generator, like) - 0.5) / samples
+    inner = borders[:, 1:-1] + move
+    return torch.cat([borders[:, :1], inner, borders[:, -1:]], dim=-1)
+
+
+def resampled_borders(
+    borders: Float[Tensor, "R N1"],
+    weights: Float[Tensor, "R N"],
+    samples: int,
+    generator: torch.Generator | None,
+) -> Float[Tensor, "R M1"]:
+    """Return the borders of M intervals that have about equal shares of a histogram.
+
+    Args:
+        borders, weights: intervals and weights of the histogram; both are taken as constants.
+        samples: number of intervals M.
+        generator: see `first_borders`.
+    """
+    with torch.no_grad():
+        share = weights + _LEAST_SHARE / weights.shape[1]
+        passed = torch.cumsum(share, dim=-1)
+        passed = torch.cat([torch.zeros_like(passed[:, :1]), passed / passed[:, -1:]], dim=-1)
+        wanted = first_borders(len(borders), samples, generator, borders).contiguous()
+        return interpolated(wanted, passed, borders)
+
+
+def interpolated(
+    x: Float[Tensor, "R M"], at: Float[Tensor, "R N"], value: Float[Tensor, "R N"]
+) -> Float[Tensor, "R M"]:
+    """Return the piecewise linear functions through (at, value) at x, constant beyond their ends."""
+    right = torch.searchsorted(at, x, right=True).clamp(1, at.shape[1] - 1)
+    x0, x1 = at.gather(1, right - 1), at.gather(1, right)
+    y0, y1 = value.gather(1, right - 1), value.gather(1, right)
+    part = ((x - x0) / (x1 - x0).clamp_min(torch.finfo(x.dtype).tiny)).clamp(0, 1)
+    return y0 + part * (y1 - y0)
+
+
+def _random(count: int, generator: torch.Generator, like: Tensor) -> Float[Tensor, "R 1"]:
+    return torch.rand(count, 1, generator=generator, device=generator.device).to(like)
