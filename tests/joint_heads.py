@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import torch
 
 from foredrive.data.task_truth import TaskTruthConfig
-from foredrive.models.tasks.agents import AgentHeadConfig
+from foredrive.models.tasks.agents import AgentHeadConfig, CarriedConfig
 from foredrive.models.tasks.decoder import DecoderConfig
 from foredrive.models.tasks.maps import MapHeadConfig
 from foredrive.models.tasks.motion import MotionConfig
@@ -30,7 +30,10 @@ def small_heads(tasks: Sequence[str], steps: int = 2) -> TaskHeadsRecipe:
         max_cells=8,
         agents=agents
         and AgentHeadConfig(
-            queries=6, decoder=decoder, motion=agents.motion and MotionConfig(decoder=decoder)
+            queries=6,
+            decoder=decoder,
+            motion=agents.motion and MotionConfig(decoder=decoder),
+            carried=agents.carried and CarriedConfig(agents=2, born=0.0, frames=2),
         ),
         elements=recipe.heads.elements and MapHeadConfig(elements=3, points=4, decoder=decoder),
     )

@@ -44,6 +44,31 @@ def test_a_joint_run_is_trained_end_to_end_and_evaluated(trained: Run, log: LogP
     assert "motion.uniad.car.min_ade_m" in summary
 
 
+def test_tracks_are_learned_jointly_and_by_a_probe(trained: Run, log: LogPath, tmp_path: Path) -> None:
+    """Either way the evaluation follows the drive, beside a tracker of the same detections."""
+    tasks = ("detection", "tracking")
+    recipe = with_small_heads(trained.recipe, tasks, attends=("agents",))
+    joint = train_run(recipe, [log], tmp_path / "joint", trained.cache_dir, trained.folder)
+    probe = probe_run(trained.recipe, [log], tmp_path / "probe", trained.cache_dir, trained.folder)
+    train_heads(probe, small_heads(tasks))
+    for run in (joint, probe):
+        summary = evaluate_run(run, [log], tmp_path / "evaluated", views=False).summary
+        assert summary["failed"] == 0
+        assert summary["tracking.scenes"] == 1
+        for key in ("amota", "ids", "car.recall"):
+            assert f"tracking.nuscenes.{key}" in summary
+            assert f"tracking.nuscenes.{key}.greedy_association" in summary
+    short = dataclasses.replace(recipe.clips, now_stride_s=1.0)
+    with pytest.raises(InputError, match=r"no log has 2 clips that are 0\.5 s apart"):
+        train_run(
+            dataclasses.replace(recipe, clips=short),
+            [log],
+            tmp_path / "no",
+            trained.cache_dir,
+            trained.folder,
+        )
+
+
 @pytest.mark.parametrize("make", [miniature, miniature_driveworld])
 def test_an_interrupted_joint_run_goes_on_to_the_same_bits(
     make: Callable[[], Recipe], log: LogPath, tmp_path: Path

@@ -96,6 +96,7 @@ def scene() -> TaskExample:
             raster=MapRaster(RASTER, layers, torch.tensor(True)),
             semantics=SemanticVoxels(SPEC, "occ3d", index, everywhere, everywhere, everywhere),
         ),
+        T_world_ego=torch.eye(4, dtype=torch.float64),
         key=(),
     )
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from joint_heads import with_small_heads, with_truth
+from joint_heads import ALL, with_small_heads, with_truth
 from miniature import shrunk
 from torch import nn
 
@@ -45,8 +45,8 @@ def test_after_a_step_no_trainable_parameter_is_without_a_gradient(
 def test_with_heads_that_a_planner_attends_to_none_is_without_a_gradient(
     name: str, make_example: Callable[..., Example]
 ) -> None:
-    """Gradients of the plan reach the world model through the heads' queries too."""
-    recipe = with_small_heads(shrunk(RECIPES[name]), attends=("agents", "map"))
+    """Gradients of the plan reach the world model through the heads' queries too. The batch is a sequence."""
+    recipe = with_small_heads(shrunk(RECIPES[name]), (*ALL, "tracking"), attends=("agents", "map"))
     clips = recipe.clips
     assert clips.tasks is not None
     example = make_example(past=clips.past_frames, future=clips.future_frames, spec=clips.voxels)

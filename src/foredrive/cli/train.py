@@ -36,8 +36,8 @@ def train(
         start: Another run's folder: use its pre-trained weights and begin with fine-tuning. With --probe, use
             its world model and planner as they are. With --set transfer=frozen, keep its world model and its
             heads as they are and train the planner alone.
-        tasks: Tasks to train heads for, separated by commas: detection, map, motion, occupancy. Fine-tuning
-            trains them together with the world model.
+        tasks: Tasks to train heads for, separated by commas: detection, tracking, map, motion, occupancy.
+            Fine-tuning trains them together with the world model.
         probe: Train the heads of --tasks on the frozen world model instead. Its volumes are computed once and
             kept.
         set: Entries of the recipe to replace, such as finetune.schedule.lr=1e-3; `foredrive recipes RECIPE`

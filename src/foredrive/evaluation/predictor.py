@@ -1,5 +1,6 @@
 """The interface between models and evaluations: a `Predictor` returns a `Prediction`."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal, Protocol, runtime_checkable
 
@@ -64,6 +65,15 @@ class Predictor(Protocol):
             asked: parts that the metrics need. A part that is not asked for may be left None, and so may a
                 part that the model cannot predict.
         """
+        ...
+
+
+@runtime_checkable
+class DriveFollowing(Protocol):
+    """A `Predictor` that carries something from frame to frame of a drive."""
+
+    def follow(self, keys: Sequence[str]) -> None:
+        """Receive the names, LOG@T_US, of the clips that `predict` is given next, in the order of time."""
         ...
 
 

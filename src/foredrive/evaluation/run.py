@@ -13,7 +13,13 @@ from torch import Tensor
 from foredrive.errors import InputError
 from foredrive.evaluation.metric import EvaluationContext, Figures, MetricFactory
 from foredrive.evaluation.metrics import METRICS
-from foredrive.evaluation.predictor import Part, PlannerPredictor, Prediction, Predictor
+from foredrive.evaluation.predictor import (
+    DriveFollowing,
+    Part,
+    PlannerPredictor,
+    Prediction,
+    Predictor,
+)
 from foredrive.evaluation.provenance import peak_rss_gib
 from foredrive.evaluation.task_priors import TaskPriors
 from foredrive.metrics.occupancy import OccupancyPrior
@@ -158,7 +164,10 @@ class _EvaluatedMethod:
         while batches:
             chosen = batches.pop(0)
             try:
-                observed = _select(example, chosen).clip.observed()
+                part = _select(example, chosen)
+                observed = part.clip.observed()
+                if isinstance(self._predictor, DriveFollowing):
+                    self._predictor.follow(part.key)
                 prediction = self._predictor.predict(observed, self._asked)
             except Exception as error:  # whatever a model does wrong, the others are still to be judged
                 if len(chosen) > 1:

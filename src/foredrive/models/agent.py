@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from foredrive.geometry.precision import full_precision
 from foredrive.models.ego_mlp import ego_motion, route_target
 from foredrive.models.planner import VolumePlanner
+from foredrive.models.tasks.carried import CarriedAgents
 from foredrive.models.tasks.heads import HeadOutput, TaskHeads, volumes_of
 from foredrive.scene import Belief, Clip, Decoded, Trajectory, WorldModel
 
@@ -54,17 +55,29 @@ class PlanningAgent(nn.Module, Generic[W]):
         now = self.world_model.observe(clip)
         return [now, *self.world_model.imagine(now, steps)] if steps else [now]
 
-    def perceive(self, now: Belief) -> HeadOutput | None:
+    def perceive(
+        self, now: Belief, sequences: Clip | None = None, carried: CarriedAgents | None = None
+    ) -> HeadOutput | None:
         """Return the output of the agent's task heads for a belief about now; None without heads.
 
         Heads compute in 32 bits, because positions in 16 are off by tenths of a cell.
+
+        Args:
+            now: belief about now.
+            sequences: the clips, if they are the sequences in which heads that carry agents on are trained.
+            carried: agents of the frame before.
         """
         if self.heads is None:
             return None
+        steps = None
+        if sequences is not None:
+            steps = self.heads.config.steps(sequences.T_world_ego[:, sequences.now])
         read = volumes_of(self.world_model, now, self.heads.config.tasks)
         with full_precision(now.volume):
             cast = {id(volume): volume.map_tensors(Tensor.float) for volume in read.values()}
-            found: HeadOutput = self.heads({task: cast[id(volume)] for task, volume in read.items()})
+            found: HeadOutput = self.heads(
+                {task: cast[id(volume)] for task, volume in read.items()}, steps, carried
+            )
         return found
 
     def tokens(self, now: Belief, found: HeadOutput | None = None) -> Float[Tensor, "b N C"] | None:

@@ -7,7 +7,7 @@ from typing import Any, TypeVar, get_args
 
 from foredrive.data.task_truth import TaskTruthConfig
 from foredrive.errors import InputError
-from foredrive.models.tasks.agents import AgentHeadConfig
+from foredrive.models.tasks.agents import AgentHeadConfig, CarriedConfig
 from foredrive.models.tasks.decoder import DecoderConfig
 from foredrive.models.tasks.heads import TaskHeadsConfig
 from foredrive.models.tasks.maps import MapHeadConfig
@@ -22,7 +22,7 @@ R = TypeVar("R", bound="Recipe[Any, Any]")
 
 LARGE_CELLS = 100
 """Grids with more cells along a side get heads of the published sizes."""
-HEADED: tuple[Task, ...] = ("detection", "map", "motion", "occupancy")
+HEADED: tuple[Task, ...] = ("detection", "tracking", "map", "motion", "occupancy")
 """Tasks that have a head."""
 
 
@@ -41,12 +41,13 @@ class TaskHeadsRecipe:
 
 
 def town_heads(tasks: Sequence[str]) -> TaskHeadsRecipe:
-    """Return heads of the given tasks for towns on two cores. Motion needs detection and adds it.
+    """Return heads of the given tasks for towns on two cores. Motion and tracking add detection.
 
     Raises:
         InputError: a task is unknown or has no head.
     """
-    return _heads_of(tasks, TaskHeadsConfig(), Schedule(batch_size=8, lr=1e-3, steps=600, warmup_steps=30))
+    sizes = TaskHeadsConfig(agents=AgentHeadConfig(carried=CarriedConfig()))
+    return _heads_of(tasks, sizes, Schedule(batch_size=8, lr=1e-3, steps=600, warmup_steps=30))
 
 
 def base_heads(tasks: Sequence[str]) -> TaskHeadsRecipe:
@@ -59,7 +60,9 @@ def base_heads(tasks: Sequence[str]) -> TaskHeadsRecipe:
     sizes = TaskHeadsConfig(
         width=256,
         max_cells=100,
-        agents=AgentHeadConfig(queries=300, decoder=deep, motion=MotionConfig()),
+        agents=AgentHeadConfig(
+            queries=300, decoder=deep, motion=MotionConfig(), carried=CarriedConfig(agents=100)
+        ),
         elements=MapHeadConfig(elements=50, points=20, decoder=deep),
     )
     return _heads_of(tasks, sizes, Schedule(batch_size=8, lr=2e-4, epochs=24, warmup_steps=500))
@@ -128,9 +131,11 @@ def _heads_of(tasks: Sequence[str], sizes: TaskHeadsConfig, schedule: Schedule) 
         if task not in HEADED:
             known = "has no head" if task in get_args(Task) else "is unknown"
             raise InputError(f"the task {task!r} {known}; heads can be trained for {', '.join(HEADED)}")
-    agents = sizes.agents if {"detection", "motion"} & set(tasks) else None
+    agents = sizes.agents if {"detection", "motion", "tracking"} & set(tasks) else None
     if agents is not None and "motion" not in tasks:
         agents = replace(agents, motion=None)
+    if agents is not None and "tracking" not in tasks:
+        agents = replace(agents, carried=None)
     kept = replace(
         sizes,
         agents=agents,
@@ -143,4 +148,7 @@ def _heads_of(tasks: Sequence[str], sizes: TaskHeadsConfig, schedule: Schedule) 
         truth = replace(truth, elements_lw_m=None, raster=None)
     if "occupancy" not in tasks:
         truth = replace(truth, semantics=None)
-    return TaskHeadsRecipe(kept, truth, schedule)
+    recipe = TaskHeadsRecipe(kept, truth, schedule)
+    if agents is None or agents.carried is None:
+        return recipe
+    return replace(recipe, now_stride_s=agents.carried.dt_s)

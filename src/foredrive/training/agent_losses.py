@@ -11,11 +11,13 @@ from foredrive.losses.centres import centre_loss, centre_target
 from foredrive.losses.masked import masked_mean
 from foredrive.losses.motion import motion_losses
 from foredrive.models.tasks.agents import AGENT_CLASSES, AgentSet
+from foredrive.models.tasks.carried import Lineage
 from foredrive.models.tasks.proposals import CentreMap
 from foredrive.scene import Boxes, VoxelSpec
 from foredrive.scene.task_truth import TaskTruth
-from foredrive.training.detection_losses import MatchingLossConfig, best_matching, matched_loss
+from foredrive.training.detection_losses import MatchingLossConfig, matched_loss
 from foredrive.training.task_targets import AgentTargets, agent_targets
+from foredrive.training.track_matching import NOBODY, held_objects, matching_beside, owners
 
 SPREAD = 0.25
 """Standard deviation of a centre's Gaussian as a share of the box's mean edge over ground."""
@@ -47,6 +49,8 @@ def agent_losses(
     truth: TaskTruth,
     spec: VoxelSpec,
     weights: AgentLossWeights,
+    lineage: Lineage | None = None,
+    frames: int = 1,
 ) -> dict[str, Float[Tensor, ""]]:
     """Return weighted losses, means over the annotated items (that of the queries over layers too).
 
@@ -58,24 +62,35 @@ def agent_losses(
         truth: of b items.
         spec: grid of the volumes.
         weights: weights of the terms.
+        lineage: of agents that are carried on: a query stays with the object it was matched to before.
+        frames: items of a sequence; a sequence's first item has no carried agents.
     """
     last = layers[-1]
     steps = 0 if last.future_xy is None else last.future_xy.shape[-2]
     terms: dict[str, list[Tensor]] = {
         name: [] for name in ("centres", "cells", "queries", "velocity", "attribute", "motion")
     }
-    for item in boxes_valid.nonzero()[:, 0].tolist():
+    count = last.velocity.shape[1]
+    nobody = torch.full((count,), NOBODY, device=boxes_valid.device)
+    owner = nobody
+    for item, annotated in enumerate(boxes_valid.tolist()):
+        owner = nobody if item % frames == 0 or not annotated else owner
+        if not annotated:
+            continue
         futures = None if truth.futures is None else truth.futures[item]
         targets = agent_targets(boxes[item], futures, spec, steps)
         for name, value in _cell_losses(centres[item], targets, spec).items():
             terms[name].append(value)
+        source = nobody if lineage is None else lineage.source[item]
+        held = held_objects(source, owner, targets.track_id)
         for number, layer in enumerate(layers):
             found = layer[item]
-            query, match = best_matching(found.boxes, targets.boxes, weights.boxes)
+            query, match = matching_beside(found.boxes, targets.boxes, held, weights.boxes)
             terms["queries"].append(matched_loss(found.boxes, targets.boxes, query, match, weights.boxes))
             if number == len(layers) - 1:
                 for name, value in _matched_terms(found, targets, query, match).items():
                     terms[name].append(value)
+                owner = owners(query, match, targets.track_id, count)
     if last.future_xy is None:
         del terms["motion"]
     zero = last.velocity.sum() * 0 + centres.logits.sum() * 0

@@ -24,11 +24,18 @@ class AugmentConfig:
     """Probability that a camera is left out, in all frames of the clip."""
 
 
-def augmented(example: Example, config: AugmentConfig, generator: torch.Generator) -> Example:
-    """Return a batch after augmentation. Its random numbers come from `generator` alone."""
+def augmented(
+    example: Example, config: AugmentConfig, generator: torch.Generator, frames: int = 1
+) -> Example:
+    """Return a batch after augmentation. Its random numbers come from `generator` alone.
+
+    Args:
+        frames: items of a sequence, of which all or none are mirrored.
+    """
     batch, cameras = example.clip.image_valid.shape[0], example.clip.image_valid.shape[2]
     if config.mirror > 0:
-        example = mirrored(example, torch.rand(batch, generator=generator) < config.mirror)
+        drawn = torch.rand(batch // frames, generator=generator) < config.mirror
+        example = mirrored(example, drawn.repeat_interleave(frames))
     clip = example.clip
     if config.colour > 0:
         drawn = config.colour * (2 * torch.rand(batch, 4, generator=generator) - 1)

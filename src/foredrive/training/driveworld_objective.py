@@ -104,7 +104,7 @@ class DriveWorldObjective(nn.Module):
         terms: dict[str, Float[Tensor, ""]] = {}
         if stage.weights.wpts > 0 or self.tasks is not None:
             now = world.belief_about_now(lifted)
-            found = None if self.tasks is None else self.agent.perceive(now)
+            found = None if self.tasks is None else self.agent.perceive(now, clip)
             if stage.weights.wpts > 0:
                 future = world.imagine(now, 1) if self.agent.planner.imagined_frames else []
                 plan = self.agent.plan(observed, [now, *future], found)

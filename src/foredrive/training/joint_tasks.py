@@ -55,6 +55,7 @@ class TaskTerms(nn.Module):
             self.spec,
             self.class_weight,
             self.config.weights,
+            self.config.heads.frames,
         )
         total = losses.pop("loss")
         return {f"task_{name}": value for name, value in losses.items()} | {

@@ -126,14 +126,15 @@ class NemoObjective(nn.Module):
 
     def forward(self, example: Example, generator: torch.Generator) -> dict[str, Float[Tensor, ""]]:
         """Return losses by name; "loss" is minimised. The generator augments and picks rays and samples."""
-        example = augmented(example, self.stage.augment, generator)
+        frames = 1 if self.tasks is None else self.tasks.config.heads.frames
+        example = augmented(example, self.stage.augment, generator, frames)
         clip, world = example.clip, self.agent.world_model
         now, weights = clip.now, self.weights
         observed = clip.observed()
         needed = self.agent.planner.imagined_frames if weights.wpts > 0 else 0
         steps = self.steps if self._imagines_now() else 0
         beliefs = self._rollout(observed, max(steps, needed))
-        found = None if self.tasks is None else self.agent.perceive(beliefs[0])
+        found = None if self.tasks is None else self.agent.perceive(beliefs[0], clip)
         plan = self.agent.plan(observed, beliefs, found) if weights.wpts > 0 else None
         decoded = [world.decode(belief) for belief in beliefs[: steps + 1]]
 

@@ -37,6 +37,6 @@ class PlannerObjective(nn.Module):
         observed, agent = example.clip.observed(), self.agent
         with torch.no_grad():
             beliefs = agent.rollout(observed, agent.planner.imagined_frames)
-            found = agent.perceive(beliefs[0])
+            found = agent.perceive(beliefs[0], observed)
         loss = waypoint_loss(agent.plan(observed, beliefs, found), example.clip.future)
         return {"wpts": loss, "loss": loss}

@@ -37,6 +37,7 @@ def task_losses(
     spec: VoxelSpec,
     class_weight: Float[Tensor, "C"] | None,
     weights: TaskWeights,
+    frames: int = 1,
 ) -> dict[str, Float[Tensor, ""]]:
     """Return the weighted losses of the heads by name; "loss" is their sum.
 
@@ -48,11 +49,22 @@ def task_losses(
         spec: grid of the volumes.
         class_weight: weight of each class of semantic voxels.
         weights: weights of the losses.
+        frames: items of a sequence, if the items are sequences.
     """
     losses: dict[str, Float[Tensor, ""]] = {}
     if output.agents is not None:
         assert output.centres is not None
-        losses |= agent_losses(output.centres, output.agents, boxes, boxes_valid, truth, spec, weights.agents)
+        losses |= agent_losses(
+            output.centres,
+            output.agents,
+            boxes,
+            boxes_valid,
+            truth,
+            spec,
+            weights.agents,
+            output.lineage,
+            frames,
+        )
     if output.elements is not None and truth.elements is not None:
         losses["elements"] = weights.elements * _map_loss(output.elements, truth.elements, weights.map)
     if output.raster is not None and truth.raster is not None:

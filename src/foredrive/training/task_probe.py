@@ -3,7 +3,7 @@
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Float64
 from torch import Tensor, nn
 
 from foredrive.models.tasks.heads import TaskHeads, TaskVolume, volumes_of
@@ -44,6 +44,8 @@ class TaskExample(Record):
     boxes_valid: Bool[Tensor, "*b"]
     """Whether the log is annotated at now."""
     truth: TaskTruth
+    T_world_ego: Float64[Tensor, "*b 4 4"]
+    """Pose at now."""
     key: tuple[str, ...]
 
 
@@ -72,6 +74,7 @@ def mirrored_item(example: TaskExample, chosen: Bool[Tensor, "b"]) -> TaskExampl
         example,
         volumes=volumes,
         boxes=mirrored_boxes(example.boxes, chosen),
+        T_world_ego=mirrored_pose(example.T_world_ego, chosen, axis=1),
         truth=mirrored_truth(example.truth, chosen),
     )
 
@@ -108,10 +111,13 @@ class ProbeObjective(nn.Module):
 
     def forward(self, example: TaskExample, generator: torch.Generator) -> dict[str, Float[Tensor, ""]]:
         """Return losses by name; "loss" is minimised. The generator draws the items to mirror."""
+        frames = self.heads.config.frames
         if self.mirror > 0:
-            chosen = torch.rand(len(example.boxes_valid), generator=generator) < self.mirror
+            drawn = torch.rand(len(example.boxes_valid) // frames, generator=generator) < self.mirror
+            chosen = drawn.repeat_interleave(frames)  # all frames of a sequence, or none
             example = mirrored_item(example, chosen.to(example.boxes_valid.device))
-        output = self.heads(example.volumes.by_task())
+        steps = self.heads.config.steps(example.T_world_ego)
+        output = self.heads(example.volumes.by_task(), steps)
         return task_losses(
             output,
             example.boxes,
@@ -120,4 +126,5 @@ class ProbeObjective(nn.Module):
             self.spec,
             self.class_weight,
             self.weights,
+            frames,
         )

@@ -27,6 +27,7 @@ class AgentTargets(Record):
 
     boxes: LabelledBoxes
     """Labels are indices into `AGENT_CLASSES`."""
+    track_id: Int[Tensor, "N"]
     velocity: Float[Tensor, "N 2"]
     """NaN where unknown."""
     attribute: Int[Tensor, "N"]
@@ -63,6 +64,7 @@ def agent_targets(boxes: Boxes, futures: AgentFutures | None, spec: VoxelSpec, s
         valid[:found] = futures.valid[: len(rows), :steps][rows]
     return AgentTargets(
         boxes=LabelledBoxes(label[kept], state[kept], boxes.yaw[kept]),
+        track_id=boxes.track_id[kept],
         velocity=boxes.velocity[kept],
         attribute=boxes.attribute[kept],
         future_xy=xy,

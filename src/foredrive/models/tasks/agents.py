@@ -6,6 +6,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
+from foredrive.errors import InputError
 from foredrive.models.detection import LOG_STD_RANGE, BoxSet
 from foredrive.models.tasks.decoder import DecoderConfig, PlaceEmbedding, QueryDecoderLayer
 from foredrive.models.tasks.motion import MotionConfig, MotionModes
@@ -33,6 +34,22 @@ _CHANGES = (len(AGENT_CLASSES), 3, 3, 2, 7, 2, len(Attribute))
 
 
 @dataclass(frozen=True)
+class CarriedConfig:
+    """Carrying of agents from frame to frame (`models.tasks.carried`)."""
+
+    agents: int = 30
+    """Number of queries that are carried on; as many fewer begin at proposals then."""
+    decay: float = 0.6
+    """Share of its rank that a carried query keeps at least from frame to frame."""
+    born: float = 0.3
+    """Minimum score at which a query gets an identity, which it keeps as long as it is carried."""
+    frames: int = 4
+    """Key frames of a training sequence, at least 2."""
+    dt_s: float = 0.5
+    """Time between them."""
+
+
+@dataclass(frozen=True)
 class AgentHeadConfig:
     """Sizes of an `AgentHead`. The defaults are for towns on two cores."""
 
@@ -40,6 +57,8 @@ class AgentHeadConfig:
     decoder: DecoderConfig = field(default_factory=DecoderConfig)
     motion: MotionConfig | None = field(default_factory=MotionConfig)
     """None: no forecasts."""
+    carried: CarriedConfig | None = None
+    """None: no identities."""
 
 
 @dataclass(frozen=True)
@@ -98,6 +117,10 @@ class AgentHead(nn.Module):
         super().__init__()
         width = planes.width
         self.queries = config.queries
+        self.renew: nn.Module | None = None
+        if config.carried is not None:
+            check_carried(config.carried, config.queries)
+            self.renew = nn.Sequential(nn.LayerNorm(width), nn.Linear(width, width))
         self.centres = CentreHead(planes.fine_width, len(AGENT_CLASSES))
         self.kind = nn.Embedding(len(AGENT_CLASSES), width)
         self.place = PlaceEmbedding(width)
@@ -116,19 +139,25 @@ class AgentHead(nn.Module):
         self.motion = None if config.motion is None else MotionModes(width, config.motion)
 
     def forward(
-        self, planes: Planes, motion_planes: Planes | None = None
+        self, planes: Planes, motion_planes: Planes | None = None, carried: AgentSet | None = None
     ) -> tuple[CentreMap, list[AgentSet]]:
         """Return the dense map, and the agents after each layer; the last has the forecasts.
 
         Args:
             planes: features of detection.
             motion_planes: features of motion. None: no forecasts.
+            carried: agents of the frame before in the ego frame at now, with their queries. They are the
+                first of the queries, before the most probable proposals.
         """
         cells, fine = planes.coarse.cells, planes.fine
         cell_place = self.place(planes.coarse.share(planes.coarse.middle_m))[None]
         centres = self.centres(fine)
-        first = best_proposals(centres, self.queries)
+        old = 0 if carried is None else carried.velocity.shape[1]
+        first = best_proposals(centres, self.queries - old)
         queries, before = self.kind(first.label), _first_agents(first)
+        if carried is not None and carried.query is not None and self.renew is not None:
+            queries = torch.cat([self.renew(carried.query), queries], dim=1)
+            before = _joined(carried, before)
         found: list[AgentSet] = []
         for layer in self.layers:
             at_m = before.boxes.mean[..., :2]
@@ -146,6 +175,18 @@ class AgentHead(nn.Module):
         return centres, found
 
 
+def check_carried(config: CarriedConfig, queries: int) -> None:
+    """Check the numbers of carried agents and of frames.
+
+    Raises:
+        InputError: a number is impossible.
+    """
+    if not 0 < config.agents < queries:
+        raise InputError(f"carried.agents is {config.agents}; the head has {queries} queries for all agents")
+    if config.frames < 2:
+        raise InputError(f"carried.frames is {config.frames}; agents are carried on from 2 frames on")
+
+
 def _first_agents(first: Proposals) -> AgentSet:
     """Return proposals as agents. The logit of "no object" is 0, so each class keeps its own probability."""
     nothing = torch.zeros_like(first.z)
@@ -158,6 +199,23 @@ def _first_agents(first: Proposals) -> AgentSet:
         log_std_yaw=nothing,
     )
     return AgentSet(boxes, first.velocity, nothing[..., None].expand(*nothing.shape, len(Attribute)))
+
+
+def _joined(first: AgentSet, second: AgentSet) -> AgentSet:
+    """Return two sets as one, without queries and forecasts."""
+
+    def join(one: Tensor, other: Tensor) -> Tensor:
+        return torch.cat([one, other], dim=1)
+
+    one, other = first.boxes, second.boxes
+    boxes = BoxSet(
+        logits=join(one.logits, other.logits),
+        mean=join(one.mean, other.mean),
+        log_std=join(one.log_std, other.log_std),
+        heading=join(one.heading, other.heading),
+        log_std_yaw=join(one.log_std_yaw, other.log_std_yaw),
+    )
+    return AgentSet(boxes, join(first.velocity, second.velocity), join(first.attribute, second.attribute))
 
 
 def _changed(before: AgentSet, change: Float[Tensor, "b Q _N"]) -> AgentSet:

@@ -3,10 +3,18 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
-from jaxtyping import Float
+from jaxtyping import Float, Float64
 from torch import Tensor, nn
 
 from foredrive.models.tasks.agents import AgentHead, AgentHeadConfig, AgentSet
+from foredrive.models.tasks.carried import (
+    CarriedAgents,
+    FrameSteps,
+    Lineage,
+    follow,
+    frame_steps,
+    lineage_of,
+)
 from foredrive.models.tasks.maps import MapHead, MapHeadConfig, MapSet, RasterHead, RasterHeadConfig
 from foredrive.models.tasks.plane import PlanePyramid, Planes
 from foredrive.models.tasks.proposals import CentreMap
@@ -41,6 +49,21 @@ class TaskHeadsConfig:
         if self.voxels is not None:
             found.append("occupancy")
         return tuple(found)
+
+    @property
+    def frames(self) -> int:
+        """Return the number of key frames of a training sequence; 1 if no agents are carried on."""
+        return 1 if self.agents is None or self.agents.carried is None else self.agents.carried.frames
+
+    def steps(self, T_world_ego: Float64[Tensor, "b 4 4"]) -> FrameSteps | None:
+        """Return the ego motion of a batch of training sequences; None if no agents are carried on.
+
+        Args:
+            T_world_ego: pose at the now of each item.
+        """
+        if self.agents is None or self.agents.carried is None:
+            return None
+        return frame_steps(T_world_ego, self.agents.carried.frames, self.agents.carried.dt_s)
 
 
 @dataclass(frozen=True)
@@ -77,6 +100,8 @@ class HeadOutput:
     """Logits."""
     voxels: Float[Tensor, "b C Z Y X"] | None = None
     """Logits."""
+    lineage: Lineage | None = None
+    """Where the agents come from in the frame before; of heads that carry agents on."""
 
 
 class TaskHeads(nn.Module):
@@ -112,11 +137,18 @@ class TaskHeads(nn.Module):
         if config.voxels is not None:
             self.voxels = VoxelHead(planes, channels, spec.shape_zyx[0], config.voxels)
 
-    def forward(self, volumes: Mapping[Task, TaskVolume]) -> HeadOutput:
+    def forward(
+        self,
+        volumes: Mapping[Task, TaskVolume],
+        steps: FrameSteps | None = None,
+        carried: CarriedAgents | None = None,
+    ) -> HeadOutput:
         """Return the output of every head. Tasks that share one volume share its planes.
 
         Args:
             volumes: for each of `config.tasks`, the volume of `WorldModel.volume_for`.
+            steps: ego motion, if the items are sequences of frames, in which agents are carried on.
+            carried: agents of the frame before, for items that are single frames.
         """
         made: dict[int, Planes] = {}
 
@@ -126,14 +158,31 @@ class TaskHeads(nn.Module):
                 made[id(volume)] = self.planes(volume.now, volume.past, volume.T_past_now)
             return made[id(volume)]
 
-        agents = centres = elements = raster = voxels = None
+        agents = centres = elements = raster = voxels = lineage = None
         if self.agents is not None:
             motion = None if self.agents.motion is None else planes_of("motion")
-            centres, agents = self.agents(planes_of("detection"), motion)
+            centres, agents, lineage = self._follow(
+                self.agents, planes_of("detection"), motion, steps, carried
+            )
         if self.elements is not None:
             elements = self.elements(planes_of("map"))
         if self.raster is not None:
             raster = self.raster(planes_of("map"))
         if self.voxels is not None:
             voxels = self.voxels(volumes["occupancy"].now, planes_of("occupancy"))
-        return HeadOutput(agents, centres, elements, raster, voxels)
+        return HeadOutput(agents, centres, elements, raster, voxels, lineage)
+
+    def _follow(
+        self,
+        head: AgentHead,
+        planes: Planes,
+        motion: Planes | None,
+        steps: FrameSteps | None,
+        carried: CarriedAgents | None,
+    ) -> tuple[CentreMap, list[AgentSet], Lineage | None]:
+        """Return the agents of all items, and their lineage if the head carries agents on."""
+        config = None if self.config.agents is None else self.config.agents.carried
+        if config is not None and steps is not None:
+            return follow(head, config, planes, motion, steps)
+        centres, agents = head(planes, motion, None if carried is None else carried.agents)
+        return centres, agents, None if config is None else lineage_of(agents[-1], carried, config.decay)

@@ -1,19 +1,20 @@
 """A trained agent in the form that an evaluation asks for."""
 
 import dataclasses
-from collections.abc import Sequence
+import functools
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from foredrive.evaluation.predictor import Part, Prediction
-from foredrive.models.agent import AgentOutput, PlanningAgent
-from foredrive.models.tasks.heads import TaskHeads
-from foredrive.scene import Belief, Clip, Decoded, RayRenderer, WorldModel
+from foredrive.models.agent import PlanningAgent
+from foredrive.models.tasks.heads import HeadOutput, TaskHeads, TaskVolume, volumes_of
+from foredrive.runs.evaluate.streaming import DriveFollower, together
+from foredrive.scene import Belief, Clip, Decoded, RayRenderer, Task, WorldModel
 from foredrive.training import thinned_rays
-from foredrive.training.task_probe import task_volumes
 
 
 class AgentPredictor:
@@ -40,12 +41,22 @@ class AgentPredictor:
         self.agent, self.steps, self.ray_stride, self.futures = agent, steps, ray_stride, futures
         self.heads = heads
         self._generator = torch.Generator().manual_seed(0)
+        agents = None if heads is None else heads.config.agents
+        carried = None if agents is None else agents.carried
+        self._follower = None if carried is None else DriveFollower(carried)
+        self._keys: Sequence[str] = ()
+
+    def follow(self, keys: Sequence[str]) -> None:
+        """Receive the names of the clips of the next call of `predict`; without, no agents are carried on."""
+        self._keys = keys
 
     @torch.no_grad()
     def predict(self, observed: Clip, asked: frozenset[Part]) -> Prediction:
         """Predict plan, occupancy and flow for now and the next key frames; views and futures if asked."""
-        output = self.agent(observed, self.steps)
-        decoded, world = output.decoded, self.agent.world_model
+        agent, world = self.agent, self.agent.world_model
+        beliefs = agent.rollout(observed, max(self.steps, agent.planner.imagined_frames))
+        found, track_id = self._perceive(beliefs[0], observed)
+        decoded = [world.decode(belief) for belief in beliefs[: self.steps + 1]]
         flow = [frame.flow for frame in decoded if frame.flow is not None]
         views = None
         if "images" in asked and self.ray_stride and world.renderer is not None:
@@ -53,41 +64,64 @@ class AgentPredictor:
         futures = None
         if "futures" in asked and self.futures and self.steps and world.samples_futures:
             drawn = [
-                world.imagine(output.beliefs[0], self.steps, generator=self._generator)
-                for _ in range(self.futures)
+                world.imagine(beliefs[0], self.steps, generator=self._generator) for _ in range(self.futures)
             ]
             futures = torch.stack([_occupied(world, beliefs) for beliefs in drawn], dim=1)
-        tasks = Prediction() if self.heads is None else self._tasks(self.heads, output)
+        tasks = Prediction()
+        if self.heads is not None and found is not None:
+            tasks = _tasks(self.heads, found, track_id)
+        own = found if self.heads is agent.heads else None
         return dataclasses.replace(
             tasks,
             occupancy_logit=torch.stack([frame.occupancy_logit for frame in decoded], dim=1),
-            plan=output.plan,
+            plan=agent.plan(observed, beliefs, own),
             flow_mps=torch.stack(flow, dim=1) if len(flow) == len(decoded) else None,
             futures=futures,
             images=views,
             image_stride=max(self.ray_stride, 1),
         )
 
-    def _tasks(self, heads: TaskHeads, output: AgentOutput) -> Prediction:
-        """Return the parts of a prediction that the heads give; those without a head are None."""
-        found = output.found
-        if heads is not self.agent.heads or found is None:
-            now, world = output.beliefs[0], self.agent.world_model
-            found = heads(task_volumes(world, now, heads.config.tasks).by_task())
-        motion = None if heads.agents is None else heads.agents.motion
-        dt_s = 0.5 if motion is None else motion.config.dt_s
-        return Prediction(
-            agents=None if found.agents is None else found.agents[-1].agents(dt_s),
-            map_lines=None if found.elements is None else found.elements[-1].lines(),
-            map_layers=None if found.raster is None else found.raster.sigmoid(),
-            semantics=None if found.voxels is None else found.voxels.argmax(dim=1).to(torch.uint8),
-        )
+    def _perceive(self, now: Belief, observed: Clip) -> tuple[HeadOutput | None, Int[Tensor, "b _Q"] | None]:
+        """Return the output of the heads, and the identities of the agents if they have any."""
+        heads, follower = self.heads, self._follower
+        if heads is None:
+            return None, None
+        volumes = volumes_of(self.agent.world_model, now, heads.config.tasks)
+        if follower is None:
+            return heads(volumes), None
+        found = []
+        for item, key in enumerate(self._keys or [""] * len(now.volume)):
+            of_item = functools.partial(heads, _of_item(volumes, item), None)
+            found.append(follower.step(of_item, key, observed.T_world_ego[item, observed.now]))
+        self._keys = ()
+        return together([output for output, _ in found]), torch.cat([track_id for _, track_id in found])
 
     def _views(self, renderer: RayRenderer, observed: Clip, now: Decoded) -> Float[Tensor, "b C 3 h w"]:
         rays = thinned_rays(observed, observed.now, self.ray_stride)
         rendered = renderer(now.feature, now.occupancy_logit, rays.origin, rays.direction)
         b, c, _, h, w = rays.rgb.shape
         return rendered.rgb.view(b, c, h, w, 3).permute(0, 1, 4, 2, 3)
+
+
+def _of_item(volumes: Mapping[Task, TaskVolume], item: int) -> dict[Task, TaskVolume]:
+    """Return the volumes of one item, as a batch of one. Tasks that share a volume still do."""
+    distinct = {id(volume): volume[item : item + 1] for volume in volumes.values()}
+    return {task: distinct[id(volume)] for task, volume in volumes.items()}
+
+
+def _tasks(heads: TaskHeads, found: HeadOutput, track_id: Int[Tensor, "b Q"] | None) -> Prediction:
+    """Return the parts of a prediction that heads give; those without a head are None."""
+    motion = None if heads.agents is None else heads.agents.motion
+    agents = None
+    if found.agents is not None:
+        agents = found.agents[-1].agents(0.5 if motion is None else motion.config.dt_s)
+        agents = agents if track_id is None else dataclasses.replace(agents, track_id=track_id)
+    return Prediction(
+        agents=agents,
+        map_lines=None if found.elements is None else found.elements[-1].lines(),
+        map_layers=None if found.raster is None else found.raster.sigmoid(),
+        semantics=None if found.voxels is None else found.voxels.argmax(dim=1).to(torch.uint8),
+    )
 
 
 def _occupied(world: WorldModel, beliefs: Sequence[Belief]) -> Bool[Tensor, "b F Z Y X"]:

@@ -121,6 +121,7 @@ def _without_volumes(clip: Clip, truth: TaskTruth | None, key: str) -> TaskExamp
         boxes=boxes_now(clip),
         boxes_valid=clip.boxes_valid[clip.now],
         truth=truth,
+        T_world_ego=clip.T_world_ego[clip.now],
         key=(key,),
     )
 

@@ -21,6 +21,7 @@ from foredrive.runs.open_clips import open_clips
 from foredrive.runs.train.baselines import fit_baselines
 from foredrive.runs.train.kept_parts import load_kept, with_kept_heads
 from foredrive.runs.train.path_features import sample_paths
+from foredrive.runs.train.sequences import in_sequences
 from foredrive.runs.train.task_priors import PRIORS, TASKS, check_truth, save_priors, semantic_weights
 from foredrive.scene.task_truth import TaskTruth
 from foredrive.training import CONDITIONS, PathFit, fit_path, load_weights, save_weights, train
@@ -241,7 +242,12 @@ def _train_stage(
         objective = build_objective(
             run.recipe, stage, agent, semantic_weights(_truths(dataset)) if voxels else None
         )
-        train(objective, dataset, collate, stage.schedule, run.folder / name, fabric)
+        if tasks is None:
+            train(objective, dataset, collate, stage.schedule, run.folder / name, fabric)
+        else:
+            keys = [dataset.key(index) for index in range(len(dataset))]
+            items, join, schedule = in_sequences(dataset, keys, collate, tasks.heads, stage.schedule)
+            train(objective, items, join, schedule, run.folder / name, fabric)
         if fabric.is_global_zero:
             with atomic_path(weights) as temporary:
                 save_weights(agent, temporary)

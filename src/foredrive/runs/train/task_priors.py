@@ -54,7 +54,9 @@ def check_truth(recipe: Recipe[Any, Any], logs: Sequence[LogPath]) -> None:
     """
     if recipe.tasks is None or recipe.transfer == "frozen":
         return
-    missing: dict[str, str] = dict.fromkeys(recipe.tasks.heads.tasks, "")
+    heads = recipe.tasks.heads
+    asked = (*heads.tasks, "tracking") if heads.frames > 1 else heads.tasks
+    missing: dict[str, str] = dict.fromkeys(asked, "")
     for log in logs:
         if not missing:
             return

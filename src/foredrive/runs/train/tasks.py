@@ -18,6 +18,7 @@ from foredrive.recipes.task_heads import TaskHeadsRecipe, load_task_heads
 from foredrive.runs.folder import CONFIG, WEIGHTS
 from foredrive.runs.train.kept_volumes import KeptVolumes, collate_kept
 from foredrive.runs.train.run import Run, begin_run, load_agent, open_run
+from foredrive.runs.train.sequences import in_sequences
 from foredrive.runs.train.task_priors import PRIORS, TASKS, load_priors, save_priors, semantic_weights
 from foredrive.training import load_weights, save_weights, train
 from foredrive.training.task_probe import ProbeObjective
@@ -84,7 +85,9 @@ def train_heads(run: Run, heads: TaskHeadsRecipe) -> TrainedHeads:
         objective = ProbeObjective(fresh, voxels, heads.weights, class_weight, heads.mirror)
         fabric = make_fabric("32-true")
         fabric.launch()
-        train(objective, dataset, collate_kept, heads.schedule, folder, fabric)
+        keys = [key for example in dataset.examples for key in example.key]
+        items, join, schedule = in_sequences(dataset, keys, collate_kept, heads.heads, heads.schedule)
+        train(objective, items, join, schedule, folder, fabric)
         if fabric.is_global_zero:
             save_priors(fit_task_priors(example.truth for example in dataset.examples), folder / PRIORS)
             with atomic_path(folder / WEIGHTS) as temporary:

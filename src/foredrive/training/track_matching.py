@@ -1,0 +1,60 @@
+"""Matching of queries to objects over time: a carried query stays with the object that it was matched to."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Int
+from torch import Tensor
+
+from foredrive.models.detection import BoxSet
+from foredrive.sets import LabelledBoxes
+from foredrive.training.detection_losses import MatchingLossConfig, best_matching
+
+NOBODY = -1
+"""Owner of a query that was matched to no object."""
+
+
+@dataclass(frozen=True)
+class Held:
+    """The queries of one frame that carry on an object of the frame before."""
+
+    query: Int[Tensor, "h"]
+    match: Int[Tensor, "h"]
+    """The object of each of `query` at now."""
+    bound: Bool[Tensor, "Q"]
+    """Queries that carry on an object, also one that has left: they can have no other."""
+
+
+def held_objects(source: Int[Tensor, "Q"], owner: Int[Tensor, "_Q"], track_id: Int[Tensor, "N"]) -> Held:
+    """Return which queries have to find which objects (MOTR, Zeng et al. 2022, §3.3).
+
+    Args:
+        source: index of each query in the frame before, or -1.
+        owner: identity of the object that each query of the frame before was matched to, or `NOBODY`.
+        track_id: identity of each object at now.
+    """
+    mine = torch.where(source >= 0, owner[source.clamp_min(0)], NOBODY)
+    same = (mine[:, None] == track_id) & (mine[:, None] != NOBODY)
+    query, match = same.nonzero(as_tuple=True)
+    return Held(query, match, mine != NOBODY)
+
+
+def matching_beside(
+    found: BoxSet, truth: LabelledBoxes, held: Held, config: MatchingLossConfig
+) -> tuple[Int[Tensor, "n"], Int[Tensor, "n"]]:
+    """Return queries and their objects: the held ones, and the best matching of all others."""
+    free_query = (~held.bound).nonzero()[:, 0]
+    free = torch.ones(len(truth.label), dtype=torch.bool, device=held.match.device)
+    free[held.match] = False
+    free_object = free.nonzero()[:, 0]
+    query, match = best_matching(found[free_query], truth[free_object], config)
+    return torch.cat([held.query, free_query[query]]), torch.cat([held.match, free_object[match]])
+
+
+def owners(
+    query: Int[Tensor, "n"], match: Int[Tensor, "n"], track_id: Int[Tensor, "N"], queries: int
+) -> Int[Tensor, "Q"]:
+    """Return the identity of the object of each query, or `NOBODY`."""
+    owner = torch.full((queries,), NOBODY, dtype=torch.long, device=query.device)
+    owner[query] = track_id[match].long()
+    return owner
