@@ -19,6 +19,7 @@ from foredrive.view.bev import EGO_OUTLINE_XY, draw_bev, legend_handles, path_po
 from foredrive.view.html import Picture, picture
 from foredrive.view.image_drawing import Camera, draw_path_on_image, resize, to_image
 from foredrive.view.log_sheet import camera_rows
+from foredrive.view.task_pictures import task_pictures
 from foredrive.view.voxel_drawing import draw_comparison, draw_volume_pca, draw_voxels
 
 CAMERA_WIDTH_PX, FRONT_WIDTH_PX = 400, 960
@@ -42,6 +43,8 @@ class ExamplePanel:
     speed: str
     plan: list[Picture]
     """The driven future and the plan: in the front camera, and from above."""
+    tasks: list[list[Picture]]
+    """Rows of truth and prediction of task heads; empty without heads."""
     cameras: dict[str, list[Picture]]
     """Recorded images and, in the same order, rendered images; empty if the log has no camera."""
     camera_columns: Literal["two", "three"]
@@ -64,6 +67,7 @@ def draw_example(shown: ExamplePrediction) -> ExamplePanel:
         command=palette.label(Command(int(clip.command))) if known_command else "unknown",
         speed=f"{float(clip.ego_speed_mps[clip.now]):.1f} m/s" if known_speed else "unknown",
         plan=_plan(shown),
+        tasks=task_pictures(shown, front_camera(clip)),
         cameras=cameras,
         camera_columns="two" if len(next(iter(cameras.values()), [])) in (2, 4) else "three",
         occupancy=[

@@ -6,6 +6,7 @@ from jaxtyping import Float, UInt8
 from matplotlib.colors import to_rgb
 
 from foredrive.scene import Category, Command, MapKind
+from foredrive.scene.map_elements import ElementKind
 
 GROUND = "#11151c"
 """Background of every picture."""
@@ -46,6 +47,34 @@ MAP_COLOURS: dict[MapKind, str] = {
     MapKind.STOP_ZONE: "#c9655f",
     MapKind.INTERSECTION: "#4a5a86",
 }
+
+ELEMENT_COLOURS: dict[ElementKind, str] = {
+    ElementKind.DIVIDER: "#e8a33d",
+    ElementKind.CROSSING: "#5b9bff",
+    ElementKind.BOUNDARY: "#ef6a5a",
+    ElementKind.CENTRELINE: "#5b6b80",
+}
+
+VOXEL_COLOURS: dict[str, str] = {
+    "others": "#c8d0da",
+    "barrier": "#ff7b54",
+    "bicycle": "#ff70a6",
+    "bus": "#b388ff",
+    "car": "#4cc9f0",
+    "construction_vehicle": "#e0a458",
+    "motorcycle": "#ff8fd2",
+    "pedestrian": "#ffe14d",
+    "traffic_cone": "#ff9a3c",
+    "trailer": "#9d7bd8",
+    "truck": "#7b8cff",
+    "driveable_surface": "#6b7480",
+    "other_flat": "#8a7f9a",
+    "sidewalk": "#b79aa8",
+    "terrain": "#8fae62",
+    "manmade": "#d8ccb4",
+    "vegetation": "#2f8f46",
+}
+"""By name of the class in Occ3D and OpenOcc. Road users have the colours of their boxes."""
 
 TRUE_POSITIVE = "#3ddc84"
 FALSE_POSITIVE = "#ff8c42"

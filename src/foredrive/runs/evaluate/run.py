@@ -14,6 +14,7 @@ from foredrive.data import ClipDataset, LogPath, collate
 from foredrive.data.task_truth import TaskTruthConfig
 from foredrive.errors import InputError
 from foredrive.evaluation.baselines import ConstantVelocity, StandStill
+from foredrive.evaluation.predictor import Prediction
 from foredrive.evaluation.provenance import collect_provenance
 from foredrive.evaluation.results_files import ResultsFiles
 from foredrive.evaluation.run import EvaluationResult, evaluate
@@ -45,6 +46,8 @@ class ExamplePrediction:
     volume: Float[Tensor, "D Z Y X"]
     plan: Trajectory
     """The plan; batch shape [1 T]."""
+    tasks: Prediction | None = None
+    """What task heads predict, as a batch of one; None from a run without heads."""
 
 
 def evaluation_data(
@@ -158,11 +161,13 @@ def evaluate_run(
 @torch.no_grad()
 def predict_examples(run: Run, logs: Sequence[LogPath], count: int) -> list[ExamplePrediction]:
     """Predict `count` examples spread evenly over the logs; leave out those that cannot be read."""
-    agent = load_agent(run)
+    agent, trained = load_agent(run), load_heads(run)
     clips = run.recipe.clips
-    config = dataclasses.replace(clips.judged, lidar=True, map=True)
+    tasks = clips.tasks if trained is None else trained.recipe.truth
+    config = dataclasses.replace(clips.judged, lidar=True, map=True, tasks=tasks)
     dataset = open_clips(logs, config, run.cache_dir)
-    predictor = AgentPredictor(agent, clips.future_frames, RENDER_STRIDE)
+    heads = None if trained is None else trained.heads
+    predictor = AgentPredictor(agent, clips.future_frames, RENDER_STRIDE, heads=heads)
     found = []
     for k in range(min(count, len(dataset))):
         try:
@@ -180,6 +185,7 @@ def predict_examples(run: Run, logs: Sequence[LogPath], count: int) -> list[Exam
                 rendered=None if prediction.images is None else prediction.images[0, 0],
                 volume=agent.world_model.observe(observed).volume[0],
                 plan=prediction.plan[0],
+                tasks=None if trained is None else prediction,
             )
         )
     return found
