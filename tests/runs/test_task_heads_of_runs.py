@@ -23,13 +23,14 @@ def test_heads_of_a_run_are_trained_continued_and_evaluated(
 ) -> None:
     run = probe_run(trained.recipe, [log], tmp_path / "probe", trained.cache_dir, trained.folder)
     before = load_file(run.weights)
-    found = train_heads(run, small_heads(("detection", "motion", "map", "occupancy")))
+    found = train_heads(run, small_heads(("detection", "motion", "map", "occupancy", "instances")))
     assert len(read_metrics(run.folder / TASKS / "metrics.jsonl")) == 2
     assert all(torch.equal(value, before[name]) for name, value in load_file(run.weights).items())
     assert run.start == trained.folder
     result = evaluate_run(run, [log], tmp_path / "evaluated", views=False)
     assert result.summary["detection.frames_counted"] == result.summary["items"]
     assert result.summary["detection.nuscenes.map.nothing_detected"] == 0
+    assert {"occupancy.uniad.vpq_near_pct", "occupancy.uniad.vpq_near_pct.persistence"} <= set(result.summary)
     again = train_heads(run, found.recipe)  # is finished
     weights = zip(again.heads.parameters(), found.heads.parameters(), strict=True)
     assert all(torch.equal(one, other) for one, other in weights)

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal, Protocol, runtime_checkable
 
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 from foredrive.scene import Agent, Clip, Trajectory
@@ -21,6 +21,7 @@ Part = Literal[
     "map_lines",
     "map_layers",
     "semantics",
+    "instances",
 ]
 """A part of a `Prediction`, by the name of its field."""
 
@@ -49,6 +50,8 @@ class Prediction(Record):
     """Probability of each `RasterLayer` on the grid of the truth."""
     semantics: UInt8[Tensor, "b Z Y X"] | None = None
     """Index of the class of each voxel, in the classes and on the grid of the truth."""
+    instances: Int[Tensor, "b S _Y _X"] | None = None
+    """Number + 1 of the vehicle at each cell now and later, the same over time, on the grid of the truth."""
     image_stride: int = 1
     """One pixel in `image_stride` along rows and columns is rendered, the first at `image_stride // 2`."""
 

@@ -10,6 +10,7 @@ from foredrive.errors import InputError
 from foredrive.models.tasks.agents import AgentHeadConfig, CarriedConfig
 from foredrive.models.tasks.decoder import DecoderConfig
 from foredrive.models.tasks.heads import TaskHeadsConfig
+from foredrive.models.tasks.instances import InstanceHeadConfig
 from foredrive.models.tasks.maps import MapHeadConfig
 from foredrive.models.tasks.motion import MotionConfig
 from foredrive.recipes.config import Recipe, overridden, read_values, validated
@@ -24,6 +25,8 @@ LARGE_CELLS = 100
 """Grids with more cells along a side get heads of the published sizes."""
 HEADED: tuple[Task, ...] = ("detection", "tracking", "map", "motion", "occupancy")
 """Tasks that have a head."""
+INSTANCES = "instances"
+"""Name of the head of instance occupancy, beside the tasks."""
 
 
 @dataclass(frozen=True)
@@ -91,6 +94,8 @@ def with_joint_heads(recipe: R, heads: TaskHeadsRecipe, settings: Sequence[str] 
     """
     if recipe.transfer == "frozen":
         raise InputError(f"{recipe.name}: transfer is frozen, which keeps the heads of --start: no --tasks")
+    if heads.heads.instances is not None:
+        raise InputError(f"{INSTANCES} are trained on a frozen world model: use --probe")
     joint = JointTasks(heads.heads, heads.weights)
     if settings:
         joint = validated(JointTasks, overridden(asdict(joint), settings), "--set")
@@ -128,10 +133,11 @@ def _heads_of(tasks: Sequence[str], sizes: TaskHeadsConfig, schedule: Schedule) 
     if not tasks:
         raise InputError("name at least one task")
     for task in tasks:
-        if task not in HEADED:
+        if task not in (*HEADED, INSTANCES):
             known = "has no head" if task in get_args(Task) else "is unknown"
-            raise InputError(f"the task {task!r} {known}; heads can be trained for {', '.join(HEADED)}")
-    agents = sizes.agents if {"detection", "motion", "tracking"} & set(tasks) else None
+            there = ", ".join((*HEADED, INSTANCES))
+            raise InputError(f"the task {task!r} {known}; heads can be trained for {there}")
+    agents = sizes.agents if {"detection", "motion", "tracking", INSTANCES} & set(tasks) else None
     if agents is not None and "motion" not in tasks:
         agents = replace(agents, motion=None)
     if agents is not None and "tracking" not in tasks:
@@ -142,8 +148,11 @@ def _heads_of(tasks: Sequence[str], sizes: TaskHeadsConfig, schedule: Schedule) 
         elements=sizes.elements if "map" in tasks else None,
         raster=sizes.raster if "map" in tasks else None,
         voxels=sizes.voxels if "occupancy" in tasks else None,
+        instances=InstanceHeadConfig() if INSTANCES in tasks else None,
     )
-    truth = TaskTruthConfig(instances=None)
+    truth = TaskTruthConfig()
+    if INSTANCES not in tasks:
+        truth = replace(truth, instances=None)
     if "map" not in tasks:
         truth = replace(truth, elements_lw_m=None, raster=None)
     if "occupancy" not in tasks:

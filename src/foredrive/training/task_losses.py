@@ -15,6 +15,7 @@ from foredrive.scene.map_elements import MapElements
 from foredrive.scene.semantics import SemanticVoxels
 from foredrive.scene.task_truth import TaskTruth
 from foredrive.training.agent_losses import AgentLossWeights, agent_losses
+from foredrive.training.instance_losses import instance_loss
 from foredrive.training.task_targets import map_targets
 
 
@@ -26,6 +27,7 @@ class TaskWeights:
     elements: float = 1.0
     raster: float = 1.0
     voxels: float = 1.0
+    instances: float = 1.0
     map: MapLossWeights = field(default_factory=MapLossWeights)
 
 
@@ -73,6 +75,16 @@ def task_losses(
         )
     if output.voxels is not None and truth.semantics is not None:
         losses["voxels"] = weights.voxels * _voxel_loss(output.voxels, truth.semantics, class_weight)
+    if output.instances is not None and output.agents is not None and truth.instances is not None:
+        losses["instances"] = weights.instances * instance_loss(
+            output.instances,
+            output.agents[-1],
+            boxes,
+            boxes_valid,
+            truth.instances,
+            spec,
+            weights.agents.boxes,
+        )
     return losses | {"loss": torch.stack(list(losses.values())).sum()}
 
 

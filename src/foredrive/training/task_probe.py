@@ -28,10 +28,15 @@ class TaskVolumes(Record):
     """The volume one key frame earlier, in its own ego frame, of world models that keep it."""
     T_past_now: Float[Tensor, "*b 4 4"] | None = None
     """The ego frame at now -> the ego frame of `past`."""
+    later: Float[Tensor, "*b K D Z Y X"] | None = None
+    """Volumes of K imagined key frames, each in its own ego frame, for heads that read them."""
+    T_now_later: Float[Tensor, "*b K 4 4"] | None = None
+    """The ego frames of these -> the ego frame at now."""
 
     def by_task(self) -> dict[Task, TaskVolume]:
         """Return the volume of each task. Tasks that share a volume get the same record."""
-        distinct = [TaskVolume(now, self.past, self.T_past_now) for now in self.volume.unbind(dim=1)]
+        others = (self.past, self.T_past_now, self.later, self.T_now_later)
+        distinct = [TaskVolume(now, *others) for now in self.volume.unbind(dim=1)]
         return {task: distinct[number] for task, number in zip(self.tasks, self.index, strict=True)}
 
 
@@ -49,14 +54,23 @@ class TaskExample(Record):
     key: tuple[str, ...]
 
 
-def task_volumes(world: WorldModel, belief: Belief, tasks: tuple[Task, ...]) -> TaskVolumes:
-    """Return the volumes of a belief about now as the heads of some tasks read them."""
-    read = volumes_of(world, belief, tasks)
+def task_volumes(world: WorldModel, belief: Belief, tasks: tuple[Task, ...], later: int = 0) -> TaskVolumes:
+    """Return the volumes of a belief about now as the heads of some tasks read them.
+
+    Arguments and errors are those of `volumes_of`.
+    """
+    read = volumes_of(world, belief, tasks, later)
     distinct = list({id(volume): volume for volume in read.values()}.values())
     index = tuple(next(n for n, other in enumerate(distinct) if other is read[task]) for task in tasks)
     first = distinct[0]
     return TaskVolumes(
-        torch.stack([volume.now for volume in distinct], dim=1), tasks, index, first.past, first.T_past_now
+        torch.stack([volume.now for volume in distinct], dim=1),
+        tasks,
+        index,
+        first.past,
+        first.T_past_now,
+        first.later,
+        first.T_now_later,
     )
 
 
@@ -69,6 +83,11 @@ def mirrored_item(example: TaskExample, chosen: Bool[Tensor, "b"]) -> TaskExampl
     past, T_past_now = volumes.past, volumes.T_past_now
     if past is not None and T_past_now is not None:
         past, T_past_now = _flipped(past, chosen), mirrored_pose(T_past_now, chosen, axis=1)
+    later, T_now_later = volumes.later, volumes.T_now_later
+    if later is not None and T_now_later is not None:
+        later = _flipped(later, chosen)
+        T_now_later = mirrored_pose(T_now_later, chosen, axis=1)
+    volumes = replace(volumes, later=later, T_now_later=T_now_later)
     volumes = replace(volumes, volume=_flipped(volumes.volume, chosen), past=past, T_past_now=T_past_now)
     return replace(
         example,

@@ -5,6 +5,7 @@ from foredrive.evaluation.metrics.detection import DetectionMetric
 from foredrive.evaluation.metrics.flow import FlowMetric
 from foredrive.evaluation.metrics.futures import FuturesMetric
 from foredrive.evaluation.metrics.images import ImageMetric
+from foredrive.evaluation.metrics.instances import InstanceMetric
 from foredrive.evaluation.metrics.maps import MapLinesMetric, MapRasterMetric
 from foredrive.evaluation.metrics.motion import MotionMetric
 from foredrive.evaluation.metrics.occupancy import OccupancyMetric
@@ -26,5 +27,6 @@ METRICS: tuple[MetricFactory, ...] = (
     MapRasterMetric,
     MapLinesMetric,
     SemanticVoxelMetric,
+    InstanceMetric,
 )
 """In the order of their figures in a summary."""

@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
+import torch
 from jaxtyping import Float, Float64
 from torch import Tensor, nn
 
@@ -15,6 +16,7 @@ from foredrive.models.tasks.carried import (
     frame_steps,
     lineage_of,
 )
+from foredrive.models.tasks.instances import InstanceHead, InstanceHeadConfig, InstanceSet
 from foredrive.models.tasks.maps import MapHead, MapHeadConfig, MapSet, RasterHead, RasterHeadConfig
 from foredrive.models.tasks.plane import PlanePyramid, Planes
 from foredrive.models.tasks.proposals import CentreMap
@@ -37,6 +39,8 @@ class TaskHeadsConfig:
     elements: MapHeadConfig | None = field(default_factory=MapHeadConfig)
     raster: RasterHeadConfig | None = field(default_factory=RasterHeadConfig)
     voxels: VoxelHeadConfig | None = field(default_factory=VoxelHeadConfig)
+    instances: InstanceHeadConfig | None = None
+    """Needs agents, and beliefs that the world model imagines."""
 
     @property
     def tasks(self) -> tuple[Task, ...]:
@@ -65,6 +69,11 @@ class TaskHeadsConfig:
             return None
         return frame_steps(T_world_ego, self.agents.carried.frames, self.agents.carried.dt_s)
 
+    @property
+    def later(self) -> int:
+        """Return the number of imagined key frames that the heads read."""
+        return 0 if self.instances is None else self.instances.steps
+
 
 @dataclass(frozen=True)
 class TaskVolume(Record):
@@ -75,17 +84,47 @@ class TaskVolume(Record):
     """In its own ego frame."""
     T_past_now: Float[Tensor, "b 4 4"] | None = None
     """The ego frame at now -> the ego frame of the past volume."""
+    later: Float[Tensor, "b K D Z Y X"] | None = None
+    """Volumes of K imagined key frames, each in its own ego frame, for heads that read them."""
+    T_now_later: Float[Tensor, "b K 4 4"] | None = None
+    """The ego frames of these -> the ego frame at now."""
 
 
-def volumes_of(world: WorldModel, belief: Belief, tasks: Sequence[Task]) -> dict[Task, TaskVolume]:
-    """Return what the heads of some tasks read of a belief about now. Equal volumes are the same record."""
+def volumes_of(
+    world: WorldModel, belief: Belief, tasks: Sequence[Task], later: int = 0
+) -> dict[Task, TaskVolume]:
+    """Return what the heads of some tasks read of a belief about now. Equal volumes are the same record.
+
+    Args:
+        world: the world model.
+        belief: about now.
+        tasks: tasks of the heads.
+        later: number of key frames to imagine, or as many as the world model can.
+    """
+    imagined, T_now_later = imagined_volumes(world, belief, later) if later else (None, None)
     past = None if belief.T_past_now is None or belief.history is None else belief.history[:, -2]
     made: dict[int, TaskVolume] = {}
     found: dict[Task, TaskVolume] = {}
     for task in tasks:
         volume = world.volume_for(belief, task)
-        found[task] = made.setdefault(id(volume), TaskVolume(volume, past, belief.T_past_now))
+        found[task] = made.setdefault(
+            id(volume), TaskVolume(volume, past, belief.T_past_now, imagined, T_now_later)
+        )
     return found
+
+
+def imagined_volumes(
+    world: WorldModel, belief: Belief, steps: int
+) -> tuple[Float[Tensor, "b K D Z Y X"], Float[Tensor, "b K 4 4"]]:
+    """Return the volumes of the next `steps` key frames, as occupancy reads them, and their ego motion.
+
+    There are fewer if the world model imagines fewer.
+    """
+    found = world.imagine(belief, steps if world.max_steps is None else min(steps, world.max_steps))
+    eye = torch.eye(4, device=belief.volume.device).expand(len(belief.volume), 4, 4)
+    poses = [eye if each.T_now_ego is None else each.T_now_ego for each in found]
+    volumes = [world.volume_for(each, "occupancy") for each in found]
+    return torch.stack(volumes, dim=1), torch.stack(poses, dim=1)
 
 
 @dataclass(frozen=True)
@@ -102,6 +141,8 @@ class HeadOutput:
     """Logits."""
     lineage: Lineage | None = None
     """Where the agents come from in the frame before; of heads that carry agents on."""
+    instances: InstanceSet | None = None
+    """Where the agents are, now and later."""
 
 
 class TaskHeads(nn.Module):
@@ -112,6 +153,7 @@ class TaskHeads(nn.Module):
         spec: grid of the volumes.
         channels: D of the volumes.
         raster: grid of the map's raster layers. Needed for this head only.
+        instance_grid: grid of instances. Needed for their prediction only.
     """
 
     def __init__(
@@ -121,6 +163,7 @@ class TaskHeads(nn.Module):
         *,
         channels: int,
         raster: PlaneSpec | None = None,
+        instance_grid: PlaneSpec | None = None,
     ) -> None:
         super().__init__()
         self.config = config
@@ -129,6 +172,8 @@ class TaskHeads(nn.Module):
         )
         self.agents = None if config.agents is None else AgentHead(planes, config.agents)
         self.elements = None if config.elements is None else MapHead(planes, config.elements)
+        self.instances = None if config.instances is None else InstanceHead(planes, config.instances)
+        self.instance_grid = instance_grid
         self.raster: RasterHead | None = None
         if config.raster is not None:
             assert raster is not None, "a raster head needs its grid"
@@ -170,7 +215,27 @@ class TaskHeads(nn.Module):
             raster = self.raster(planes_of("map"))
         if self.voxels is not None:
             voxels = self.voxels(volumes["occupancy"].now, planes_of("occupancy"))
-        return HeadOutput(agents, centres, elements, raster, voxels, lineage)
+        instances = None
+        if self.instances is not None and agents is not None:
+            instances = self._imagined(
+                self.instances, agents[-1], volumes["detection"], planes_of("detection")
+            )
+        return HeadOutput(agents, centres, elements, raster, voxels, lineage, instances)
+
+    def _imagined(
+        self, head: InstanceHead, agents: AgentSet, volume: TaskVolume, planes: Planes
+    ) -> InstanceSet:
+        """Return the instances on the planes of the imagined volumes; each has the one before as its past."""
+        assert agents.query is not None
+        assert volume.later is not None, "instances need imagined volumes"
+        assert volume.T_now_later is not None
+        later, before = [], volume.now
+        T_now_before = torch.eye(4, device=before.device).expand(len(before), 4, 4)
+        for imagined, T_now in zip(volume.later.unbind(1), volume.T_now_later.unbind(1), strict=True):
+            T_before_now = torch.linalg.inv(T_now_before.to(T_now)) @ T_now
+            later.append(self.planes(imagined, before, T_before_now).fine)
+            before, T_now_before = imagined, T_now
+        return head(agents.query, planes.fine, later, volume.T_now_later)
 
     def _follow(
         self,

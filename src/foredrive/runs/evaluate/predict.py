@@ -12,6 +12,7 @@ from torch import Tensor
 from foredrive.evaluation.predictor import Part, Prediction
 from foredrive.models.agent import PlanningAgent
 from foredrive.models.tasks.heads import HeadOutput, TaskHeads, TaskVolume, volumes_of
+from foredrive.models.tasks.instances import instance_raster
 from foredrive.runs.evaluate.streaming import DriveFollower, together
 from foredrive.scene import Belief, Clip, Decoded, RayRenderer, Task, WorldModel
 from foredrive.training import thinned_rays
@@ -86,7 +87,7 @@ class AgentPredictor:
         heads, follower = self.heads, self._follower
         if heads is None:
             return None, None
-        volumes = volumes_of(self.agent.world_model, now, heads.config.tasks)
+        volumes = volumes_of(self.agent.world_model, now, heads.config.tasks, heads.config.later)
         if follower is None:
             return heads(volumes), None
         found = []
@@ -116,7 +117,11 @@ def _tasks(heads: TaskHeads, found: HeadOutput, track_id: Int[Tensor, "b Q"] | N
     if found.agents is not None:
         agents = found.agents[-1].agents(0.5 if motion is None else motion.config.dt_s)
         agents = agents if track_id is None else dataclasses.replace(agents, track_id=track_id)
+    instances = None
+    if found.instances is not None and found.agents is not None and heads.instance_grid is not None:
+        instances = instance_raster(found.instances, found.agents[-1], heads.instance_grid)
     return Prediction(
+        instances=instances,
         agents=agents,
         map_lines=None if found.elements is None else found.elements[-1].lines(),
         map_layers=None if found.raster is None else found.raster.sigmoid(),

@@ -39,6 +39,7 @@ class KeptVolumes(Dataset[TaskExample]):
         logs: logs to read.
         clips: clips with the truth of the tasks.
         tasks: tasks whose volumes are kept.
+        later: number of imagined key frames to keep too.
         cache_dir: folder of the files.
 
     Raises:
@@ -52,10 +53,11 @@ class KeptVolumes(Dataset[TaskExample]):
         clips: ClipConfig,
         tasks: tuple[Task, ...],
         cache_dir: Path,
+        later: int = 0,
     ) -> None:
         dataset = open_clips(logs, dataclasses.replace(clips, future_images=False), cache_dir)
-        self.tasks = tasks
-        folder = cache_dir / "volumes" / _key(agent, clips, tasks)
+        self.tasks, self._later = tasks, later
+        folder = cache_dir / "volumes" / _key(agent, clips, (*tasks, *([f"later {later}"] if later else [])))
         self._files = [folder / f"{_name(dataset, index)}.safetensors" for index in range(len(dataset))]
         self._keep(agent, dataset)
         without_images = dataclasses.replace(clips, cameras=(), future_images=False, tasks=None)
@@ -79,6 +81,8 @@ class KeptVolumes(Dataset[TaskExample]):
             index=tuple(kept["index"].tolist()),
             past=kept["past"].float() if "past" in kept else None,
             T_past_now=kept.get("T_past_now"),
+            later=kept["later"].float() if "later" in kept else None,
+            T_now_later=kept.get("T_now_later"),
         )
         return dataclasses.replace(self.examples[index], volumes=volumes)
 
@@ -93,7 +97,7 @@ class KeptVolumes(Dataset[TaskExample]):
             clip = stack_records([dataset.clip(row) for row in rows]).to(device)
             world = agent.world_model
             with torch.no_grad():
-                found = task_volumes(world, world.observe(clip.observed()), self.tasks)
+                found = task_volumes(world, world.observe(clip.observed()), self.tasks, self._later)
             for item, row in enumerate(rows):
                 with atomic_path(self._files[row]) as temporary:
                     save_file(_tensors(found[item].to("cpu")), temporary)
@@ -104,6 +108,8 @@ def _tensors(volumes: TaskVolumes) -> dict[str, Tensor]:
     kept = {"volume": volumes.volume.half().contiguous(), "index": torch.tensor(volumes.index)}
     if volumes.past is not None and volumes.T_past_now is not None:
         kept |= {"past": volumes.past.half().contiguous(), "T_past_now": volumes.T_past_now.contiguous()}
+    if volumes.later is not None and volumes.T_now_later is not None:
+        kept |= {"later": volumes.later.half().contiguous(), "T_now_later": volumes.T_now_later.contiguous()}
     return kept
 
 

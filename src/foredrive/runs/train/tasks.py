@@ -75,7 +75,9 @@ def train_heads(run: Run, heads: TaskHeadsRecipe) -> TrainedHeads:
     if not (folder / WEIGHTS).is_file():
         agent = load_agent(run)
         clips = dataclasses.replace(run.recipe.clips, tasks=heads.truth, now_stride_s=heads.now_stride_s)
-        dataset = KeptVolumes(agent, run.logs, clips, heads.heads.tasks, run.cache_dir)
+        _check_later(run, heads)
+        sizes = heads.heads
+        dataset = KeptVolumes(agent, run.logs, clips, sizes.tasks, run.cache_dir, sizes.later)
         if not (folder / CONFIG).is_file():
             save_recipe(heads, folder / CONFIG)
         torch.manual_seed(heads.schedule.seed)
@@ -131,4 +133,14 @@ def _build(run: Run, recipe: TaskHeadsRecipe) -> TaskHeads:
         run.recipe.clips.voxels,
         channels=run.recipe.model.channels,
         raster=recipe.truth.raster,
+        instance_grid=recipe.truth.instances,
     )
+
+
+def _check_later(run: Run, heads: TaskHeadsRecipe) -> None:
+    """Refuse heads that read imagined key frames of another time step than the run's."""
+    instances, dt_s = heads.heads.instances, run.recipe.clips.frame_dt_s
+    if instances is not None and instances.dt_s != dt_s:
+        raise InputError(
+            f"{run.folder}: key frames are {dt_s:g} s apart, instances need {instances.dt_s:g} s"
+        )

@@ -1,0 +1,69 @@
+"""The loss of instance occupancy: the masks of matched vehicles, now and later."""
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from foredrive.losses.semantics import raster_loss
+from foredrive.models.tasks.agents import AGENT_CLASSES, AgentSet
+from foredrive.models.tasks.instances import InstanceSet, instance_logits
+from foredrive.scene import Boxes, VoxelSpec
+from foredrive.scene.boxes import VEHICLES
+from foredrive.scene.map_elements import InstanceRaster, PlaneSpec
+from foredrive.training.detection_losses import MatchingLossConfig, best_matching
+from foredrive.training.task_targets import agent_targets
+
+OCCUPIED_WEIGHT = 2.0
+_VEHICLE_LABELS = torch.tensor([n for n, kind in enumerate(AGENT_CLASSES) if kind in VEHICLES])
+
+
+def instance_loss(
+    instances: InstanceSet,
+    agents: AgentSet,
+    boxes: Boxes,
+    boxes_valid: Bool[Tensor, "b"],
+    truth: InstanceRaster,
+    spec: VoxelSpec,
+    matching: MatchingLossConfig,
+) -> Float[Tensor, ""]:
+    """Return cross-entropy plus Dice of the masks of all matched vehicles and steps; 0 without any.
+
+    Each vehicle that matches an agent's box has its cells of the truth as the mask, at all steps that the log
+    annotates. Cells outside of the volume's plane do not count.
+    """
+    wanted = _inside(truth.spec, spec)
+    points = torch.stack(
+        torch.meshgrid(
+            *(
+                truth.spec.lower_m[axis] + (torch.arange(size) + 0.5)[wanted[1 - axis]] * truth.spec.cell_m
+                for axis, size in ((0, truth.spec.shape_yx[1]), (1, truth.spec.shape_yx[0]))
+            ),
+            indexing="xy",
+        ),
+        dim=-1,
+    ).to(instances.embedding)
+    losses = []
+    for item in boxes_valid.nonzero()[:, 0].tolist():
+        targets = agent_targets(boxes[item], None, spec, 0)
+        query, match = best_matching(agents[item].boxes, targets.boxes, matching)
+        vehicle = torch.isin(targets.boxes.label[match], _VEHICLE_LABELS.to(match.device))
+        steps = truth.valid[item]
+        query, track_id = query[vehicle], targets.track_id[match[vehicle]]
+        if not len(query) or not bool(steps.any()):
+            continue
+        logits = instance_logits(instances[item], agents[item], query, points.flatten(0, 1))
+        cells = truth.track_id[item][:, wanted[0]][:, :, wanted[1]]
+        masks = cells == (track_id + 1)[:, None, None, None]
+        whole = logits.unflatten(-1, points.shape[:2])[:, steps]
+        known = torch.ones(len(query), dtype=torch.bool, device=whole.device)
+        losses.append(raster_loss(whole, masks[:, steps], known, OCCUPIED_WEIGHT))
+    return torch.stack(losses).mean() if losses else instances.embedding.sum() * 0
+
+
+def _inside(raster: PlaneSpec, spec: VoxelSpec) -> tuple[Bool[Tensor, "Y"], Bool[Tensor, "X"]]:
+    """Return which rows and columns of a raster have their middle above a volume."""
+    found = []
+    for axis, size in ((1, raster.shape_yx[0]), (0, raster.shape_yx[1])):
+        middle = raster.lower_m[axis] + (torch.arange(size) + 0.5) * raster.cell_m
+        found.append((middle > spec.lower_m[axis]) & (middle < spec.upper_m[axis]))
+    return found[0], found[1]
