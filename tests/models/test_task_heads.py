@@ -84,7 +84,11 @@ def test_all_heads_in_parallel() -> None:
 def test_a_head_can_be_left_out(left_out: str) -> None:
     found = heads(dataclasses.replace(CONFIG, **{left_out: None}))(volumes())
     missing = ["agents", "centres"] if left_out == "agents" else [left_out]
-    assert [name for name, value in vars(found).items() if value is None] == [*missing, "lineage"]
+    assert [name for name, value in vars(found).items() if value is None] == [
+        *missing,
+        "lineage",
+        "instances",
+    ]
 
 
 def test_only_the_volumes_of_the_tasks_are_needed() -> None:
