@@ -98,16 +98,23 @@ def true_views(name: str) -> list[TrueViews]:
 
 
 def rebuilt(arm: str, seed: int) -> dict[str, float]:
-    """Return the metrics of one run: "VIEWS.METRIC", and "VIEWS.changed.METRIC" where an edit changes the
-    views.
-    """
+    """Return the metrics of one run, see `judged_town`, and its minutes."""
     recipe = rescheduled_recipe(ARMS[arm], seed=seed)
     run = reconstruct(recipe, DRIVE.recorded(WORK / "town"), WORK / f"{arm}_seed{seed}", WORK / "cache")
     figures = {name: float(run.summary[name] or 0.0) for name in ("minutes", "gaussians")}
+    return figures | judged_town(run)
+
+
+def judged_town(run: Reconstruction) -> dict[str, float]:
+    """Return the metrics of a run of `DRIVE`.
+
+    They are "VIEWS.METRIC", and "VIEWS.changed.METRIC" where an edit changes the views.
+    """
+    figures: dict[str, float] = {}
     for name in NAMES:
         edits = edits_of(name)
         edited = any(isinstance(edit, Move | Remove) for edit in edits)
-        if edited and not recipe.actors:
+        if edited and not run.recipe.actors:
             continue
         graph = apply_edits(run.scene.graph, edits).graph
         views, title = true_views(name), f"{name}, beside what the town's camera sees there"

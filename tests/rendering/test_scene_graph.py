@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from collections.abc import Iterator
 
 import pytest
 import torch
@@ -105,6 +106,33 @@ def test_velocities_are_those_of_the_poses() -> None:
     before, after = place_gaussians(graph, 0.999), place_gaussians(graph, 1.001)
     measured = (after.gaussians.mean_m - before.gaussians.mean_m) / 0.002
     assert torch.allclose(place_gaussians(graph, 1.0).velocity_mps, measured, atol=2e-3)
+
+
+@pytest.fixture
+def two_threads() -> Iterator[None]:
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.mark.usefixtures("two_threads")
+def test_gradients_of_poses_have_the_same_bits_every_time() -> None:
+    """Thousands of Gaussians add up to the gradient of one pose, in whatever order threads come."""
+    spots = torch.randn(30_000, 3, generator=torch.Generator().manual_seed(0))
+    graph, offset = graph_of(spots.tolist(), [0] * len(spots), two_actors()), torch.zeros(2, 2, 6)
+    offset.requires_grad_()
+
+    def gradient() -> torch.Tensor:
+        placed = place_gaussians(dataclasses.replace(graph, tracks=graph.tracks.moved(offset)), 0.7)
+        change = (
+            placed.gaussians.mean_m.sin() * placed.velocity_mps
+        ).sum() + placed.gaussians.quaternion.sum()
+        return torch.autograd.grad(change, offset)[0]
+
+    first = gradient()
+    assert float(first.abs().max()) > 0
+    assert all(torch.equal(gradient(), first) for _ in range(5))
 
 
 @given(st.lists(st.floats(-1, 1), min_size=4, max_size=4).filter(lambda q: sum(x * x for x in q) > 0.1))

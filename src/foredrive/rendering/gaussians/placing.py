@@ -52,15 +52,18 @@ def place_gaussians(
     own = content.gaussians[moving]
     if mirror is not None:
         own = _mirrored(own, mirror[owner])
-    T = states.T_scene_actor
-    R = T[:, :3, :3]
-    arm = (R[owner] @ own.mean_m[..., None])[..., 0]
+
+    def of_owner(values: Float[Tensor, "A *n"]) -> Float[Tensor, "M *n"]:
+        return values.index_select(0, owner)  # indexing would add up gradients in the order of threads
+
+    R = states.T_scene_actor[:, :3, :3]
+    arm = (of_owner(R) @ own.mean_m[..., None])[..., 0]
     moved = dataclasses.replace(
         own,
-        mean_m=T[owner, :3, 3] + arm,
-        quaternion=multiply_quaternions(quaternion_from_matrix(R)[owner], own.quaternion),
+        mean_m=of_owner(states.T_scene_actor[:, :3, 3]) + arm,
+        quaternion=multiply_quaternions(of_owner(quaternion_from_matrix(R)), own.quaternion),
     )
-    velocity = states.velocity_mps[owner] + torch.linalg.cross(states.turn_radps[owner], arm)
+    velocity = of_owner(states.velocity_mps) + torch.linalg.cross(of_owner(states.turn_radps), arm)
     return PlacedGaussians(
         gaussians=joined([standing, moved]),
         velocity_mps=torch.cat([torch.zeros_like(standing.mean_m), velocity]),

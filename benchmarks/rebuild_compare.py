@@ -1,0 +1,104 @@
+"""Compare the representations of rebuilt logs, in quality over CPU time: `foredrive bench rebuild-compare`.
+
+Each representation rebuilds PandaSet 002 (raw, in FOREDRIVE_REAL_DATA/pandaset) from the front camera and
+the lidar of every second frame, and the drive of `rebuild_town.py`, which is judged at the held-out poses,
+2 m and 3 m beside them, and after edits. An arm ARM@LENGTH is one point of a curve: a whole training of a
+share of the recipe's steps, with its own schedule. CPU time is that of the training alone, on all threads.
+
+Runs are kept in runs/rebuild_compare, so that an interrupted study continues where it stopped.
+"""
+
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from benchmarks.common.measuring import forget_peak
+from benchmarks.common.study import pandaset_log
+from benchmarks.rebuild_pandaset import FIGURES
+from benchmarks.rebuild_town import DRIVE, judged_town
+from foredrive.evaluation.bench import Benchmark, study_identity
+from foredrive.recipes.rebuilding import RebuildRecipe, gaussians_tiny, rescheduled_recipe
+from foredrive.runs.rebuild.reconstruct import reconstruct
+
+ROOT = Path("runs/rebuild_compare")
+RECIPES: dict[str, RebuildRecipe[Any]] = {"gaussians": gaussians_tiny()}
+"""The smallest recipe of each representation, by the name of its arm."""
+LENGTHS = {"eighth": 1 / 8, "third": 1 / 3, "whole": 1.0}
+"""Shares of a recipe's steps."""
+STEP_COUNTS = ("steps", "shrink_steps", "grow_from", "grow_until", "grow_every")
+"""Entries of a schedule that are numbers of steps; a shorter training has as many rounds of growth."""
+RENAMED = {"moving.psnr_db": "psnr_driving_db", "moving.nearest.psnr_db": "nearest.psnr_driving_db"}
+DECIDED_BY = (
+    "benchmarks.rebuild_town",
+    "benchmarks.common.rebuilt_towns",
+    "foredrive.evaluation.rendering",
+    "foredrive.geometry",
+    "foredrive.losses.rendering",
+    "foredrive.metrics.images",
+    "foredrive.metrics.lidar_rendering",
+    "foredrive.ops.splatting",
+    "foredrive.ops.splatting_back_kernels",
+    "foredrive.ops.splatting_kernels",
+    "foredrive.recipes.gaussians",
+    "foredrive.rendering",
+    "foredrive.training.gaussian_steps",
+    "foredrive.training.gaussian_training",
+    "foredrive.training.rebuilding",
+)
+CONFIG = {
+    "recipes": {arm: dataclasses.asdict(recipe) for arm, recipe in RECIPES.items()},
+    "lengths": LENGTHS,
+    "drive": dataclasses.asdict(DRIVE),
+}
+WORK = ROOT / study_identity(CONFIG, DECIDED_BY)
+
+
+def shortened(recipe: RebuildRecipe[Any], share: float) -> RebuildRecipe[Any]:
+    """Return a recipe of a share of the steps, with as many rounds of growth."""
+    schedule = recipe.representation.schedule
+
+    def scaled(value: int | tuple[int, ...]) -> int | tuple[int, ...]:
+        if isinstance(value, tuple):
+            return tuple(max(round(share * step), 1) for step in value)
+        return max(round(share * value), 1)
+
+    counts = {name: scaled(getattr(schedule, name)) for name in STEP_COUNTS if hasattr(schedule, name)}
+    return rescheduled_recipe(recipe, **counts)
+
+
+def on_pandaset(arm: str, length: str) -> Callable[[int], dict[str, float]]:
+    """Return the measurement of one point: figures KEY_LENGTH, or KEY for the whole training."""
+    end = "" if length == "whole" else f"_{length}"
+
+    def measure(seed: int) -> dict[str, float]:
+        recipe = dataclasses.replace(shortened(RECIPES[arm], LENGTHS[length]), cameras=("pcam_f0",))
+        recipe = rescheduled_recipe(recipe, seed=seed)
+        forget_peak("cpu")
+        log, folder = pandaset_log(ROOT / "pandaset"), WORK / f"{arm}_{length}_seed{seed}"
+        summary = reconstruct(recipe, log, folder, ROOT / "cache").summary
+        names = (*FIGURES, "peak_memory_gib")
+        known = {name: float(value) for name in names if isinstance(value := summary.get(name), float | int)}
+        return {RENAMED.get(name, name) + end: value for name, value in known.items()}
+
+    return measure
+
+
+def in_town(arm: str) -> Callable[[int], dict[str, float]]:
+    """Return the measurement of the views of a rebuilt town: figures VIEWS.KEY."""
+
+    def measure(seed: int) -> dict[str, float]:
+        recipe = dataclasses.replace(rescheduled_recipe(RECIPES[arm], seed=seed), cameras=DRIVE.cameras)
+        log, folder = DRIVE.recorded(ROOT / "town"), WORK / f"{arm}_town_seed{seed}"
+        return judged_town(reconstruct(recipe, log, folder, ROOT / "cache"))
+
+    return measure
+
+
+BENCHMARK = Benchmark(
+    question="Which representation of a rebuilt log is better: for how much CPU time, and from where?",
+    arms={f"{arm}@{length}": on_pandaset(arm, length) for length in LENGTHS for arm in RECIPES}
+    | {f"{arm}@town": in_town(arm) for arm in RECIPES},
+    config=CONFIG,
+    decided_by=DECIDED_BY,
+)
