@@ -21,7 +21,8 @@ from foredrive.errors import InputError
 from foredrive.evaluation.bench import Benchmark
 from foredrive.scene import LidarSweep, VoxelSpec
 from foredrive.scene.conditions import CONDITIONS
-from foredrive.sensors.vehicle import camera_rig, find_lidar
+from foredrive.sensors.rigs import camera_rig
+from foredrive.sensors.vehicle import find_lidar
 from foredrive.towns.map.town_map import load_town_map
 from foredrive.towns.sensing.capture import SensorSuite
 from foredrive.towns.traffic.expert import ExpertDrive

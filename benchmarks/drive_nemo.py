@@ -22,6 +22,7 @@ from foredrive.runs.drive.records import summarise
 from foredrive.runs.drive.suite import DriveSuite, SuiteResult, drive_suite
 from foredrive.runs.evaluate.run import SUMMARY, evaluate_run
 from foredrive.runs.train.run import train_run
+from foredrive.sensors.rigs import SURROUND
 from foredrive.towns.campaign import Campaign, plan_drives
 
 WORK = work_folder(Path("runs/drive_nemo"))
@@ -29,7 +30,6 @@ RECIPE = "nemo_drive"
 DEMONSTRATIONS = ("training-short", "training-long")
 JUDGED = {"short": "town05-short", "long": "town05-long"}
 OPEN_LOOP = Campaign(("Town05",), seeds=tuple(range(1, 7)), seconds=60.0, rate_hz=2.0)
-IMAGE_HW = (144, 256)
 CORES = len(os.sched_getaffinity(0))
 
 
@@ -77,7 +77,7 @@ def learned(pretrained: bool) -> Callable[[int], Mapping[str, float]]:
         folder = WORK / "runs" / f"{name}_seed{seed}"
         run = train_run(recipe, _demonstrations(), folder, WORK / "cache")
         if not (folder / SUMMARY).is_file():
-            recorded = record_drives(plan_drives(OPEN_LOOP), WORK / "towns", IMAGE_HW, CORES)
+            recorded = record_drives(plan_drives(OPEN_LOOP), WORK / "towns", SURROUND, CORES)
             logs = tuple(recorded.logs.values())
             evaluate_run(run, logs, folder, batch_size=8, views=False, stride_s=JUDGED_EVERY_S)
         l2_m = read_summary(folder / SUMMARY)[f"planning.{HEADLINE}.l2_avg_m"]

@@ -21,7 +21,8 @@ from foredrive.recipes import find_recipe
 from foredrive.runs.build import build_agent
 from foredrive.scene import Clip
 from foredrive.scene.conditions import BackgroundTraffic
-from foredrive.sensors.vehicle import camera_rig, roof_lidar
+from foredrive.sensors.rigs import camera_rig
+from foredrive.sensors.vehicle import roof_lidar
 from foredrive.simulation.controller import ControllerState, follow
 from foredrive.simulation.dynamics import STEP_S
 from foredrive.simulation.observation import FRAME_DT_S

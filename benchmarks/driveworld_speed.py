@@ -19,12 +19,12 @@ from foredrive.recipes import RECIPES, Recipe
 from foredrive.runs.build import build_agent, build_objective
 from foredrive.runs.drive.recording import record_drives
 from foredrive.runs.open_clips import open_clips
+from foredrive.sensors.rigs import SURROUND
 from foredrive.towns.campaign import Campaign, plan_drives
 from foredrive.training import make_fabric
 
 DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
 PLANS = plan_drives(Campaign(("Town01",), (1,), seconds=20.0, rate_hz=2.0))
-IMAGE_HW = (144, 256)
 TURNS = 7
 STAGES = ("pretrain", "finetune")
 
@@ -35,7 +35,7 @@ class Stepper:
     def __init__(self, recipe: Recipe, stage_name: str, folder: Path, seed: int) -> None:
         stage = recipe.pretrain if stage_name == "pretrain" else recipe.finetune
         assert stage is not None
-        logs = list(record_drives(PLANS, folder / "towns", IMAGE_HW, workers=1).logs.values())
+        logs = list(record_drives(PLANS, folder / "towns", SURROUND, workers=1).logs.values())
         dataset = open_clips(logs, dataclasses.replace(recipe.clips, future_images=True), folder / "cache")
         size = stage.schedule.batch_size
         torch.manual_seed(seed)

@@ -24,7 +24,8 @@ from foredrive.geometry.se3 import exp_se3
 from foredrive.runs.drive.recording import log_of
 from foredrive.scene import CameraRig
 from foredrive.scene.conditions import BackgroundTraffic, find_conditions
-from foredrive.sensors.vehicle import camera_rig, roof_lidar
+from foredrive.sensors.rigs import camera_rig
+from foredrive.sensors.vehicle import roof_lidar
 from foredrive.towns.campaign import ANY_CONDITIONS, Campaign, DrivePlan, plan_drives
 from foredrive.towns.recorder import record
 from foredrive.towns.sensing.capture import SensorSuite

@@ -16,19 +16,20 @@ from foredrive.evaluation.bench import Benchmark
 from foredrive.runs.drive.recording import record_drives
 from foredrive.runs.search.sector_views import gather_views
 from foredrive.runs.search.towers import EMBEDDED, find_towers
+from foredrive.sensors.rigs import SURROUND
 from foredrive.towns.campaign import Campaign, plan_drives
 
 TOWERS = tuple(os.environ.get("SEARCH_RETRIEVAL_TOWERS", EMBEDDED).split(":"))
 WORK = Path("runs/search_retrieval")
 TOWN, SEEDS, WEATHERS = "Town05", tuple(range(201, 206)), ("clear", "night", "rain", "fog")
-SECONDS, RATE_HZ, IMAGE_HW, CROWD = 40.0, 0.5, (144, 256), (40, 40)
+SECONDS, RATE_HZ, CROWD = 40.0, 0.5, (40, 40)
 
 
 def drives() -> list[LogPath]:
     """Return the drives; record them if they do not exist yet."""
     campaign = Campaign((TOWN,), SEEDS, WEATHERS, CROWD, CROWD, SECONDS, RATE_HZ)
     plans = plan_drives(campaign)
-    done = record_drives(plans, WORK / "towns", IMAGE_HW, workers=os.cpu_count() or 1)
+    done = record_drives(plans, WORK / "towns", SURROUND, workers=os.cpu_count() or 1)
     assert not done.failed, done.failed
     return [done.logs[plan] for plan in plans]
 

@@ -25,6 +25,7 @@ from foredrive.models.lidar_clip import LidarEncoder, LidarEncoderConfig, PointC
 from foredrive.runs.drive.recording import record_plan
 from foredrive.search.crops import Crop
 from foredrive.search.embedding import read_views
+from foredrive.sensors.rigs import SURROUND
 from foredrive.towns.campaign import DrivePlan
 
 SWEEPS, REPEATS, DIM, SIDE_PX = 8, 9, 384, 128
@@ -35,7 +36,7 @@ BLOCK_LAYERS = {"tiny": 1, "base": 2}
 
 def record(seed: int, folder: Path) -> None:
     """Record the sweeps in this process."""
-    record_plan(DrivePlan("Town05", seed, "clear", 20, 20, SWEEPS / 2, 2.0), folder, (144, 256))
+    record_plan(DrivePlan("Town05", seed, "clear", 20, 20, SWEEPS / 2, 2.0), folder, SURROUND)
 
 
 def embed_speed(folder: Path, size: str) -> dict[str, float]:

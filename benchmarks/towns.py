@@ -18,7 +18,8 @@ import torch
 
 from foredrive.evaluation.bench import Benchmark
 from foredrive.scene.conditions import BackgroundTraffic
-from foredrive.sensors.vehicle import camera_rig, roof_lidar
+from foredrive.sensors.rigs import camera_rig
+from foredrive.sensors.vehicle import roof_lidar
 from foredrive.towns.map.town_map import load_town_map
 from foredrive.towns.recorder import record
 from foredrive.towns.sensing.capture import SensorSuite

@@ -24,7 +24,8 @@ from foredrive.scene.map_elements import (
     RasterLayer,
 )
 from foredrive.scene.semantics import VOXEL_CLASSES, SemanticVoxels
-from foredrive.sensors.vehicle import camera_rig, roof_lidar
+from foredrive.sensors.rigs import camera_rig
+from foredrive.sensors.vehicle import roof_lidar
 from foredrive.towns.recorder import record
 from foredrive.towns.sensing.capture import SensorSuite
 

@@ -11,7 +11,8 @@ from PIL import Image, ImageDraw, ImageFont
 from foredrive.geometry.se3 import inverse_se3, transform_points
 from foredrive.scene import LidarSweep
 from foredrive.scene.conditions import CONDITIONS, Conditions
-from foredrive.sensors.vehicle import camera_rig, roof_lidar
+from foredrive.sensors.rigs import camera_rig
+from foredrive.sensors.vehicle import roof_lidar
 from foredrive.towns.map.town_map import TOWNS, load_town_map
 from foredrive.towns.sensing.capture import SensorSuite
 from foredrive.towns.traffic.expert import ExpertDrive

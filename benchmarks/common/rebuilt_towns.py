@@ -20,7 +20,8 @@ from foredrive.rendering.vehicle import EgoState
 from foredrive.rendering.views import CameraView, SweepView
 from foredrive.scene.actors import ActorState
 from foredrive.scene.conditions import BackgroundTraffic
-from foredrive.sensors.vehicle import camera_rig, find_lidar
+from foredrive.sensors.rigs import camera_rig
+from foredrive.sensors.vehicle import find_lidar
 from foredrive.towns.map.town_map import load_town_map
 from foredrive.towns.recorder import LabelOptions, record, split_of
 from foredrive.towns.sensing.capture import SensorSuite

@@ -19,6 +19,7 @@ from foredrive.recipes.nemo import NemoRecipe
 from foredrive.runs.drive.recording import record_drives
 from foredrive.runs.evaluate.run import SUMMARY, evaluate_run
 from foredrive.runs.train.run import train_run
+from foredrive.sensors.rigs import SURROUND
 from foredrive.towns.campaign import Campaign, plan_drives
 from foredrive.training import PathFit, read_metrics
 
@@ -64,7 +65,7 @@ def record_study(towns: StudyTowns, out: Path, workers: int) -> StudyLogs:
     found = []
     for names, seeds in ((towns.train, towns.train_seeds), (towns.test, towns.test_seeds)):
         plans = plan_drives(Campaign(names, seeds, seconds=towns.seconds, rate_hz=towns.rate_hz))
-        recorded = record_drives(plans, out, towns.image_hw, workers)
+        recorded = record_drives(plans, out, SURROUND.of_size(towns.image_hw), workers)
         if recorded.failed:
             plan, reason = next(iter(recorded.failed.items()))
             raise InputError(f"{len(recorded.failed)} drives failed, {plan.log_name}: {reason}")

@@ -22,6 +22,7 @@ from foredrive.runs.drive.records import read_drive, suite_title, summarise
 from foredrive.runs.drive.route_source import job_of
 from foredrive.runs.drive.suite import DriveJob, DriveSuite, SuiteResult, drive_suite, folder_of
 from foredrive.scene import VoxelSpec
+from foredrive.sensors.rigs import SURROUND
 from foredrive.simulation.route_sets import RouteWaypoints
 from foredrive.simulation.routes import snap_route
 from foredrive.simulation.scenarios.places import scenarios_on
@@ -59,7 +60,9 @@ def changed(suite: DriveSuite, **fields: Any) -> DriveSuite:
 
 @pytest.fixture(scope="module")
 def suite(routes: Path) -> DriveSuite:
-    return DriveSuite("constant-velocity", TownRoutes(str(routes), image_hw=(18, 32), vehicles=4, people=2))
+    return DriveSuite(
+        "constant-velocity", TownRoutes(str(routes), rig=SURROUND.of_size((18, 32)), vehicles=4, people=2)
+    )
 
 
 @pytest.fixture(scope="module")

@@ -8,9 +8,10 @@ import pytest
 
 from foredrive.runs.drive.recording import RecordingResult, is_recorded, record_drives, record_plan
 from foredrive.runs.fan_out import fan_out
+from foredrive.sensors.rigs import SURROUND
 from foredrive.towns.campaign import DrivePlan
 
-IMAGE_HW = (36, 64)
+RIG = SURROUND.of_size((36, 64))
 PLANS = [
     DrivePlan("Town02", seed, conditions, 6, 4, 1.0, 2.0)
     for seed, conditions in ((1, None), (2, None), (2, "clear"))
@@ -33,7 +34,7 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def recorded(root: Path) -> RecordingResult:
-    return record_drives([LOST, *PLANS], root, IMAGE_HW, workers=2)
+    return record_drives([LOST, *PLANS], root, RIG, workers=2)
 
 
 def test_side_by_side_gives_the_bytes_of_one_after_another(
@@ -41,7 +42,7 @@ def test_side_by_side_gives_the_bytes_of_one_after_another(
 ) -> None:
     assert list(recorded.logs) == PLANS
     for plan in PLANS[1:]:
-        record_plan(plan, tmp_path, IMAGE_HW)
+        record_plan(plan, tmp_path, RIG)
     one_by_one = digests(tmp_path)
     assert {f"logs/town_train/{plan.log_name}/sync.arrow" for plan in PLANS[1:]} <= set(one_by_one)
     assert one_by_one.items() <= digests(root).items()
@@ -54,7 +55,7 @@ def test_a_drive_that_fails_is_named_and_the_others_go_on(recorded: RecordingRes
 
 def test_whole_logs_are_skipped(recorded: RecordingResult, root: Path) -> None:
     before, ticks = {file: file.stat().st_mtime_ns for file in root.rglob("*.arrow")}, []
-    again = record_drives(PLANS, root, IMAGE_HW, workers=2, tick=lambda: ticks.append(None))
+    again = record_drives(PLANS, root, RIG, workers=2, tick=lambda: ticks.append(None))
     assert (again.skipped, again.logs, again.failed) == (len(PLANS), recorded.logs, {})
     assert len(ticks) == len(PLANS)
     assert {file: file.stat().st_mtime_ns for file in root.rglob("*.arrow")} == before
@@ -62,16 +63,16 @@ def test_whole_logs_are_skipped(recorded: RecordingResult, root: Path) -> None:
 
 def test_a_log_of_another_length_rate_or_size_does_not_count(recorded: RecordingResult, root: Path) -> None:
     plan = PLANS[0]
-    assert is_recorded(plan, root, IMAGE_HW)
-    assert not is_recorded(plan, root, (72, 128))
+    assert is_recorded(plan, root, RIG)
+    assert not is_recorded(plan, root, SURROUND.of_size((72, 128)))
     for other in ({"seconds": 2.0}, {"rate_hz": 1.0, "seconds": 2.0}, {"seed": 7}):
-        assert not is_recorded(DrivePlan(**(vars(plan) | other)), root, IMAGE_HW)
+        assert not is_recorded(DrivePlan(**(vars(plan) | other)), root, RIG)
 
 
 def test_a_refusing_disk_ends_it_all(tmp_path: Path) -> None:
     (tmp_path / "logs").write_text("in the way")
     with pytest.raises(OSError, match="logs"):
-        record_drives(PLANS[:1], tmp_path, IMAGE_HW, workers=1)
+        record_drives(PLANS[:1], tmp_path, RIG, workers=1)
 
 
 def die_of_the_first(plan: DrivePlan) -> None:
@@ -89,7 +90,7 @@ def test_a_process_that_dies_takes_its_own_drive_along() -> None:
 )
 @pytest.mark.filterwarnings("ignore::ResourceWarning")  # Ray leaves its own processes to the system
 def test_on_ray(tmp_path: Path, recorded: RecordingResult, root: Path) -> None:
-    on_ray = record_drives([LOST, PLANS[0]], tmp_path, IMAGE_HW, workers=1, on_ray=True)
+    on_ray = record_drives([LOST, PLANS[0]], tmp_path, RIG, workers=1, on_ray=True)
     assert list(on_ray.logs) == [PLANS[0]]
     assert "unknown town 'Town99'" in on_ray.failed[LOST]
     assert digests(tmp_path).items() <= digests(root).items()

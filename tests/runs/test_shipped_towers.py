@@ -20,6 +20,7 @@ from foredrive.search.embedding import read_views
 from foredrive.search.index import FrameIndex
 from foredrive.search.query import Query
 from foredrive.search.zero_shot import class_vectors, classify
+from foredrive.sensors.rigs import SURROUND
 from foredrive.towns.campaign import DrivePlan
 
 MOST_BYTES = 10_000_000
@@ -31,7 +32,7 @@ def drives(tmp_path_factory: pytest.TempPathFactory) -> dict[str, LogPath]:
     """A moment of the held-out town, by day and by night."""
     out = tmp_path_factory.mktemp("held_out")
     return {
-        light: record_plan(DrivePlan("Town05", 77, light, 20, 10, 0.5, 2.0), out, (144, 256))
+        light: record_plan(DrivePlan("Town05", 77, light, 20, 10, 0.5, 2.0), out, SURROUND)
         for light in LIGHTS
     }
 

@@ -25,6 +25,7 @@ from foredrive.runs.drive.suite import DriveSuite, drive_one
 from foredrive.runs.evaluate.imagination import imagine_run
 from foredrive.runs.export import export_run
 from foredrive.scene import Belief, Clip, Decoded, Example, Frames, Task, VoxelSpec, WorldModel, last_frames
+from foredrive.sensors.rigs import SURROUND
 from foredrive.towns.map.town_map import load_town_map
 from foredrive.towns.traffic.lane_graph import build_lane_graph
 from foredrive.training import Schedule
@@ -164,7 +165,7 @@ def test_it_drives(run: Run, tmp_path: Path) -> None:
     points = "".join(f'<waypoint x="{x}" y="{-y}" z="{z}"/>' for x, y, z in ends)
     routes = tmp_path / "one.xml"
     routes.write_text(f'<routes><route id="a" town="Town02">{points}</route></routes>')
-    source = TownRoutes(str(routes), image_hw=(18, 32), vehicles=2, people=0)
+    source = TownRoutes(str(routes), rig=SURROUND.of_size((18, 32)), vehicles=2, people=0)
     drive = drive_one(job_of("a", 0), DriveSuite(str(run.folder), source), tmp_path / "drives")
     assert not drive.error
     assert len(drive.act_s) > 0

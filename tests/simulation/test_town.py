@@ -10,7 +10,8 @@ import torch
 from foredrive.errors import InputError
 from foredrive.scene import Category, Clip, Command, Control, Event, Trajectory
 from foredrive.scene.conditions import BackgroundTraffic
-from foredrive.sensors.vehicle import camera_rig, roof_lidar
+from foredrive.sensors.rigs import camera_rig
+from foredrive.sensors.vehicle import roof_lidar
 from foredrive.simulation.collisions import Contacts
 from foredrive.simulation.controller import ControllerState, follow
 from foredrive.simulation.dynamics import STEP_S

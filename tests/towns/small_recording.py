@@ -4,7 +4,8 @@ from pathlib import Path
 
 from foredrive.data.log_paths import LogPath
 from foredrive.scene.conditions import BackgroundTraffic
-from foredrive.sensors.vehicle import camera_rig, roof_lidar
+from foredrive.sensors.rigs import camera_rig
+from foredrive.sensors.vehicle import roof_lidar
 from foredrive.towns.recorder import LabelOptions, record
 from foredrive.towns.sensing.capture import SensorSuite
 

@@ -9,7 +9,8 @@ from scenes import ACTOR_ID, STILL, actor_at, ego_pose
 
 from foredrive.scene.actors import ActorState
 from foredrive.sensors import CameraOptics
-from foredrive.sensors.vehicle import camera_rig, roof_lidar
+from foredrive.sensors.rigs import camera_rig
+from foredrive.sensors.vehicle import roof_lidar
 from foredrive.towns.map.town_map import TownMap
 from foredrive.towns.sensing.capture import SensorSuite
 from foredrive.towns.world import World

@@ -9,7 +9,7 @@ import torch
 from foredrive.scene import Category
 from foredrive.scene.actors import ActorState
 from foredrive.sensors import SpinningLidar
-from foredrive.sensors.vehicle import camera_rig
+from foredrive.sensors.rigs import camera_rig
 from foredrive.towns.map.town_map import TownMap
 from foredrive.towns.sensing.capture import SensorSuite
 from foredrive.towns.sensing.echoes import footprint_chance, group_echoes, pick_echo

@@ -21,7 +21,8 @@ from foredrive.data.recorded_labels import recorded_labels
 from foredrive.scene import Category, VoxelSpec
 from foredrive.scene.conditions import BackgroundTraffic
 from foredrive.scene.traffic_light import LightState
-from foredrive.sensors.vehicle import camera_rig, roof_lidar
+from foredrive.sensors.rigs import camera_rig
+from foredrive.sensors.vehicle import roof_lidar
 from foredrive.towns.map.town_map import TownMap
 from foredrive.towns.recorder import LabelOptions, record
 from foredrive.towns.sensing.capture import SensorSuite

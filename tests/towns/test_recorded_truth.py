@@ -15,7 +15,8 @@ from foredrive.scene import Attribute, Category, Example
 from foredrive.scene.conditions import BackgroundTraffic
 from foredrive.scene.map_elements import ElementKind, RasterLayer
 from foredrive.scene.semantics import VOXEL_CLASSES
-from foredrive.sensors.vehicle import camera_rig, roof_lidar
+from foredrive.sensors.rigs import camera_rig
+from foredrive.sensors.vehicle import roof_lidar
 from foredrive.towns import recorder
 from foredrive.towns.recorder import OCCUPANCY, record
 from foredrive.towns.sensing.capture import SensorSuite

@@ -16,7 +16,8 @@ from foredrive.scene import Category, VoxelSpec
 from foredrive.scene.conditions import find_conditions
 from foredrive.scene.traffic_light import LightState
 from foredrive.sensors import SpinningLidar
-from foredrive.sensors.vehicle import camera_rig, roof_lidar
+from foredrive.sensors.rigs import camera_rig
+from foredrive.sensors.vehicle import roof_lidar
 from foredrive.towns.map.town_map import TownMap
 from foredrive.towns.place.materials import Surface
 from foredrive.towns.sensing.capture import SensorSuite

@@ -9,7 +9,8 @@ from scipy.integrate import quad
 
 from foredrive.scene.actors import ActorState
 from foredrive.scene.conditions import CONDITIONS, Conditions, find_conditions
-from foredrive.sensors.vehicle import camera_rig, roof_lidar
+from foredrive.sensors.rigs import camera_rig
+from foredrive.sensors.vehicle import roof_lidar
 from foredrive.towns.map.town_map import TownMap
 from foredrive.towns.place.materials import Material, MaterialArrays, MaterialTable, Surface, Texture
 from foredrive.towns.sensing import lens

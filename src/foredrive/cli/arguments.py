@@ -2,12 +2,15 @@
 
 import math
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
 from foredrive.errors import InputError
 from foredrive.runs.shipped import run_folder
+
+if TYPE_CHECKING:
+    from foredrive.sensors.rigs import RigPlan
 
 OptionalPath = Annotated[Path | None, tyro.conf.arg(metavar="PATH")]
 SomePaths = Annotated[tuple[Path, ...], tyro.conf.arg(metavar="PATH [PATH ...]")]
@@ -59,6 +62,18 @@ def check_image_size(size: tuple[int, int] | None) -> None:
     """Check --image-size. Raise `InputError` if the size is impossible."""
     if size is not None and not all(0 < side <= MAX_IMAGE_PX for side in size):
         raise InputError(f"--image-size must be 1 to {MAX_IMAGE_PX} px, got {size[0]} {size[1]}")
+
+
+def chosen_rig(rig: str, image_hw: tuple[int, int] | None) -> "RigPlan":
+    """Return the rig of --rig, with images of --image-size if that is given.
+
+    Raises:
+        InputError: there is no such rig.
+    """
+    from foredrive.sensors.rigs import find_rig
+
+    plan = find_rig(rig)
+    return plan if image_hw is None else plan.of_size(image_hw)
 
 
 def check_out_folder(folder: Path | None) -> None:

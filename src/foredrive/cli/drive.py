@@ -45,7 +45,7 @@ def drive(
         from foredrive.runs.drive.suite import DriveSuite, drive_suite
 
     name = str(Path(agent).absolute()) if Path(agent).is_dir() else agent
-    source = rebuilt.source() or towns.source()
+    source = rebuilt.source() or towns.source(name)
     suite = DriveSuite(name, source, planning.sensors, planning.period, planning.latency)
     workers = towns.workers or len(os.sched_getaffinity(0))
     with _Progress(len(suite.jobs())) as progress:

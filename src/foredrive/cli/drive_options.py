@@ -13,6 +13,7 @@ from foredrive.cli.arguments import (
     check_image_size,
     check_number,
     check_rebuilt,
+    chosen_rig,
 )
 from foredrive.errors import InputError
 
@@ -56,7 +57,11 @@ class InTowns:
         seed: Seed of the town, the traffic and all noise in the first repetition; each repetition adds one.
         conditions: clear, morning, overcast, dusk, night, rain, night_rain, fog or night_fog; any: drawn for
             each drive; by default a bright day.
-        image_size: Size of the six cameras' images (height, width), px.
+        rig: Cameras of the vehicle: surround (six in all directions), driving (the same and a narrow one for
+            traffic lights), or a YAML file of image_hw and cameras. By default that of the agent's training
+            logs.
+        other_rig: Drive with a rig that the agent was not trained with.
+        image_size: Size of the images (height, width), px; by default the rig's.
         vehicles: Number of vehicles on the road near the ego vehicle.
         people: Number of pedestrians near the ego vehicle.
         scenarios: Include scenarios like CARLA's: actors brake, cut in, run lights and step out.
@@ -69,7 +74,9 @@ class InTowns:
     repetitions: int = 1
     seed: int = 0
     conditions: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
-    image_size: ImageSize = (144, 256)
+    rig: Annotated[str | None, tyro.conf.arg(metavar="NAME|FILE.yaml")] = None
+    other_rig: bool = False
+    image_size: ImageSize | None = None
     vehicles: int = 30
     people: int = 20
     scenarios: bool = True
@@ -85,14 +92,18 @@ class InTowns:
         check_number("--people", self.people, low=0)
         check_number("--workers", self.workers, low=0)
 
-    def source(self) -> "TownRoutes | CarlaRoutes":
-        """Return the source of the drives."""
+    def source(self, agent: str) -> "TownRoutes | CarlaRoutes":
+        """Return the source of the drives of an agent."""
+        from foredrive.runs.drive.agents import rig_of
+
+        rig = rig_of(agent) if self.rig is None else chosen_rig(self.rig, None)
         options: dict[str, Any] = {
             "routes": self.routes,
             "repetitions": self.repetitions,
             "seed": self.seed,
             "conditions": self.conditions,
-            "image_hw": self.image_size,
+            "rig": rig if self.image_size is None else rig.of_size(self.image_size),
+            "other_rig": self.other_rig,
             "vehicles": self.vehicles,
             "people": self.people,
         }

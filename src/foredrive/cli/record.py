@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from foredrive.cli.arguments import ImageSize, check_image_size, check_number, check_out_folder
+from foredrive.cli.arguments import ImageSize, check_image_size, check_number, check_out_folder, chosen_rig
 from foredrive.cli.failures import listed_failures
 from foredrive.errors import InputError
 from foredrive.lazy import importing
@@ -33,7 +33,8 @@ def record(
     seed: int = 0,
     seeds: Annotated[str | None, tyro.conf.arg(metavar="N|FIRST..LAST")] = None,
     rate: Annotated[float, tyro.conf.arg(metavar="HZ")] = 10.0,
-    image_size: ImageSize = (144, 256),
+    rig: Annotated[str, tyro.conf.arg(metavar="NAME|FILE.yaml")] = "surround",
+    image_size: ImageSize | None = None,
     vehicles: Range = "30",
     people: Range = "20",
     conditions: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME [NAME ...]")] = (),
@@ -53,7 +54,9 @@ def record(
         seeds: Instead of one seed: a range FIRST..LAST, or the number of drives in each town and condition.
             For a number, seeds are chosen whose routes turn left, turn right and go straight equally often.
         rate: Frames per second.
-        image_size: Size of the six cameras' images (height, width), px.
+        rig: Cameras of the vehicle: surround (six in all directions), driving (the same and a narrow one for
+            traffic lights), or a YAML file of image_hw and cameras.
+        image_size: Size of the images (height, width), px; by default the rig's.
         vehicles: Number of vehicles on the road near the ego vehicle; from a range, drawn for each drive.
         people: Number of pedestrians, where the town has walkways; from a range, drawn for each drive.
         conditions: clear, morning, overcast, dusk, night, rain, night_rain or fog: every drive under each;
@@ -65,6 +68,7 @@ def record(
     check_number("--seed", seed, low=0)
     check_number("--rate", rate, above=0)
     check_image_size(image_size)
+    cameras = chosen_rig(rig, image_size)
     check_number("--workers", workers, low=0)
     check_out_folder(out)
     between = _range("vehicles", vehicles), _range("people", people)
@@ -79,13 +83,13 @@ def record(
 
     plans = plan_drives(Campaign(town, some_seeds, weather, *between, seconds=seconds, rate_hz=rate))
     if len(plans) == 1 and not ray:
-        log = record_plan(plans[0], out, image_size)
+        log = record_plan(plans[0], out, cameras)
         print(f"wrote {log.folder}")
         print(f"next: foredrive view {log.folder} --save {log.folder.name}.png")
         return
     workers = workers or len(os.sched_getaffinity(0))
     with _progress(len(plans)) as tick:
-        done = record_drives(plans, out, image_size, workers, on_ray=ray, tick=tick)
+        done = record_drives(plans, out, cameras, workers, on_ray=ray, tick=tick)
     _tell(done, plans, out)
 
 

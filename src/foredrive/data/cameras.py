@@ -21,6 +21,8 @@ from foredrive.data.arrow_files import column_array, fixed_lists, pose_matrices,
 from foredrive.data.camera_streams import RollingCameraMetadata
 from foredrive.data.logs import Log
 from foredrive.errors import InputError
+from foredrive.scene import CameraRig
+from foredrive.sensors.rigs import RigPlan, rig_of_cameras
 
 _log = logging.getLogger(__name__)
 
@@ -57,6 +59,31 @@ def pinhole_cameras(log: Log) -> dict[str, PinholeCameraMetadata]:
         else:
             _log.warning("%s: %s is not a pinhole camera and is left out", log.path.folder, key)
     return dict(sorted(cameras.items(), key=lambda item: int(item[1].camera_id)))
+
+
+def rig_of_log(log: Log) -> RigPlan:
+    """Return the places and fields of view of a log's cameras, by 123D's names, front first.
+
+    Distortion and principal points are left out. The size is that of the first camera's images.
+
+    Raises:
+        InputError: the log has no pinhole cameras.
+    """
+    cameras = pinhole_cameras(log).values()
+    if not cameras:
+        raise InputError(f"{log.path.folder}: no pinhole cameras")
+    mounted = [np.linalg.inv(log.T_imu_ego) @ one.camera_to_imu_se3.transformation_matrix for one in cameras]
+    height, width = next((one.height, one.width) for one in cameras)
+    return rig_of_cameras(
+        CameraRig(
+            K=torch.stack([_scaled_intrinsics(one, (height, width)) for one in cameras]),
+            T_ego_cam=torch.from_numpy(np.stack(mounted)),
+            dist=torch.zeros(len(cameras), 5),
+            readout_s=torch.zeros(len(cameras)),
+            names=tuple(one.camera_id.name for one in cameras),
+            size_hw=(height, width),
+        )
+    )
 
 
 def find_camera(cameras: dict[str, PinholeCameraMetadata], name: str) -> PinholeCameraMetadata | None:

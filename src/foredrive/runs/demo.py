@@ -10,7 +10,8 @@ from foredrive.recipes.config import Recipe, rescheduled
 from foredrive.recipes.nemo import nemo_tiny
 from foredrive.runs.evaluate.run import evaluate_run
 from foredrive.runs.train.run import Run, train_run
-from foredrive.sensors.vehicle import camera_rig, roof_lidar
+from foredrive.sensors.rigs import camera_rig
+from foredrive.sensors.vehicle import roof_lidar
 from foredrive.towns.recorder import LabelOptions, record, split_of
 from foredrive.towns.sensing.capture import SensorSuite
 

@@ -23,7 +23,8 @@ from foredrive.scene import CameraRig, VoxelSpec
 from foredrive.scene.actors import ActorState, boxes_in_ego_frame, in_box_range
 from foredrive.scene.conditions import BackgroundTraffic, Conditions
 from foredrive.scene.traffic_light import LightState
-from foredrive.sensors.vehicle import camera_rig, roof_lidar
+from foredrive.sensors.rigs import camera_rig
+from foredrive.sensors.vehicle import roof_lidar
 from foredrive.towns.labels.captions import caption
 from foredrive.towns.labels.frame_facts import FactCollector
 from foredrive.towns.labels.semantics import (

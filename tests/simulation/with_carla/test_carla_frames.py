@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from foredrive.errors import InputError
-from foredrive.sensors.vehicle import camera_rig, roof_lidar
+from foredrive.sensors.rigs import camera_rig
+from foredrive.sensors.vehicle import roof_lidar
 from foredrive.simulation.carla.frames import (
     MIRROR,
     camera_pose,

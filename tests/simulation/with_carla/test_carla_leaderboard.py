@@ -12,7 +12,8 @@ from carla_stand_in import lat_lon
 
 from foredrive.errors import InputError
 from foredrive.scene import BicycleState, Clip, Command, Trajectory
-from foredrive.sensors.vehicle import camera_rig, roof_lidar
+from foredrive.sensors.rigs import camera_rig
+from foredrive.sensors.vehicle import roof_lidar
 from foredrive.simulation.carla.global_plan import GlobalPlan
 from foredrive.simulation.carla.leaderboard import GPS, IMU, LIDAR, SPEED, LeaderboardDriver
 from foredrive.simulation.dynamics import STEP_S

@@ -11,7 +11,8 @@ from carla_stand_in import Client, Light, World
 from foredrive.errors import InputError
 from foredrive.scene import Category, Command, Control
 from foredrive.scene.conditions import BackgroundTraffic, find_conditions
-from foredrive.sensors.vehicle import VehicleSensors, camera_rig, roof_lidar
+from foredrive.sensors.rigs import camera_rig
+from foredrive.sensors.vehicle import VehicleSensors, roof_lidar
 from foredrive.simulation.carla.simulator import CarlaSimulator
 from foredrive.simulation.drive import drive_route
 from foredrive.simulation.dynamics import EGO

@@ -14,8 +14,10 @@ from foredrive.models.agent import PlanningAgent
 from foredrive.models.ego_mlp import EgoMLP
 from foredrive.runs.shipped import run_folder
 from foredrive.runs.train.baselines import run_baselines
+from foredrive.runs.train.rigs import TrainedRigs, check_rig, read_rigs
 from foredrive.runs.train.run import load_agent, open_run
 from foredrive.scene import Agent, Clip, Trajectory
+from foredrive.sensors.rigs import SURROUND, RigPlan
 from foredrive.simulation.demonstrations import AlternatingStudent, DisturbedExpert
 from foredrive.simulation.observation import FRAME_DT_S
 from foredrive.simulation.restarts import RestartingAgent
@@ -75,6 +77,29 @@ def inputs_of(agent: str) -> AgentInputs:
         raise InputError(f"{agent}: trained on key frames {clips.frame_dt_s} s apart, not {FRAME_DT_S} s")
     seeing = not agent.startswith(EGO_MLP)
     return AgentInputs(seeing, lidar=True, past_frames=clips.past_frames, camera_names=clips.cameras)
+
+
+def rig_of(agent: str) -> RigPlan:
+    """Return the rig that most of an agent's training logs have; the surround rig if the agent has none."""
+    rigs = _rigs_of(agent)
+    return SURROUND if rigs is None else rigs.usual
+
+
+def check_rig_of(agent: str, rig: RigPlan) -> None:
+    """Check that an agent knows a rig.
+
+    Raises:
+        InputError: it was not trained with such a rig.
+    """
+    rigs = _rigs_of(agent)
+    if rigs is not None:
+        check_rig(rigs, rig, agent)
+
+
+def _rigs_of(agent: str) -> TrainedRigs | None:
+    if agent in (EXPERT, STOP, CONSTANT_VELOCITY, DISTURBED) or agent.startswith(EGO_MLP):
+        return None
+    return read_rigs(_run_folder(agent))
 
 
 def make_agent(

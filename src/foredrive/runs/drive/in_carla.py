@@ -11,7 +11,8 @@ from foredrive.runs.drive.agents import inputs_of, make_agent
 from foredrive.runs.drive.route_source import RouteSource
 from foredrive.runs.drive.suite import DriveJob, DriveSetup, DriveSuite
 from foredrive.scene.conditions import BackgroundTraffic
-from foredrive.sensors.vehicle import VehicleSensors, camera_rig, roof_lidar
+from foredrive.sensors.rigs import camera_rig
+from foredrive.sensors.vehicle import VehicleSensors, roof_lidar
 from foredrive.simulation.carla.client import connect
 from foredrive.simulation.carla.simulator import CarlaSimulator
 from foredrive.simulation.drive_log import drive_log, log_frame
@@ -53,7 +54,7 @@ class CarlaRoutes(RouteSource):
         """Set up a drive on the server; restore the server's state afterwards."""
         route, inputs = self.route_of(job), inputs_of(suite.agent)
         seed = self.seed + job.repetition
-        rig = camera_rig(self.image_hw) if inputs.lidar or suite.sensors else None
+        rig = camera_rig(plan=self.rig) if inputs.lidar or suite.sensors else None
         scenario = RouteScenario(
             town=route.town,
             route_xyz=route.xyz,

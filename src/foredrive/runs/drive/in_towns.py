@@ -10,7 +10,8 @@ from foredrive.runs.drive.route_source import RouteSource, drive_hash
 from foredrive.runs.drive.suite import DriveJob, DriveSetup, DriveSuite
 from foredrive.scene import Trajectory
 from foredrive.scene.conditions import BackgroundTraffic
-from foredrive.sensors.vehicle import camera_rig, roof_lidar
+from foredrive.sensors.rigs import camera_rig
+from foredrive.sensors.vehicle import roof_lidar
 from foredrive.simulation.demonstrations import AlternatingStudent, DisturbedExpert
 from foredrive.simulation.drive_log import drive_log, town_log_frame
 from foredrive.simulation.routes import DriveRoute
@@ -67,7 +68,7 @@ class TownRoutes(RouteSource):
             seed=seed,
             background_traffic=BackgroundTraffic(self.vehicles, self.people),
             conditions=self.conditions_of(route.id, seed),
-            sensors=SensorSuite(camera_rig(self.image_hw), roof_lidar()) if sensed else None,
+            sensors=SensorSuite(camera_rig(plan=self.rig), roof_lidar()) if sensed else None,
             past_frames=inputs.past_frames,
             limit_s=timeout_s(route.length_m),
             lanes=route.lanes,

@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import Any
 
 from foredrive.files import atomic_path
-from foredrive.runs.drive.agents import inputs_of, make_agent
-from foredrive.runs.drive.route_source import RouteSource
-from foredrive.sensors.vehicle import camera_rig, roof_lidar
+from foredrive.runs.drive.agents import inputs_of, make_agent, rig_of
+from foredrive.sensors.rigs import camera_rig
+from foredrive.sensors.vehicle import roof_lidar
 from foredrive.simulation.carla.client import import_carla
 from foredrive.simulation.carla.leaderboard import LeaderboardDriver
 
@@ -56,7 +56,7 @@ class ForedriveAgent(_AutonomousAgent):
         name, self._route_name = agent_of(path_to_conf_file)
         inputs, self._t_s = inputs_of(name), 0.0
         agent = make_agent(name, lambda: self._t_s)
-        rig = camera_rig(RouteSource.image_hw) if inputs.cameras else None
+        rig = camera_rig(plan=rig_of(name)) if inputs.cameras else None
         self._driver = LeaderboardDriver(
             agent, rig, roof_lidar() if inputs.lidar else None, inputs.past_frames
         )

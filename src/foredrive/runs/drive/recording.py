@@ -12,13 +12,14 @@ from pathlib import Path
 
 import torch
 
-from foredrive.data.cameras import pinhole_cameras
+from foredrive.data.cameras import rig_of_log
 from foredrive.data.log_paths import LogPath
 from foredrive.data.logs import Log
 from foredrive.errors import InputError
 from foredrive.runs.fan_out import fan_out, reason
 from foredrive.scene.conditions import BackgroundTraffic, find_conditions
-from foredrive.sensors.vehicle import camera_rig, roof_lidar
+from foredrive.sensors.rigs import RigPlan, camera_rig, same_rig
+from foredrive.sensors.vehicle import roof_lidar
 from foredrive.towns.campaign import DrivePlan
 from foredrive.towns.recorder import record, split_of
 from foredrive.towns.sensing.capture import SensorSuite
@@ -39,7 +40,7 @@ class RecordingResult:
 def record_drives(
     plans: Sequence[DrivePlan],
     out: Path,
-    image_hw: tuple[int, int],
+    rig: RigPlan,
     workers: int,
     *,
     on_ray: bool = False,
@@ -51,7 +52,7 @@ def record_drives(
 
     Args:
         out: 123D data root; on a Ray cluster with several machines, a folder that they share.
-        image_hw: image size of the six cameras, px.
+        rig: cameras of every drive.
         workers: number of drives recorded at a time. On Ray it is the size of the cluster that is started
             here; a cluster that RAY_ADDRESS names is used as it is.
         tick: called after each drive.
@@ -61,13 +62,13 @@ def record_drives(
     """
     logs, failed = {}, {}
     for plan in plans:
-        if is_recorded(plan, out, image_hw):
+        if is_recorded(plan, out, rig):
             logs[plan] = log_of(plan, out)
             tick()
     skipped = len(logs)
     todo = [plan for plan in plans if plan not in logs]
     threads = max(1, torch.get_num_threads() // workers)
-    work = functools.partial(record_plan, out=out, image_hw=image_hw, threads=threads)
+    work = functools.partial(record_plan, out=out, rig=rig, threads=threads)
     with contextlib.closing(fan_out(todo, work, workers, on_ray=on_ray)) as results:
         for plan, result in results:
             if isinstance(result, BaseException):
@@ -78,7 +79,7 @@ def record_drives(
     return RecordingResult({plan: logs[plan] for plan in plans if plan in logs}, skipped, failed)
 
 
-def record_plan(plan: DrivePlan, out: Path, image_hw: tuple[int, int], threads: int | None = None) -> LogPath:
+def record_plan(plan: DrivePlan, out: Path, rig: RigPlan, threads: int | None = None) -> LogPath:
     """Record one drive with this number of threads; None keeps the number."""
     if threads is not None:
         torch.set_num_threads(threads)
@@ -88,7 +89,7 @@ def record_plan(plan: DrivePlan, out: Path, image_hw: tuple[int, int], threads: 
         plan.seed,
         out,
         plan.rate_hz,
-        SensorSuite(camera_rig(image_hw), roof_lidar()),
+        SensorSuite(camera_rig(plan=rig), roof_lidar()),
         BackgroundTraffic(plan.vehicles, plan.people),
         conditions=None if plan.conditions is None else find_conditions(plan.conditions),
         log_name=plan.log_name,
@@ -100,8 +101,8 @@ def log_of(plan: DrivePlan, out: Path) -> LogPath:
     return LogPath(out / "logs" / split_of(plan.town) / plan.log_name, out / "maps")
 
 
-def is_recorded(plan: DrivePlan, out: Path, image_hw: tuple[int, int]) -> bool:
-    """Return whether the log exists with the planned length, rate and image size."""
+def is_recorded(plan: DrivePlan, out: Path, rig: RigPlan) -> bool:
+    """Return whether the log exists with the planned length, rate and cameras."""
     path = log_of(plan, out)
     if not path.folder.is_dir():
         return False
@@ -109,6 +110,5 @@ def is_recorded(plan: DrivePlan, out: Path, image_hw: tuple[int, int]) -> bool:
         log = Log(path)
     except InputError:
         return False
-    sizes = {(camera.height, camera.width) for camera in pinhole_cameras(log).values()}
     rate_fits = plan.frames == 1 or abs(log.period_s * plan.rate_hz - 1) < 1e-3
-    return len(log) == plan.frames and sizes == {image_hw} and rate_fits
+    return len(log) == plan.frames and rate_fits and same_rig(rig_of_log(log), rig)

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from foredrive.errors import InputError
-from foredrive.runs.drive.agents import inputs_of
+from foredrive.runs.drive.agents import check_rig_of, inputs_of
 from foredrive.runs.drive.suite import DriveJob
 from foredrive.scene.conditions import (
     ANY_CONDITIONS,
@@ -15,6 +15,7 @@ from foredrive.scene.conditions import (
     Conditions,
     find_conditions,
 )
+from foredrive.sensors.rigs import SURROUND, RigPlan
 from foredrive.simulation.route_sets import load_route_set
 from foredrive.simulation.routes import DriveRoute, snap_route
 
@@ -32,7 +33,10 @@ class RouteSource:
     """Name of the conditions. `ANY_CONDITIONS` draws a name for each drive; None draws bright daylight from
     the seed.
     """
-    image_hw: tuple[int, int] = (144, 256)
+    rig: RigPlan = SURROUND
+    """Cameras of the vehicle."""
+    other_rig: bool = False
+    """Whether a run may drive with a rig that it was not trained with."""
     vehicles: int = BackgroundTraffic.vehicles
     people: int = BackgroundTraffic.pedestrians
 
@@ -44,12 +48,19 @@ class RouteSource:
             raise InputError(f"unknown conditions {self.conditions}; the conditions are {there_are}")
 
     def noted(self) -> Mapping[str, object]:
-        """Return the fields."""
-        return dataclasses.asdict(self)
+        """Return the fields. Those of the cameras are left out for the usual rig."""
+        fields = dataclasses.asdict(self)
+        rig = fields.pop("rig")
+        if not self.other_rig:
+            del fields["other_rig"]
+        other = {} if self.rig.cameras == SURROUND.cameras else {"cameras": rig["cameras"]}
+        return {**fields, "image_hw": self.rig.image_hw, **other}
 
     def jobs(self, agent: str) -> Sequence[DriveJob]:
         """Return one drive for each route and repetition."""
         inputs_of(agent)
+        if not self.other_rig:
+            check_rig_of(agent, self.rig)
         routes = load_route_set(self.routes)
         return [job_of(route.id, n) for n in range(self.repetitions) for route in routes]
 

@@ -21,6 +21,7 @@ from foredrive.runs.open_clips import open_clips
 from foredrive.runs.train.baselines import fit_baselines
 from foredrive.runs.train.kept_parts import load_kept, with_kept_heads
 from foredrive.runs.train.path_features import sample_paths
+from foredrive.runs.train.rigs import RIGS, trained_rigs, write_rigs
 from foredrive.runs.train.sequences import in_sequences
 from foredrive.runs.train.task_priors import PRIORS, TASKS, check_truth, save_priors, semantic_weights
 from foredrive.scene.task_truth import TaskTruth
@@ -132,6 +133,10 @@ def train_run(
     with claim.claimed():  # only now: logs that cannot be read must not create a run
         fabric = make_fabric(recipe.precision)
         fabric.launch()
+        if fabric.is_global_zero and not (folder / RIGS).is_file():
+            rigs = trained_rigs(run.logs, dataset.camera_names)
+            if rigs is not None:
+                write_rigs(rigs, folder)
         _train_stages(run, dataset, pretrained or kept, fabric)
     return run
 
