@@ -13,19 +13,21 @@ from miniature import miniature
 from torch import Tensor, nn
 
 from foredrive.data import ClipConfig, LogPath
+from foredrive.errors import InputError
 from foredrive.losses import waypoint_loss
 from foredrive.models.agent import PlanningAgent
 from foredrive.recipes import Recipe
 from foredrive.recipes.config import load_recipe
 from foredrive.recipes.world_models import WORLD_MODELS, WorldModelEntry
 from foredrive.runs import Run, evaluate_run, open_run, predict_examples, train_run
+from foredrive.runs.drive.agents import rig_of
 from foredrive.runs.drive.in_towns import TownRoutes
 from foredrive.runs.drive.route_source import job_of
 from foredrive.runs.drive.suite import DriveSuite, drive_one
 from foredrive.runs.evaluate.imagination import imagine_run
 from foredrive.runs.export import export_run
 from foredrive.scene import Belief, Clip, Decoded, Example, Frames, Task, VoxelSpec, WorldModel, last_frames
-from foredrive.sensors.rigs import SURROUND
+from foredrive.sensors.rigs import DRIVING, SURROUND
 from foredrive.towns.map.town_map import load_town_map
 from foredrive.towns.traffic.lane_graph import build_lane_graph
 from foredrive.training import Schedule
@@ -156,6 +158,16 @@ def test_it_is_viewed(run: Run, log: LogPath) -> None:
 def test_it_is_exported(run: Run, log: LogPath, tmp_path: Path) -> None:
     facts = export_run(run, [log], tmp_path, clips=1)
     assert facts["largest_difference"]["model.onnx"]["waypoints_xy"] < 1e-4
+
+
+def test_it_knows_its_rig(run: Run) -> None:
+    """Its own rig is the default; another one is refused before anything is driven, unless it is wanted."""
+    agent = str(run.folder)
+    assert rig_of(agent).cameras.keys() == SURROUND.cameras.keys()
+    with pytest.raises(InputError, match="was trained with the cameras"):
+        TownRoutes("town05-short", rig=DRIVING).jobs(agent)
+    for source in (TownRoutes("town05-short"), TownRoutes("town05-short", rig=DRIVING, other_rig=True)):
+        assert len(source.jobs(agent)) == 32
 
 
 def test_it_drives(run: Run, tmp_path: Path) -> None:
