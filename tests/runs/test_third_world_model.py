@@ -27,7 +27,7 @@ from foredrive.runs.drive.suite import DriveSuite, drive_one
 from foredrive.runs.evaluate.imagination import imagine_run
 from foredrive.runs.export import export_run
 from foredrive.scene import Belief, Clip, Decoded, Example, Frames, Task, VoxelSpec, WorldModel, last_frames
-from foredrive.sensors.rigs import DRIVING, SURROUND
+from foredrive.sensors.rigs import SURROUND
 from foredrive.towns.map.town_map import load_town_map
 from foredrive.towns.traffic.lane_graph import build_lane_graph
 from foredrive.training import Schedule
@@ -163,10 +163,11 @@ def test_it_is_exported(run: Run, log: LogPath, tmp_path: Path) -> None:
 def test_it_knows_its_rig(run: Run) -> None:
     """Its own rig is the default; another one is refused before anything is driven, unless it is wanted."""
     agent = str(run.folder)
-    assert rig_of(agent).cameras.keys() == SURROUND.cameras.keys()
-    with pytest.raises(InputError, match="was trained with the cameras"):
-        TownRoutes("town05-short", rig=DRIVING).jobs(agent)
-    for source in (TownRoutes("town05-short"), TownRoutes("town05-short", rig=DRIVING, other_rig=True)):
+    own = rig_of(agent)
+    assert set(own.cameras) == {"PCAM_F0", "PCAM_L0"}
+    with pytest.raises(InputError, match="was trained with the cameras PCAM_F0, PCAM_L0, not PCAM_F0, "):
+        TownRoutes("town05-short", rig=SURROUND).jobs(agent)
+    for source in (TownRoutes("town05-short", rig=own), TownRoutes("town05-short", other_rig=True)):
         assert len(source.jobs(agent)) == 32
 
 
