@@ -3,7 +3,13 @@
 import torch
 from torch import Tensor
 
-from foredrive.losses.field import beam_depth_loss, carving_loss, distortion_loss, interlevel_loss
+from foredrive.losses.field import (
+    beam_depth_loss,
+    carving_loss,
+    distortion_loss,
+    hit_loss,
+    interlevel_loss,
+)
 
 
 def histogram(seed: int, rays: int, count: int) -> tuple[Tensor, Tensor]:
@@ -94,3 +100,17 @@ def test_the_worst_errors_are_left_out() -> None:
     returned = torch.ones(10, dtype=torch.bool)
     loss = beam_depth_loss(depth, real, returned, 150.0, 0.1, quantile=0.8)
     torch.testing.assert_close(loss, (torch.arange(8.0) ** 2).mean())
+
+
+def test_a_hit_is_the_share_of_a_beam_near_its_return() -> None:
+    """Of the interval from 9 to 11 m, half lies within 0.5 m of 10 m. A mean of 10 m does not count."""
+    border = torch.tensor([[0.0, 9, 11, 20], [0, 9, 11, 20], [0, 9, 11, 20]])
+    weight = torch.tensor([[0.1, 0.8, 0.1], [0.5, 0.0, 0.5], [0.3, 0.3, 0.3]], requires_grad=True)
+    returned = torch.tensor([True, True, False])
+    loss = hit_loss(border, weight, torch.full((3,), 10.0), returned, near_m=0.5)
+    expected = -(torch.tensor([0.4, 0.0]) + 0.01).log().mean()
+    torch.testing.assert_close(loss, expected)
+    loss.backward()
+    assert weight.grad is not None
+    assert (weight.grad != 0).int().tolist() == [[0, 1, 0], [0, 1, 0], [0, 0, 0]]
+    assert hit_loss(border, weight, torch.full((3,), 10.0), ~returned & False, 0.5) == 0

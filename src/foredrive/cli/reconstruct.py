@@ -8,14 +8,15 @@ import tyro
 
 from foredrive.cli.arguments import ImageSize, OptionalPath, Settings, check_image_size, check_out_folder
 from foredrive.data.log_paths import find_one_log
+from foredrive.errors import InputError
 from foredrive.lazy import importing
 
 
 def reconstruct(
     log: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="LOG")],
     out: Path,
-    method: Literal["gaussians"] = "gaussians",
-    recipe: str = "gaussians_tiny",
+    method: Literal["gaussians", "field"] | None = None,
+    recipe: str | None = None,
     cameras: Annotated[tuple[str, ...], tyro.conf.arg(metavar="CAMERA [CAMERA ...]")] = (),
     image_size: ImageSize | None = None,
     cache: OptionalPath = None,
@@ -32,9 +33,10 @@ def reconstruct(
     Args:
         log: Folder of a 123D log, or of a split or data root with exactly one log in it.
         out: Folder of the run. If it holds this run already, the run continues from the last checkpoint.
-        method: Representation of the scene.
-        recipe: Name of the recipe: gaussians_tiny (minutes on two cores), gaussians_base or
-            gaussians_published (a GPU), or a YAML file.
+        method: Representation of the scene; by default the recipe's.
+        recipe: Name of the recipe: gaussians_tiny (minutes on two cores), field_tiny (half an hour on two
+            cores), gaussians_base, gaussians_published or field_base (a GPU), or a YAML file; by default
+            METHOD_tiny.
         cameras: Use only these cameras, by their own names or 123D's, such as pcam_f0; by default the
             recipe's.
         image_size: Images are shrunk to this size (height, width), px; by default the recipe's, 270 480 or
@@ -54,7 +56,10 @@ def reconstruct(
         from foredrive.recipes.rebuilding import find_rebuild_recipe
         from foredrive.runs.rebuild.reconstruct import reconstruct as rebuild_log
 
-    chosen = find_rebuild_recipe(recipe, set)
+    chosen = find_rebuild_recipe(recipe or f"{method or 'gaussians'}_tiny", set)
+    kind = chosen.representation.kind
+    if method not in (None, kind):
+        raise InputError(f"--method {method} does not go with the recipe {chosen.name}, which is {kind}")
     if cameras:
         chosen = dataclasses.replace(chosen, cameras=cameras)
     if image_size is not None:
@@ -70,7 +75,7 @@ def reconstruct(
         write_rebuilt_sheet(out / "held_out.png", run.scene, run.held_out.cameras, title)
     if not run.held_out.cameras and not run.held_out.sweeps:
         print(f"{found.name} is too short: no frame was held out, so the scene is not evaluated")
-    print(f"rebuilt {found.name} by {method}: {out}")
+    print(f"rebuilt {found.name} by {kind}: {out}")
     for name in (
         *(*run.scene.sizes, "minutes", "psnr_db", "nearest.psnr_db", "ssim", "lpips", "fid"),
         *("depth_median_sq_m2", "intensity_rmse", "drop_accuracy", "chamfer_m2"),

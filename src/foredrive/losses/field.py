@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 _LEAST_WEIGHT = 1e-5
+_LEAST_SHARE = 1e-2
 
 
 def interlevel_loss(
@@ -121,3 +122,31 @@ def beam_depth_loss(
         limit = error.detach().kthvalue(max(int(quantile * len(error)), 1)).values
         error = error[error <= limit]
     return error.mean()
+
+
+def hit_loss(
+    border_m: Float[Tensor, "R S1"],
+    weight: Float[Tensor, "R S"],
+    range_m: Float[Tensor, "R"],
+    returned: Bool[Tensor, "R"],
+    near_m: float,
+) -> Float[Tensor, ""]:
+    """Return the mean of -log of the share of a beam that ends near its return; 0 if none returned.
+
+    An interval that reaches beyond the neighbourhood counts with the part inside. The expected distance of
+    `beam_depth_loss` can be right where a beam ends nowhere near its return; this loss cannot.
+
+    Args:
+        border_m, weight: intervals of the beams.
+        range_m: distance of the returns.
+        returned: whether the beams returned.
+        near_m: what is nearer to the return than this counts.
+    """
+    if not bool(returned.any()):
+        return weight.new_zeros(())
+    low, high = border_m[:, :-1], border_m[:, 1:]
+    target = range_m[:, None]
+    inside = torch.minimum(high, target + near_m) - torch.maximum(low, target - near_m)
+    part = inside.clamp_min(0) / (high - low).clamp_min(1e-6)
+    share = (weight * part).sum(-1)[returned]
+    return -(share + _LEAST_SHARE).log().mean()

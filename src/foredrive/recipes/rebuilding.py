@@ -7,6 +7,7 @@ from typing import Any, Generic, TypeVar
 
 from foredrive.errors import InputError
 from foredrive.recipes.config import is_recipe_file, overridden, read_values, rescheduled, validated
+from foredrive.recipes.field import FieldRecipe, base_field, tiny_field
 from foredrive.recipes.gaussians import (
     GaussianRecipe,
     base_gaussians,
@@ -19,7 +20,10 @@ from foredrive.recipes.representation import Representation
 
 R = TypeVar("R", bound=Representation)
 
-REPRESENTATIONS: dict[str, type[Representation]] = {"gaussians": GaussianRecipe}
+REPRESENTATIONS: dict[str, type[Representation]] = {
+    "gaussians": GaussianRecipe,
+    "field": FieldRecipe,
+}
 """The representations by their `kind`: frozen dataclasses of plain values."""
 
 
@@ -76,13 +80,37 @@ def gaussians_published() -> RebuildRecipe[GaussianRecipe]:
     )
 
 
+def field_tiny() -> RebuildRecipe[FieldRecipe]:
+    """Return a recipe for half an hour on two cores, with images of 480×270."""
+    return RebuildRecipe(
+        name="field_tiny",
+        about="a log rebuilt as a neural field in half an hour on two CPU cores",
+        image_hw=(270, 480),
+        representation=tiny_field(),
+    )
+
+
+def field_base() -> RebuildRecipe[FieldRecipe]:
+    """Return NeuRAD in its sizes, for a GPU."""
+    return RebuildRecipe(
+        name="field_base",
+        about="NeuRAD in the sizes of its reference implementation, for a GPU",
+        image_hw=(1080, 1920),
+        representation=base_field(),
+    )
+
+
 def rescheduled_recipe(recipe: RebuildRecipe[R], **changes: Any) -> RebuildRecipe[R]:
     """Return the recipe with changed entries of the schedule of its representation, such as `seed`."""
     return replace(recipe, representation=rescheduled(recipe.representation, **changes))
 
 
 REBUILD_RECIPES: dict[str, RebuildRecipe[Any]] = {
-    recipe.name: recipe for recipe in (gaussians_tiny(), gaussians_base(), gaussians_published())
+    recipe.name: recipe
+    for recipe in (
+        *(gaussians_tiny(), gaussians_base(), gaussians_published()),
+        *(field_tiny(), field_base()),
+    )
 }
 
 

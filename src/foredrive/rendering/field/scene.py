@@ -1,0 +1,210 @@
+"""A rebuilt scene that is a neural field (Tonderski et al., "NeuRAD", 2024)."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Float, Int
+from safetensors import SafetensorError
+from safetensors.torch import load_file
+from torch import Tensor, nn
+
+from foredrive.errors import InputError
+from foredrive.rendering.field.config import FieldConfig
+from foredrive.rendering.field.content import FieldContent, field_of
+from foredrive.rendering.field.decoders import UPSAMPLING, BeamDecoder, PatchDecoder, PatchDecoderConfig
+from foredrive.rendering.field.rays import FieldRays, beam_rays, pixel_rays
+from foredrive.rendering.field.render import FieldActors, NeuralField, SeenAlongRays
+from foredrive.rendering.gaussians.content import GaussianContent
+from foredrive.rendering.gaussians.gaussians import Gaussians
+from foredrive.rendering.rebuilt import RebuiltScene, saved_tracks
+from foredrive.rendering.rendered import RenderedImage, RenderedSweep
+from foredrive.rendering.scene_graph import SceneGraph
+from foredrive.rendering.tracks import ActorTracks
+from foredrive.rendering.views import CameraView, SweepView
+
+RAYS_AT_ONCE = 4096
+"""Rays of an image or a sweep that are rendered together. More take memory and are not faster."""
+_LEAST_ALPHA = 1e-6
+
+
+@dataclass(frozen=True)
+class FieldSceneConfig:
+    """Parts of a `FieldScene`."""
+
+    network: FieldConfig = field(default_factory=FieldConfig)
+    decoder: PatchDecoderConfig = field(default_factory=PatchDecoderConfig)
+    rolling: bool = True
+    """Rows of an image and beams of a sweep have their own times. If False, all are simultaneous."""
+
+
+class FieldScene(RebuiltScene):
+    """A field, its decoders, learned tracks and sensor corrections.
+
+    Args:
+        tracks: actors; row k is at place k of the grid of actors.
+        shown: coloured points of the static part and of the actors, for viewers.
+        cameras: number of cameras in the rig.
+        config: parts of the scene.
+        reach_m: nothing beyond stops a beam.
+        middle_m: middle of the part of the scene that is not contracted.
+    """
+
+    shown_mean_m: Tensor
+    shown_log_scale: Tensor
+    shown_rgb: Tensor
+    shown_actor: Tensor
+
+    def __init__(
+        self,
+        tracks: ActorTracks,
+        shown: GaussianContent,
+        cameras: int,
+        config: FieldSceneConfig,
+        reach_m: float,
+        middle_m: Float[Tensor, "3"],
+    ) -> None:
+        super().__init__(tracks, cameras, reach_m, frames=0)
+        self.config = config
+        sizes = config.network
+        self.field = NeuralField(sizes, len(tracks), middle_m)
+        self.camera_decoder = PatchDecoder(sizes.width, cameras, sizes.appearance, config.decoder)
+        self.camera_decoder.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        self.lidar_decoder = BeamDecoder(sizes.width, sizes.appearance)
+        points = shown.gaussians
+        self.register_buffer("shown_mean_m", points.mean_m)
+        self.register_buffer("shown_log_scale", points.log_scale)
+        self.register_buffer("shown_rgb", points.feature[:, :3].contiguous())
+        self.register_buffer("shown_actor", shown.actor)
+        self.eval()
+
+    @property
+    def content(self) -> FieldContent:
+        """The actors' places in the grid, with points for viewers."""
+        count = len(self.shown_rgb)
+        points = Gaussians(
+            mean_m=self.shown_mean_m,
+            quaternion=self.shown_mean_m.new_tensor([1.0, 0, 0, 0]).expand(count, 4),
+            log_scale=self.shown_log_scale,
+            opacity_logit=self.shown_mean_m.new_full((count,), 4.0),
+            feature=self.shown_rgb,
+        )
+        slot = torch.arange(len(self.track_id), device=self.device)
+        table = self.field.grids.actors.table.detach()
+        return FieldContent(slot, GaussianContent(points, self.shown_actor), table)
+
+    @property
+    def sizes(self) -> dict[str, int]:
+        """The number of numbers in the tables of all grids."""
+        return {"grid entries": sum(table.numel() for table in tables_of(self.field))}
+
+    def look(
+        self,
+        graph: SceneGraph,
+        rays: FieldRays,
+        mirror: Bool[Tensor, "A"] | None = None,
+        generator: torch.Generator | None = None,
+    ) -> SeenAlongRays:
+        """Render features along rays.
+
+        Args:
+            graph: this scene, or an edited version of it.
+            rays: in the scene's frame.
+            mirror: actors whose left and right sides are swapped; None: none.
+            generator: for the random places of samples in training.
+        """
+        actors = FieldActors(graph.tracks, field_of(graph).slot, mirror)
+        seen: SeenAlongRays = self.field(rays, actors, generator)
+        return seen
+
+    def rays_of_pixels(
+        self, view: CameraView, corner_uv: Int[Tensor, "2"], size: Int[Tensor, "2"]
+    ) -> FieldRays:
+        """Return the rays of a patch of an image, one for 3 × 3 pixels, row by row.
+
+        Args:
+            view: the camera as logged; it is corrected as learned.
+            corner_uv: upper left pixel.
+            size: numbers of rays along u and v.
+        """
+        width, height = size.tolist()
+        v, u = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
+        uv = corner_uv + UPSAMPLING * (torch.stack([u, v], dim=-1).flatten(0, 1) + 0.5)
+        exposed = self.corrected_camera(view)
+        return pixel_rays(view, exposed, uv.to(view.K), float(UPSAMPLING), self.config.rolling)
+
+    def camera(self, graph: SceneGraph, view: CameraView) -> RenderedImage:
+        """Render an image. One ray stands for 3 × 3 pixels; the last ones may reach beyond the image."""
+        high, wide = (-(-side // UPSAMPLING) for side in view.size_hw)
+        rays = self.rays_of_pixels(view, torch.zeros(2, dtype=torch.int64), torch.tensor([wide, high]))
+        seen = self._in_parts(graph, rays)
+        feature = seen["feature"].view(1, high, wide, -1)
+        rgb = self.camera_decoder(feature, view.sensor)[0, :, : view.size_hw[0], : view.size_hw[1]]
+        along = (rays.direction @ self.corrected_camera(view).T_scene_cam[:3, 2]).view(high, wide)
+        alpha = seen["alpha"].view(high, wide)
+        range_m = seen["depth_m"].view(high, wide) / alpha.clamp_min(_LEAST_ALPHA) * along
+        return RenderedImage(rgb, _enlarged(range_m, view.size_hw), _enlarged(alpha, view.size_hw))
+
+    def prepare_sweep(self, view: SweepView) -> FieldRays:
+        """Return the beams of a sweep as rays in the scene's frame."""
+        return beam_rays(view, self.config.rolling)
+
+    def sweep(self, graph: SceneGraph, points: FieldRays, t_s: float) -> RenderedSweep:
+        """Render a sweep. The beams' own times count, not `t_s`.
+
+        Beams that end beyond the reach do not return.
+        """
+        rays = FieldRays(*(tensor.to(self.device) for tensor in points))
+        seen = self._in_parts(graph, rays)
+        intensity, drop_logit = self.lidar_decoder(seen["feature"])
+        range_m = seen["depth_m"] / seen["alpha"].clamp_min(_LEAST_ALPHA)
+        median_m = seen["median_m"]
+        beyond = torch.where(median_m.isfinite(), median_m, range_m) > self.reach_m
+        drop_logit = torch.where(beyond, drop_logit.abs() + 1, drop_logit)
+        return RenderedSweep(range_m, median_m, intensity, drop_logit, seen["alpha"], None)
+
+    def _in_parts(self, graph: SceneGraph, rays: FieldRays) -> Mapping[str, Tensor]:
+        """Return the features, distances and opacities of any number of rays."""
+        found: dict[str, list[Tensor]] = {"feature": [], "depth_m": [], "alpha": [], "median_m": []}
+        for first in range(0, max(len(rays.t_s), 1), RAYS_AT_ONCE):
+            part = FieldRays(*(tensor[first : first + RAYS_AT_ONCE] for tensor in rays))
+            seen = self.look(graph, part)
+            for name, values in found.items():
+                values.append(getattr(seen, name))
+        return {name: torch.cat(values) for name, values in found.items()}
+
+
+def _enlarged(rays: Float[Tensor, "h w"], size_hw: tuple[int, int]) -> Float[Tensor, "H W"]:
+    """Repeat the values of rays for their pixels."""
+    pixels = rays.repeat_interleave(UPSAMPLING, 0).repeat_interleave(UPSAMPLING, 1)
+    return pixels[: size_hw[0], : size_hw[1]]
+
+
+def saved_field(weights: Path, config: FieldSceneConfig, reach_m: float) -> FieldScene:
+    """Return a scene of the sizes of saved weights, which are to be loaded into it.
+
+    Raises:
+        InputError: the file cannot be read or holds no weights of a field.
+    """
+    try:
+        saved: dict[str, Any] = load_file(weights)
+        count = len(saved["shown_rgb"])
+        points = Gaussians(
+            saved["shown_mean_m"],
+            torch.zeros(count, 4),
+            saved["shown_log_scale"],
+            torch.zeros(count),
+            saved["shown_rgb"],
+        )
+        shown, cameras = GaussianContent(points, saved["shown_actor"]), len(saved["camera_late_s"])
+        middle_m = saved["field.middle_m"]
+        return FieldScene(saved_tracks(saved), shown, cameras, config, reach_m, middle_m)
+    except (OSError, SafetensorError, KeyError) as error:
+        raise InputError(f"{weights}: not the weights of a field: {error}") from error
+
+
+def tables_of(module: nn.Module) -> list[nn.Parameter]:
+    """Return the tables of all grids of a module."""
+    return [parameter for name, parameter in module.named_parameters() if name.endswith("table")]

@@ -1,0 +1,304 @@
+"""Training of a scene that is a neural field: patches of images and beams of sweeps in every step."""
+
+import dataclasses
+from collections import defaultdict
+from dataclasses import dataclass, field
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+from torch.optim import Optimizer
+
+from foredrive.errors import InputError
+from foredrive.losses.field import (
+    beam_depth_loss,
+    carving_loss,
+    distortion_loss,
+    hit_loss,
+    interlevel_loss,
+)
+from foredrive.losses.rendering import drop_loss, intensity_loss
+from foredrive.rendering.field.decoders import UPSAMPLING
+from foredrive.rendering.field.rays import FieldRays
+from foredrive.rendering.field.render import Intervals, SeenAlongRays
+from foredrive.rendering.field.scene import FieldScene, tables_of
+from foredrive.training.learning_rates import Rate
+from foredrive.training.rebuilding import ParameterGroup, SensorViews, StepLosses
+
+PULSES = (0.03, 0.003)
+"""Half widths of the blur for the first and for further proposals, in positions on the ray (Zip-NeRF)."""
+
+
+@dataclass(frozen=True)
+class FieldWeights:
+    """Weights of the losses. The defaults are those of NeuRAD's reference implementation."""
+
+    rgb: float = 5.0
+    """Mean squared error of colours."""
+    depth: float = 0.01
+    carving: float = 0.01
+    hit: float = 0.0
+    """Negative logarithm of the share of a beam that ends near its return; not in the paper."""
+    intensity: float = 0.1
+    drop: float = 0.01
+    interlevel: float = 0.001
+    distortion: float = 0.002
+    proposal: float = 0.1
+    """Factor of depth, carving and hit for the proposals."""
+    lost: float = 0.1
+    """Factor of depth for beams that did not return."""
+
+
+@dataclass(frozen=True)
+class FieldRates:
+    """Learning rates. The defaults are those of NeuRAD's reference implementation."""
+
+    grids: Rate = field(default_factory=lambda: Rate(1e-2, warmup_steps=500))
+    layers: Rate = field(default_factory=lambda: Rate(1e-2, warmup_steps=500))
+    decoder: Rate = field(default_factory=lambda: Rate(1e-3, warmup_steps=2_500))
+    """The CNN for images."""
+    actor_offset: Rate = field(default_factory=lambda: Rate(1e-3, warmup_steps=2_500))
+    camera_offset: Rate = field(default_factory=lambda: Rate(0.0))
+    camera_twist: Rate = field(default_factory=lambda: Rate(0.0))
+    camera_late_s: Rate = field(default_factory=lambda: Rate(0.0))
+
+
+@dataclass(frozen=True)
+class FieldSchedule:
+    """Length of the training of a field, and what a step looks at."""
+
+    steps: int
+    patches: int = 40
+    """Patches of images in a step, of any of the images."""
+    patch: int = 32
+    """Rays along a side of a patch; fewer where the image is smaller."""
+    beams: int = 16_384
+    """Beams in a step."""
+    sweeps: int = 4
+    """Sweeps that the beams of a step are from."""
+    weights: FieldWeights = field(default_factory=FieldWeights)
+    rates: FieldRates = field(default_factory=FieldRates)
+    margin_m: float = 0.1
+    """Samples within this distance of a return count as surface, for carving."""
+    hit_m: float = 0.5
+    """Distance from a return that counts as near, for `FieldWeights.hit`."""
+    free_m: float = 150.0
+    """Beams that did not return are free up to this distance."""
+    depth_quantile: float = 0.95
+    """Share of the depth errors that count. The worst hit something thin or moving."""
+    mirror_share: float = 0.5
+    """Probability that a left-right symmetric actor is mirrored in a step."""
+    checkpoint_every: int = 500
+    seed: int = 0
+
+
+class FieldTraining:
+    """The `SceneTraining` of a field.
+
+    Args:
+        scene: trained in place.
+        views: training data.
+        schedule: length, rates and losses.
+
+    Raises:
+        InputError: there are neither images nor sweeps.
+    """
+
+    def __init__(self, scene: FieldScene, views: SensorViews, schedule: FieldSchedule) -> None:
+        if not views.cameras and not views.sweeps:
+            raise InputError("there is nothing to learn from: neither images nor sweeps")
+        self.scene, self.views, self.schedule = scene, views, schedule
+        self.steps, self.checkpoint_every, self.seed = (
+            schedule.steps,
+            schedule.checkpoint_every,
+            schedule.seed,
+        )
+        self._beams = [scene.prepare_sweep(view) for view in views.sweeps]
+
+    def parameter_groups(self) -> list[ParameterGroup]:
+        """Return one group per kind of parameter, named as in `FieldRates`."""
+        scene, groups = self.scene, []
+        tables = tables_of(scene.field)
+        of_table = {id(table) for table in tables}
+        layers = [p for p in scene.field.parameters() if id(p) not in of_table]
+        found = {
+            "grids": tables,
+            "layers": [*layers, *scene.lidar_decoder.parameters()],
+            "decoder": list(scene.camera_decoder.parameters()),
+        }
+        for rate in dataclasses.fields(self.schedule.rates):
+            parameters = found.get(rate.name) or [getattr(scene, rate.name)]
+            groups.append(ParameterGroup(rate.name, parameters, getattr(self.schedule.rates, rate.name)))
+        return groups
+
+    def losses(self, step: int, generator: torch.Generator) -> StepLosses:
+        """Return the losses of patches and beams, rendered together, some actors mirrored."""
+        schedule, scene = self.schedule, self.scene
+        drawn = torch.rand(len(scene.track_id), generator=generator) < schedule.mirror_share
+        mirror = drawn.to(scene.device) & scene.tracks.mirrored
+        patches = self._patches(generator)
+        beams = self._some_beams(generator)
+        rays = [patch.rays for patch in patches] + [beam.rays for beam in beams]
+        joined = FieldRays(*(torch.cat(tensors).to(scene.device) for tensors in zip(*rays, strict=True)))
+        seen = scene.look(scene.graph, joined, mirror, generator)
+        losses: dict[str, Tensor] = {}
+        first = 0
+        if patches:
+            first = sum(len(patch.rays.t_s) for patch in patches)
+            losses["rgb"] = self._rgb(patches, seen.feature[:first])
+        if beams:
+            losses |= self._beam_losses(beams, seen, first)
+        losses["interlevel"] = torch.stack(
+            [
+                interlevel_loss(
+                    seen.intervals.border,
+                    seen.intervals.weight,
+                    proposal.border,
+                    proposal.weight,
+                    PULSES[min(i, len(PULSES) - 1)],
+                )
+                for i, proposal in enumerate(seen.proposals)
+            ]
+        ).sum()
+        losses["distortion"] = distortion_loss(seen.intervals.border[:, :-1], seen.intervals.weight[:, :-1])
+        losses["loss"] = torch.stack([self._weight(name) * loss for name, loss in losses.items()]).sum()
+        if patches:
+            losses["psnr_db"] = -10 * losses["rgb"].detach().log10()
+        return StepLosses(f"step {step}", losses)
+
+    def evolve(self, step: int, optimizer: Optimizer, generator: torch.Generator) -> None:
+        """Do nothing: a field keeps its size."""
+
+    def _weight(self, name: str) -> float:
+        weights = self.schedule.weights
+        if name.startswith("proposal_"):
+            return weights.proposal * float(getattr(weights, name.removeprefix("proposal_")))
+        return float(getattr(weights, name))
+
+    def _patches(self, generator: torch.Generator) -> list["_Patch"]:
+        """Draw patches of images. The corner may be any pixel from which a patch fits into the image."""
+        found = []
+        for _ in range(self.schedule.patches if self.views.cameras else 0):
+            view = self.views.cameras[_draw(len(self.views.cameras), generator)]
+            assert view.image is not None
+            high, wide = (min(self.schedule.patch, side // UPSAMPLING) for side in view.size_hw)
+            top = _draw(view.size_hw[0] - UPSAMPLING * high + 1, generator)
+            left = _draw(view.size_hw[1] - UPSAMPLING * wide + 1, generator)
+            rays = self.scene.rays_of_pixels(
+                view.to(self.scene.device), torch.tensor([left, top]), torch.tensor([wide, high])
+            )
+            image = view.image[:, top : top + UPSAMPLING * high, left : left + UPSAMPLING * wide]
+            found.append(_Patch(rays, image.float() / 255, view.sensor, (high, wide)))
+        return found
+
+    def _some_beams(self, generator: torch.Generator) -> list["_Beams"]:
+        schedule, found = self.schedule, []
+        for _ in range(schedule.sweeps if self.views.sweeps else 0):
+            number = _draw(len(self.views.sweeps), generator)
+            view, rays = self.views.sweeps[number], self._beams[number]
+            if not len(rays.t_s):
+                continue
+            count = max(schedule.beams // schedule.sweeps, 1)
+            chosen = torch.randint(len(rays.t_s), (count,), generator=generator)
+            beams = view.beams
+            # Where misses are unknown, no beam is known to be lost.
+            found.append(
+                _Beams(
+                    FieldRays(*(tensor[chosen] for tensor in rays)),
+                    beams.range_m[chosen],
+                    beams.intensity[chosen],
+                    beams.returned[chosen],
+                    view.misses_known,
+                )
+            )
+        return found
+
+    def _rgb(self, patches: list["_Patch"], feature: Float[Tensor, "R D"]) -> Float[Tensor, ""]:
+        """Return the mean squared error over all pixels of the patches."""
+        parts = feature.split([len(patch.rays.t_s) for patch in patches])
+        groups: dict[tuple[int, tuple[int, int]], list[tuple[Tensor, Tensor]]] = defaultdict(list)
+        for patch, part in zip(patches, parts, strict=True):
+            groups[patch.camera, patch.size_hw].append((part.view(*patch.size_hw, -1), patch.rgb))
+        total, count = feature.new_zeros(()), 0
+        for (camera, _), alike in groups.items():  # patches of one camera are decoded together
+            rgb = self._decoded(torch.stack([part for part, _ in alike]), camera)
+            real = torch.stack([real for _, real in alike]).to(rgb)
+            total, count = total + ((rgb - real) ** 2).sum(), count + rgb.numel()
+        return total / count
+
+    def _decoded(self, feature: Float[Tensor, "n H W D"], camera: int) -> Float[Tensor, "n 3 H3 W3"]:
+        """Decode patches. Batch normalisation counts its statistics here alone, never when a view is seen."""
+        decoder = self.scene.camera_decoder.train()
+        rgb: Tensor = decoder(feature, camera)
+        decoder.eval()
+        return rgb
+
+    def _beam_losses(self, beams: list["_Beams"], seen: SeenAlongRays, first: int) -> dict[str, Tensor]:
+        """Return the losses of the rays from `first` on."""
+        device = seen.feature.device
+        range_m, real_intensity, returned = (
+            torch.cat([getattr(part, name) for part in beams]).to(device)
+            for name in ("range_m", "intensity", "returned")
+        )
+        intensity, drop_logit = self.scene.lidar_decoder(seen.feature[first:])
+        losses = {"intensity": intensity_loss(intensity, real_intensity, returned)}
+        if all(part.misses_known for part in beams):
+            losses["drop"] = drop_loss(drop_logit, returned)
+        for prefix, intervals in (
+            ("", seen.intervals),
+            *(("proposal_", proposal) for proposal in seen.proposals),
+        ):
+            found = self._distance_losses(intervals, first, range_m, returned, quantile=not prefix)
+            for name, loss in found.items():
+                losses[prefix + name] = losses.get(prefix + name, 0) + loss
+        return losses
+
+    def _distance_losses(
+        self,
+        intervals: Intervals,
+        first: int,
+        range_m: Float[Tensor, "P"],
+        returned: Bool[Tensor, "P"],
+        quantile: bool,
+    ) -> dict[str, Tensor]:
+        """Return the losses of where beams end. The last interval, the sky, does not count."""
+        schedule = self.schedule
+        border_m, weight = intervals.border_m[first:, :-1], intervals.weight[first:, :-1]
+        middle_m = intervals.middle_m[first:, :-1]
+        free_m = schedule.free_m
+        losses = {
+            "depth": beam_depth_loss(
+                (weight * middle_m).sum(-1),
+                range_m,
+                returned,
+                free_m,
+                schedule.weights.lost,
+                schedule.depth_quantile if quantile else 1.0,
+            ),
+            "carving": carving_loss(middle_m, weight, range_m, returned, schedule.margin_m, free_m),
+        }
+        if schedule.weights.hit:
+            losses["hit"] = hit_loss(border_m, weight, range_m, returned, schedule.hit_m)
+        return losses
+
+
+@dataclass(frozen=True)
+class _Patch:
+    rays: FieldRays
+    rgb: Float[Tensor, "3 H W"]
+    camera: int
+    size_hw: tuple[int, int]
+    """Numbers of rays."""
+
+
+@dataclass(frozen=True)
+class _Beams:
+    rays: FieldRays
+    range_m: Float[Tensor, "P"]
+    intensity: Float[Tensor, "P"]
+    returned: Bool[Tensor, "P"]
+    misses_known: bool
+
+
+def _draw(count: int, generator: torch.Generator) -> int:
+    return int(torch.randint(count, (), generator=generator))

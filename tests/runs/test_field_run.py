@@ -1,0 +1,156 @@
+"""A log rebuilt as a neural field: trained, resumed to the same bits, opened, edited, rendered."""
+
+import dataclasses
+from pathlib import Path
+
+import pytest
+import synthetic_log as world
+import torch
+from torch import Tensor
+
+from foredrive.cli.main import main
+from foredrive.data import LogPath, find_logs
+from foredrive.errors import InputError
+from foredrive.recipes.field import FieldRecipe, tiny_field
+from foredrive.recipes.rebuilding import RebuildRecipe, field_base, field_tiny, rescheduled_recipe
+from foredrive.rendering.edits import Duplicate, Insert, Move, Remove, apply_edits
+from foredrive.rendering.field.config import FieldConfig, GridConfig, GridsConfig
+from foredrive.rendering.field.content import FieldContent, field_of
+from foredrive.rendering.field.decoders import PatchDecoderConfig
+from foredrive.rendering.field.scene import FieldScene, FieldSceneConfig
+from foredrive.rendering.gaussians.content import GaussianContent
+from foredrive.rendering.scene_graph import STATIC, SceneGraph
+from foredrive.runs.rebuild.rebuilt_run import open_rebuilt
+from foredrive.runs.rebuild.reconstruct import Reconstruction, reconstruct
+from foredrive.training import loop
+from foredrive.training.learning_rates import Rate
+
+STEPS = 6
+
+
+def recipe(steps: int = STEPS) -> RebuildRecipe[FieldRecipe]:
+    actors = GridConfig(levels=2, features=1, coarsest=8, finest=32, log2_rows=10)
+    small = GridsConfig(GridConfig(levels=3, features=1, coarsest=8, finest=64, log2_rows=12), actors)
+    schedule = dataclasses.replace(
+        tiny_field().schedule, steps=steps, patch=8, beams=64, checkpoint_every=3, free_m=50.0
+    )
+    rates = dataclasses.replace(schedule.rates, camera_offset=Rate(1e-4), actor_offset=Rate(1e-3))
+    return RebuildRecipe(
+        name="small_field",
+        image_hw=(48, 96),
+        representation=FieldRecipe(
+            schedule=dataclasses.replace(schedule, rates=rates),
+            scene=FieldSceneConfig(
+                network=FieldConfig(
+                    small, (small,), proposal_samples=(12,), samples=8, width=8, scale_m=20.0, appearance=2
+                ),
+                decoder=PatchDecoderConfig(8, 8, 3, 1, 1, batch_norm=True),
+            ),
+        ),
+    )
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory: pytest.TempPathFactory) -> LogPath:
+    (log,) = find_logs(world.write(tmp_path_factory.mktemp("field"), frames=7))
+    return log
+
+
+@pytest.fixture(scope="module")
+def run(log: LogPath, tmp_path_factory: pytest.TempPathFactory) -> Reconstruction:
+    return reconstruct(recipe(), log, tmp_path_factory.mktemp("run") / "run")
+
+
+def image(scene: FieldScene, graph: SceneGraph, run: Reconstruction) -> Tensor:
+    with torch.no_grad():
+        return scene.camera(graph, run.held_out.cameras[0]).rgb
+
+
+def test_it_is_trained_evaluated_and_opens_as_it_was(run: Reconstruction) -> None:
+    scene = run.scene
+    assert isinstance(scene, FieldScene)
+    assert run.summary["grid entries"] == scene.sizes["grid entries"] > 1000
+    for name in ("psnr_db", "depth_median_sq_m2", "drop_accuracy"):
+        assert isinstance(run.summary[name], float)
+    assert bool(scene.actor_offset.any())
+    assert bool(scene.camera_offset.any())
+    assert image(scene, scene.graph, run).shape == (3, 48, 96)
+    opened = open_rebuilt(run.folder).scene
+    assert isinstance(opened, FieldScene)
+    assert torch.equal(image(opened, opened.graph, run), image(scene, scene.graph, run))
+
+
+def test_an_interrupted_run_goes_on_to_the_same_bits(
+    run: Reconstruction, log: LogPath, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Stopped at its first checkpoint, after three of six steps."""
+    save = loop.save_checkpoint
+
+    def save_and_stop(*args):  # type: ignore[no-untyped-def]
+        save(*args)
+        if args[-1] == 3:
+            raise KeyboardInterrupt
+
+    folder = tmp_path / "halves"
+    with monkeypatch.context() as patched:
+        patched.setattr(loop, "save_checkpoint", save_and_stop)
+        with pytest.raises(KeyboardInterrupt):
+            reconstruct(recipe(), log, folder)
+    halves, whole = reconstruct(recipe(), log, folder).scene.state_dict(), run.scene.state_dict()
+    assert [name for name in whole if not torch.equal(whole[name], halves[name])] == []
+
+
+def test_edits_move_places_and_never_weights(run: Reconstruction) -> None:
+    scene = run.scene
+    before = {name: value.clone() for name, value in scene.state_dict().items()}
+    graph = apply_edits(scene.graph, [Duplicate(7, copy=9, offset_m=(3.0, 0.0, 0.0)), Remove(11)]).graph
+    content = field_of(graph)
+    assert graph.tracks.track_id.tolist() == [7, 9]
+    assert content.slot.tolist() == [scene.tracks.index_of(7)] * 2
+    assert content.evidence(0) == content.evidence(1) > 0
+    assert len(content.preview(STATIC).mean_m) > 100
+    assert not torch.equal(image(scene, graph, run), image(scene, scene.graph, run))
+    moved = apply_edits(scene.graph, [Move(7, (0.0, 0.0, 0.0))]).graph
+    assert torch.allclose(image(scene, moved, run), image(scene, scene.graph, run), atol=1e-5)
+    after = scene.state_dict()
+    assert all(torch.equal(value, after[name]) for name, value in before.items())
+
+
+def test_actors_of_other_scenes_are_refused(run: Reconstruction, log: LogPath, tmp_path: Path) -> None:
+    scene = run.scene
+    gaussians = GaussianContent(scene.content.preview(0), torch.zeros(1, dtype=torch.int64))
+    other = SceneGraph(scene.tracks, gaussians)
+    insert = Insert("other", 7, 30, 11)
+    with pytest.raises(
+        InputError, match="actor 7 cannot be copied here: an actor that is not part of a field"
+    ):
+        apply_edits(scene.graph, [insert], lambda _: other)
+    elsewhere = reconstruct(rescheduled_recipe(recipe(1), seed=1), log, tmp_path / "run").scene
+    with pytest.raises(InputError, match="only this field's decoder can read it"):
+        apply_edits(scene.graph, [insert], lambda _: elsewhere.graph)
+    same = apply_edits(scene.graph, [insert], lambda _: scene.graph).graph
+    assert isinstance(same.content, FieldContent)
+    assert same.content.slot.tolist()[-1] == scene.tracks.index_of(7)
+
+
+def test_the_sizes_of_neurad() -> None:
+    """Table of parameters of the reference implementation: 8 levels of 4 features in 2^22 rows."""
+    sizes = field_base().representation.scene.network
+    assert (sizes.grids.static.levels, sizes.grids.static.features, sizes.grids.static.log2_rows) == (
+        8,
+        4,
+        22,
+    )
+    assert sizes.proposal_samples == (128, 64)
+    assert field_base().representation.learning_gib(1080 * 1920) > 8
+    assert field_tiny().representation.learning_gib(270 * 480) < 2
+
+
+def test_the_method_names_the_recipe(
+    log: LogPath, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    wrong = ["reconstruct", str(log.folder), "--out", str(tmp_path / "run"), "--recipe", "field_tiny"]
+    assert main([*wrong, "--method", "gaussians"]) == 2
+    assert (
+        "--method gaussians does not go with the recipe field_tiny, which is field" in capsys.readouterr().err
+    )
