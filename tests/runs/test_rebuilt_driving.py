@@ -126,6 +126,6 @@ def test_scores_of_threats_stand_in_the_summary(run: Path, tmp_path: Path) -> No
     assert drive.threat is not None
     assert drive.threat.reference_mps == pytest.approx(world.EGO_SPEED_MPS, abs=0.1)
     assert drive.threat.impact_mps == pytest.approx(world.EGO_SPEED_MPS, abs=0.5)
-    assert read_summary(tmp_path / "summary.json")["threats.stationary.collision_share"] == 1.0
+    assert read_summary(tmp_path / "summary.json")["threats.stationary.collision_rate"] == 1.0
     assert drive.score.infractions[0].kind == "collision_vehicle"
     assert LogPath(tmp_path / drive.log, tmp_path / "maps").folder.is_dir()

@@ -48,8 +48,9 @@ def drive(
     source = rebuilt.source() or towns.source(name)
     suite = DriveSuite(name, source, planning.sensors, planning.period, planning.latency)
     workers = towns.workers or len(os.sched_getaffinity(0))
-    with _Progress(len(suite.jobs())) as progress:
+    with DrivesProgress(len(suite.jobs())) as progress:
         driven = drive_suite(suite, out, workers, on_ray=towns.ray, tick=progress.tick)
+    check_driven(driven)
     _tell(driven)
 
     from foredrive.view.drive_report import write_drive_report
@@ -57,18 +58,12 @@ def drive(
     print(f"report: {write_drive_report(out)}")
 
 
-def _tell(driven: "SuiteResult") -> None:
-    """Print the scores.
+def check_driven(driven: "SuiteResult") -> None:
+    """Check that no drive broke off, and print how many had been driven before.
 
     Raises:
         InputError: some drives broke off.
     """
-    from rich.console import Console
-
-    from foredrive.runs.drive.records import summarise
-    from foredrive.view.drive_report import score_table, threat_text
-    from foredrive.view.table import print_table
-
     if driven.broken:
         failures = listed_failures({job.name: reason for job, reason in driven.broken.items()})
         whole = len(driven.drives) + len(driven.broken)
@@ -78,12 +73,22 @@ def _tell(driven: "SuiteResult") -> None:
         )
     if driven.skipped:
         print(f"{driven.skipped} of {len(driven.drives)} drives had been driven before")
+
+
+def _tell(driven: "SuiteResult") -> None:
+    """Print the scores."""
+    from rich.console import Console
+
+    from foredrive.runs.drive.records import summarise
+    from foredrive.view.drive_report import score_table, threat_text
+    from foredrive.view.table import print_table
+
     print_table(score_table(summarise(list(driven.drives.values()))), Console())
     for met in (drive.threat for drive in driven.drives.values() if drive.threat):
         print(f"{met.kind} threat: {threat_text(met)}")
 
 
-class _Progress:
+class DrivesProgress:
     """A progress bar over all drives, with the mean driving score so far."""
 
     def __init__(self, total: int) -> None:
@@ -101,7 +106,7 @@ class _Progress:
         self._bar = self._progress.add_task("", total=total, score="")
         self._scores: list[float] = []
 
-    def __enter__(self) -> "_Progress":
+    def __enter__(self) -> "DrivesProgress":
         self._progress.start()
         return self
 

@@ -20,6 +20,7 @@ from foredrive.cli.evaluate import evaluate
 from foredrive.cli.export import export
 from foredrive.cli.imagine import imagine
 from foredrive.cli.memory import keep_freed_memory
+from foredrive.cli.ncap import ncap
 from foredrive.cli.recipes import recipes
 from foredrive.cli.reconstruct import reconstruct
 from foredrive.cli.record import record
@@ -43,6 +44,7 @@ VERBS: dict[str, Callable[..., Any]] = {
     "train": train,
     "evaluate": evaluate,
     "drive": drive,
+    "ncap": ncap,
     "score": score,
     "search": search,
     "search index": search_index,

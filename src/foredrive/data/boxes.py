@@ -145,6 +145,24 @@ def read_tracks(log: Log) -> Tracks | None:
         return _tracks(log, file.stat().st_mtime_ns)
 
 
+def read_track_ids(log: Log) -> dict[str, int]:
+    """Read the id of each track of a log by its token, the ego vehicle's included. Empty without boxes.
+
+    Raises:
+        InputError: the boxes cannot be read.
+    """
+    file = log.file(_KEY)
+    if not file.is_file():
+        return {}
+    with reading(file, "the boxes"):
+        table = get_modality_table(log.path.folder, _KEY)
+        if table is None:
+            raise ValueError("the table is missing")
+        (name,) = [name for name in table.column_names if name.split(".")[-1] == "track_token"]
+        tokens = np.array(column_array(table, name).flatten().to_pylist(), dtype=object)
+    return dict(zip(tokens.tolist(), _track_ids(tokens).tolist(), strict=True))
+
+
 def box_row(log: Log, frame: int) -> int | None:
     """Return the row of a frame in the box table. Return None if the frame is not annotated."""
     frames, rows = log.rows(_KEY)

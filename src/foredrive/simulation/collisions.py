@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float32, Float64
 
 from foredrive.scene import BicycleState, Category, Event
-from foredrive.simulation.dynamics import EGO
+from foredrive.simulation.dynamics import EGO, Vehicle
 from foredrive.simulation.road_users import Box, RoadUsers, touched
 from foredrive.towns.place.materials import Surface
 from foredrive.towns.world import World
@@ -32,6 +32,25 @@ class Contacts:
     """Track id and time of the last contact, s, of each road user hit recently."""
     standing_xy: tuple[float, float] | None = None
     """Position of the last counted contact with a static object, m, world frame."""
+
+
+@dataclass(frozen=True)
+class EgoContact:
+    """What counts as a collision of the ego vehicle with a road user."""
+
+    vehicle: Vehicle = EGO
+    """Its body is the box that collides."""
+    categories: frozenset[Category] | None = None
+    """Road users that count; None: all."""
+    struck_counts: bool = False
+    """Whether an impact counts if the road user comes from behind the ego vehicle."""
+
+    def counted(self, users: RoadUsers) -> RoadUsers:
+        """Return the road users that count; the others are marked as absent."""
+        if self.categories is None:
+            return users
+        counts = np.isin(users.category, [int(category) for category in self.categories])
+        return users._replace(track_id=np.where(counts, users.track_id, -1))
 
 
 class CollisionSense:
@@ -119,7 +138,7 @@ def blocked(box: Box, users: RoadUsers) -> bool:
     return bool((touched(bumper, users) & (users.category != Category.PEDESTRIAN)).any())
 
 
-def ego_box(T_world_ego: Float64[np.ndarray, "4 4"], ego: BicycleState) -> Box:
+def ego_box(T_world_ego: Float64[np.ndarray, "4 4"], ego: BicycleState, vehicle: Vehicle = EGO) -> Box:
     """Return the box of the ego vehicle."""
-    foot = T_world_ego[:3, 3] + EGO.axle_to_centre_m * T_world_ego[:3, 0]
-    return Box(foot, ego.yaw_rad, 0.5 * np.array([EGO.length_m, EGO.width_m]))
+    foot = T_world_ego[:3, 3] + vehicle.axle_to_centre_m * T_world_ego[:3, 0]
+    return Box(foot, ego.yaw_rad, 0.5 * np.array([vehicle.length_m, vehicle.width_m]))

@@ -4,17 +4,18 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
 from foredrive.data.batches import stack_records
 from foredrive.errors import InputError
-from foredrive.scene import Agent, BicycleState, Clip, Event, Simulator
+from foredrive.scene import Agent, BicycleState, Clip, Event, Simulator, Step, Trajectory
 from foredrive.simulation.comfort import JERK_S, Comfort, comfort_of
 from foredrive.simulation.controller import ControllerState, follow
 from foredrive.simulation.dynamics import EGO, STEP_S
 from foredrive.simulation.observation import FRAME_DT_S
-from foredrive.simulation.plans import Plan, fixed_in_world
+from foredrive.simulation.plans import fixed_in_world
 from foredrive.simulation.scores import Ending, RouteScore, infraction_of
 from foredrive.simulation.time_to_collision import MovingBoxes, time_to_collision_s
 
@@ -64,6 +65,41 @@ class Drive:
     """Error of the agent; empty if there was none."""
 
 
+@runtime_checkable
+class Pilot(Protocol):
+    """Moves the vehicle of a simulator along an agent's plans."""
+
+    def expect(self, trajectory: Trajectory, ego: BicycleState, t_s: float) -> None:
+        """Take a plan that was made from an observation at `t_s`, where the vehicle was at `ego`.
+
+        Raises:
+            InputError: the plan cannot be followed.
+        """
+        ...
+
+    def step(self, ego: BicycleState, t_s: float) -> Step:
+        """Move on by one step of the simulation from `ego` at `t_s`."""
+        ...
+
+
+class FollowingPilot:
+    """A `Pilot` by `simulation.controller`: it follows smoothed plans once the latency has passed."""
+
+    def __init__(self, simulator: Simulator, latency_s: float) -> None:
+        self._simulator, self._latency_s = simulator, latency_s
+        self._controller = ControllerState()
+
+    def expect(self, trajectory: Trajectory, ego: BicycleState, t_s: float) -> None:
+        """Take a plan. It takes effect after the latency."""
+        plan = fixed_in_world(trajectory, ego, t_s)
+        self._controller = self._controller.expecting(plan, t_s + self._latency_s)
+
+    def step(self, ego: BicycleState, t_s: float) -> Step:
+        """Move on by one step."""
+        control, self._controller = follow(self._controller, ego, t_s)
+        return self._simulator.step(control)
+
+
 def drive_route(
     simulator: Simulator,
     scenario: object,
@@ -72,6 +108,7 @@ def drive_route(
     route: str,
     repetition: int = 0,
     pace: PlanningTiming | None = None,
+    pilot: Pilot | None = None,
     on_frame: Callable[[], None] = lambda: None,
 ) -> Drive:
     """Drive until the route ends.
@@ -82,6 +119,7 @@ def drive_route(
         scenario: scenario to which the simulator is reset.
         agent: agent that drives; it observes a batch of one clip.
         route: name of the route.
+        pilot: moves the vehicle of this simulator along the plans; by default a `FollowingPilot`.
         on_frame: called at each key frame, including the first, before the agent observes it.
 
     Raises:
@@ -91,20 +129,18 @@ def drive_route(
     clip = simulator.reset(scenario)
     on_frame()
     states, events, nearest, act_s = [simulator.ego()], list[Event](), [_nearest_s(clip)], list[float]()
-    controller, ending, error = ControllerState(), None, ""
+    pilot, ending, error = pilot or FollowingPilot(simulator, pace.latency_s), None, ""
     while ending is None:
         index = len(states) - 1
         if index % pace.steps == 0:
             began = time.perf_counter()
             try:
-                plan = _plan(agent, clip, states[-1], index * STEP_S)
+                pilot.expect(agent.act(stack_records([clip])), states[-1], index * STEP_S)
             except Exception as problem:  # any error of an agent ends the drive, but the route still counts
                 ending, error = Ending.CRASHED, f"{type(problem).__name__}: {problem}"
                 break
             act_s.append(time.perf_counter() - began)
-            controller = controller.expecting(plan, index * STEP_S + pace.latency_s)
-        control, controller = follow(controller, states[-1], index * STEP_S)
-        step = simulator.step(control)
+        step = pilot.step(states[-1], index * STEP_S)
         states.append(simulator.ego())
         events += step.events
         if step.clip is not clip:
@@ -119,10 +155,6 @@ def drive_route(
     )
     comfort = comfort_of(states) if len(states) * STEP_S > JERK_S + STEP_S else None
     return Drive(score, tuple(states), tuple(events), tuple(nearest), tuple(act_s), comfort, error)
-
-
-def _plan(agent: Agent, clip: Clip, ego: BicycleState, t_s: float) -> Plan:
-    return fixed_in_world(agent.act(stack_records([clip])), ego, t_s)
 
 
 def _nearest_s(clip: Clip) -> float:

@@ -52,7 +52,7 @@ def fixed_in_world(
     Raises:
         InputError: the trajectory has no valid step, a step that is not finite, or more than one item.
     """
-    waypoints = _waypoints(trajectory)
+    waypoints = waypoints_of(trajectory)
     local = fit_path(waypoints, trajectory.dt_s, math.tan(seen_from.steering_rad) / vehicle.wheelbase_m)
     way_m = np.maximum.accumulate([0.0, *(local.project(point)[0] for point in waypoints)])
     times_s = trajectory.dt_s * np.arange(len(way_m))
@@ -66,8 +66,12 @@ def fixed_in_world(
     )
 
 
-def _waypoints(trajectory: Trajectory) -> Float64[np.ndarray, "T 2"]:
-    """Return the points of the most probable alternative, up to its first invalid step, m, ego frame."""
+def waypoints_of(trajectory: Trajectory) -> Float64[np.ndarray, "T 2"]:
+    """Return the points of the most probable alternative, up to its first invalid step, m, ego frame.
+
+    Raises:
+        InputError: the trajectory has no valid step, a step that is not finite, or more than one item.
+    """
     if trajectory.log_prob.shape[:-1].numel() != 1:
         raise InputError(f"expected one plan, got a batch of {tuple(trajectory.log_prob.shape[:-1])}")
     best, steps = int(trajectory.log_prob.reshape(-1).argmax()), trajectory.xy.shape[-2]

@@ -12,17 +12,19 @@ from foredrive.geometry.se3 import inverse_se3
 from foredrive.rendering.tracks import ActorTracks, boxes_at
 from foredrive.scene import BicycleState, Clip, Control, DriveProgress, Event, Renderer, Step
 from foredrive.scene.actors import BOX_RANGE_M
-from foredrive.simulation.collisions import Contacts, blocked, collide, ego_box
+from foredrive.simulation.collisions import Contacts, EgoContact, blocked, collide, ego_box
 from foredrive.simulation.dynamics import STEP_S, step, yaw_rate_radps
 from foredrive.simulation.logged_drive import LoggedDrive
 from foredrive.simulation.logged_lanes import LoggedLanes
 from foredrive.simulation.observation import FRAME_DT_S, FRAME_STEPS, KeyFrame, no_images
 from foredrive.simulation.replayed import comes_from_behind, users_at
-from foredrive.simulation.route_progress import RouteLine, RouteProgress
+from foredrive.simulation.route_progress import ARRIVED_M, RouteLine, RouteProgress
 
 REACH_M = 6.0
 """Maximum distance from the logged path, m. Further away, sensors would mostly show unobserved space, so
 the drive ends."""
+MIN_WAY_M = 1.0
+"""Shortest way of which a share can be driven, m."""
 COLLISION = "collision"
 """Kind of the event in which the first collision ends a drive."""
 STRUCK = "struck"
@@ -42,6 +44,11 @@ class RebuiltScenario:
     """Number of key frames before now in an observation. They are rendered along the logged path."""
     ends_on_collision: bool = False
     """Whether the first collision of the ego vehicle ends the drive, as in a safety test."""
+    length_s: float | None = None
+    """Time after which the drive ends, s. The way of the log in this time is the route to complete. None: the
+    drive may last to the log's end."""
+    contact: EgoContact = field(default_factory=EgoContact)
+    """What counts as a collision."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,6 +108,7 @@ class RebuiltSimulator:
             )
         self._scenario = scenario
         self._route = RouteLine(self.drive.route_from(scenario.start_s))
+        self._way_m = self.way_m(scenario)
         frames: tuple[KeyFrame, ...] = ()
         for number in range(-scenario.past_frames, 1):
             t_s = number * FRAME_DT_S
@@ -116,10 +124,18 @@ class RebuiltSimulator:
         Raises:
             InputError: the drive is over, or the control is not finite.
         """
+        return self.step_to(step(self.state.ego, control))
+
+    def step_to(self, moved: BicycleState) -> Step:
+        """Drive on for `STEP_S` to the state that another model of the vehicle has found.
+
+        Raises:
+            InputError: the drive is over.
+        """
         state = self.state
         if state.ended is not None:
             raise InputError(f"the drive is over ({state.ended}): reset the simulator")
-        state, events = self._drive(state, step(state.ego, control))
+        state, events = self._drive(state, moved)
         self.state = state
         if state.step_index % FRAME_STEPS == 0:
             T = self.drive.on_ground(state.ego)
@@ -137,7 +153,26 @@ class RebuiltSimulator:
         """Return the progress of the drive. Without lanes the distance outside of them is 0."""
         state = self.state
         outside = state.outside_m / state.driven_m if state.driven_m > 0 else 0.0
-        return DriveProgress(self._route.completion(state.progress), outside, state.driven_m)
+        completion = self._route.completion(state.progress)
+        if self._scenario.length_s is not None:
+            completion = min(1.0, state.progress.done_m / self._way_m)
+        return DriveProgress(completion, outside, state.driven_m)
+
+    def way_m(self, scenario: RebuiltScenario) -> float:
+        """Return the distance to drive in a scenario, m: that of the log in the scenario's time.
+
+        Raises:
+            InputError: the log stands in this time.
+        """
+        left_m = self.drive.way_left_m(scenario.start_s)
+        if scenario.length_s is None:
+            return left_m
+        way_m = left_m - self.drive.way_left_m(min(scenario.start_s + scenario.length_s, self.drive.end_s))
+        if way_m < MIN_WAY_M:
+            raise InputError(
+                f"from {scenario.start_s:g} s on, the log drives {way_m:.1f} m in {scenario.length_s:g} s"
+            )
+        return way_m
 
     @property
     def scenario(self) -> RebuiltScenario:
@@ -153,9 +188,11 @@ class RebuiltSimulator:
         """Move the ego vehicle unless an obstacle stops it. Return the new state and the events."""
         index = state.step_index + 1
         t_s = index * STEP_S
+        contact = self._scenario.contact
         users = users_at(self._tracks, self._T_world_scene, self._scenario.start_s + t_s)
-        box = ego_box(self.drive.on_ground(moved), moved)
-        behind = comes_from_behind(box, users)
+        users = contact.counted(users)
+        box = ego_box(self.drive.on_ground(moved), moved, contact.vehicle)
+        behind = comes_from_behind(box, users) & (not contact.struck_counts)
         before = users.without(users.track_id[behind])
         events, met = collide(box, moved, before, state.contacts.users, t_s)
         struck, met = collide(box, moved, users.without(users.track_id[~behind]), met, t_s)
@@ -185,7 +222,12 @@ class RebuiltSimulator:
 
         A drive also ends when it leaves the part of space or time that the log covers.
         """
-        ended = self._route.end_of(progress, t_s, self.drive.end_s - self._scenario.start_s - 0.5 * STEP_S)
+        left_s = self.drive.end_s - self._scenario.start_s
+        length_s = left_s if self._scenario.length_s is None else min(left_s, self._scenario.length_s)
+        ended = self._route.end_of(progress, t_s, length_s - 0.5 * STEP_S)
+        left_m = self._way_m - progress.done_m
+        if ended == "timeout" and left_m < min(ARRIVED_M, 0.5 * self._way_m):
+            return "completed"
         return "deviation" if ended is None and progress.beside_m > REACH_M else ended
 
     def _with_frame(

@@ -26,7 +26,7 @@ class StraightAgent:
         """Return the same plan for every item of the batch."""
         x = self.speed_mps * FRAME_DT_S * torch.arange(1, HORIZON_STEPS + 1)
         xy = torch.stack([x, torch.zeros_like(x)], dim=-1)
-        return _plan(xy.expand(len(observation.t_s), 1, -1, -1))
+        return plan_of(xy.expand(len(observation.t_s), 1, -1, -1))
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,10 +48,10 @@ class ReplayAgent:
         poses = [self.drive.pose_at(now_s + FRAME_DT_S * k) for k in range(HORIZON_STEPS + 1)]
         xy = (np.linalg.inv(T_world_ego) @ np.stack(poses))[:, :2, 3]
         left = 1 - np.arange(1, HORIZON_STEPS + 1)[:, None] / HORIZON_STEPS
-        return _plan(torch.from_numpy(xy[1:] - left * xy[0]).float()[None, None])
+        return plan_of(torch.from_numpy(xy[1:] - left * xy[0]).float()[None, None])
 
 
-def _plan(xy: Float[Tensor, "b 1 T 2"]) -> Trajectory:
+def plan_of(xy: Float[Tensor, "b 1 T 2"]) -> Trajectory:
     """Build a trajectory from points. Its headings are 0, because controllers derive them from the points."""
     flat = xy[..., 0]
     return Trajectory(

@@ -91,10 +91,14 @@ def score_table(summary: Summary) -> Table:
     return Table([Column(align="left"), Column()], [Section(scores), Section(wrong), Section(rest)], title)
 
 
-def write_drive_report(out: Path) -> Path:
-    """Write the report page into a suite's folder, and a video of each drive.
+def write_drive_report(out: Path, shown: int | None = None, safety: Table | None = None) -> Path:
+    """Write the report page into a suite's folder, and a video of each drive that it shows.
 
     Films that exist already are kept.
+
+    Args:
+        shown: number of drives to show, the lowest scores first. None: all.
+        safety: table of safety tests, shown above all others.
 
     Raises:
         InputError: the folder holds no suite whose drives are all complete.
@@ -103,12 +107,12 @@ def write_drive_report(out: Path) -> Path:
         raise InputError(f"{out}: not a suite of drives (no {SUMMARY})")
     title = suite_title(out)
     drives = {path.stem: read_drive(path) for path in sorted((out / DRIVES).glob("*.json"), key=_order)}
-    for name, drive in drives.items():
-        video = out / VIDEOS / f"{name}.webp"
+    worst_first = sorted(drives, key=lambda name: _badness(drives[name]))[:shown]
+    for name in worst_first:
+        drive, video = drives[name], out / VIDEOS / f"{name}.webp"
         if not video.is_file():
             write_drive_video(video, LogPath(out / drive.log, out / "maps"), drive)
     summary = read_summary(out / SUMMARY)
-    worst_first = sorted(drives, key=lambda name: drives[name].driving_score_1_0)
     write_page(
         out / REPORT,
         "drive_report.html.j2",
@@ -119,7 +123,8 @@ def write_drive_report(out: Path) -> Path:
         scenarios=_counted(summary, "scenarios", ScenarioKind),
         infractions=_infraction_table(summary),
         letters={LETTERS[kind]: words(kind) for kind in LETTERS if summary[f"infractions.{kind}"]},
-        table=_drive_table(drives),
+        safety=safety,
+        table=_drive_table(drives, set(worst_first)),
         drives=[_show_drive(name, drives[name]) for name in worst_first],
         near_collision_s=f"{NEAR_COLLISION_S:g}",
         all_metrics=full_table(summary),
@@ -179,7 +184,13 @@ def _counted(summary: Summary, what: str, kinds: Iterable[str]) -> str:
     return ", ".join(f"{number(count)} {words(kind)}" for kind, count in counts.items() if count)
 
 
-def _drive_table(drives: Mapping[str, DriveRecord]) -> Table:
+def _badness(drive: DriveRecord) -> tuple[float, float]:
+    """Return a sort key: failed safety tests first, then low scores."""
+    safety = 0.0 if drive.threat is None else (-1.0 if drive.threat.score is None else drive.threat.score)
+    return safety, drive.driving_score_1_0
+
+
+def _drive_table(drives: Mapping[str, DriveRecord], shown: set[str]) -> Table:
     columns = (
         Column("drive", align="left"),
         Column("length, m", digits=0),
@@ -191,13 +202,13 @@ def _drive_table(drives: Mapping[str, DriveRecord]) -> Table:
         Column("ending", align="left"),
         Column("infractions", align="left"),
     )
-    return simple_table(columns, [_drive_row(name, drive) for name, drive in drives.items()])
+    return simple_table(columns, [_drive_row(name, drive, name in shown) for name, drive in drives.items()])
 
 
-def _drive_row(name: str, drive: DriveRecord) -> list[Value | Cell]:
+def _drive_row(name: str, drive: DriveRecord, is_shown: bool) -> list[Value | Cell]:
     score = drive.score
     return [
-        Cell(name, link=name),
+        Cell(name, link=name if is_shown else ""),
         drive.length_m,
         score.driving_score_1_0,
         score.driving_score_2_1,

@@ -95,9 +95,9 @@ def test_failures_are_counted_and_leave_the_means_alone() -> None:
     assert summary["threats.side.failed"] == 1
     assert summary["threats.side.left_way"] == 1
     assert summary["threats.side.stopped_short"] == 1
-    assert summary["threats.side.passed"] == 0
+    assert summary["threats.side.runs"] == 4
     assert summary["threats.side.score"] == pytest.approx((5.0 + 0.0 + 3.0) / 3)
-    assert summary["threats.side.collision_share"] == pytest.approx(1 / 3)
+    assert summary["threats.side.collision_rate"] == pytest.approx(1 / 3)
     assert summary["threats.side.progress"] == pytest.approx((0.4 + 0.4 + 0.5) / 3)
     assert summary["threats.side.score_progress"] == pytest.approx((2.0 + 0.0 + 1.5) / 3)
     alone = summarise([drives[1]])

@@ -58,12 +58,12 @@ class RebuiltRoutes:
 
     def jobs(self, agent: str) -> Sequence[DriveJob]:
         """Return one drive for each start and threat."""
-        past_frames = _past_frames(agent)
+        past_frames = past_frames_of(agent)
         _edits_of(self.edits)
         return [job for job, _, _ in self._plan(past_frames)]
 
     def _plan(self, past_frames: int) -> list[tuple[DriveJob, float, Threat | None]]:
-        first_s = float(_opened(self.run).vehicle.t_s[0]) + past_frames * FRAME_DT_S
+        first_s = float(opened_rebuilt(self.run).vehicle.t_s[0]) + past_frames * FRAME_DT_S
         plan = []
         for start_s in self.starts_s or (first_s,):
             for threat in self.threats or (None,):
@@ -74,7 +74,8 @@ class RebuiltRoutes:
     @contextlib.contextmanager
     def set_up(self, job: DriveJob, suite: DriveSuite, out: Path) -> Iterator[DriveSetup]:
         """Set up a drive in the reconstructed scene."""
-        opened, edits, past_frames = _opened(self.run), _edits_of(self.edits), _past_frames(suite.agent)
+        opened, edits = opened_rebuilt(self.run), _edits_of(self.edits)
+        past_frames = past_frames_of(suite.agent)
         _, start_s, threat = next(each for each in self._plan(past_frames) if each[0] == job)
         edited = edited_scene(opened.scene, edits)
         drive = LoggedDrive(opened.vehicle, edited.T_ego_shifted.cpu())
@@ -83,10 +84,10 @@ class RebuiltRoutes:
             sent = send_threat(threat, graph, drive, start_s)
             graph = edited_scene(opened.scene, [*edits, sent]).graph
         renderer = RebuiltRenderer(opened.scene, graph, opened.vehicle)
-        lanes = _lanes(opened.folder)
+        lanes = lanes_of(opened.folder)
         simulator = RebuiltSimulator(renderer, graph.tracks, drive, lanes)
         sensors = suite.sensors or (suite.agent != REPLAY and inputs_of(suite.agent).lidar)
-        agent = _agent(suite.agent, simulator)
+        agent = agent_in(suite.agent, simulator)
         route_xyz = drive.route_from(start_s)
         rig = renderer.rig if sensors else None
         with drive_log(out, job.name, route_xyz, rig) as log:
@@ -106,7 +107,8 @@ class RebuiltRoutes:
 
 
 @functools.lru_cache(maxsize=1)  # consecutive drives share one scene
-def _opened(run: str) -> OpenedReconstruction:
+def opened_rebuilt(run: str) -> OpenedReconstruction:
+    """Open a reconstruction. Drives one after another in one log share it."""
     return open_rebuilt(Path(run))
 
 
@@ -114,11 +116,12 @@ def _edits_of(file: str | None) -> list[Edit]:
     return [] if file is None else load_edits(Path(file))
 
 
-def _past_frames(agent: str) -> int:
+def past_frames_of(agent: str) -> int:
+    """Return the number of key frames before now that an agent observes."""
     return 1 if agent == REPLAY else inputs_of(agent).past_frames
 
 
-def _lanes(folder: Path) -> LoggedLanes | None:
+def lanes_of(folder: Path) -> LoggedLanes | None:
     """Read the lanes from the map of a run's log; return None if the log or its map is missing."""
     try:
         outlines = read_lane_outlines(Log(open_run_log(folder)[1]))
@@ -139,7 +142,8 @@ class _SelectedCameras:
         return self.agent.act(observation.through(self.cameras))
 
 
-def _agent(name: str, simulator: RebuiltSimulator) -> Agent:
+def agent_in(name: str, simulator: RebuiltSimulator) -> Agent:
+    """Return the agent of a name, which sees only the cameras that it was trained on."""
     if name == REPLAY:
         return ReplayAgent(simulator.drive, lambda: simulator.scenario.start_s + simulator.state.t_s)
     agent = make_agent(name, lambda: simulator.state.t_s)

@@ -1,5 +1,6 @@
 """Files of drives (drives/NAME.json in a folder), and the summary of a suite."""
 
+import dataclasses
 import json
 import statistics
 from collections import Counter
@@ -13,10 +14,9 @@ from foredrive.evaluation.provenance import collect_provenance
 from foredrive.evaluation.summary import write_json
 from foredrive.runs.folder import SUITE
 from foredrive.simulation.drive_record import DriveRecord
-from foredrive.simulation.ncap.outcome import Outcome
+from foredrive.simulation.ncap.aggregation import TestedRun, aggregate
 from foredrive.simulation.scenarios.scenario import ScenarioKind
 from foredrive.simulation.scores import score_suite
-from foredrive.simulation.threats import Threat
 from foredrive.simulation.time_to_collision import NEAR_COLLISION_S
 
 _RECORD = TypeAdapter(DriveRecord)
@@ -107,20 +107,33 @@ def summarise(drives: Sequence[DriveRecord]) -> Figures:
     return out | collect_provenance() | _threat_figures(drives)
 
 
+def tested_runs(drives: Sequence[DriveRecord]) -> list[TestedRun]:
+    """Return the drives against a threat as runs of safety tests; the route of a drive is its scenario."""
+    return [
+        TestedRun(
+            drive.score.route,
+            drive.threat,
+            min((seconds for seconds in drive.nearest_s if seconds is not None), default=None),
+            drive.comfort.comfortable_share if drive.comfort else None,
+        )
+        for drive in drives
+        if drive.threat is not None
+    ]
+
+
 def _threat_figures(drives: Sequence[DriveRecord]) -> Figures:
-    """Return the figures of each kind of threat met: means over the drives that did not fail, and counts."""
+    """Return the figures of each kind of threat met, and their mean over the kinds."""
+    runs = tested_runs(drives)
+    if not runs:
+        return {}
+    _, kinds, overall = aggregate(runs)
     out: Figures = {}
-    for threat in Threat:
-        met = [drive.threat for drive in drives if drive.threat and drive.threat.kind == threat]
-        if not met:
-            continue
-        scored = [each for each in met if each.score is not None]
-        values: dict[str, list[float]] = {
-            "score": [each.score or 0.0 for each in scored],
-            "collision_share": [float(each.outcome is Outcome.COLLIDED) for each in scored],
-            "progress": [each.progress for each in scored],
-            "score_progress": [each.score_progress or 0.0 for each in scored],
-        }
-        out |= {f"threats.{threat}.{key}": statistics.fmean(of) if of else None for key, of in values.items()}
-        out |= {f"threats.{threat}.{each}": sum(one.outcome is each for one in met) for each in Outcome}
+    for name, of in [*((str(kind), of) for kind, of in kinds.items()), ("all", overall)]:
+        for key in ("score", "collision_rate"):
+            interval = getattr(of, key)
+            for part, end in (("mean", ""), ("low", ".low"), ("high", ".high")):
+                out[f"threats.{name}.{key}{end}"] = None if interval is None else getattr(interval, part)
+        for field in dataclasses.fields(of):
+            if field.name not in ("score", "collision_rate"):
+                out[f"threats.{name}.{field.name}"] = getattr(of, field.name)
     return out

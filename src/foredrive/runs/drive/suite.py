@@ -27,7 +27,7 @@ from foredrive.runs.drive.records import read_drive, read_suite, summarise, writ
 from foredrive.runs.fan_out import fan_out, reason
 from foredrive.runs.folder import DRIVES, SUITE, SUMMARY, RunFolder
 from foredrive.scene import Agent, Simulator
-from foredrive.simulation.drive import Drive, PlanningTiming, drive_route
+from foredrive.simulation.drive import Drive, Pilot, PlanningTiming, drive_route
 from foredrive.simulation.drive_record import DriveRecord, record_of
 from foredrive.simulation.ncap.outcome import SafetyResult
 from foredrive.training.interrupts import start_fork_server
@@ -62,6 +62,8 @@ class DriveSetup:
     lanes_known: bool = True
     judge: Callable[[Drive], SafetyResult | None] = lambda drive: None
     """Scores the drive against a threat; None: there is no threat."""
+    pilot: Pilot | None = None
+    """Moves the vehicle along the plans; None: as `drive_route` does by itself."""
 
 
 @runtime_checkable
@@ -202,6 +204,7 @@ def drive_one(job: DriveJob, suite: DriveSuite, out: Path, threads: int | None =
             route=job.route,
             repetition=job.repetition,
             pace=PlanningTiming(suite.period_s, suite.latency_s),
+            pilot=setup.pilot,
             on_frame=lambda: setup.log.write(setup.frame()),
         )
     record = record_of(

@@ -10,6 +10,7 @@ import math
 from dataclasses import dataclass
 
 from foredrive.errors import InputError
+from foredrive.scene import Event
 from foredrive.simulation.drive import Drive
 from foredrive.simulation.scores import Ending
 from foredrive.simulation.threats import Threat
@@ -81,6 +82,11 @@ def threat_score(impact_mps: float | None, reference_mps: float) -> float:
     return AFTER_COLLISION * max(0.0, 1.0 - impact_mps / reference_mps)
 
 
+def first_collision(drive: Drive) -> Event | None:
+    """Return the first collision of the ego vehicle. None without one."""
+    return next((event for event in drive.events if event.kind.startswith("collision_")), None)
+
+
 def judge(
     kind: Threat, drive: Drive, reference_mps: float, left_way_score: float = LEFT_WAY_SCORE
 ) -> SafetyResult:
@@ -89,7 +95,7 @@ def judge(
     A test ends at the first collision. What happens to a drive afterwards, an error of the agent included,
     changes nothing.
     """
-    hit = next((event for event in drive.events if event.kind.startswith("collision_")), None)
+    hit = first_collision(drive)
     impact_mps = None if hit is None else hit.severity
     outcome = OUTCOME_OF[drive.score.ending] if hit is None else Outcome.COLLIDED
     scores = {Outcome.FAILED: None, Outcome.LEFT_WAY: left_way_score}

@@ -1,0 +1,85 @@
+"""`foredrive ncap`."""
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from foredrive.cli.arguments import OptionalPath, check_number, check_out_folder, check_rebuilt
+from foredrive.cli.drive import DrivesProgress, check_driven
+from foredrive.errors import InputError
+from foredrive.lazy import importing
+
+
+def ncap(
+    rebuilt: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="REBUILT")],
+    scenarios: Path,
+    agent: Annotated[str | None, tyro.conf.arg(metavar="RUN|constant-velocity|stop|log|…")] = None,
+    out: OptionalPath = None,
+    runs: int = 10,
+    rules: Literal["paper", "released", "ours"] = "ours",
+    sensors: bool = True,
+    films: int = 6,
+    propose: bool = False,
+) -> None:
+    """Test an agent in safety-critical scenarios in reconstructed logs, after NeuroNCAP.
+
+    Each run puts a vehicle in the way: it stands, comes head-on or crosses. Scenarios in which a vehicle that
+    takes no action does not crash in every run are named and left out. Finished runs are kept and not driven
+    again. docs/safety-tests.md compares the rules.
+
+    Args:
+        rebuilt: Folders of reconstructions. A scenario's scene is the name of a folder or of its log.
+        scenarios: File or folder of scenarios, ours or neuro-ncap's. With --propose: file to write.
+        agent: As for `foredrive drive --in`. Required without --propose.
+        out: Folder of the suite: summary.json, report.html, drives, logs. Required without --propose.
+        runs: Number of runs of each scenario; a later call may ask for more.
+        rules: Rules of the paper, of its released code, or ours.
+        sensors: Render cameras and lidar even if the agent does not need them.
+        films: Number of films in the report: of the runs with the lowest scores.
+        propose: Find feasible scenarios in the logs and write them to the file, instead of testing an agent.
+    """
+    check_out_folder(out)
+    check_number("--runs", runs, low=1)
+    check_number("--films", films, low=0)
+    for folder in rebuilt:
+        check_rebuilt(folder)
+    folders = tuple(str(folder.absolute()) for folder in rebuilt)
+    if propose:
+        _propose(folders, scenarios, rules, runs)
+        return
+    if agent is None or out is None:
+        raise InputError("a test needs --agent and --out; --propose needs neither")
+    with importing():
+        from rich.console import Console
+
+        from foredrive.runs.drive.in_ncap import SafetyTests
+        from foredrive.runs.drive.records import tested_runs
+        from foredrive.runs.drive.suite import DriveSuite, drive_suite
+        from foredrive.simulation.ncap.rules import RULES
+        from foredrive.view.drive_report import write_drive_report
+        from foredrive.view.ncap_tables import safety_table
+        from foredrive.view.table import print_table
+
+    name = str(Path(agent).absolute()) if Path(agent).is_dir() else agent
+    source = SafetyTests(folders, str(scenarios.absolute()), rules, runs)
+    suite = DriveSuite(name, source, sensors, latency_s=RULES[rules].latency_s)
+    with DrivesProgress(len(suite.jobs())) as progress:
+        driven = drive_suite(suite, out, tick=progress.tick)
+    check_driven(driven)
+    table = safety_table(tested_runs(list(driven.drives.values())), source.tested().left_out)
+    print_table(table, Console())
+    print(f"report: {write_drive_report(out, films, table)}")
+
+
+def _propose(folders: tuple[str, ...], file: Path, rules: str, runs: int) -> None:
+    """Write proposed scenarios and print their names."""
+    with importing():
+        from foredrive.runs.drive.in_ncap import propose_scenarios
+
+    tested = propose_scenarios(folders, file, rules, runs)
+    for scenario in tested.passed:
+        print(f"{scenario.label}: {scenario.length_s:g} s from key frame {scenario.start_frame}")
+    for label, why in tested.left_out.items():
+        print(f"left out, {label}: {why}")
+    print(f"{len(tested.passed)} scenarios: {file}")

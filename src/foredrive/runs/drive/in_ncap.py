@@ -1,0 +1,166 @@
+"""Safety tests after NeuroNCAP in reconstructed logs, as a source of drives."""
+
+import contextlib
+import functools
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from foredrive.data.boxes import read_track_ids
+from foredrive.data.logs import Log
+from foredrive.errors import InputError
+from foredrive.rendering.renderer import RebuiltRenderer
+from foredrive.runs.drive.in_rebuilt import agent_in, lanes_of, opened_rebuilt, past_frames_of
+from foredrive.runs.drive.suite import DriveJob, DriveSetup, DriveSuite
+from foredrive.runs.rebuild.rebuilt_run import open_run_log
+from foredrive.simulation.drive_log import drive_log, log_frame
+from foredrive.simulation.ncap.outcome import judge
+from foredrive.simulation.ncap.proposing import propose
+from foredrive.simulation.ncap.rules import RULES, Rules
+from foredrive.simulation.ncap.running import Place, set_up_run
+from foredrive.simulation.ncap.scenario import SafetyScenario
+from foredrive.simulation.ncap.scenario_file import load_scenarios, save_scenarios
+from foredrive.simulation.ncap.self_test import SelfTest, self_test
+
+
+@dataclass(frozen=True)
+class SafetyTests:
+    """A `DriveSource` of safety tests: a number of runs of each scenario that passes the self-test."""
+
+    runs: tuple[str, ...]
+    """Folders of the reconstructions; a scenario's scene is the name of a folder or of its log."""
+    scenarios: str
+    """File or folder of scenarios."""
+    rules: str = "ours"
+    count: int = 10
+    """Number of runs of each scenario."""
+
+    in_turn = True
+    grows = ("count",)
+
+    def noted(self) -> Mapping[str, object]:
+        """Return the fields, and the scenarios as the routes."""
+        return {
+            "runs": list(self.runs),
+            "scenarios": self.scenarios,
+            "rules": self.rules,
+            "count": self.count,
+            "routes": self.scenarios,
+        }
+
+    def jobs(self, agent: str) -> Sequence[DriveJob]:
+        """Return the runs of all scenarios that pass the self-test."""
+        past_frames_of(agent)
+        jobs = [
+            DriveJob(f"{scenario.label}_rep{number}", scenario.label, number)
+            for scenario in self.tested().passed
+            for number in range(self.count)
+        ]
+        if not jobs:
+            raise InputError(f"{self.scenarios}: no scenario passes the self-test: {self.tested().told}")
+        return jobs
+
+    def tested(self) -> SelfTest:
+        """Return the result of the self-test. It is run once in a process."""
+        return _tested(self)
+
+    @contextlib.contextmanager
+    def set_up(self, job: DriveJob, suite: DriveSuite, out: Path) -> Iterator[DriveSetup]:
+        """Set up a run in the reconstructed scene."""
+        rules, tested = _rules(self.rules), self.tested()
+        scenario = next(each for each in tested.passed if each.label == job.route)
+        folder = _folders(self.runs)[scenario.scene]
+        run = set_up_run(
+            _place(folder),
+            scenario,
+            job.repetition,
+            rules,
+            sensors=suite.sensors,
+            past_frames=past_frames_of(suite.agent),
+        )
+        simulator, start = run.simulator, run.scenario
+        rig = simulator.renderer.rig if suite.sensors else None
+        route_xyz = simulator.drive.route_from(start.start_s)
+        reference = tested.reference_mps[scenario.label][job.repetition]
+        with drive_log(out, job.name, route_xyz, rig) as log:
+            yield DriveSetup(
+                simulator,
+                start,
+                agent_in(suite.agent, simulator),
+                route_xyz,
+                simulator.way_m(start),
+                log,
+                lambda: log_frame(simulator.state.frames[-1], simulator.state.ego, rig),
+                lanes_known=lanes_of(Path(folder)) is not None,
+                judge=lambda driven: judge(scenario.kind, driven, reference, rules.left_way_score),
+                pilot=run.pilot,
+            )
+
+
+def propose_scenarios(runs: Sequence[str], file: Path, rules: str, count: int) -> SelfTest:
+    """Find the feasible scenarios of reconstructions; write those that pass the self-test to a file.
+
+    Returns:
+        The result of the self-test.
+
+    Raises:
+        InputError: the file exists, or no scenario is feasible.
+    """
+    if file.exists():
+        raise InputError(f"{file}: exists already; proposed scenarios are written to a new file")
+    places = {Path(run).name: run for run in runs}
+    found = [each for scene, run in places.items() for each in propose(_place(run), scene)]
+    if not found:
+        raise InputError("no scenario is feasible in these logs: they are too short, too slow or too full")
+    tested = self_test(found, lambda scenario: _place(places[scenario.scene]), count, _rules(rules))
+    if not tested.passed:
+        raise InputError(f"no scenario passes the self-test: {tested.told}")
+    save_scenarios(tested.passed, file)
+    return tested
+
+
+def _rules(name: str) -> Rules:
+    if name not in RULES:
+        raise InputError(f"there are no rules {name!r}; there are: {', '.join(RULES)}")
+    return RULES[name]
+
+
+def _folders(runs: Sequence[str]) -> dict[str, str]:
+    """Return the folder of each run by its own name and by the name of its log."""
+    folders: dict[str, str] = {}
+    for run in runs:
+        names = {Path(run).name}
+        with contextlib.suppress(InputError):
+            names.add(open_run_log(Path(run))[1].folder.name)
+        folders |= dict.fromkeys(names, run)
+    return folders
+
+
+@functools.lru_cache(maxsize=2)
+def _tested(source: SafetyTests) -> SelfTest:
+    rules, folders = _rules(source.rules), _folders(source.runs)
+
+    def place_of(scenario: SafetyScenario) -> Place:
+        if scenario.scene not in folders:
+            raise InputError(
+                f"its scene {scenario.scene!r} is none of the reconstructions ({', '.join(folders)})"
+            )
+        return _place(folders[scenario.scene])
+
+    return self_test(load_scenarios(Path(source.scenarios)), place_of, source.count, rules)
+
+
+@functools.lru_cache(maxsize=1)  # consecutive runs share one scene
+def _place(folder: str) -> Place:
+    opened = opened_rebuilt(folder)
+    ids = {str(track_id): track_id for track_id in opened.scene.graph.tracks.track_id.tolist()}
+    with contextlib.suppress(InputError):  # without its log, actors are known by their numbers alone
+        of_log = read_track_ids(Log(open_run_log(Path(folder))[1]))
+        ids |= {token: track_id for token, track_id in of_log.items() if track_id in set(ids.values())}
+    return Place(
+        opened.scene.graph,
+        opened.vehicle,
+        lambda graph: RebuiltRenderer(opened.scene, graph, opened.vehicle),
+        ids,
+        lanes_of(Path(folder)),
+    )

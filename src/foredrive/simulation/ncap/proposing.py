@@ -1,0 +1,170 @@
+"""Scenarios that are feasible in a rebuilt log: where and when each kind of test makes sense.
+
+Neuro-ncap's scenarios were placed by hand. Here they are found. A place is where the ego vehicle would be 4 s
+after it begins to drive itself, at constant speed on the logged path. A scenario is feasible if
+
+- the log moves at the start, and the place lies on its path, so that it was seen from near;
+- the actor's way is free of the log's actors while the test lasts, and so is the ego vehicle's up to there;
+- the actor is on a lane around the time of the impact, if the log has a map;
+- no actor hides the target from the ego vehicle 2 s before the impact;
+- the ego vehicle could stop in front of the place with comfortable braking, so that the test can be passed;
+- the copied car was seen, and from near.
+
+What is proposed still has to pass the self-test.
+"""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import shapely
+import torch
+from jaxtyping import Float64
+
+from foredrive.errors import InputError
+from foredrive.geometry.polylines import arc_lengths, points_at
+from foredrive.rendering.tracks import states_at
+from foredrive.scene import Category
+from foredrive.simulation.dynamics import EGO
+from foredrive.simulation.logged_drive import LoggedDrive
+from foredrive.simulation.ncap.placing import way_points
+from foredrive.simulation.ncap.running import Place
+from foredrive.simulation.ncap.scenario import Jitter, Polyline, Rectilinear, SafetyScenario, ScenarioActor
+from foredrive.simulation.observation import FRAME_DT_S
+from foredrive.simulation.replayed import users_at
+from foredrive.simulation.threats import Threat
+
+PRIMING_FRAMES, EVERY_FRAMES = 2, 2
+"""Priming of each test, and distance between two starts that are tried, key frames."""
+IMPACT_S, AFTERWARDS_S, LENGTH_S = 4.0, 1.0, 8.0
+"""Time from the end of the priming to the impact without action, shortest time left in the log afterwards,
+and longest length of a test, s."""
+HIDDEN_BEFORE_S, ON_LANE_S = 2.0, 1.5
+"""Time before the impact from which the actor must be in sight, and time around it on a lane, s."""
+MIN_MPS, BRAKING_MPS2, REACTION_S = 3.0, 4.0, 1.0
+"""Slowest start, m/s, braking that passes a test, m/s², and time before it begins, s."""
+ACTOR_MPS = 5.0
+SEEN_WITHIN_M, BODY_M = 20.0, 2.7
+"""A copied car was seen from within this distance, m. Nothing is nearer to its middle than `BODY_M` on a free
+way, half a car's length and some margin."""
+MODELS = 3
+"""Number of cars to choose from."""
+
+
+def propose(place: Place, scene: str) -> list[SafetyScenario]:
+    """Return the feasible scenarios of a rebuilt log, in the order of their starts.
+
+    Args:
+        scene: name of the reconstruction in the scenarios.
+
+    Raises:
+        InputError: no car of the log was seen from near.
+    """
+    drive = LoggedDrive(place.vehicle, torch.eye(4))
+    models, found = _models(place, drive), list[SafetyScenario]()
+    first = math.ceil(drive.first_s / FRAME_DT_S) + 1
+    for frame in range(first, int(drive.end_s / FRAME_DT_S), EVERY_FRAMES):
+        begin_s = FRAME_DT_S * (frame + PRIMING_FRAMES)
+        length_s = min(LENGTH_S, FRAME_DT_S * math.floor((drive.end_s - FRAME_DT_S * frame) / FRAME_DT_S))
+        if begin_s + IMPACT_S + AFTERWARDS_S > FRAME_DT_S * frame + length_s:
+            break
+        for kind in Threat:
+            actor = _actor(kind, drive, begin_s, models)
+            if actor is not None and _feasible(place, drive, actor, begin_s, length_s):
+                name = f"{scene}_{FRAME_DT_S * frame:g}s"
+                found.append(SafetyScenario(name, kind, scene, frame, length_s, (actor,), PRIMING_FRAMES))
+    return found
+
+
+def _models(place: Place, drive: LoggedDrive) -> tuple[str, ...]:
+    """Return the names of the cars that were seen best, from near."""
+    tracks, token = place.graph.tracks, {number: name for name, number in place.track_ids.items()}
+    rows = []
+    for t_s in np.arange(drive.first_s, drive.end_s, FRAME_DT_S).tolist():
+        users = users_at(tracks, place.vehicle.T_world_scene, t_s)
+        away_m = np.hypot(*(users.foot_m[:, :2] - drive.pose_at(t_s)[:2, 3]).T)
+        near = (users.track_id >= 0) & (users.category == int(Category.CAR)) & (away_m < SEEN_WITHIN_M)
+        rows += np.flatnonzero(near).tolist()
+    if not rows:
+        raise InputError(f"no car of the log was seen from within {SEEN_WITHIN_M:g} m")
+    best = sorted(set(rows), key=lambda row: -place.graph.content.evidence(row))[:MODELS]
+    return tuple(token[int(tracks.track_id[row])] for row in best)
+
+
+def _actor(kind: Threat, drive: LoggedDrive, begin_s: float, models: Sequence[str]) -> ScenarioActor | None:
+    """Return the actor of a test. None if the log is too slow, or its path too short for it."""
+    speed_mps = drive.state_at(begin_s).speed_mps
+    path = np.stack([drive.pose_at(t_s)[:3, 3] for t_s in np.arange(begin_s, drive.end_s, 0.1).tolist()])
+    arc_m = arc_lengths(path[:, :2])
+    bumper_m = EGO.axle_to_centre_m + 0.5 * EGO.length_m
+    at_m = speed_mps * IMPACT_S + bumper_m
+    if speed_mps < MIN_MPS or at_m + 4.0 > arc_m[-1]:
+        return None
+    before, spot, after = points_at(path, arc_m, np.array([at_m - 0.5, at_m, at_m + 0.5]))
+    yaw = float(math.atan2(after[1] - before[1], after[0] - before[0]))
+    x, y, z = spot.tolist()
+    impact_s, names = begin_s + IMPACT_S, tuple(models)
+    shift = Jitter(yaw, longitudinal_m=2.0, lateral_m=0.5)
+    if kind is Threat.STATIONARY:
+        centre = (x + 2.2 * math.cos(yaw), y + 2.2 * math.sin(yaw), z)
+        standing = Jitter(yaw, longitudinal_m=2.0, lateral_m=0.5, yaw_rad=0.3)
+        return ScenarioActor(names, Rectilinear(centre, impact_s, yaw), yaw, jitter=standing)
+    if kind is Threat.SIDE:
+        way = Rectilinear((x, y, z), impact_s, yaw + 0.5 * math.pi, ACTOR_MPS)
+        return ScenarioActor(names, way, jitter=Jitter(yaw, longitudinal_m=0.5, lateral_m=0.5))
+    return _oncoming(path, arc_m, at_m, impact_s, names, shift)
+
+
+def _oncoming(
+    path: Float64[np.ndarray, "N 3"],
+    arc_m: Float64[np.ndarray, "N"],
+    at_m: float,
+    impact_s: float,
+    names: tuple[str, ...],
+    shift: Jitter,
+) -> ScenarioActor:
+    """Return the actor that comes along the logged path, as far as the log knows it, and straight before."""
+    ahead_m = np.arange(0.0, min(float(arc_m[-1]) - at_m, 30.0), 2.0)
+    points = points_at(path, arc_m, at_m + ahead_m[::-1])
+    times = impact_s - ahead_m[::-1] / ACTOR_MPS
+    way = Polyline(tuple(times.tolist()), tuple((x, y, z) for x, y, z in points.tolist()))
+    return ScenarioActor(names, way, jitter=shift)
+
+
+def _feasible(
+    place: Place, drive: LoggedDrive, actor: ScenarioActor, begin_s: float, length_s: float
+) -> bool:
+    """Return whether the ways of actor and ego vehicle are free, and the actor is seen in time."""
+    way = actor.way if isinstance(actor.way, Polyline) else actor.way.polyline()
+    speed_mps = drive.state_at(begin_s).speed_mps
+    if speed_mps * REACTION_S + speed_mps**2 / (2 * BRAKING_MPS2) > speed_mps * IMPACT_S:
+        return False
+    end_s = begin_s + length_s - FRAME_DT_S * PRIMING_FRAMES
+    for t_s in np.arange(begin_s, end_s, FRAME_DT_S).tolist():
+        others = _others(place, t_s)
+        foot = way_points(way, np.array([t_s]))[0, :2]
+        if shapely.Point(foot).buffer(BODY_M).intersects(others):
+            return False
+        near = abs(t_s - begin_s - IMPACT_S) <= ON_LANE_S
+        if near and place.lanes is not None and place.lanes.outside(foot):
+            return False
+        if t_s <= begin_s + IMPACT_S:
+            ego = shapely.Point(drive.pose_at(t_s)[:2, 3]).buffer(0.5 * EGO.width_m)
+            sight = shapely.LineString([drive.pose_at(t_s)[:2, 3], foot])
+            late = t_s >= begin_s + IMPACT_S - HIDDEN_BEFORE_S
+            if ego.intersects(others) or (late and sight.intersects(others)):
+                return False
+    return True
+
+
+def _others(place: Place, t_s: float) -> shapely.Geometry:
+    """Return the boxes of the log's actors at a time, in the plane of the world."""
+    states, tracks = states_at(place.graph.tracks, t_s), place.graph.tracks
+    users = users_at(tracks, place.vehicle.T_world_scene, t_s)
+    boxes = []
+    for row in states.present.nonzero()[:, 0].tolist():
+        half_l, half_w = users.half_lw[row]
+        corners = np.array([[half_l, half_w], [half_l, -half_w], [-half_l, -half_w], [-half_l, half_w]])
+        cos, sin = math.cos(users.yaw[row]), math.sin(users.yaw[row])
+        boxes.append(shapely.Polygon(corners @ [[cos, sin], [-sin, cos]] + users.foot_m[row, :2]))
+    return shapely.union_all(boxes)

@@ -1,0 +1,66 @@
+"""Tables of safety tests: each scenario, each kind, and the mean of the kinds."""
+
+from collections.abc import Mapping, Sequence
+
+from foredrive.simulation.ncap.aggregation import Interval, SafetyFigures, TestedRun, aggregate
+from foredrive.view.table import Cell, Column, Row, Section, Table, Value, number, words
+
+COLUMNS = (
+    Column(align="left"),
+    Column("runs"),
+    Column("score"),
+    Column("collisions, %"),
+    Column("progress", digits=2),
+    Column("score by progress", digits=2),
+    Column("impact / reference", digits=2),
+    Column("time to collision, s", digits=1),
+    Column("comfort, %", digits=0),
+    Column("stopped short"),
+    Column("left way"),
+    Column("failed"),
+)
+
+
+def safety_table(runs: Sequence[TestedRun], left_out: Mapping[str, str]) -> Table:
+    """Return the figures of a suite with their 95 % intervals.
+
+    Args:
+        left_out: reason for each scenario that the self-test left out.
+    """
+    scenarios, kinds, overall = aggregate(runs)
+    notes = [
+        "score: 0 to 5; in brackets 95 % intervals over runs; score by progress: mean of their product",
+        *(f"left out, {label}: {why}" for label, why in left_out.items()),
+    ]
+    sections = [
+        Section([_row(name, figures) for name, figures in scenarios.items()]),
+        Section([_row(words(kind), figures) for kind, figures in kinds.items()]),
+        Section([_row(f"mean of {len(kinds)} kinds", overall, is_strong=True)]),
+    ]
+    return Table(COLUMNS, sections, notes=notes)
+
+
+def _row(name: str, of: SafetyFigures, is_strong: bool = False) -> Row:
+    comfort = None if of.comfortable_share is None else 100 * of.comfortable_share
+    cells: list[Value | Cell] = [
+        name,
+        of.runs,
+        _interval(of.score, 2),
+        _interval(of.collision_rate, 0, 100.0),
+        of.progress,
+        of.score_progress,
+        of.relative_impact_speed,
+        of.time_to_collision_s,
+        comfort,
+        of.stopped_short,
+        of.left_way,
+        Cell(of.failed, "bad" if of.failed else ""),
+    ]
+    return Row(cells, is_strong)
+
+
+def _interval(of: Interval | None, digits: int, factor: float = 1.0) -> str:
+    if of is None:
+        return number(None)
+    mean, low, high = (number(factor * value, digits) for value in (of.mean, of.low, of.high))
+    return f"{mean} [{low}, {high}]"

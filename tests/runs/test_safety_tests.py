@@ -1,0 +1,92 @@
+"""The verb for safety tests, in a small log that was rebuilt: scenarios, runs that are kept, report."""
+
+from pathlib import Path
+
+import pytest
+import synthetic_log as world
+from small_rebuild import SMALLEST
+
+from foredrive.cli.main import main
+from foredrive.data import find_logs
+from foredrive.evaluation.summary import read_summary
+from foredrive.runs.drive.in_ncap import SafetyTests
+from foredrive.runs.drive.in_rebuilt import opened_rebuilt
+from foredrive.runs.drive.suite import DriveSuite, drive_suite
+from foredrive.runs.rebuild.reconstruct import reconstruct
+from foredrive.simulation.ncap.outcome import Outcome
+from foredrive.simulation.ncap.scenario import Jitter, Polyline, SafetyScenario, ScenarioActor
+from foredrive.simulation.ncap.scenario_file import save_scenarios
+from foredrive.simulation.threats import Threat
+
+
+@pytest.fixture(scope="module")
+def rebuilt(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("tested_in")
+    (log,) = find_logs(world.write(folder, frames=67))
+    reconstruct(SMALLEST, log, folder / "run")
+    return folder / "run"
+
+
+@pytest.fixture(scope="module")
+def scenarios(rebuilt: Path) -> Path:
+    """A car stands on the logged path 5 s on, and in a second scenario far beside it."""
+    vehicle = opened_rebuilt(str(rebuilt)).vehicle
+    spot = vehicle.T_world_scene @ vehicle.at(5.0).T_scene_ego.double()
+    x, y, z = spot[:3, 3].tolist()
+    car = str(opened_rebuilt(str(rebuilt)).scene.graph.tracks.track_id.tolist()[0])
+    found = []
+    for name, aside_m in (("on", 0.0), ("beside", 30.0)):
+        point = (x - aside_m * float(spot[1, 0]), y + aside_m * float(spot[0, 0]), z)
+        actor = ScenarioActor((car,), Polyline((0.0, 9.0), (point, point)), jitter=Jitter(lateral_m=0.3))
+        found.append(SafetyScenario(name, Threat.STATIONARY, "run", 1, 6.0, (actor,), 1))
+    save_scenarios(found, rebuilt.parent / "scenarios.yaml")
+    return rebuilt.parent / "scenarios.yaml"
+
+
+def test_the_verb_tests_keeps_and_reports(
+    rebuilt: Path, scenarios: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = ["ncap", str(rebuilt), "--scenarios", str(scenarios), "--out", str(tmp_path / "out")]
+    command += ["--agent", "stop", "--rules", "paper", "--no-sensors", "--films", "1"]
+    assert main([*command, "--runs", "1"]) == 0
+    told = capsys.readouterr().out
+    assert "stationary-on" in told
+    assert "left out, stationary-beside: run 0 passes without any action" in " ".join(told.split())
+    first = (tmp_path / "out" / "drives" / "stationary-on_rep0.json").stat().st_mtime_ns
+    assert main([*command, "--runs", "2"]) == 0
+    assert "1 of 2 drives had been driven before" in capsys.readouterr().out
+    assert (tmp_path / "out" / "drives" / "stationary-on_rep0.json").stat().st_mtime_ns == first
+    summary = read_summary(tmp_path / "out" / "summary.json")
+    assert (summary["threats.all.runs"], summary["threats.all.failed"]) == (2, 0)
+    assert summary["threats.stationary.score"] == 5.0
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert "Safety tests" in page
+    assert len(list((tmp_path / "out" / "videos").glob("*.webp"))) == 1
+    other = [*command, "--runs", "1"]
+    other[other.index("paper")] = "ours"
+    assert main(other) == 2
+    assert "another suite" in capsys.readouterr().err
+
+
+def test_log_replay_crashes_and_wrong_input_is_one_line(
+    rebuilt: Path, scenarios: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    source = SafetyTests((str(rebuilt),), str(scenarios), "ours", 1)
+    (drive,) = drive_suite(DriveSuite("log", source, sensors=False), tmp_path / "log").drives.values()
+    assert drive.threat is not None
+    assert drive.threat.outcome is Outcome.COLLIDED
+    assert drive.threat.score == pytest.approx(0.0, abs=0.3)
+    out = ["--agent", "stop", "--out", str(tmp_path / "none")]
+    assert main(["ncap", str(rebuilt), "--scenarios", str(tmp_path / "no.yaml"), *out]) == 2
+    assert "no.yaml: cannot be read" in capsys.readouterr().err
+    scenarios.with_name("late.yaml").write_text(
+        scenarios.read_text().replace("length_s: 6.0", "length_s: 60.0")
+    )
+    assert main(["ncap", str(rebuilt), "--scenarios", str(scenarios.with_name("late.yaml")), *out]) == 2
+    error = capsys.readouterr().err
+    assert "no scenario passes the self-test" in error
+    assert "the log ends at 6.6 s" in error
+    assert main(["ncap", str(rebuilt), "--scenarios", str(scenarios), "--propose"]) == 2
+    assert "scenarios.yaml: exists already" in capsys.readouterr().err
+    assert main(["ncap", str(rebuilt), "--scenarios", str(scenarios)]) == 2
+    assert "needs --agent and --out" in capsys.readouterr().err

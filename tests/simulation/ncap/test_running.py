@@ -1,0 +1,212 @@
+"""Runs of safety tests in a straight log of ten seconds, under all rules; nothing is rendered."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from foredrive.errors import InputError
+from foredrive.geometry.se3 import inverse_se3, matrix_from_yaw
+from foredrive.rendering.gaussians import Gaussians
+from foredrive.rendering.gaussians.content import GaussianContent
+from foredrive.rendering.gaussians.scene import GaussianScene
+from foredrive.rendering.renderer import RebuiltRenderer
+from foredrive.rendering.scene_graph import SceneGraph
+from foredrive.rendering.tracks import ActorTracks, states_at
+from foredrive.rendering.vehicle import LoggedVehicle
+from foredrive.scene import CameraRig, Category
+from foredrive.simulation.drive import drive_route
+from foredrive.simulation.ncap.drawing import draw_run
+from foredrive.simulation.ncap.outcome import Outcome, SafetyResult, judge
+from foredrive.simulation.ncap.proposing import propose
+from foredrive.simulation.ncap.rules import OURS, PAPER, RELEASED, RULES, Rules
+from foredrive.simulation.ncap.running import Place, drive_without_action, reference_mps, set_up_run
+from foredrive.simulation.ncap.scenario import Jitter, Rectilinear, SafetyScenario, ScenarioActor
+from foredrive.simulation.ncap.self_test import self_test
+from foredrive.simulation.simple_agents import StraightAgent
+from foredrive.simulation.threats import Threat
+
+SPEED_MPS, END_S, YAW = 8.0, 10.0, 0.6
+ORIGIN = np.array([300.0, -40.0, 5.0])
+AHEAD, LEFT = np.array([math.cos(YAW), math.sin(YAW), 0.0]), np.array([-math.sin(YAW), math.cos(YAW), 0.0])
+
+
+def at(ahead_m: float, left_m: float = 0.0) -> tuple[float, float, float]:
+    x, y, z = (ORIGIN + ahead_m * AHEAD + left_m * LEFT).tolist()
+    return x, y, z
+
+
+def place(category: Category = Category.CAR, parked_m: tuple[float, float] = (-50.0, 3.0)) -> Place:
+    """8 m/s straight on in the direction `YAW`, with one car parked that far ahead and left of the start."""
+    t_s = torch.arange(0.0, END_S + 1e-6, 0.1)
+    zero = torch.zeros_like(t_s)
+    T_world_scene = matrix_from_yaw(torch.tensor(YAW), torch.from_numpy(ORIGIN).float()).double()
+    parked = matrix_from_yaw(zero, torch.stack([zero + parked_m[0], zero + parked_m[1], zero + 0.8], dim=-1))
+    tracks = ActorTracks(
+        torch.tensor([4]),
+        torch.tensor([int(category)]),
+        torch.tensor([[4.0, 1.8, 1.6]]),
+        t_s,
+        parked[None],
+        torch.ones(1, len(t_s), dtype=torch.bool),
+    )
+    rig = CameraRig(torch.zeros(0, 3, 3), torch.zeros(0, 4, 4), torch.zeros(0, 5), torch.zeros(0), (), (4, 4))
+    poses = matrix_from_yaw(zero, torch.stack([SPEED_MPS * t_s, zero, zero], dim=-1))
+    vehicle = LoggedVehicle(t_s, poses, T_world_scene, rig, None, None, math.inf)
+    one = Gaussians(
+        torch.zeros(1, 3), torch.tensor([[1.0, 0, 0, 0]]), torch.zeros(1, 3), torch.zeros(1), torch.ones(1, 5)
+    )
+    graph = SceneGraph(tracks, GaussianContent(one, torch.zeros(1, dtype=torch.int64)))
+    return Place(
+        graph,
+        vehicle,
+        lambda changed: RebuiltRenderer(GaussianScene(graph, cameras=1), changed, vehicle),
+        {"0101": 4},
+    )
+
+
+def scenario(way: Rectilinear, kind: Threat, jitter: Jitter | None = None) -> SafetyScenario:
+    """From 1 s to 9 s of the log, of which the vehicle drives the last 7 s itself."""
+    actor = ScenarioActor(("0101",), way, yaw_rad=YAW + 0.3, jitter=jitter or Jitter())
+    return SafetyScenario("0001", kind, "log", 2, 8.0, (actor,), priming_frames=2)
+
+
+STANDING = scenario(Rectilinear(at(50.0), 0.0, YAW), Threat.STATIONARY)
+FRONTAL = scenario(Rectilinear(at(55.0), 5.0, YAW + math.pi, 4.0), Threat.FRONTAL)
+SIDE = scenario(Rectilinear(at(45.0), 5.0, YAW + 0.5 * math.pi, 5.0), Threat.SIDE)
+
+
+@pytest.mark.parametrize("rules", list(RULES.values()), ids=list(RULES))
+@pytest.mark.parametrize(
+    ("test", "impact_mps"),
+    [(STANDING, 8.0), (FRONTAL, 12.0), (SIDE, math.hypot(8.0, 5.0))],
+    ids=lambda value: value.label if isinstance(value, SafetyScenario) else "",
+)
+def test_who_takes_no_action_hits_at_the_speed_of_both(
+    test: SafetyScenario, impact_mps: float, rules: Rules
+) -> None:
+    here = place()
+    hit_mps = drive_without_action(here, test, 0, rules)
+    assert hit_mps == pytest.approx(impact_mps, rel=0.03)
+    drive = set_up_run(here, test, 0, rules, sensors=False, past_frames=1).simulator.drive
+    assert reference_mps(rules, drive, draw_run(test, 0), hit_mps) == pytest.approx(impact_mps, rel=0.03)
+
+
+def judged(test: SafetyScenario, rules: Rules, speed_mps: float) -> SafetyResult:
+    run = set_up_run(place(), test, 0, rules, sensors=False, past_frames=1)
+    drive = drive_route(
+        run.simulator, run.scenario, StraightAgent(speed_mps), route=test.label, pilot=run.pilot
+    )
+    assert drive.error == ""
+    return judge(test.kind, drive, SPEED_MPS, rules.left_way_score)
+
+
+@pytest.mark.parametrize("rules", list(RULES.values()), ids=list(RULES))
+def test_who_brakes_at_once_is_not_hit_but_makes_no_progress(rules: Rules) -> None:
+    """The run begins at 2 s, 16 m on, and the log drives 56 m in the 7 s."""
+    result = judged(STANDING, rules, 0.0)
+    assert (result.outcome, result.score) == (Outcome.STOPPED_SHORT, 5.0)
+    assert 0.05 < result.progress < 0.45
+
+
+def test_the_actor_stands_where_and_as_it_was_drawn() -> None:
+    test = dataclasses.replace(STANDING, actors=(dataclasses.replace(STANDING.actors[0], flipped=("0101",)),))
+    here = place()
+    run = set_up_run(here, test, 0, PAPER, sensors=False, past_frames=1)
+    states = states_at(run.simulator._tracks, 4.05)
+    (T_scene_actor,) = states.T_scene_actor  # the log's own car is gone
+    T = here.vehicle.T_world_scene @ T_scene_actor.double()
+    assert np.allclose(T[:3, 3], np.add(at(50.0), [0.0, 0.0, 0.8]), atol=1e-4)
+    yaw = math.atan2(T[1, 0], T[0, 0])
+    assert math.remainder(yaw - (YAW + 0.3 + math.pi), 2 * math.pi) == pytest.approx(0.0, abs=1e-5)
+    ours = set_up_run(here, test, 0, OURS, sensors=False, past_frames=1)
+    assert ours.simulator._tracks.track_id.tolist() == [4, 5]
+
+
+def test_a_moving_actor_heads_where_it_moves() -> None:
+    here = place()
+    run = set_up_run(here, SIDE, 0, PAPER, sensors=False, past_frames=1)
+    states = states_at(run.simulator._tracks, 6.0)
+    T = here.vehicle.T_world_scene @ states.T_scene_actor[0].double()
+    assert np.allclose(T[:2, 3], at(45.0, 5.0)[:2], atol=1e-3)
+    assert math.atan2(T[1, 0], T[0, 0]) == pytest.approx(YAW + 0.5 * math.pi, abs=1e-4)
+    inverse = inverse_se3(here.vehicle.T_world_scene)
+    velocity = inverse[:3, :3].T @ states.velocity_mps[0].double()
+    assert np.allclose(velocity[:2], 5.0 * LEFT[:2], atol=1e-3)
+
+
+def test_pedestrians_count_under_our_rules_alone() -> None:
+    here = place(Category.PEDESTRIAN)
+    assert drive_without_action(here, STANDING, 0, OURS) == pytest.approx(8.0, rel=0.03)
+    assert drive_without_action(here, STANDING, 0, RELEASED) is None
+
+
+def test_the_end_of_the_log_is_the_reference_of_the_released_code() -> None:
+    """The log brakes from 8 to 2 m/s in its last second; 4 s after the start it drives 8 m/s."""
+    here = place()
+    t_s, poses = here.vehicle.t_s, here.vehicle.T_scene_ego.clone()
+    late = (t_s - 9.0).clamp(min=0.0)
+    poses[:, 0, 3] -= 6.0 * late
+    vehicle = dataclasses.replace(here.vehicle, T_scene_ego=poses)
+    slowed = dataclasses.replace(here, vehicle=vehicle)
+    drive = set_up_run(slowed, STANDING, 0, PAPER, sensors=False, past_frames=1).simulator.drive
+    drawn = draw_run(STANDING, 0)
+    assert reference_mps(PAPER, drive, drawn, 1.0) == pytest.approx(8.0, abs=0.05)
+    assert reference_mps(RELEASED, drive, drawn, 1.0) == pytest.approx(2.0, abs=0.05)
+    assert reference_mps(OURS, drive, drawn, 7.5) == 7.5
+
+
+def test_scenarios_that_nobody_hits_are_named_and_left_out() -> None:
+    aside = dataclasses.replace(
+        scenario(Rectilinear(at(50.0, 12.0), 0.0, YAW), Threat.STATIONARY), name="aside"
+    )
+    long = dataclasses.replace(STANDING, name="long", length_s=20.0)
+    nobody = dataclasses.replace(
+        STANDING, name="nobody", actors=(dataclasses.replace(STANDING.actors[0], names=("0102",)),)
+    )
+    elsewhere = dataclasses.replace(STANDING, name="elsewhere", scene="0102")
+    here = place()
+
+    def place_of(test: SafetyScenario) -> Place:
+        if test.scene != "log":
+            raise InputError("there is no such scene")
+        return here
+
+    tested = self_test([aside, STANDING, long, nobody, elsewhere], place_of, 2, OURS)
+    assert tested.passed == (STANDING,)
+    assert tested.reference_mps[STANDING.label] == pytest.approx((8.0, 8.0), rel=0.03)
+    assert set(tested.left_out) == {f"stationary-{name}" for name in ("aside", "long", "nobody", "elsewhere")}
+    assert "run 0 passes without any action" in tested.told
+    assert "the log ends at 10.0 s" in tested.told
+    assert "no actor '0102'; some of those that it has: 0101" in tested.told
+
+
+def test_the_run_of_a_number_is_the_same_for_every_agent() -> None:
+    shaken = scenario(
+        Rectilinear(at(50.0), 0.0, YAW), Threat.STATIONARY, Jitter(YAW, longitudinal_m=4.0, lateral_m=0.5)
+    )
+    here = place()
+    runs = [set_up_run(here, shaken, number, OURS, sensors=False, past_frames=1) for number in (3, 3, 4)]
+    poses = [run.simulator._tracks.T_scene_actor[-1, 0] for run in runs]
+    assert torch.equal(poses[0], poses[1])
+    assert not torch.equal(poses[0], poses[2])
+
+
+def test_every_kind_is_proposed_where_the_way_is_free() -> None:
+    here = place(parked_m=(10.0, 8.0))
+    found = propose(here, "log")
+    assert {scenario.kind for scenario in found} == set(Threat)
+    first = found[: len(Threat)]
+    assert all(scenario.start_frame == 1 and scenario.length_s == 8.0 for scenario in first)
+    assert all(actor.names == ("0101",) for scenario in found for actor in scenario.actors)
+    assert max(0.5 * scenario.start_frame + scenario.length_s for scenario in found) <= END_S
+    tested = self_test(first, lambda scenario: here, 1, OURS)
+    assert tested.passed == tuple(first)
+
+
+def test_nothing_is_proposed_where_something_stands_in_the_way() -> None:
+    assert propose(place(parked_m=(45.0, 0.0)), "log") == []
+    with pytest.raises(InputError, match="no car of the log was seen"):
+        propose(place(), "log")
