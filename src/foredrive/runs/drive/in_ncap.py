@@ -10,7 +10,7 @@ from foredrive.data.boxes import read_track_ids
 from foredrive.data.logs import Log
 from foredrive.errors import InputError
 from foredrive.rendering.renderer import RebuiltRenderer
-from foredrive.runs.drive.in_rebuilt import agent_in, lanes_of, opened_rebuilt, past_frames_of
+from foredrive.runs.drive.in_rebuilt import agent_in, lanes_of, opened_rebuilt, past_frames_of, renders_for
 from foredrive.runs.drive.suite import DriveJob, DriveSetup, DriveSuite
 from foredrive.runs.rebuild.rebuilt_run import open_run_log
 from foredrive.simulation.drive_log import drive_log, log_frame
@@ -70,16 +70,17 @@ class SafetyTests:
         rules, tested = _rules(self.rules), self.tested()
         scenario = next(each for each in tested.passed if each.label == job.route)
         folder = _folders(self.runs)[scenario.scene]
+        sensors = renders_for(suite)
         run = set_up_run(
             _place(folder),
             scenario,
             job.repetition,
             rules,
-            sensors=suite.sensors,
+            sensors=sensors,
             past_frames=past_frames_of(suite.agent),
         )
         simulator, start = run.simulator, run.scenario
-        rig = simulator.renderer.rig if suite.sensors else None
+        rig = simulator.renderer.rig if sensors else None
         route_xyz = simulator.drive.route_from(start.start_s)
         reference = tested.reference_mps[scenario.label][job.repetition]
         with drive_log(out, job.name, route_xyz, rig) as log:

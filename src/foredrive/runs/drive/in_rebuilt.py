@@ -86,7 +86,7 @@ class RebuiltRoutes:
         renderer = RebuiltRenderer(opened.scene, graph, opened.vehicle)
         lanes = lanes_of(opened.folder)
         simulator = RebuiltSimulator(renderer, graph.tracks, drive, lanes)
-        sensors = suite.sensors or (suite.agent != REPLAY and inputs_of(suite.agent).lidar)
+        sensors = renders_for(suite)
         agent = agent_in(suite.agent, simulator)
         route_xyz = drive.route_from(start_s)
         rig = renderer.rig if sensors else None
@@ -110,6 +110,11 @@ class RebuiltRoutes:
 def opened_rebuilt(run: str) -> OpenedReconstruction:
     """Open a reconstruction. Drives one after another in one log share it."""
     return open_rebuilt(Path(run))
+
+
+def renders_for(suite: DriveSuite) -> bool:
+    """Return whether cameras and lidar are rendered: if they are asked for, or the agent is a learned one."""
+    return suite.sensors or (suite.agent != REPLAY and inputs_of(suite.agent).lidar)
 
 
 def _edits_of(file: str | None) -> list[Edit]:
