@@ -314,7 +314,7 @@ def test_figures_of_tasks_stand_beside_their_baselines() -> None:
         "motion.uniad.car.min_ade_m": 1.5,
     }
     assert cells_of(task_table(found)) == [
-        ["motion.uniad.car.min ade m", "1.500", "constant velocity", DASH],
-        ["map.uniad.iou lanes", "0.250", "best constant", "0.125"],
+        ["UniAD, minADE of cars, m", "1.500", "constant velocity", DASH],
+        ["UniAD, IoU of lanes", "0.250", "prior of the training logs", "0.125"],
     ]
     assert task_table({}) is None

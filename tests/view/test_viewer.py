@@ -10,17 +10,20 @@ import numpy as np
 import pytest
 import torch
 from miniature import miniature, write_log
+from test_task_pictures import agents
 
 from foredrive.cli.main import main
 from foredrive.data import LogPath
 from foredrive.runs import Run, train_run
 from foredrive.runs.evaluate.display import DisplayPrediction
 from foredrive.scene import Trajectory, VoxelSpec
+from foredrive.scene.agents import MapLines
 from foredrive.view.log_frames import LogFrames
 from foredrive.view.model_panel import pinhole
 from foredrive.view.page import free_port
+from foredrive.view.task_nodes import show_agents, show_lines
 from foredrive.view.viewer import Viewer
-from foredrive.view.volume_nodes import arrows, shown_voxels
+from foredrive.view.volume_nodes import arrows, show_true_classes, shown_voxels
 from foredrive.view.voxel_drawing import pca_colours
 
 SPEC = VoxelSpec((0.0, -1.0, 0.0), 1.0, (1, 2, 3))
@@ -198,3 +201,22 @@ def test_a_port_that_is_taken_is_passed_over() -> None:
     with socket.create_server(("localhost", 0)) as taken:
         port = int(taken.getsockname()[1])
         assert free_port("localhost", port) > port
+
+
+def test_what_heads_find_is_shown_and_cleared(viewer: Viewer) -> None:
+    scene = viewer.server.scene
+    classes = torch.full(SPEC.shape_zyx, 17, dtype=torch.uint8)
+    classes[0, 0, 0] = 4
+    for _ in range(2):  # a second time in place of the first
+        show_agents(scene, agents([0.9, 0.1, 0.5], [4, 5, -1], [0.6, 0.4]))
+        show_lines(scene, MapLines(torch.zeros(2, 3, 2), torch.tensor([0, 2]), torch.tensor([0.9, 0.1])))
+        show_true_classes(scene, classes, "occ3d", SPEC, 0.0)
+    assert node(viewer, "/found boxes/name 1") is not None
+    assert node(viewer, "/found boxes/name 2") is None  # of three agents, two are likely
+    assert node(viewer, "/found map") is not None
+    assert node(viewer, "/true voxels") is not None
+    show_agents(scene, None)
+    show_lines(scene, None)
+    show_true_classes(scene, None, "occ3d", SPEC, 0.0)
+    for name in ("/found boxes", "/found boxes/lines", "/found map", "/true voxels"):
+        assert node(viewer, name) is None

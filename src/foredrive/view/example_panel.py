@@ -179,7 +179,8 @@ def _cameras(shown: ExamplePrediction) -> dict[str, list[Picture]]:
 def _above(shown: ExamplePrediction) -> list[Picture]:
     """Draw occupancy at now from above, beside the volume."""
     spec = shown.example.occupancy.spec
-    across = f"{spec.shape_zyx[2] * spec.voxel_m:.0f} m across"
+    _, rows, columns = spec.shape_zyx
+    across = f"{rows * spec.voxel_m:.0f} m wide and {columns * spec.voxel_m:.0f} m long"
     volume = with_ego(draw_volume_pca(shown.volume), spec)
     return [
         picture(comparison_picture(shown, 0), f"Prediction and labels from above, {across}", "png"),

@@ -4,11 +4,17 @@ import dataclasses
 import functools
 from typing import TYPE_CHECKING
 
+import numpy as np
+from jaxtyping import UInt8
+from torch import Tensor
+
 from foredrive.data import ClipConfig, ClipDataset, LogPath, collate
 from foredrive.data.cameras import pinhole_cameras
 from foredrive.data.logs import Log
+from foredrive.data.semantic_labels import read_semantics
 from foredrive.errors import InputError
 from foredrive.scene import Clip, VoxelSpec
+from foredrive.scene.semantics import Taxonomy
 
 if TYPE_CHECKING:
     from foredrive.runs import Run
@@ -35,9 +41,11 @@ class LogFrames:
 
     predictor: "DisplayPredictor | None"
     """Predicts with the run; None without a run."""
+    taxonomy: Taxonomy | None = None
+    """Classes of the run's semantic voxels; None without such a head."""
 
     def __init__(self, path: LogPath, image_width_px: int, run: "Run | None" = None) -> None:
-        log = Log(path)
+        self._log = log = Log(path)
         camera = next(iter(pinhole_cameras(log).values()), None)
         aspect = 9 / 16 if camera is None else camera.height / camera.width
         self.name, self.run = path.name, run
@@ -60,9 +68,13 @@ class LogFrames:
         if run is not None:
             from foredrive.runs.evaluate.display import DisplayPredictor
             from foredrive.runs.train.run import load_agent  # without a run, models are not imported
+            from foredrive.runs.train.tasks import load_heads
 
-            size = run.recipe.clips
-            self.predictor = DisplayPredictor(load_agent(run), size.future_frames)
+            size, trained = run.recipe.clips, load_heads(run)
+            heads = None if trained is None else trained.heads
+            self.predictor = DisplayPredictor(load_agent(run), size.future_frames, heads)
+            if heads is not None and heads.voxels is not None:
+                self.taxonomy = heads.voxels.taxonomy
             seen = dataclasses.replace(
                 size,
                 future_frames=0,
@@ -74,6 +86,7 @@ class LogFrames:
             index_at = {self._observed.now_us(index): index for index in range(len(self._observed))}
             self._observed_index = [index_at.get(t_us) for t_us in self.now_us]
         self.clip = functools.lru_cache(KEPT)(self._clip)
+        self.true_classes = functools.lru_cache(KEPT)(self._true_classes)
         self.prediction = functools.lru_cache(KEPT)(self._prediction)
 
     def __len__(self) -> int:
@@ -93,6 +106,14 @@ class LogFrames:
     def _clip(self, index: int) -> Clip:
         """Read a frame as a clip of one key frame, without batch dimension."""
         return self._clips[index].clip
+
+    def _true_classes(self, index: int) -> UInt8[Tensor, "Z Y X"] | None:
+        """Read the recorded classes of a frame's voxels, on the grid of the run; None if there are none."""
+        if self.run is None or self.taxonomy is None:
+            return None
+        frame = int(np.searchsorted(self._log.t_us, self.now_us[index]))
+        found = read_semantics(self._log, frame, self.run.recipe.clips.voxels, self.taxonomy, [])
+        return found.index if bool(found.known.any()) else None
 
     def _prediction(self, index: int) -> "DisplayPrediction | None":
         """Predict with the run; None without a run, and at frames without enough past."""

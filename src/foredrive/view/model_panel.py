@@ -2,7 +2,7 @@
 
 import math
 import threading
-from typing import Literal, cast
+from typing import cast
 
 import numpy as np
 import torch
@@ -11,15 +11,25 @@ from jaxtyping import Float
 from viser.transforms import SO3
 
 from foredrive.metrics.occupancy import ABOVE_GROUND_M
+from foredrive.runs.evaluate.display import DisplayPrediction
 from foredrive.scene import CameraRig
 from foredrive.view import palette
 from foredrive.view.image_drawing import to_image
 from foredrive.view.log_frames import LogFrames
 from foredrive.view.scene_nodes import FRUSTUM_M, show_path
-from foredrive.view.volume_nodes import show_flow, show_occupancy, shown_voxels
+from foredrive.view.task_nodes import show_agents, show_lines
+from foredrive.view.volume_nodes import (
+    ColourBy,
+    show_flow,
+    show_occupancy,
+    show_true_classes,
+    shown_voxels,
+)
 
 RENDERED_HEIGHT_PX = 160
 NODES = ("occupancy", "flow", "plan")
+TASK_NODES = ("found boxes", "found map", "true voxels")
+"""Shown where the run has task heads."""
 
 
 class ModelPanel:
@@ -42,8 +52,10 @@ class ModelPanel:
         with gui.add_folder("Model"):
             self._note = gui.add_markdown("")
             self.frame = gui.add_slider("imagined frame", 0, max(steps, 1), 1, 0, disabled=steps == 0)
-            self.boxes = {name: gui.add_checkbox(name, True) for name in NODES}
-            self.colour_by = gui.add_dropdown("coloured by", ("height", "features"))
+            nodes = NODES if self._predictor.heads is None else (*NODES, *TASK_NODES)
+            self.boxes = {name: gui.add_checkbox(name, True) for name in nodes}
+            ways = ("height", "features") if frames.taxonomy is None else ("classes", "height", "features")
+            self.colour_by = gui.add_dropdown("coloured by", ways)
             self.above = gui.add_slider("probability >", 0.05, 0.95, 0.05, 0.5)
             self.min_height_m = gui.add_slider(
                 "height, m >", low_m, high_m, spec.voxel_m, min(above_road, high_m)
@@ -71,14 +83,24 @@ class ModelPanel:
                 if prediction is not None:
                     spec = self.spec
                     shown = shown_voxels(prediction, k, spec, self.above.value, self.min_height_m.value)
-                    colour_by = cast(Literal["height", "features"], self.colour_by.value)
+                    colour_by = cast(ColourBy, self.colour_by.value)
                     show_occupancy(scene, prediction, k, spec, shown, colour_by)
                     show_flow(scene, prediction, k, spec, shown)
                     show_path(scene, "plan", prediction.plan, palette.PLAN)
+                    self._show_tasks(prediction)
                 for name, box in self.boxes.items():
                     node = scene.get_handle_by_name(f"/{name}")
                     if node is not None:
                         node.visible = box.value and prediction is not None
+
+    def _show_tasks(self, prediction: DisplayPrediction) -> None:
+        """Draw what the task heads have found now, and the true voxels beside it."""
+        scene = self._server.scene
+        show_agents(scene, prediction.agents)
+        show_lines(scene, prediction.lines)
+        if self._frames.taxonomy is not None:
+            true = self._frames.true_classes(self._index)
+            show_true_classes(scene, true, self._frames.taxonomy, self.spec, self.min_height_m.value)
 
     def _when(self, k: int) -> str:
         return f"imagined, **{k * self._dt_s:g} s** ahead" if k else "observed **now**"

@@ -150,6 +150,8 @@ def _tiles(summary: Summary) -> list[MetricTile]:
         other = summary.get(f"planning.{REFERENCE}.{metric}")
         note = "" if other is None else f"{words(REFERENCE)}: {number(other, 2)} {unit}"
         add(title, summary.get(f"planning.{metric}"), 2, unit, note)
+    add("Cars found, AP at 2 m within 30 m", summary.get("detection.car_ap_2m_30m"), 3)
+    add("Semantic voxels, RayIoU", summary.get("occupancy.occ3d.rayiou_pct"), 1, "%")
     psnr = next((value for key, value in summary.items() if key.endswith(".psnr_db")), None)
     add("Rendered images, PSNR", psnr, 1, "dB")
     add("Evaluation time", summary.get("wall_s"), 0, "s")

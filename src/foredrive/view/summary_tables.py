@@ -48,21 +48,31 @@ BASELINE_TITLES = {
 }
 """Titles of the baselines by their keys in summary.json."""
 TASK_FIGURES = (
-    ("detection.nuscenes.map", "nothing_detected"),
-    ("detection.nuscenes.nds", "nothing_detected"),
-    ("detection.car_ap_2m_30m", "nothing_detected"),
-    ("tracking.nuscenes.amota", "greedy_association"),
-    ("tracking.nuscenes.ids", "greedy_association"),
-    ("motion.uniad.car.min_ade_m", "constant_velocity"),
-    ("motion.uniad.car.epa", "constant_velocity"),
-    ("motion.uniad.pedestrian.min_ade_m", "constant_velocity"),
-    ("map.maptr.map", "nothing_detected"),
-    ("map.uniad.iou_lanes", PRIOR),
-    ("map.uniad.iou_drivable", PRIOR),
-    ("occupancy.occ3d.miou_pct", PRIOR),
-    ("occupancy.occ3d_unmasked.miou_pct", PRIOR),
+    ("Detection", "nuScenes mAP", "detection.nuscenes.map", "nothing_detected"),
+    ("Detection", "NDS", "detection.nuscenes.nds", "nothing_detected"),
+    ("Detection", "AP of cars, 2 m, within 30 m", "detection.car_ap_2m_30m", "nothing_detected"),
+    ("Tracking", "AMOTA", "tracking.nuscenes.amota", "greedy_association"),
+    ("Tracking", "changed identities", "tracking.nuscenes.ids", "greedy_association"),
+    ("Motion", "UniAD, minADE of cars, m", "motion.uniad.car.min_ade_m", "constant_velocity"),
+    ("Motion", "UniAD, EPA of cars", "motion.uniad.car.epa", "constant_velocity"),
+    ("Motion", "UniAD, minADE of people, m", "motion.uniad.pedestrian.min_ade_m", "constant_velocity"),
+    ("Map", "MapTR mAP", "map.maptr.map", "nothing_detected"),
+    ("Map", "UniAD, IoU of lanes", "map.uniad.iou_lanes", PRIOR),
+    ("Map", "UniAD, IoU of the drivable area", "map.uniad.iou_drivable", PRIOR),
+    ("Voxels", "mIoU, camera mask, %", "occupancy.occ3d.miou_pct", PRIOR),
+    ("Voxels", "mIoU, lidar mask, %", "occupancy.occ3d_lidar.miou_pct", PRIOR),
+    ("Voxels", "mIoU, all voxels, %", "occupancy.occ3d_unmasked.miou_pct", PRIOR),
+    ("Voxels", "RayIoU, %", "occupancy.occ3d.rayiou_pct", PRIOR),
+    ("Voxels", "RayIoU at 1 m, %", "occupancy.occ3d.rayiou_1m_pct", PRIOR),
+    ("Voxels", "RayIoU at 2 m, %", "occupancy.occ3d.rayiou_2m_pct", PRIOR),
+    ("Voxels", "RayIoU at 4 m, %", "occupancy.occ3d.rayiou_4m_pct", PRIOR),
+    ("Voxels", "OpenOcc's OccScore", "occupancy.openocc.occ_score", PRIOR),
+    ("Instances", "UniAD, IoU near, %", "occupancy.uniad.iou_near_pct", "constant_velocity"),
+    ("Instances", "UniAD, IoU far, %", "occupancy.uniad.iou_far_pct", "constant_velocity"),
+    ("Instances", "UniAD, VPQ near, %", "occupancy.uniad.vpq_near_pct", "constant_velocity"),
+    ("Instances", "UniAD, VPQ far, %", "occupancy.uniad.vpq_far_pct", "constant_velocity"),
 )
-"""Main figures of the task heads, each with its baseline."""
+"""Main figures of the task heads: task, title, key, and the baseline beside it."""
 _BASELINE = re.compile(r"occupancy\.iou_\w+\.(\w+)")
 _PLANNING = re.compile(rf"planning\.(?:(\w+)\.)?({'|'.join(PROTOCOLS)})\.\w+")
 _OCCUPANCY = re.compile(r"occupancy\.iou_(\w+)")
@@ -204,13 +214,21 @@ def image_table(summary: Summary) -> Table | None:
 
 def task_table(summary: Summary) -> Table | None:
     """Compare the main figures of detection, motion, map and semantic occupancy with their baselines."""
-    rows = [
-        (words(key), summary.get(key), words(baseline), summary.get(f"{key}.{baseline}"))
-        for key, baseline in TASK_FIGURES
-        if key in summary or f"{key}.{baseline}" in summary
-    ]
-    columns = (Column("figure", align="left"), Column(""), Column("baseline", align="left"), Column(""))
-    return simple_table(columns, rows, "Tasks at now") if rows else None
+    sections = []
+    for task in dict.fromkeys(task for task, *_ in TASK_FIGURES):
+        rows = [
+            Row((title, summary.get(key), _baseline(name), summary.get(f"{key}.{name}")))
+            for of, title, key, name in TASK_FIGURES
+            if of == task and (key in summary or f"{key}.{name}" in summary)
+        ]
+        sections += [Section(rows, task)] if rows else []
+    left = Column(align="left")
+    columns = [left, Column("this model"), Column("baseline", align="left"), Column("its figure")]
+    return Table(columns, sections, "Tasks at now") if sections else None
+
+
+def _baseline(name: str) -> str:
+    return "prior of the training logs" if name == PRIOR else words(name)
 
 
 def full_table(summary: Summary) -> Table:

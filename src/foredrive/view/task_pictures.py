@@ -18,6 +18,7 @@ from PIL import Image
 from torch import Tensor
 
 from foredrive.evaluation.predictor import Prediction
+from foredrive.metrics.maps.lines import CLASSES
 from foredrive.runs import ExamplePrediction
 from foredrive.scene import Boxes, Category, Clip, VoxelSpec
 from foredrive.scene.agents import Agents
@@ -31,8 +32,8 @@ from foredrive.view.image_drawing import Camera, draw_boxes_on_image, resize
 
 MIN_SCORE = 0.3
 """Boxes and lines with a lower score are not drawn."""
-MIN_PROBABILITY = 0.1
-"""Futures with a lower probability are not drawn."""
+MIN_PROBABILITY = 0.25
+"""Of an agent's futures, the likeliest is drawn, and others with a probability of at least this."""
 STILL_M = 1.0
 """Futures that end nearer to their box are not drawn."""
 FIGURE_IN, DPI = (5.6, 6.3), 110
@@ -76,7 +77,7 @@ def true_scene(shown: ExamplePrediction) -> SeenScene:
     lines = None
     if truth is not None and truth.elements is not None and bool(truth.elements.known):
         each = zip(truth.elements.kind.tolist(), truth.elements.vertices, truth.elements.valid, strict=True)
-        lines = [(ElementKind(kind), line[valid].numpy()) for kind, line, valid in each if kind >= 0]
+        lines = [(ElementKind(kind), line[valid].numpy()) for kind, line, valid in each if kind in CLASSES]
     semantics = None if truth is None else truth.semantics
     voxels = None if semantics is None or not bool(semantics.known.any()) else semantics.index.numpy()
     return SeenScene(agents, lines, voxels)
@@ -114,7 +115,8 @@ def found_agents(agents: Agents) -> SeenAgents:
     if agents.future_xy is not None and agents.log_prob is not None:
         for n, (modes, log_prob) in enumerate(zip(agents.future_xy, agents.log_prob, strict=True)):
             each = zip(modes.numpy(), log_prob.exp().tolist(), strict=True)
-            futures[n] = [(mode, p) for mode, p in each if p >= MIN_PROBABILITY]
+            likeliest = float(log_prob.exp().max())
+            futures[n] = [(mode, p) for mode, p in each if p >= min(MIN_PROBABILITY, likeliest)]
     return SeenAgents(boxes, names, futures)
 
 
@@ -175,8 +177,7 @@ def scene_picture(scene: SeenScene, spec: VoxelSpec) -> UInt8[ndarray, "H W 3"]:
     (x0, y0, _), (x1, y1, _) = spec.lower_m, spec.upper_m
     ax.add_patch(Rectangle((y0, x0), y1 - y0, x1 - x0, fill=False, edgecolor=palette.FAINT, linewidth=0.6))
     for kind, line in scene.lines or ():
-        width = 0.7 if kind is ElementKind.CENTRELINE else 1.5
-        ax.plot(line[:, 1], line[:, 0], color=palette.ELEMENT_COLOURS[kind], linewidth=width, zorder=2)
+        ax.plot(line[:, 1], line[:, 0], color=palette.ELEMENT_COLOURS[kind], linewidth=1.5, zorder=2)
     if scene.agents is not None:
         draw_agents(ax, scene.agents, reach_m)
     draw_ego(ax)
@@ -196,11 +197,16 @@ def scene_picture(scene: SeenScene, spec: VoxelSpec) -> UInt8[ndarray, "H W 3"]:
 
 
 def draw_agents(ax: Axes, agents: SeenAgents, reach_m: float) -> None:
-    """Draw footprints with their names, and futures with their probability as opacity."""
+    """Draw footprints with their names, and futures with their probability as opacity.
+
+    A name that would cover that of a box nearer to the ego vehicle is left out.
+    """
     draw_boxes(ax, agents.boxes)
     centres, kinds = agents.boxes.centre.numpy(), agents.boxes.category.tolist()
-    for (x, y, _), kind, name, futures in zip(centres, kinds, agents.names, agents.futures, strict=True):
-        colour = palette.box_colour(kind)
+    named: list[tuple[float, float]] = []
+    for n in np.linalg.norm(centres[:, :2], axis=1).argsort().tolist():
+        (x, y, _), name, futures = centres[n], agents.names[n], agents.futures[n]
+        colour = palette.box_colour(kinds[n])
         for xy, probability in futures:
             if np.linalg.norm(xy[-1] - (x, y)) < STILL_M:
                 continue
@@ -208,9 +214,18 @@ def draw_agents(ax: Axes, agents: SeenAgents, reach_m: float) -> None:
             alpha = 0.25 + 0.75 * probability
             ax.add_collection(LineCollection([path], color=colour, linewidth=1.1, alpha=alpha, zorder=3.4))
             ax.plot(*path[1:].T, ".", color=colour, markersize=2.2, alpha=alpha, zorder=3.5)
-        if max(abs(x), abs(y)) < reach_m - 2:
+        free = all(abs(x - other_x) > 2.5 or abs(y - other_y) > 6.0 for other_x, other_y in named)
+        if free and max(abs(x), abs(y)) < reach_m - 2:
+            named.append((x, y))
             ax.annotate(
-                name, (y, x), (5, 5), textcoords="offset points", color=colour, fontsize=6.5, zorder=6
+                name,
+                (y, x),
+                (5, 5),
+                textcoords="offset points",
+                color=colour,
+                fontsize=6.5,
+                zorder=6,
+                clip_on=True,
             )
 
 
@@ -242,10 +257,11 @@ def voxels_picture(
     names = VOXEL_CLASSES[taxonomy]
     figure = Figure(figsize=FIGURE_IN, dpi=DPI, facecolor=palette.GROUND)
     ax = figure.add_axes((0.125, 0.17, 0.855, 0.79))
-    start_bev(ax, max(*(abs(corner) for corner in (*spec.lower_m[:2], *spec.upper_m[:2]))) + 2.0)
+    start_bev(ax, max(abs(corner) for corner in (*spec.lower_m[:2], *spec.upper_m[:2])))
     (x0, y0, _), (x1, y1, _) = spec.lower_m, spec.upper_m
     rgb = columns_rgb(voxels, taxonomy).swapaxes(0, 1)
     ax.imshow(rgb, origin="lower", extent=(y0, y1, x0, x1), interpolation="nearest", zorder=1)
+    ax.set(xlim=(y1, y0), ylim=(x0, x1))
     draw_ego(ax)
     present = [name for n, name in enumerate(names[:-1]) if bool((voxels == n).any())]
     handles = [Patch(color=palette.VOXEL_COLOURS[n], label=n.replace("_", " ")) for n in present]

@@ -11,10 +11,15 @@ from viser.transforms import SO3
 
 from foredrive.runs.evaluate.display import DisplayPrediction
 from foredrive.scene import VoxelSpec
+from foredrive.scene.semantics import VOXEL_CLASSES, Taxonomy
 from foredrive.view import palette
 from foredrive.view.scene_nodes import clear
+from foredrive.view.task_pictures import voxel_colours
 from foredrive.view.voxel_drawing import height_colours, pca_colours
 
+ColourBy = Literal["height", "features", "classes"]
+BESIDE_M = 4.0
+"""Distance between predicted and true voxels, m."""
 FILL = 0.94
 """Edge of a drawn cube relative to its voxel; below 1, so that neighbours stay apart."""
 MOVES_M = 0.25
@@ -48,18 +53,49 @@ def show_occupancy(
     k: int,
     spec: VoxelSpec,
     shown: Bool[Tensor, "Z Y X"],
-    colour_by: Literal["height", "features"],
+    colour_by: ColourBy,
 ) -> None:
-    """Draw voxels of frame k as cubes in the ego frame now, where the model expects them."""
-    colours: UInt8[np.ndarray, "Z Y X 3"] = (
-        height_colours(spec) if colour_by == "height" else pca_colours(prediction.volume[k], shown)
-    )
-    pose = prediction.T_now_ego[k].double().numpy()
-    count = int(shown.sum())
+    """Draw voxels of frame k as cubes in the ego frame now, where the model expects them.
+
+    Classes are those of now; later frames have the colours of height instead.
+    """
+    colours: UInt8[np.ndarray, "Z Y X 3"] = height_colours(spec)
+    if colour_by == "features":
+        colours = pca_colours(prediction.volume[k], shown)
+    elif colour_by == "classes" and k == 0 and prediction.classes is not None:
+        colours = voxel_colours(prediction.taxonomy)[prediction.classes.numpy()]
+    return _show_cubes(scene, "/occupancy", prediction.T_now_ego[k], spec, shown, colours)
+
+
+def show_true_classes(
+    scene: viser.SceneApi,
+    classes: UInt8[Tensor, "Z Y X"] | None,
+    taxonomy: Taxonomy,
+    spec: VoxelSpec,
+    min_height_m: float,
+) -> None:
+    """Draw the recorded voxels of now in the colours of their classes, to the left of the scene."""
+    if classes is None:
+        return clear(scene, "/true voxels")
+    shown = (classes != len(VOXEL_CLASSES[taxonomy]) - 1) & (spec.centres_m()[..., 2] >= min_height_m)
+    beside = torch.eye(4)
+    beside[1, 3] = spec.upper_m[1] - spec.lower_m[1] + BESIDE_M
+    return _show_cubes(scene, "/true voxels", beside, spec, shown, voxel_colours(taxonomy)[classes.numpy()])
+
+
+def _show_cubes(
+    scene: viser.SceneApi,
+    name: str,
+    T_now_ego: Float[Tensor, "4 4"],
+    spec: VoxelSpec,
+    shown: Bool[Tensor, "Z Y X"],
+    colours: UInt8[np.ndarray, "Z Y X 3"],
+) -> None:
+    pose, count = T_now_ego.double().numpy(), int(shown.sum())
     if count == 0:
-        return clear(scene, "/occupancy")
+        return clear(scene, name)
     scene.add_batched_meshes_simple(
-        "/occupancy",
+        name,
         FILL * spec.voxel_m * _CUBE,
         _CUBE_FACES,
         batched_wxyzs=np.tile([1.0, 0.0, 0.0, 0.0], (count, 1)),

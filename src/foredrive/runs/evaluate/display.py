@@ -5,13 +5,18 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 from torch import Tensor
 
+from foredrive.evaluation.predictor import Prediction
 from foredrive.geometry.se3 import transform_points
 from foredrive.models.agent import PlanningAgent
+from foredrive.models.tasks.heads import TaskHeads
+from foredrive.runs.evaluate.predict import AgentPredictor
 from foredrive.scene import CameraRig, Clip, Decoded, RayRenderer, Trajectory, VoxelSpec
+from foredrive.scene.agents import Agents, MapLines
 from foredrive.scene.record import Record
+from foredrive.scene.semantics import Taxonomy
 from foredrive.sensors import camera_rays
 
 RAYS_AT_ONCE = 8192
@@ -32,6 +37,12 @@ class DisplayPrediction(Record):
     """
     plan: Trajectory
     """The plan; batch shape [1 T]."""
+    agents: Agents | None = None
+    """Road users at now; None without a head."""
+    lines: MapLines | None = None
+    classes: UInt8[Tensor, "Z Y X"] | None = None
+    """Class of each voxel at now, in `taxonomy`."""
+    taxonomy: Taxonomy = "occ3d"
 
     def movement_m(
         self, k: int, spec: VoxelSpec
@@ -55,10 +66,11 @@ class DisplayPredictor:
     Args:
         agent: in evaluation mode.
         steps: number of key frames to imagine.
+        heads: trained task heads in evaluation mode; None shows no further tasks.
     """
 
-    def __init__(self, agent: PlanningAgent[Any], steps: int) -> None:
-        self.agent, self.steps = agent, steps
+    def __init__(self, agent: PlanningAgent[Any], steps: int, heads: TaskHeads | None = None) -> None:
+        self.agent, self.steps, self.heads = agent, steps, heads
         self._renderer: RayRenderer | None = agent.world_model.renderer
 
     @property
@@ -72,7 +84,16 @@ class DisplayPredictor:
         output = self.agent(observed, self.steps)
         beliefs = output.beliefs
         eye = torch.eye(4)
+        tasks = Prediction()
+        if self.heads is not None:
+            predictor = AgentPredictor(self.agent, self.steps, 0, heads=self.heads)
+            tasks = predictor.predict(observed, frozenset())
+        voxels = None if self.heads is None else self.heads.voxels
         return DisplayPrediction(
+            agents=None if tasks.agents is None else tasks.agents[0],
+            lines=None if tasks.map_lines is None else tasks.map_lines[0],
+            classes=None if tasks.semantics is None else tasks.semantics[0],
+            taxonomy="occ3d" if voxels is None else voxels.taxonomy,
             occupancy_logit=torch.stack([frame.occupancy_logit[0] for frame in output.decoded]),
             volume=torch.stack([belief.volume[0] for belief in beliefs]),
             T_now_ego=torch.stack([eye if b.T_now_ego is None else b.T_now_ego[0] for b in beliefs]),
