@@ -78,7 +78,7 @@ def draw_drive_path(drive: DriveRecord) -> Figure:
 def draw_timeline(drive: DriveRecord) -> Figure:
     """Draw speed over time, with marks for scenarios and infractions and shaded times of near collisions."""
     figure = Figure(figsize=(7.6, 2.3))
-    ax = figure.add_axes((0.07, 0.22, 0.92, 0.70))
+    ax = figure.add_axes((0.07, 0.22, 0.90, 0.70))  # half of the last label stands to the right
     t_s, speed = drive.track.t_s, drive.track.speed_mps
     ax.fill_between(t_s, speed, color="#4c8be0", alpha=0.25, linewidth=0)
     ax.plot(t_s, speed, color="#4c8be0", linewidth=1.6)
