@@ -1,21 +1,26 @@
 """Heads that are trained on the frozen world model of a run, and evaluated with it."""
 
+import dataclasses
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
-from joint_heads import small_heads
+from joint_heads import ALL, small_heads
 from miniature import miniature, miniature_driveworld
 from safetensors.torch import load_file
 
 from foredrive.data import LogPath
 from foredrive.errors import InputError
+from foredrive.models.driveworld.planes import VectorToPlaneConfig
+from foredrive.models.driveworld.task_prompt import PROMPTS, PromptConfig
 from foredrive.recipes.task_heads import base_heads, town_heads, with_settings
 from foredrive.runs import Run, evaluate_run
+from foredrive.runs.build import build_agent
 from foredrive.runs.folder import WEIGHTS
+from foredrive.runs.train.run import begin_run
 from foredrive.runs.train.tasks import TASKS, load_heads, probe_run, train_heads
-from foredrive.training import read_metrics
+from foredrive.training import read_metrics, save_weights
 
 
 def test_heads_of_a_run_are_trained_continued_and_evaluated(
@@ -65,6 +70,37 @@ def test_a_probe_keeps_the_recipe_of_its_world_model(trained: Run, log: LogPath,
     assert trained.recipe == miniature()
 
 
+@pytest.mark.parametrize(("prompted", "volumes"), [(True, 4), (False, 1)])
+def test_heads_on_a_driveworld_read_a_volume_for_each_prompt(
+    log: LogPath, tmp_path: Path, prompted: bool, volumes: int
+) -> None:
+    """Four tasks that are read have four prompts; without prompts they share one volume."""
+    recipe = miniature_driveworld()
+    if prompted:
+        prompt = PromptConfig(
+            expand=VectorToPlaneConfig(widths=(8, 4)), encoding=16, text_encoder="", prompts=tuple(PROMPTS)
+        )
+        recipe = dataclasses.replace(recipe, model=dataclasses.replace(recipe.model, prompt=prompt))
+    cache, start = tmp_path / "cache", tmp_path / "start"
+    begin_run(recipe, [log], start, cache, start)
+    torch.manual_seed(0)
+    agent = build_agent(recipe, fetch=False)
+    if prompted:
+        agent.world_model.prompt.encodings.normal_()
+    (start / "finetune").mkdir()
+    save_weights(agent, start / "finetune" / WEIGHTS)
+    run = probe_run(recipe, [log], tmp_path / "probe", cache, start)
+    train_heads(run, small_heads((*ALL, "tracking")))
+    kept = [load_file(file) for file in (cache / "volumes").rglob("*.safetensors")]
+    assert {len(each["volume"]) for each in kept} == {volumes}
+    for each in kept[:1]:
+        others = [each["volume"][n] for n in range(1, volumes)]
+        assert not any(torch.equal(each["volume"][0], other) for other in others)
+    summary = evaluate_run(run, [log], tmp_path / "evaluated", views=False).summary
+    assert summary["failed"] == 0
+    assert {"tracking.nuscenes.ids", "motion.uniad.car.epa"} < summary.keys()
+
+
 @pytest.mark.parametrize("make", [town_heads, base_heads])
 def test_tasks_choose_heads_and_truth(make: Any) -> None:
     alone = make(["map"])
@@ -75,6 +111,10 @@ def test_tasks_choose_heads_and_truth(make: Any) -> None:
     both = make(["occupancy", "motion"])
     assert both.heads.tasks == ("detection", "motion", "occupancy")
     assert both.truth.raster is None
+    assert both.heads.frames == 1
+    tracks = make(["tracking", "map"])
+    assert tracks.heads.tasks == ("detection", "map")
+    assert (tracks.heads.frames, tracks.now_stride_s) == (4, 0.5)
 
 
 def test_wrong_tasks_and_settings_are_one_line() -> None:
