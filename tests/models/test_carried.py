@@ -21,6 +21,7 @@ from foredrive.models.tasks.carried import (
 from foredrive.models.tasks.decoder import DecoderConfig
 from foredrive.models.tasks.heads import HeadOutput, TaskHeads, TaskHeadsConfig, TaskVolume
 from foredrive.models.tasks.motion import MotionConfig
+from foredrive.models.tasks.taking import take_proposals
 from foredrive.runs.evaluate.streaming import DriveFollower
 from foredrive.scene import Attribute, VoxelSpec
 
@@ -100,6 +101,29 @@ def test_queries_carry_gradients_and_boxes_do_not() -> None:
     assert carried.agents.query is not None
     assert carried.agents.query.requires_grad
     assert not carried.agents.boxes.mean.requires_grad
+
+
+def test_carried_agents_take_the_nearest_proposals_in_turn() -> None:
+    """The first takes the one that the second is nearer to; the third finds none within 2 m. Two items."""
+    carried_m = torch.tensor([[[0.0, 0.0], [1.0, 0.0], [9.0, 9.0]]])
+    proposals_m = torch.tensor([[[20.0, 0.0], [1.2, 0.0], [-5.0, 0.0], [2.5, 0.0], [7.0, 7.0]]])
+    taken, rest = take_proposals(
+        torch.cat([carried_m, carried_m + 100.0]), torch.cat([proposals_m, proposals_m]), 2.0
+    )
+    assert taken.tolist() == [[1, 3, -1], [-1, -1, -1]]
+    assert rest.tolist() == [[0, 2], [0, 1]]
+
+
+def test_the_object_of_a_taken_proposal_is_not_proposed_again_as_another_class() -> None:
+    """The second proposal lies 0.4 m from the one that is taken: it comes last, if all are needed."""
+    proposals_m = torch.tensor([[[0.1, 0.0], [0.5, 0.0], [1.5, 0.0], [9.0, 0.0]]])
+    carried_m = torch.tensor([[[0.0, 0.0]]])
+    taken, rest = take_proposals(carried_m, proposals_m, 2.0)
+    assert taken.tolist() == [[0]]
+    assert rest.tolist() == [[2, 3, 1]]
+    both, left = take_proposals(carried_m.expand(1, 2, 2), proposals_m, 2.0)
+    assert both.tolist() == [[0, 2]]
+    assert left.tolist() == [[3, 1]]
 
 
 def heads(carried: CarriedConfig) -> TaskHeads:

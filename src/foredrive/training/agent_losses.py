@@ -82,7 +82,10 @@ def agent_losses(
         for name, value in _cell_losses(centres[item], targets, spec).items():
             terms[name].append(value)
         source = nobody if lineage is None else lineage.source[item]
-        held = held_objects(source, owner, targets.track_id)
+        away_m = torch.cdist(
+            last.boxes.mean[item, :, :2].detach(), targets.boxes.state[:, :2].to(last.boxes.mean)
+        )
+        held = held_objects(source, owner, targets.track_id, away_m)
         for number, layer in enumerate(layers):
             found = layer[item]
             query, match = matching_beside(found.boxes, targets.boxes, held, weights.boxes)

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from foredrive.models.detection import BoxSet
@@ -12,6 +12,8 @@ from foredrive.training.detection_losses import MatchingLossConfig, best_matchin
 
 NOBODY = -1
 """Owner of a query that was matched to no object."""
+RELEASED_M = 4.0
+"""Distance from which on a carried query is no longer held to its object."""
 
 
 @dataclass(frozen=True)
@@ -25,18 +27,28 @@ class Held:
     """Queries that carry on an object, also one that has left: they can have no other."""
 
 
-def held_objects(source: Int[Tensor, "Q"], owner: Int[Tensor, "_Q"], track_id: Int[Tensor, "N"]) -> Held:
+def held_objects(
+    source: Int[Tensor, "Q"],
+    owner: Int[Tensor, "_Q"],
+    track_id: Int[Tensor, "N"],
+    away_m: Float[Tensor, "Q N"],
+) -> Held:
     """Return which queries have to find which objects (MOTR, Zeng et al. 2022, §3.3).
+
+    A query that is `RELEASED_M` away from its object has lost it: both are free.
 
     Args:
         source: index of each query in the frame before, or -1.
         owner: identity of the object that each query of the frame before was matched to, or `NOBODY`.
         track_id: identity of each object at now.
+        away_m: distance of each query from each object, m.
     """
     mine = torch.where(source >= 0, owner[source.clamp_min(0)], NOBODY)
     same = (mine[:, None] == track_id) & (mine[:, None] != NOBODY)
+    lost = (same & (away_m >= RELEASED_M)).any(dim=1)
+    same = same & ~lost[:, None]
     query, match = same.nonzero(as_tuple=True)
-    return Held(query, match, mine != NOBODY)
+    return Held(query, match, (mine != NOBODY) & ~lost)
 
 
 def matching_beside(

@@ -1,5 +1,6 @@
 """The head of road users: a set of boxes with velocity, attribute and motion."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import torch
@@ -12,6 +13,7 @@ from foredrive.models.tasks.decoder import DecoderConfig, PlaceEmbedding, QueryD
 from foredrive.models.tasks.motion import MotionConfig, MotionModes
 from foredrive.models.tasks.plane import PlanePyramid, Planes
 from foredrive.models.tasks.proposals import CentreHead, CentreMap, Proposals, best_proposals
+from foredrive.models.tasks.taking import take_proposals
 from foredrive.scene import Attribute, Category
 from foredrive.scene.agents import Agents
 from foredrive.scene.record import Record
@@ -41,7 +43,9 @@ class CarriedConfig:
     """Number of queries that are carried on; as many fewer begin at proposals then."""
     decay: float = 0.6
     """Share of its rank that a carried query keeps at least from frame to frame."""
-    born: float = 0.3
+    reach_m: float = 2.0
+    """Maximum distance of the proposal at which a carried agent goes on from where it is expected."""
+    born: float = 0.1
     """Minimum score at which a query gets an identity, which it keeps as long as it is carried."""
     frames: int = 4
     """Key frames of a training sequence, at least 2."""
@@ -116,7 +120,7 @@ class AgentHead(nn.Module):
     def __init__(self, planes: PlanePyramid, config: AgentHeadConfig) -> None:
         super().__init__()
         width = planes.width
-        self.queries = config.queries
+        self.queries, self.carried = config.queries, config.carried
         self.renew: nn.Module | None = None
         if config.carried is not None:
             check_carried(config.carried, config.queries)
@@ -147,17 +151,15 @@ class AgentHead(nn.Module):
             planes: features of detection.
             motion_planes: features of motion. None: no forecasts.
             carried: agents of the frame before in the ego frame at now, with their queries. They are the
-                first of the queries, before the most probable proposals.
+                first of the queries, before the most probable proposals that they leave.
         """
         cells, fine = planes.coarse.cells, planes.fine
         cell_place = self.place(planes.coarse.share(planes.coarse.middle_m))[None]
         centres = self.centres(fine)
-        old = 0 if carried is None else carried.velocity.shape[1]
-        first = best_proposals(centres, self.queries - old)
+        first = best_proposals(centres, self.queries)
         queries, before = self.kind(first.label), _first_agents(first)
-        if carried is not None and carried.query is not None and self.renew is not None:
-            queries = torch.cat([self.renew(carried.query), queries], dim=1)
-            before = _joined(carried, before)
+        if carried is not None:
+            queries, before = self._with_carried(queries, before, carried)
         found: list[AgentSet] = []
         for layer in self.layers:
             at_m = before.boxes.mean[..., :2]
@@ -173,6 +175,35 @@ class AgentHead(nn.Module):
             )
             found[-1] = replace(found[-1], future_xy=future_xy, log_prob=log_prob)
         return centres, found
+
+    def _with_carried(
+        self, queries: Float[Tensor, "b Q W"], first: AgentSet, carried: AgentSet
+    ) -> tuple[Float[Tensor, "b Q W"], AgentSet]:
+        """Return queries and boxes of carried agents and of the proposals that they leave.
+
+        A carried agent goes on at the proposal that it takes, or where it is expected if there is none.
+        """
+        assert self.carried is not None
+        assert self.renew is not None
+        assert carried.query is not None
+        expected_m, proposed_m = carried.boxes.mean[..., :2], first.boxes.mean[..., :2]
+        taken, rest = take_proposals(expected_m, proposed_m, self.carried.reach_m)
+        sees = taken >= 0
+        at = taken.clamp_min(0)
+
+        def go_on(seen: Tensor, expected: Tensor) -> Tensor:
+            return torch.where(sees.view(*sees.shape, *[1] * (seen.dim() - 2)), seen, expected)
+
+        item = torch.arange(len(at), device=at.device)[:, None]
+        renewed = self.renew(carried.query) + sees[..., None] * queries[item, at]
+        old = _merged(go_on, _chosen(first, at), carried)
+        return torch.cat([renewed, queries[item, rest]], dim=1), _merged(_join, old, _chosen(first, rest))
+
+
+def _chosen(agents: AgentSet, index: Int[Tensor, "b _N"]) -> AgentSet:
+    """Return some agents of each item."""
+    item = torch.arange(len(index), device=index.device)[:, None]
+    return agents.map_tensors(lambda tensor: tensor[item, index])
 
 
 def check_carried(config: CarriedConfig, queries: int) -> None:
@@ -201,21 +232,21 @@ def _first_agents(first: Proposals) -> AgentSet:
     return AgentSet(boxes, first.velocity, nothing[..., None].expand(*nothing.shape, len(Attribute)))
 
 
-def _joined(first: AgentSet, second: AgentSet) -> AgentSet:
+def _join(one: Tensor, other: Tensor) -> Tensor:
+    return torch.cat([one, other], dim=1)
+
+
+def _merged(merge: Callable[[Tensor, Tensor], Tensor], first: AgentSet, second: AgentSet) -> AgentSet:
     """Return two sets as one, without queries and forecasts."""
-
-    def join(one: Tensor, other: Tensor) -> Tensor:
-        return torch.cat([one, other], dim=1)
-
     one, other = first.boxes, second.boxes
     boxes = BoxSet(
-        logits=join(one.logits, other.logits),
-        mean=join(one.mean, other.mean),
-        log_std=join(one.log_std, other.log_std),
-        heading=join(one.heading, other.heading),
-        log_std_yaw=join(one.log_std_yaw, other.log_std_yaw),
+        logits=merge(one.logits, other.logits),
+        mean=merge(one.mean, other.mean),
+        log_std=merge(one.log_std, other.log_std),
+        heading=merge(one.heading, other.heading),
+        log_std_yaw=merge(one.log_std_yaw, other.log_std_yaw),
     )
-    return AgentSet(boxes, join(first.velocity, second.velocity), join(first.attribute, second.attribute))
+    return AgentSet(boxes, merge(first.velocity, second.velocity), merge(first.attribute, second.attribute))
 
 
 def _changed(before: AgentSet, change: Float[Tensor, "b Q _N"]) -> AgentSet:
