@@ -4,6 +4,10 @@
 most 2^17 rows a level. A million points lie on rays in patches of 32 × 32 pixels, 32 samples on each ray.
 Arm `proposal` has six levels of one feature. `…_mpoints_per_s` are millions of points forward and backward
 per CPU second; with `to_points`, the gradient reaches the points too. Plain PyTorch reads 65,536 of them.
+
+`scene` is the recipe `field_tiny` with 20 actors: whole steps of training (rays, losses, gradients, Adam), an
+image of 480 × 270, and a sweep of 64 × 1800 beams. Its images are noise and its sweeps show a hall of
+40 × 20 m. Freed memory is kept, as by the command line.
 """
 
 import json
@@ -14,10 +18,21 @@ import torch
 from torch import Tensor
 
 from benchmarks.common.measuring import in_a_process, measure
+from foredrive.cli.memory import keep_freed_memory
 from foredrive.evaluation.bench import Benchmark
+from foredrive.geometry.se3 import exp_se3
 from foredrive.ops.hash_grid import Level, grid_levels, read_hash_grid, read_hash_grid_reference
+from foredrive.recipes.field import tiny_field
+from foredrive.rendering.field.scene import FieldScene
+from foredrive.rendering.tracks import ActorTracks
+from foredrive.rendering.views import CameraView, SweepView
+from foredrive.scene import LidarSweep
+from foredrive.sensors import pandar64
+from foredrive.training.rebuilding import SensorViews, make_optimizer
 
 RUNS, POINTS, REFERENCE_POINTS = 7, 2**20, 2**16
+CAM_AHEAD = torch.tensor([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+"""Pose of a camera that looks along x of its mount."""
 GRIDS = {"grid": (8, 2, 8192), "proposal": (6, 1, 2048)}
 """Levels, features, finest cells of each arm; 32 cells in the coarsest level, 2^17 rows."""
 
@@ -35,7 +50,92 @@ def points_on_rays(count: int) -> Tensor:
     return (0.5 + direction[:, None] * distance[..., None]).view(-1, 3)
 
 
+def hall(count: int = 20) -> tuple[FieldScene, SensorViews]:
+    """Return a scene of `field_tiny` before training, and a drive of four frames at 5 m/s."""
+    rng = torch.Generator().manual_seed(0)
+    mount = exp_se3(torch.tensor([1.0, 0, 1.8, 0, 0, 0]))
+    cameras, sweeps = [], []
+    for frame in range(4):
+        T_scene_ego = exp_se3(torch.tensor([0.5 * frame, 0, 0, 0, 0, 0]))
+        rays = pandar64(mount).beams(torch.zeros(6))
+        apart = torch.tensor([20.0, 10.0, 1.8]) / rays.dir_ego.abs().clamp_min(1e-6)
+        range_m = apart.amin(-1)
+        beams = LidarSweep(
+            origin_ego=rays.origin_ego,
+            dir_ego=rays.dir_ego,
+            range_m=range_m,
+            returned=range_m < 50,
+            intensity=torch.full_like(range_m, 0.3),
+            dt_s=rays.dt_s,
+            beam=torch.zeros(len(range_m), dtype=torch.int64),
+            valid=torch.ones(len(range_m), dtype=torch.bool),
+        )
+        sweeps.append(SweepView(beams, True, T_scene_ego, torch.zeros(6), 0.1 * frame))
+        cameras.append(
+            CameraView(
+                K=torch.tensor([[490.0, 0, 240], [0, 490, 135], [0, 0, 1]]),
+                dist=torch.zeros(5),
+                T_scene_cam=T_scene_ego @ mount @ CAM_AHEAD,
+                twist_cam=torch.tensor([0.0, 0, 5, 0, 0.01, 0]),
+                t_s=0.1 * frame,
+                readout_s=0.04,
+                size_hw=(270, 480),
+                sensor=0,
+                image=torch.randint(256, (3, 270, 480), generator=rng, dtype=torch.uint8),
+            )
+        )
+    place = torch.rand(count, 1, 6, generator=rng) * torch.tensor([30.0, 16, 0, 0, 0, 6])
+    tracks = ActorTracks(
+        track_id=torch.arange(count),
+        category=torch.zeros(count, dtype=torch.int64),
+        size_lwh=torch.tensor([[4.5, 1.9, 1.6]]).repeat(count, 1),
+        t_s=torch.tensor([0.0, 0.3]),
+        T_scene_actor=exp_se3(place - torch.tensor([15.0, 8, -0.8, 0, 0, 0])).repeat(1, 2, 1, 1),
+        present=torch.ones(count, 2, dtype=torch.bool),
+    )
+    views = SensorViews(cameras, sweeps)
+    return tiny_field().begin(views, tracks, 1, 200.0), views
+
+
+def measure_scene(seed: int) -> dict[str, float]:
+    """Return the speed of training, of an image and of a sweep."""
+    return in_a_process(__file__, "scene", "fast") | {"threads": float(torch.get_num_threads())}
+
+
+def _measure_scene() -> dict[str, float]:
+    keep_freed_memory()
+    scene, views = hall()
+    training = tiny_field().training(scene, views)
+    optimizer, rng = make_optimizer(training), torch.Generator().manual_seed(0)
+    schedule = training.schedule
+
+    def step() -> None:
+        loss = training.losses(0, rng).losses["loss"]
+        optimizer.zero_grad(set_to_none=True)
+        torch.autograd.backward(loss)
+        optimizer.step()
+
+    for _ in range(5):  # compiles; the proposals find the walls
+        step()
+    took = measure(step, 15, "cpu")
+    with torch.no_grad():
+        image = measure(lambda: scene.camera(scene.graph, views.cameras[1]), 5, "cpu")
+        points = scene.prepare_sweep(views.sweeps[1])
+        sweep = measure(lambda: scene.sweep(scene.graph, points, 0.1), 3, "cpu")
+    krays = (schedule.patches * schedule.patch**2 + schedule.beams) / 1000
+    return {
+        "train_krays_per_s": krays / took.wall_s,
+        "train_krays_per_cpu_s": krays / took.cpu_s,
+        "image_s": image.wall_s,
+        "image_cpu_s": image.cpu_s,
+        "sweep_s": sweep.wall_s,
+        "sweep_cpu_s": sweep.cpu_s,
+    }
+
+
 def _measure_here(arm: str, path: str) -> dict[str, float]:
+    if arm == "scene":
+        return _measure_scene()
     number, features, finest = GRIDS[arm]
     levels = grid_levels(number, 32, finest, 17)
     table = 0.1 * torch.randn(levels[-1].first_row + levels[-1].rows, features)
@@ -68,7 +168,8 @@ def measure_grid(arm: str) -> dict[str, float]:
 
 BENCHMARK = Benchmark(
     question="How fast are the parts of a neural field on a CPU?",
-    arms={arm: lambda seed, arm=arm: measure_grid(arm) for arm in GRIDS},  # type: ignore[misc]
+    arms={arm: lambda seed, arm=arm: measure_grid(arm) for arm in GRIDS}  # type: ignore[misc]
+    | {"scene": measure_scene},
     seeds=(0,),
 )
 

@@ -249,24 +249,33 @@ def test_where_boxes_overlap_a_sample_belongs_to_the_one_entered_last() -> None:
     assert moving.slot.unique().tolist() == [0, 1]
 
 
-def test_directions_in_a_box_are_those_of_its_frame() -> None:
-    """The layers see an actor's sample as they see a standing one with the direction in the box' frame."""
-    net = small_field(1)
+@pytest.mark.parametrize("shading", ["samples", "rays"])
+def test_directions_in_a_box_are_those_of_its_frame(shading: str) -> None:
+    """A ray that ends at a sample of an actor looks as one with the direction in the frame of the box."""
+    net = small_field(1, shading=shading)
     rng = torch.Generator().manual_seed(3)
-    grid = torch.randn(net.grids.features, 6, generator=rng)
+    embedding = torch.randn(16, 3, 2, generator=rng)
     direction = torch.nn.functional.normalize(torch.randn(3, 3, generator=rng), dim=-1)
     own = torch.nn.functional.normalize(torch.randn(1, 3, generator=rng), dim=-1)
-    length = torch.ones(3, 2)
-    moving = ActorSamples(
-        torch.tensor([3]), torch.zeros(1, dtype=torch.int64), torch.zeros(1, 3), own, torch.ones(1)
-    )
-    _, found = net.layers(grid, direction, moving, length)
+    sample, slot = torch.tensor([3]), torch.zeros(1, dtype=torch.int64)  # the second one of ray 1
+    moving = ActorSamples(sample, slot, torch.zeros(1, 3), own, torch.ones(1))
     replaced = direction.clone()
-    replaced[1] = own  # sample 3 is the second one of ray 1
-    _, expected = net.layers(grid, replaced, None, length)
-    _, plain = net.layers(grid, direction, None, length)
-    torch.testing.assert_close(found[:, 1, 1], expected[:, 1, 1])
-    torch.testing.assert_close(found[:, 1, 0], plain[:, 1, 0])
+    replaced[1] = own
+    for weight, same in (((0.0, 1.0), replaced), ((1.0, 0.0), direction)):
+        weights = torch.tensor(weight).expand(3, 2)
+        found = net.layers.seen(embedding, weights, direction, moving)
+        torch.testing.assert_close(found, net.layers.seen(embedding, weights, same, None))
+
+
+def test_both_shadings_agree_where_one_sample_stops_the_ray() -> None:
+    rng = torch.Generator().manual_seed(4)
+    embedding, weight = torch.randn(16, 5, 3, generator=rng), torch.zeros(5, 3)
+    weight[:, 1] = 1
+    direction = torch.nn.functional.normalize(torch.randn(5, 3, generator=rng), dim=-1)
+    found = [
+        small_field(0, shading=s).layers.seen(embedding, weight, direction, None) for s in ("samples", "rays")
+    ]
+    torch.testing.assert_close(*found)
 
 
 @pytest.mark.parametrize("surface", ["sdf", "density"])

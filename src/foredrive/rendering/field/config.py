@@ -67,6 +67,8 @@ class FieldConfig:
     """The boxes are this much larger at each end: along, across, up."""
     surface: Literal["sdf", "density"] = "sdf"
     """The field's geometry: a signed distance, with opacity 1 / (1 + exp(β s)), or a density."""
+    shading: Literal["samples", "rays"] = "samples"
+    """Where directions enter: at each sample, as in the paper, or once a ray, after its samples' sum."""
     beta: float = 20.0
     """Initial slope β of the opacity."""
     width: int = 32

@@ -116,7 +116,7 @@ class FieldLayers(nn.Module):
 
     def __init__(self, config: FieldConfig, features: int) -> None:
         super().__init__()
-        width = config.width
+        width, self.shading = config.width, config.shading
         self.geometry = Layers(features, *[width] * (config.geometry_layers - 1), width + 1)
         self.first = nn.Linear(width, width)
         self.first_direction = nn.Linear(HARMONICS, width, bias=False)
@@ -128,32 +128,61 @@ class FieldLayers(nn.Module):
             last.weight[0] *= _FIRST_DISTANCE
             last.bias[0] = _FIRST_DISTANCE if self.beta is not None else 0.0
 
-    def forward(
-        self,
-        grid: Float[Tensor, "C N"],
-        direction: Float[Tensor, "R 3"],
-        moving: ActorSamples | None,
-        length_m: Float[Tensor, "R S"],
+    def surface(
+        self, grid: Float[Tensor, "C N"], length_m: Float[Tensor, "R S"]
     ) -> tuple[Float[Tensor, "R S"], Float[Tensor, "D R S"]]:
-        """Return the opacity and the features of S samples on each of R rays (N = R · S).
+        """Return the opacity and the embedding of S samples on each of R rays (N = R · S).
 
         Args:
             grid: features of the grids.
-            direction: directions of the rays.
-            moving: samples in boxes; their directions are those in the box' frame.
             length_m: lengths of the samples' intervals.
         """
-        shape = length_m.shape
         out = self.geometry(grid)
-        geometry, embedding = out[0].view(shape), out[1:]
+        return self._opacity(out[0].view(length_m.shape), length_m), out[1:].unflatten(1, length_m.shape)
+
+    def seen(
+        self,
+        embedding: Float[Tensor, "D R S"],
+        weight: Float[Tensor, "R S"],
+        direction: Float[Tensor, "R 3"],
+        moving: ActorSamples | None,
+    ) -> Float[Tensor, "D R"]:
+        """Return the features that rays see: the weighted sums over their samples.
+
+        Args:
+            embedding: of the samples, from `surface`.
+            weight: weights of the samples; they add up to 1.
+            direction: directions of the rays.
+            moving: samples in boxes; their directions are those in the box' frame.
+        """
         turned = affine_direction(self.first_direction, direction)  # [D R]
-        hidden = (affine(self.first, embedding).unflatten(1, shape) + turned[..., None]).flatten(1)
-        if moving is not None and len(moving.sample):
-            ray = moving.sample // shape[1]
-            own = affine_direction(self.first_direction, moving.direction)
-            hidden = hidden.index_add(1, moving.sample, own - turned[:, ray])
-        feature = embedding + self.rest(hidden.relu_())
-        return self._opacity(geometry, length_m), feature.unflatten(1, shape)
+        if self.shading == "samples":
+            hidden = affine(self.first, embedding.flatten(1)).unflatten(1, weight.shape) + turned[..., None]
+            hidden = self._turned_back(hidden.flatten(1), turned, moving, weight, sums=False)
+            feature = embedding + self.rest(hidden.relu_()).unflatten(1, weight.shape)
+            return (feature * weight).sum(-1)
+        # The first layer is linear, so it can be applied to the sums.
+        embedded = (embedding * weight).sum(-1)
+        hidden = affine(self.first, embedded) + turned
+        hidden = self._turned_back(hidden, turned, moving, weight, sums=True)
+        return embedded + self.rest(hidden.relu())
+
+    def _turned_back(
+        self,
+        hidden: Float[Tensor, "D M"],
+        turned: Float[Tensor, "D R"],
+        moving: ActorSamples | None,
+        weight: Float[Tensor, "R S"],
+        sums: bool,
+    ) -> Float[Tensor, "D M"]:
+        """Replace the directions of rays by those in boxes, for samples or for their weighted sums."""
+        if moving is None or len(moving.sample) == 0:
+            return hidden
+        ray = moving.sample // weight.shape[1]
+        change = affine_direction(self.first_direction, moving.direction) - turned[:, ray]
+        if sums:
+            return hidden.index_add(1, ray, change * weight.flatten()[moving.sample])
+        return hidden.index_add(1, moving.sample, change)
 
     def _opacity(
         self, geometry: Float[Tensor, "R S"], length_m: Float[Tensor, "R S"]

@@ -105,7 +105,7 @@ class NeuralField(nn.Module):
         border_m = to_distance(border, config.spacing_m, config.sky_m)
         points, footprint, moving = self._samples(rays, border_m, crossings, actors, learn_poses=True)
         grid = self.grids(points, footprint, moving)
-        opacity, feature = self.layers(grid, rays.direction, moving, border_m.diff(dim=-1))
+        opacity, embedding = self.layers.surface(grid, border_m.diff(dim=-1))
         seen = composite(opacity, opacity.detach())
         intervals = Intervals(border, border_m, seen.weights)
         # What is left of a ray sees its last sample, the sky.
@@ -113,7 +113,7 @@ class NeuralField(nn.Module):
             [seen.weights[:, :-1], (seen.weights[:, -1] + seen.transmittance)[:, None]], dim=-1
         )
         return SeenAlongRays(
-            feature=(feature * weight).sum(-1).T,
+            feature=self.layers.seen(embedding, weight, rays.direction, moving).T,
             depth_m=intervals.depth_m,
             alpha=seen.weights[:, :-1].sum(-1),
             median_m=_median(intervals),
