@@ -61,6 +61,7 @@ def test_the_verb_tests_keeps_and_reports(
     assert summary["threats.stationary.score"] == 5.0
     page = (tmp_path / "out" / "report.html").read_text()
     assert "Safety tests" in page
+    assert "5.0 of 5, stopped short" in page
     assert len(list((tmp_path / "out" / "videos").glob("*.webp"))) == 1
     other = [*command, "--runs", "1"]
     other[other.index("paper")] = "ours"

@@ -13,7 +13,7 @@ from foredrive.evaluation.summary import Summary, read_summary
 from foredrive.runs.drive.records import read_drive, suite_title
 from foredrive.runs.folder import DRIVES, SUMMARY
 from foredrive.simulation.drive_record import DriveRecord
-from foredrive.simulation.ncap.outcome import SafetyResult
+from foredrive.simulation.ncap.outcome import Outcome, SafetyResult
 from foredrive.simulation.scenarios.scenario import ScenarioKind
 from foredrive.simulation.scores import Ending, Infraction, InfractionKind
 from foredrive.simulation.time_to_collision import NEAR_COLLISION_S
@@ -35,11 +35,11 @@ from foredrive.view.table import (
 )
 
 REPORT, VIDEOS = "report.html", "videos"
-SCORES = {
+LEADERBOARDS = {
     "driving_score_1_0": "Driving score, leaderboard 1.0",
     "driving_score_2_1": "Driving score, leaderboard 2.1",
-    "completion": "Route completion, %",
 }
+SCORES = {**LEADERBOARDS, "completion": "Route completion, %"}
 
 
 @dataclass(frozen=True)
@@ -118,7 +118,7 @@ def write_drive_report(out: Path, shown: int | None = None, safety: Table | None
         "drive_report.html.j2",
         title=title,
         provenance=Provenance.of(summary),
-        tiles=_tiles(summary),
+        tiles=_tiles(summary)[0 if safety is None else len(LEADERBOARDS) :],
         endings=_counted(summary, "endings", Ending),
         scenarios=_counted(summary, "scenarios", ScenarioKind),
         infractions=_infraction_table(summary),
@@ -191,27 +191,46 @@ def _badness(drive: DriveRecord) -> tuple[float, float]:
 
 
 def _drive_table(drives: Mapping[str, DriveRecord], shown: set[str]) -> Table:
+    is_safety = all(drive.threat is not None for drive in drives.values())
     columns = (
         Column("drive", align="left"),
         Column("length, m", digits=0),
-        Column("score 1.0", digits=1),
-        Column("score 2.1", digits=1),
+        *_score_columns(is_safety),
         Column("completion, %", digits=0),
         Column("outside lanes, %", digits=1),
         Column("time, s", digits=0),
         Column("ending", align="left"),
         Column("infractions", align="left"),
     )
-    return simple_table(columns, [_drive_row(name, drive, name in shown) for name, drive in drives.items()])
+    return simple_table(
+        columns, [_drive_row(name, drive, name in shown, is_safety) for name, drive in drives.items()]
+    )
 
 
-def _drive_row(name: str, drive: DriveRecord, is_shown: bool) -> list[Value | Cell]:
+def _score_columns(is_safety: bool) -> tuple[Column, Column]:
+    """Return the columns of the scores: those of safety tests, or of the leaderboards."""
+    if is_safety:
+        return Column("safety score", digits=2), Column("outcome", align="left")
+    return Column("score 1.0", digits=1), Column("score 2.1", digits=1)
+
+
+def _score_cells(drive: DriveRecord, is_safety: bool) -> tuple[Value | Cell, Value | Cell]:
+    if not is_safety or drive.threat is None:
+        return drive.driving_score_1_0, drive.driving_score_2_1
+    outcome = drive.threat.outcome
+    return drive.threat.score, Cell(words(outcome), "good" if outcome is Outcome.PASSED else "bad")
+
+
+def _of_five(result: SafetyResult) -> str:
+    return "not scored" if result.score is None else f"{result.score:.1f} of 5"
+
+
+def _drive_row(name: str, drive: DriveRecord, is_shown: bool, is_safety: bool) -> list[Value | Cell]:
     score = drive.score
     return [
         Cell(name, link=name if is_shown else ""),
         drive.length_m,
-        score.driving_score_1_0,
-        score.driving_score_2_1,
+        *_score_cells(drive, is_safety),
         100 * score.completion,
         100 * score.outside_lanes if drive.lanes_known else None,
         score.duration_s,
@@ -238,8 +257,8 @@ def _show_drive(name: str, drive: DriveRecord) -> ShownDrive:
         events.append(DriveEvent(None, f"{words(drive.threat.kind)} threat", threat_text(drive.threat)))
     return ShownDrive(
         name=name,
-        score=number(score.driving_score_1_0, 1),
-        ending=words(score.ending),
+        score=number(score.driving_score_1_0, 1) if drive.threat is None else _of_five(drive.threat),
+        ending=words(score.ending if drive.threat is None else drive.threat.outcome),
         error=drive.error,
         path_plot=inline_svg(draw_drive_path(drive)),
         timeline=inline_svg(draw_timeline(drive)),

@@ -8,16 +8,16 @@ from foredrive.view.table import Cell, Column, Row, Section, Table, Value, numbe
 COLUMNS = (
     Column(align="left"),
     Column("runs"),
+    Column("failed"),
     Column("score"),
     Column("collisions, %"),
     Column("progress", digits=2),
     Column("score by progress", digits=2),
-    Column("impact / reference", digits=2),
-    Column("time to collision, s", digits=1),
+    Column("impact speed", digits=2),
+    Column("TTC, s", digits=1),
     Column("comfort, %", digits=0),
     Column("stopped short"),
     Column("left way"),
-    Column("failed"),
 )
 
 
@@ -30,12 +30,14 @@ def safety_table(runs: Sequence[TestedRun], left_out: Mapping[str, str]) -> Tabl
     scenarios, kinds, overall = aggregate(runs)
     notes = [
         "score: 0 to 5; in brackets 95 % intervals over runs; score by progress: mean of their product",
+        "impact speed: share of the reference speed, of runs with a collision; TTC: median of the smallest "
+        "time to collision of each run",
         *(f"left out, {label}: {why}" for label, why in left_out.items()),
     ]
     sections = [
         Section([_row(name, figures) for name, figures in scenarios.items()]),
         Section([_row(words(kind), figures) for kind, figures in kinds.items()]),
-        Section([_row(f"mean of {len(kinds)} kinds", overall, is_strong=True)]),
+        Section([_row(f"mean of {len(kinds)} kind{'s' if len(kinds) > 1 else ''}", overall, is_strong=True)]),
     ]
     return Table(COLUMNS, sections, notes=notes)
 
@@ -45,6 +47,7 @@ def _row(name: str, of: SafetyFigures, is_strong: bool = False) -> Row:
     cells: list[Value | Cell] = [
         name,
         of.runs,
+        Cell(of.failed, "bad" if of.failed else ""),
         _interval(of.score, 2),
         _interval(of.collision_rate, 0, 100.0),
         of.progress,
@@ -54,7 +57,6 @@ def _row(name: str, of: SafetyFigures, is_strong: bool = False) -> Row:
         comfort,
         of.stopped_short,
         of.left_way,
-        Cell(of.failed, "bad" if of.failed else ""),
     ]
     return Row(cells, is_strong)
 

@@ -70,7 +70,7 @@ def test_the_table_names_failures_and_what_is_left_out() -> None:
     assert any("side-x" in note for note in table.notes)
     text = [str(cell) for cell in table.sections[2].rows[0].cells]
     assert text[0] == "mean of 2 kinds"
-    assert text[2].startswith("2.25 [")
+    assert text[3].startswith("2.25 [")
 
 
 def test_a_failed_run_changes_no_mean() -> None:

@@ -13,8 +13,9 @@ after it begins to drive itself, at constant speed on the logged path. A scenari
 What is proposed still has to pass the self-test.
 """
 
+import functools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import shapely
@@ -62,6 +63,7 @@ def propose(place: Place, scene: str) -> list[SafetyScenario]:
     """
     drive = LoggedDrive(place.vehicle, torch.eye(4))
     models, found = _models(place, drive), list[SafetyScenario]()
+    others_at = functools.cache(functools.partial(_others, place))
     first = math.ceil(drive.first_s / FRAME_DT_S) + 1
     for frame in range(first, int(drive.end_s / FRAME_DT_S), EVERY_FRAMES):
         begin_s = FRAME_DT_S * (frame + PRIMING_FRAMES)
@@ -70,7 +72,7 @@ def propose(place: Place, scene: str) -> list[SafetyScenario]:
             break
         for kind in Threat:
             actor = _actor(kind, drive, begin_s, models)
-            if actor is not None and _feasible(place, drive, actor, begin_s, length_s):
+            if actor is not None and _feasible(place, drive, others_at, actor, begin_s, length_s):
                 name = f"{scene}_{FRAME_DT_S * frame:g}s"
                 found.append(SafetyScenario(name, kind, scene, frame, length_s, (actor,), PRIMING_FRAMES))
     return found
@@ -132,16 +134,27 @@ def _oncoming(
 
 
 def _feasible(
-    place: Place, drive: LoggedDrive, actor: ScenarioActor, begin_s: float, length_s: float
+    place: Place,
+    drive: LoggedDrive,
+    others_at: Callable[[float], shapely.Geometry],
+    actor: ScenarioActor,
+    begin_s: float,
+    length_s: float,
 ) -> bool:
-    """Return whether the ways of actor and ego vehicle are free, and the actor is seen in time."""
+    """Return whether the ways of actor and ego vehicle are free, and the actor is seen in time.
+
+    Args:
+        others_at: returns the boxes of the log's actors at a time.
+        begin_s: end of the priming, s.
+        length_s: length of the test with priming, s.
+    """
     way = actor.way if isinstance(actor.way, Polyline) else actor.way.polyline()
     speed_mps = drive.state_at(begin_s).speed_mps
     if speed_mps * REACTION_S + speed_mps**2 / (2 * BRAKING_MPS2) > speed_mps * IMPACT_S:
         return False
     end_s = begin_s + length_s - FRAME_DT_S * PRIMING_FRAMES
     for t_s in np.arange(begin_s, end_s, FRAME_DT_S).tolist():
-        others = _others(place, t_s)
+        others = others_at(t_s)
         foot = way_points(way, np.array([t_s]))[0, :2]
         if shapely.Point(foot).buffer(BODY_M).intersects(others):
             return False
