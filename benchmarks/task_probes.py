@@ -28,7 +28,7 @@ from foredrive.evaluation.metrics import METRICS
 from foredrive.evaluation.run import evaluate
 from foredrive.recipes import Recipe, find_recipe
 from foredrive.recipes.config import rescheduled
-from foredrive.recipes.task_heads import HEADED, TaskHeadsRecipe, town_heads
+from foredrive.recipes.task_heads import HEADED, INSTANCES, TaskHeadsRecipe, town_heads
 from foredrive.runs.evaluate.predict import AgentPredictor
 from foredrive.runs.shipped import run_folder
 from foredrive.runs.train.run import Run, load_agent, open_run, train_run
@@ -37,12 +37,13 @@ from foredrive.runs.train.tasks import probe_run, train_heads
 ROOT = Path("runs/task_probes")
 DRIVES = 28
 """Training drives: four of each town."""
-TRAINED_EVERY_S, JUDGED_EVERY_S = 1.0, 2.0
-HEAD_STEPS = 1500
+JUDGED_EVERY_S = 0.5
+"""Time between judged key frames, s: that of the key frames, because tracks are judged too."""
+TASKS = (*HEADED, INSTANCES)
 NEMO, DRIVEWORLD = "nemo_town", "driveworld_town"
 ROWS = ("occupancy", "rssm", "ssp", "dmb", "mln", "prompts")
 """Rows of Table 1 that pre-train: single frames (3-D), then one part of DriveWorld after the other (4-D)."""
-JUDGED_PARTS = frozenset({"agents", "map_lines", "map_layers", "semantics"})
+JUDGED_PARTS = frozenset({"agents", "map_lines", "map_layers", "semantics", "instances"})
 KEPT = (
     "detection.car_ap", "detection.nuscenes.", "tracking.nuscenes.", "motion.uniad.", "motion.sparsedrive.",
     "map.uniad", "map.maptr.", "map.streammapnet.", "occupancy.",
@@ -72,9 +73,8 @@ DECIDED_BY = (
 
 def heads_recipe(seed: int = 0) -> TaskHeadsRecipe:
     """Return the heads of every arm."""
-    recipe = town_heads(HEADED)
-    schedule = dataclasses.replace(recipe.schedule, steps=HEAD_STEPS, seed=seed)
-    return dataclasses.replace(recipe, schedule=schedule, now_stride_s=TRAINED_EVERY_S)
+    recipe = town_heads(TASKS)
+    return dataclasses.replace(recipe, schedule=dataclasses.replace(recipe.schedule, seed=seed))
 
 
 def world_model_alone(recipe: Recipe[Any, Any]) -> Recipe[Any, Any]:

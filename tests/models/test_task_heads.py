@@ -52,8 +52,8 @@ def volumes(batch: int = 2) -> dict[Task, TaskVolume]:
     return {task: TaskVolume(drawn(), drawn(), moved) for task in TASKS}
 
 
-def louder(volume: TaskVolume) -> TaskVolume:
-    return dataclasses.replace(volume, now=volume.now + 1)
+def turned(volume: TaskVolume) -> TaskVolume:
+    return dataclasses.replace(volume, now=volume.now.flip(-1))
 
 
 def heads(config: TaskHeadsConfig = CONFIG) -> TaskHeads:
@@ -105,10 +105,10 @@ def test_each_head_reads_the_volume_of_its_task() -> None:
     module, given = heads().eval(), volumes(1)
     before = module(given)
     for task, same in (("map", "agents"), ("detection", "elements"), ("occupancy", "agents")):
-        after = module({**given, task: louder(given[task])})
+        after = module({**given, task: turned(given[task])})
         old, new = getattr(before, same)[-1], getattr(after, same)[-1]
         assert all(torch.equal(a, b) for a, b in zip(_tensors(old), _tensors(new), strict=True))
-    moved = module({**given, "motion": louder(given["motion"])}).agents[-1]
+    moved = module({**given, "motion": turned(given["motion"])}).agents[-1]
     torch.testing.assert_close(moved.boxes.mean, before.agents[-1].boxes.mean)
     assert not torch.allclose(moved.future_xy, before.agents[-1].future_xy)
 

@@ -90,7 +90,7 @@ class PlaneFeatures(nn.Module):
 class PlanePyramid(nn.Module):
     """A U-Net over the plane of a volume: columns, their surroundings, and the whole plane.
 
-    Height is folded into the channels by one linear layer for each column. A past volume is folded by the
+    Height is folded into the channels by one normed layer for each column. A past volume is folded by the
     same layer, moved by the ego motion and read beside the present one (BEVDet4D, Huang and Huang 2022), so
     that what moves can be told from what stands.
 
@@ -107,7 +107,7 @@ class PlanePyramid(nn.Module):
         self.width, self.fine_width, self.past = width, width // 2, past
         self.halvings = max(1, halvings(spec, max_cells))
         fine = self.fine_width
-        self.columns = nn.Conv2d(spec.shape_zyx[0] * channels, fine, 1)
+        self.columns = _convolution(spec.shape_zyx[0] * channels, fine, size=1)
         self.join = _convolution(2 * fine if past else fine, fine)
         depths = self.halvings + 1  # one level below the coarse plane sees most of the surroundings
         widths = [fine] + depths * [width]
@@ -139,7 +139,7 @@ class PlanePyramid(nn.Module):
             if past is not None and T_past_now is not None:
                 before = self._moved(self.columns(past.flatten(1, 2)), T_past_now)
             at = torch.cat([at, before], dim=1)
-        levels = [self.join(at)]
+        levels = [self.join(at.contiguous(memory_format=torch.channels_last))]
         for down in self.down:
             levels.append(down(levels[-1]))
         found = levels.pop()
@@ -161,9 +161,9 @@ class PlanePyramid(nn.Module):
         return Plane(past, self.lower_m, self.cell_m).at(there).mT.unflatten(-1, self.shape_yx)
 
 
-def _convolution(width_in: int, width: int, stride: int = 1) -> nn.Sequential:
+def _convolution(width_in: int, width: int, stride: int = 1, size: int = 3) -> nn.Sequential:
     return nn.Sequential(
-        nn.Conv2d(width_in, width, 3, stride=stride, padding=1), nn.GroupNorm(8, width), nn.ReLU()
+        nn.Conv2d(width_in, width, size, stride=stride, padding=size // 2), nn.GroupNorm(8, width), nn.ReLU()
     )
 
 
