@@ -78,7 +78,7 @@ class FieldRecipe:
 
 def tiny_field() -> FieldRecipe:
     """Return a field for half an hour on two cores, with images of 480×270."""
-    actors = GridConfig(levels=4, features=2, coarsest=64, finest=1024, log2_rows=15)
+    actors = GridConfig(levels=4, features=2, coarsest=64, finest=1024, log2_rows=17)
     return FieldRecipe(
         schedule=FieldSchedule(
             steps=12_000,
@@ -105,12 +105,13 @@ def tiny_field() -> FieldRecipe:
                 proposals=(
                     GridsConfig(
                         GridConfig(levels=6, features=1, coarsest=32, finest=2048, log2_rows=17),
-                        GridConfig(levels=4, features=1, coarsest=64, finest=1024, log2_rows=13),
+                        GridConfig(levels=4, features=1, coarsest=64, finest=1024, log2_rows=15),
                     ),
                 ),
                 proposal_samples=(32,),
                 samples=16,
                 surface="density",
+                shading="rays",
                 appearance=8,
             ),
             decoder=PatchDecoderConfig(
