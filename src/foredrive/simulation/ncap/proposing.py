@@ -4,7 +4,7 @@ Neuro-ncap's scenarios were placed by hand. Here they are found. A place is wher
 after it begins to drive itself, at constant speed on the logged path. A scenario is feasible if
 
 - the log moves at the start, and the place lies on its path, so that it was seen from near;
-- the actor's way is free of the log's actors while the test lasts, and so is the ego vehicle's up to there;
+- the actor's way is free of the log's actors until 1 s after the impact, and the ego vehicle's up to there;
 - the actor is on a lane around the time of the impact, if the log has a map;
 - no actor hides the target from the ego vehicle 2 s before the impact;
 - the ego vehicle could stop in front of the place with comfortable braking, so that the test can be passed;
@@ -48,6 +48,8 @@ ACTOR_MPS = 5.0
 SEEN_WITHIN_M, BODY_M = 20.0, 2.7
 """A copied car was seen from within this distance, m. Nothing is nearer to its middle than `BODY_M` on a free
 way, half a car's length and some margin."""
+PATH_S, PATH_DT_S = 16.0, 0.2
+"""Length and step of the part of the logged path that is looked at, s."""
 MODELS = 3
 """Number of cars to choose from."""
 
@@ -70,9 +72,10 @@ def propose(place: Place, scene: str) -> list[SafetyScenario]:
         length_s = min(LENGTH_S, FRAME_DT_S * math.floor((drive.end_s - FRAME_DT_S * frame) / FRAME_DT_S))
         if begin_s + IMPACT_S + AFTERWARDS_S > FRAME_DT_S * frame + length_s:
             break
+        speed_mps, path = drive.state_at(begin_s).speed_mps, _path_from(drive, begin_s)
         for kind in Threat:
-            actor = _actor(kind, drive, begin_s, models)
-            if actor is not None and _feasible(place, drive, others_at, actor, begin_s, length_s):
+            actor = _actor(kind, path, speed_mps, begin_s, models)
+            if actor is not None and _feasible(place, drive, others_at, actor, begin_s):
                 name = f"{scene}_{FRAME_DT_S * frame:g}s"
                 found.append(SafetyScenario(name, kind, scene, frame, length_s, (actor,), PRIMING_FRAMES))
     return found
@@ -93,10 +96,20 @@ def _models(place: Place, drive: LoggedDrive) -> tuple[str, ...]:
     return tuple(token[int(tracks.track_id[row])] for row in best)
 
 
-def _actor(kind: Threat, drive: LoggedDrive, begin_s: float, models: Sequence[str]) -> ScenarioActor | None:
+def _path_from(drive: LoggedDrive, begin_s: float) -> Float64[np.ndarray, "N 3"]:
+    """Return the logged path from a time on, m, world frame."""
+    times = np.arange(begin_s, min(begin_s + PATH_S, drive.end_s), PATH_DT_S)
+    return np.stack([drive.pose_at(t_s)[:3, 3] for t_s in times.tolist()])
+
+
+def _actor(
+    kind: Threat,
+    path: Float64[np.ndarray, "N 3"],
+    speed_mps: float,
+    begin_s: float,
+    models: Sequence[str],
+) -> ScenarioActor | None:
     """Return the actor of a test. None if the log is too slow, or its path too short for it."""
-    speed_mps = drive.state_at(begin_s).speed_mps
-    path = np.stack([drive.pose_at(t_s)[:3, 3] for t_s in np.arange(begin_s, drive.end_s, 0.1).tolist()])
     arc_m = arc_lengths(path[:, :2])
     bumper_m = EGO.axle_to_centre_m + 0.5 * EGO.length_m
     at_m = speed_mps * IMPACT_S + bumper_m
@@ -139,21 +152,19 @@ def _feasible(
     others_at: Callable[[float], shapely.Geometry],
     actor: ScenarioActor,
     begin_s: float,
-    length_s: float,
 ) -> bool:
     """Return whether the ways of actor and ego vehicle are free, and the actor is seen in time.
 
     Args:
         others_at: returns the boxes of the log's actors at a time.
         begin_s: end of the priming, s.
-        length_s: length of the test with priming, s.
     """
     way = actor.way if isinstance(actor.way, Polyline) else actor.way.polyline()
     speed_mps = drive.state_at(begin_s).speed_mps
     if speed_mps * REACTION_S + speed_mps**2 / (2 * BRAKING_MPS2) > speed_mps * IMPACT_S:
         return False
-    end_s = begin_s + length_s - FRAME_DT_S * PRIMING_FRAMES
-    for t_s in np.arange(begin_s, end_s, FRAME_DT_S).tolist():
+    end_s = begin_s + IMPACT_S + AFTERWARDS_S
+    for t_s in np.arange(begin_s, end_s + 1e-6, FRAME_DT_S).tolist():
         others = others_at(t_s)
         foot = way_points(way, np.array([t_s]))[0, :2]
         if shapely.Point(foot).buffer(BODY_M).intersects(others):
