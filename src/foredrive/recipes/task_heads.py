@@ -50,7 +50,7 @@ def town_heads(tasks: Sequence[str]) -> TaskHeadsRecipe:
         InputError: a task is unknown or has no head.
     """
     sizes = TaskHeadsConfig(agents=AgentHeadConfig(carried=CarriedConfig()))
-    schedule = Schedule(batch_size=8, lr=2e-3, steps=1500, warmup_steps=60, clip_grad_norm=10.0)
+    schedule = Schedule(batch_size=8, lr=3e-3, steps=1500, warmup_steps=60, clip_grad_norm=10.0)
     return _heads_of(tasks, sizes, schedule)
 
 
