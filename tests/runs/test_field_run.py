@@ -133,6 +133,12 @@ def test_actors_of_other_scenes_are_refused(run: Reconstruction, log: LogPath, t
     assert same.content.slot.tolist()[-1] == scene.tracks.index_of(7)
 
 
+def test_a_film_of_it_without_an_actor(run: Reconstruction, tmp_path: Path) -> None:
+    film = tmp_path / "film.webp"
+    assert main(["render", str(run.folder), "--out", str(film), "--remove", "7", "--seconds", "0.2"]) == 0
+    assert film.stat().st_size > 0
+
+
 def test_the_sizes_of_neurad() -> None:
     """Table of parameters of the reference implementation: 8 levels of 4 features in 2^22 rows."""
     sizes = field_base().representation.scene.network
