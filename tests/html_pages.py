@@ -5,7 +5,7 @@ from html.parser import HTMLParser
 
 EVIL = 'x"><svg onload=alert(1)>'
 """A name that ends the attribute or the tag it is put into, and runs a script."""
-VOID = ("meta", "img", "br", "input")
+VOID = ("meta", "img", "br", "input", "wbr")
 
 
 class Page(HTMLParser):

@@ -14,6 +14,7 @@ from foredrive.data import LogPath
 from foredrive.errors import InputError
 from foredrive.models.driveworld.planes import VectorToPlaneConfig
 from foredrive.models.driveworld.task_prompt import PROMPTS, PromptConfig
+from foredrive.models.tasks.agents import CarriedConfig
 from foredrive.recipes.task_heads import base_heads, town_heads, with_settings
 from foredrive.runs import Run, evaluate_run
 from foredrive.runs.build import build_agent
@@ -41,6 +42,19 @@ def test_heads_of_a_run_are_trained_continued_and_evaluated(
     assert all(torch.equal(one, other) for one, other in weights)
     with pytest.raises(InputError, match="holds other heads"):
         train_heads(run, small_heads(("detection", "motion"), steps=3))
+
+
+def test_instances_of_agents_that_are_carried_on(trained: Run, log: LogPath, tmp_path: Path) -> None:
+    """Heads that follow a drive read one clip at a time; their instances stand together in a batch."""
+    run = probe_run(trained.recipe, [log], tmp_path / "probe", trained.cache_dir, trained.folder)
+    recipe, carried = small_heads(("detection", "instances")), CarriedConfig(agents=2, frames=2)
+    assert recipe.heads.agents is not None
+    agents = dataclasses.replace(recipe.heads.agents, carried=carried)
+    sizes = dataclasses.replace(recipe.heads, agents=agents)
+    train_heads(run, dataclasses.replace(recipe, heads=sizes, now_stride_s=carried.dt_s))
+    result = evaluate_run(run, [log], tmp_path / "evaluated", views=False)
+    assert result.summary["failed"] == 0
+    assert "occupancy.uniad.vpq_near_pct.constant_velocity" in result.summary
 
 
 def test_kept_volumes_are_shared_and_those_of_the_world_model(

@@ -129,8 +129,13 @@ def _environment() -> Environment:
         lstrip_blocks=True,
         keep_trailing_newline=True,
     )
-    environment.filters |= {"number": number, "words": words, "cell": _cell}
+    environment.filters |= {"number": number, "words": words, "cell": _cell, "breakable": _breakable}
     return environment
+
+
+def _breakable(text: str) -> Markup:
+    """Let a long name of a log be broken after its folders and before its time, not within a word."""
+    return Markup("<wbr>@").join(Markup("/<wbr>").join(part.split("/")) for part in text.split("@"))
 
 
 def _cell(value: Value | Cell) -> Cell:
