@@ -206,3 +206,28 @@ def test_a_low_score_gets_no_identity() -> None:
 def test_impossible_numbers_are_one_line(change: dict[str, int], said: str) -> None:
     with pytest.raises(InputError, match=said):
         heads(dataclasses.replace(CarriedConfig(agents=3), **change))
+
+
+@pytest.mark.parametrize(("hidden", "same"), [(2, True), (6, False)])
+def test_an_identity_waits_for_a_hidden_agent_and_ends(hidden: int, same: bool) -> None:
+    """A rank of 0.99 is 0.36 after two hidden frames, and below 0.1 after five."""
+    config = CarriedConfig(agents=1, decay=0.6, born=0.1)
+    follower = DriveFollower(config)
+
+    def frame(score_logit: float, number: int) -> list[int]:
+        found = agents([(5.0, 0.0), (-5.0, 0.0)])
+        logits = torch.full_like(found.boxes.logits, -9.0)
+        logits[..., -1] = 0.0
+        logits[0, 0, 0] = score_logit
+        found = dataclasses.replace(found, boxes=dataclasses.replace(found.boxes, logits=logits))
+
+        def perceive(carried: CarriedAgents | None) -> HeadOutput:
+            return HeadOutput(agents=[found], lineage=lineage_of(found, carried, config.decay))
+
+        track_id = follower.step(perceive, f"a@{500_000 * number}", poses(1)[0])[1]
+        return track_id[0].tolist()
+
+    assert frame(5.0, 0) == [0, -1]
+    for number in range(hidden):
+        assert frame(-9.0, 1 + number) == [-1, -1]
+    assert frame(5.0, 1 + hidden) == [0 if same else 1, -1]

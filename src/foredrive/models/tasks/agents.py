@@ -46,7 +46,7 @@ class CarriedConfig:
     reach_m: float = 2.0
     """Maximum distance of the proposal at which a carried agent goes on from where it is expected."""
     born: float = 0.1
-    """Minimum score at which a query gets an identity, which it keeps as long as it is carried."""
+    """Minimum score at which a query gets an identity, and minimum rank at which it keeps it."""
     frames: int = 4
     """Key frames of a training sequence, at least 2."""
     dt_s: float = 0.5

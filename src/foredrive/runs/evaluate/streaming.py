@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-from jaxtyping import Float64, Int
+from jaxtyping import Bool, Float64, Int
 from torch import Tensor
 
 from foredrive.evaluation.frame_keys import continues, time_of
@@ -44,7 +44,7 @@ class DriveFollower:
     def step(
         self, perceive: Perceive, key: str, T_world_ego: Float64[Tensor, "4 4"]
     ) -> tuple[HeadOutput, Int[Tensor, "1 Q"]]:
-        """Return the output of heads for the next frame, and the identity of each agent; -1: none.
+        """Return the output of heads for the next frame, and the identity of each agent; -1: none, or hidden.
 
         Args:
             perceive: the heads.
@@ -59,9 +59,10 @@ class DriveFollower:
         assert output.lineage is not None
         score = output.agents[-1].boxes.logits.softmax(dim=-1)[..., :-1].amax(dim=-1)
         old = torch.full_like(output.lineage.source, -1) if before is None else before.track_id
-        track_id = self._identities(output.lineage, old, score >= self.config.born)
+        seen = score >= self.config.born
+        track_id = self._identities(output.lineage, old, seen)
         self._before = _Frame(key, T_world_ego, output, track_id)
-        return output, track_id
+        return output, torch.where(seen, track_id, -1)
 
     def _carried(self, before: _Frame, key: str, T_world_ego: Float64[Tensor, "4 4"]) -> CarriedAgents:
         assert before.output.agents is not None
@@ -70,11 +71,16 @@ class DriveFollower:
         dt_s = 1e-6 * (time_of(key) - time_of(before.key))
         return carry(before.output.agents[-1], before.output.lineage, self.config.agents, T_now_before, dt_s)
 
-    def _identities(self, lineage: Lineage, old: Int[Tensor, "1 _Q"], born: Tensor) -> Int[Tensor, "1 Q"]:
-        """Return the identities that are carried on, and new ones for other agents of a high score."""
-        goes_on = lineage.source >= 0
+    def _identities(
+        self, lineage: Lineage, old: Int[Tensor, "1 _Q"], seen: Bool[Tensor, "1 Q"]
+    ) -> Int[Tensor, "1 Q"]:
+        """Return the identities that are carried on, and new ones for other agents that are seen.
+
+        An identity ends when the rank of its query falls below `born`.
+        """
+        goes_on = (lineage.source >= 0) & (lineage.rank >= self.config.born)
         track_id = torch.where(goes_on, old.gather(1, lineage.source.clamp_min(0)), -1)
-        new = (track_id < 0) & born
+        new = (track_id < 0) & seen
         track_id[new] = self._begun + torch.arange(int(new.sum()), device=track_id.device)
         self._begun += int(new.sum())
         return track_id
