@@ -68,7 +68,6 @@ def record(
     check_number("--seed", seed, low=0)
     check_number("--rate", rate, above=0)
     check_image_size(image_size)
-    cameras = chosen_rig(rig, image_size)
     check_number("--workers", workers, low=0)
     check_out_folder(out)
     between = _range("vehicles", vehicles), _range("people", people)
@@ -76,6 +75,7 @@ def record(
     weather = _conditions(conditions)
     for name in town:
         check_town(name)
+    cameras = chosen_rig(rig, image_size)
 
     with importing():
         from foredrive.runs.drive.recording import record_drives, record_plan
