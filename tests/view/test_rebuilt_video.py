@@ -85,7 +85,7 @@ def test_a_recorded_time_is_filmed_as_it_was_judged(run: Reconstruction) -> None
     plan = plan_frames(opened.vehicle, start_s=judged.t_s, seconds=0.0)
     shot = render_frame(opened.scene, opened.vehicle, apply_edits(opened.scene.graph, []), plan, 0)
     with torch.no_grad():
-        rgb = run.scene(run.scene.graph, judged).rgb.clamp(0, 1)
+        rgb = run.scene.camera(run.scene.graph, judged).rgb.clamp(0, 1)
     assert torch.allclose(shot.images[0].float(), 255 * rgb, atol=1.0)
     assert shot.boxes.track_id.tolist() == [7, 11]
     there = torch.tensor(world.PARKED["centre"] - world.driven(judged.t_s)).float()
