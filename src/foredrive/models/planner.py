@@ -167,8 +167,7 @@ class PathCorrection(nn.Module):
             nn.Linear(width, 2 * steps),
             nn.Unflatten(1, (steps, 2)),
         )
-        for parameter in self.change[-2].parameters():
-            nn.init.zeros_(parameter)
+        _set_to_zero(self.change[-2])
 
     def forward(self, samples: PathSamples, status: Float[Tensor, "b S"]) -> Float[Tensor, "b T 2"]:
         """Return corrections of the steps between waypoints, m.
@@ -278,8 +277,7 @@ class VolumePlanner(nn.Module):
             nn.Linear(width, width), nn.ReLU(), nn.Linear(width, 2 * horizon_steps)
         )
         if self.ego_mlp is not None:  # the MLP's plan is good already: start from no correction
-            for parameter in self.waypoints[-1].parameters():
-                nn.init.zeros_(parameter)
+            _set_to_zero(self.waypoints[-1])
         status = 0 if self.ego_mlp is None else len(self.ego_mlp.status_mean)
         self.path: PathCorrection | None = None
         if config.path is not None:
@@ -383,6 +381,11 @@ class VolumePlanner(nn.Module):
         if future is None:
             raise ValueError("this planner needs the next volume too")
         return torch.cat([now, future], 1) if self.fuse_future is None else self.fuse_future(now, future)
+
+
+def _set_to_zero(layer: nn.Module) -> None:
+    for parameter in layer.parameters():
+        nn.init.zeros_(parameter)
 
 
 def _headings(xy: Float[Tensor, "b M T 2"]) -> Float[Tensor, "b M T"]:
