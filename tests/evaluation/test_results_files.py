@@ -158,3 +158,37 @@ def test_frames_without_annotation_are_left_out_unless_all_are(example: Example,
         truth = dataclasses.replace(example, clip=dataclasses.replace(clip, boxes_valid=valid))
         write(tmp_path, near_truth(example), truth)
         assert len(json.loads((tmp_path / "detection.json").read_text())["results"]) == expected
+
+
+def test_a_frame_without_tracks_still_counts(logs: Path, example: Example, tmp_path: Path) -> None:
+    """Its road users are missed. Left out of the file, it would not be scored."""
+    prediction = near_truth(example)
+    assert prediction.agents is not None
+    track_id = prediction.agents.track_id.clone()
+    track_id[1] = -1
+    hidden = dataclasses.replace(prediction.agents, track_id=track_id)
+    prediction = dataclasses.replace(prediction, agents=hidden)
+    write(tmp_path, prediction, example)
+    results = json.loads((tmp_path / "tracking.json").read_text())["results"]
+    assert list(results) == list(example.key)
+    assert results[example.key[1]] == []
+    printed = evaluated(TrackingMetric, prediction, example)
+    scored = score_tracks(*read_objects(tmp_path / "tracking.json", logs, "tracking"))
+    assert_same_figures(printed, scored, 40)
+
+
+def test_files_of_an_earlier_evaluation_are_removed(example: Example, tmp_path: Path) -> None:
+    """Of more frames, and with identities; what others have put there stays."""
+    prediction = near_truth(example)
+    write(tmp_path, prediction, example)
+    (tmp_path / "notes.json").write_text("{}")
+    assert prediction.agents is not None
+    none = dataclasses.replace(prediction.agents, track_id=prediction.agents.track_id * 0 - 1)
+    files = ResultsFiles(tmp_path)
+    few = dataclasses.replace(prediction, agents=none)[:2]
+    files.add(few, dataclasses.replace(example[:2], key=example.key[:2]))
+    files.write()
+    found = {path.relative_to(tmp_path / "occupancy").as_posix() for path in tmp_path.rglob("*.npz")}
+    assert found == {f"{key}.npz" for key in example.key[:2]}
+    assert not (tmp_path / "tracking.json").exists()
+    assert (tmp_path / "notes.json").exists()

@@ -200,6 +200,27 @@ def test_a_low_score_gets_no_identity() -> None:
     assert (track_id == -1).all()
 
 
+def test_agents_that_are_not_finite_are_not_carried_on() -> None:
+    """The frame after a failed one begins anew, as the first of a drive does."""
+    config = CarriedConfig(agents=3, born=0.0)
+    follower, module, T_world_ego = DriveFollower(config), heads(config), poses(3)
+    volume = frame_volumes()
+    found = []
+    with torch.no_grad():
+        for item in range(3):
+            now = volume.now[item : item + 1] * (torch.nan if item == 1 else 1.0)
+            one = dataclasses.replace(volume[item : item + 1], now=now)
+
+            def perceive(carried: CarriedAgents | None, one: TaskVolume = one) -> HeadOutput:
+                return module({"detection": one, "motion": one}, carried=carried)
+
+            found.append(follower.step(perceive, f"drive@{500_000 * item}", T_world_ego[item]))
+        last = volume[2:3]
+        alone = module({"detection": last, "motion": last})
+    assert found[2][0].agents[-1].boxes.mean.equal(alone.agents[-1].boxes.mean)
+    assert not set(found[2][1][0].tolist()) & set(found[0][1][0].tolist())
+
+
 @pytest.mark.parametrize(
     ("change", "said"), [({"agents": 8}, "the head has 8 queries"), ({"frames": 1}, "2 frames")]
 )

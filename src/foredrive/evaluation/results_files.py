@@ -29,7 +29,7 @@ from foredrive.evaluation.objects.in_world import (
 )
 from foredrive.evaluation.predictor import Prediction
 from foredrive.evaluation.summary import write_json
-from foredrive.evaluation.voxels.log_results import VoxelGridOfResults, write_grid, write_voxels
+from foredrive.evaluation.voxels.log_results import GRID_FILE, VoxelGridOfResults, write_grid, write_voxels
 from foredrive.metrics.detection_protocols import CLASSES
 from foredrive.metrics.maps.protocols import HALF_XY_M
 from foredrive.metrics.tracking.protocols import TRACKING_PROTOCOLS
@@ -52,6 +52,8 @@ META = {"use_camera": True, "use_lidar": False, "use_radar": False, "use_map": F
 DIGITS = 6
 """Digits after the point of futures and polylines, m: most of the numbers in the files."""
 
+TASKS = ("detection", "tracking", "motion", "map")
+"""Tasks with one JSON file each."""
 OCCUPANCY = "occupancy"
 """Folder of semantic voxels in the folder of the files."""
 
@@ -65,17 +67,21 @@ class ResultsFiles:
     else then.
 
     Args:
-        folder: folder of the files. Voxels are written to it at once.
+        folder: folder of the files. Voxels are written to it at once, and the files of an earlier evaluation
+            are removed from it with the first batch: scored with these, they would count as predictions.
     """
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self._frames: dict[str, dict[str, tuple[bool, list[Record]]]] = {}
         self._voxels: dict[Path, bool] = {}
+        self._begun = False
 
     def add(self, prediction: Prediction, truth: Example) -> None:
         """Add a batch of b predictions with their truth."""
-        clip = truth.clip
+        if not self._begun:
+            self._remove_earlier()
+        self._begun, clip = True, truth.clip
         for item, token in enumerate(truth.key):
             annotated = bool(clip.boxes_valid[item, clip.now])
             if prediction.agents is not None:
@@ -92,6 +98,13 @@ class ResultsFiles:
             if prediction.semantics is not None and semantics is not None:
                 flow = None if prediction.flow_mps is None else prediction.flow_mps[item, 0, :2]
                 self._add_voxels(token, prediction.semantics[item], flow, semantics[item], clip.rig.names)
+
+    def _remove_earlier(self) -> None:
+        """Remove the files that an earlier evaluation has written to the folder, and no others."""
+        voxels = self.folder / OCCUPANCY
+        files = [self.folder / f"{task}.json" for task in TASKS]
+        for file in (*files, voxels / GRID_FILE, *voxels.rglob("*@*.npz")):
+            file.unlink(missing_ok=True)
 
     def _add_voxels(
         self,
@@ -114,6 +127,8 @@ class ResultsFiles:
         """Write the files of the tasks that the model predicts, and return their paths."""
         written = []
         for task, frames in self._frames.items():
+            if task == "tracking" and not any(records for _, records in frames.values()):
+                continue  # the model gives no identities
             meta: dict[str, object] = dict(META)
             content: object = {"meta": meta, "results": _judged(frames)}
             if task == "map":
@@ -147,13 +162,11 @@ def _agent_records(token: str, agents: Agents, T_world_ego: Pose) -> dict[str, l
             )
         ]
     }
-    tracks = agents.track_id.tolist()
-    if any(track >= 0 for track in tracks):
-        found["tracking"] = [
-            box | {"tracking_id": str(track), "tracking_name": name, "tracking_score": score}
-            for box, name, score, track in zip(boxes, names, scores, tracks, strict=True)
-            if track >= 0 and name in TRACKED
-        ]
+    found["tracking"] = [
+        box | {"tracking_id": str(track), "tracking_name": name, "tracking_score": score}
+        for box, name, score, track in zip(boxes, names, scores, agents.track_id.tolist(), strict=True)
+        if track >= 0 and name in TRACKED
+    ]
     if agents.future_xy is not None and agents.log_prob is not None:
         centre = agents.centre.double().numpy()
         futures = futures_in_world(agents.future_xy.double().numpy(), centre, T_world_ego)

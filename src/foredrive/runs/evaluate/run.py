@@ -4,6 +4,7 @@ import dataclasses
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float
@@ -20,11 +21,12 @@ from foredrive.evaluation.results_files import ResultsFiles
 from foredrive.evaluation.run import EvaluationResult, evaluate
 from foredrive.evaluation.summary import write_summary
 from foredrive.metrics.protocols import STEP_S, STEPS
+from foredrive.models.agent import PlanningAgent
 from foredrive.runs.evaluate.predict import AgentPredictor
 from foredrive.runs.open_clips import open_clips
 from foredrive.runs.train.baselines import run_baselines
 from foredrive.runs.train.run import Run, load_agent
-from foredrive.runs.train.tasks import load_heads
+from foredrive.runs.train.tasks import TrainedHeads, load_heads
 from foredrive.scene import Example, Trajectory
 
 SUMMARY, RESULTS = "summary.json", "results"
@@ -130,13 +132,7 @@ def evaluate_run(
     with Progress() as progress:
         task = progress.add_task("evaluate", total=len(dataset))
         result = evaluate(
-            AgentPredictor(
-                agent,
-                clips.future_frames,
-                RENDER_STRIDE if views else 0,
-                FUTURES,
-                agent.heads if trained is None or agent.heads is not None else trained.heads.to(device),
-            ),
+            _predictor(agent, trained, clips.future_frames, RENDER_STRIDE if views else 0, FUTURES),
             _Batches(dataset, batch_size),
             frame_dt_s=clips.frame_dt_s,
             baselines={
@@ -158,6 +154,16 @@ def evaluate_run(
     return result
 
 
+def _predictor(
+    agent: PlanningAgent[Any], trained: TrainedHeads | None, steps: int, ray_stride: int, futures: int = 0
+) -> AgentPredictor:
+    """Return a predictor with the agent's own heads, or else with those of a probe."""
+    heads = agent.heads
+    if heads is None and trained is not None:
+        heads = trained.heads.to(agent.planner.plan.device)
+    return AgentPredictor(agent, steps, ray_stride, futures, heads)
+
+
 @torch.no_grad()
 def predict_examples(run: Run, logs: Sequence[LogPath], count: int) -> list[ExamplePrediction]:
     """Predict `count` examples spread evenly over the logs; leave out those that cannot be read."""
@@ -166,8 +172,7 @@ def predict_examples(run: Run, logs: Sequence[LogPath], count: int) -> list[Exam
     tasks = clips.tasks if trained is None else trained.recipe.truth
     config = dataclasses.replace(clips.judged, lidar=True, map=True, tasks=tasks)
     dataset = open_clips(logs, config, run.cache_dir)
-    heads = None if trained is None else trained.heads
-    predictor = AgentPredictor(agent, clips.future_frames, RENDER_STRIDE, heads=heads)
+    predictor = _predictor(agent, trained, clips.future_frames, RENDER_STRIDE)
     found = []
     for k in range(min(count, len(dataset))):
         try:

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from foredrive.evaluation.frame_keys import continues, time_of
 from foredrive.geometry.se3 import compose_se3, inverse_se3
-from foredrive.models.tasks.agents import CarriedConfig
+from foredrive.models.tasks.agents import AgentSet, CarriedConfig
 from foredrive.models.tasks.carried import CarriedAgents, Lineage, carry, interleaved
 from foredrive.models.tasks.heads import HeadOutput
 
@@ -30,7 +30,10 @@ class _Frame:
 
 
 class DriveFollower:
-    """The state between the frames of a drive. It begins anew with each log, and where frames are missing.
+    """The state between the frames of a drive.
+
+    It begins anew with each log, where frames are missing, and after a frame whose agents are not finite:
+    one failure must not spoil the rest of the drive.
 
     Args:
         config: of the carried agents.
@@ -61,7 +64,8 @@ class DriveFollower:
         old = torch.full_like(output.lineage.source, -1) if before is None else before.track_id
         seen = score >= self.config.born
         track_id = self._identities(output.lineage, old, seen)
-        self._before = _Frame(key, T_world_ego, output, track_id)
+        whole = _is_finite(output.agents[-1])
+        self._before = _Frame(key, T_world_ego, output, track_id) if whole else None
         return output, torch.where(seen, track_id, -1)
 
     def _carried(self, before: _Frame, key: str, T_world_ego: Float64[Tensor, "4 4"]) -> CarriedAgents:
@@ -84,6 +88,13 @@ class DriveFollower:
         track_id[new] = self._begun + torch.arange(int(new.sum()), device=track_id.device)
         self._begun += int(new.sum())
         return track_id
+
+
+def _is_finite(agents: AgentSet) -> bool:
+    """Return whether agents can be carried on: whatever the next frame reads of them is finite."""
+    boxes = agents.boxes
+    read = (agents.query, agents.velocity, boxes.mean, boxes.heading, boxes.logits)
+    return all(bool(tensor.isfinite().all()) for tensor in read if tensor is not None)
 
 
 def together(outputs: Sequence[HeadOutput]) -> HeadOutput:
