@@ -12,7 +12,7 @@ from torch import Tensor
 from foredrive.geometry.se3 import exp_se3
 from foredrive.ops import ray_boxes
 from foredrive.ops.ray_boxes import Crossings, MovingBoxes, cross_boxes, key_poses
-from foredrive.rendering.tracks import poses_at
+from foredrive.rendering.tracks import ActorTracks, poses_at, states_at
 
 Cross = Callable[[Tensor, Tensor, Tensor, MovingBoxes], Crossings]
 
@@ -174,13 +174,36 @@ def test_boxes_move_as_tracks_do() -> None:
             )
 
 
+def test_boxes_are_there_as_long_as_tracks_are() -> None:
+    """At most one step beyond the key times; around a single key time for the given time."""
+    origin, direction = forward(0.0, 0.0, 0.0, 0.0)
+    still, size = pose(10, 0, 0.3), torch.tensor([[2.0, 1, 1]])
+    there = torch.ones(1, 2, dtype=torch.bool)
+    moving = MovingBoxes(torch.tensor([1.0, 1.5]), torch.stack([still, still])[None], size, there)
+    t_s = torch.tensor([0.45, 0.55, 1.95, 2.05])
+    assert cross_boxes(origin, direction, t_s, moving).ray.tolist() == [1, 2]
+    single = MovingBoxes(torch.ones(1), still[None, None], size, there[:, :1], hold_s=0.5)
+    assert cross_boxes(origin, direction, t_s, single).ray.tolist() == [1]
+    tracks = tracks_of(moving), tracks_of(single)
+    present = [[bool(states_at(held, t).present) for t in t_s.tolist()] for held in tracks]
+    assert present == [[False, True, True, False], [False, True, False, False]]
+
+
+def tracks_of(boxes: MovingBoxes) -> ActorTracks:
+    whole = torch.zeros(1, dtype=torch.int64)
+    return ActorTracks(whole, whole, 2 * boxes.half_size_m, boxes.key_t_s, boxes.T_scene_box, boxes.present)
+
+
 def test_the_number_of_threads_does_not_change_a_bit() -> None:
-    case = moving_case(5, 5000, 9, 4)
+    origin, direction, t_s, boxes = moving_case(5, 20_000, 9, 4)
     threads, results = torch.get_num_threads(), []
     try:
         for number in (1, 2, 3):
             torch.set_num_threads(number)
-            results.append(cross_boxes(*case))
+            leaves = [x.clone().requires_grad_() for x in (origin, direction, boxes.T_scene_box)]
+            found = cross_boxes(leaves[0], leaves[1], t_s, boxes._replace(T_scene_box=leaves[2]))
+            loss = found.origin_box.square().sum() + found.direction_box.pow(3).sum()
+            results.append([*(x.detach() for x in found), *torch.autograd.grad(loss, leaves)])
     finally:
         torch.set_num_threads(threads)
     for other in results[1:]:

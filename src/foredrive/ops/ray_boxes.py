@@ -1,5 +1,10 @@
-"""Where rays pass through the boxes of moving actors, each ray at its own time."""
+"""Where rays pass through the boxes of moving actors, each ray at its own time.
 
+Rows that get gradients are gathered by `index_select`: the gradient of a[index] is added up in the order of
+threads, which changes the last bits from run to run.
+"""
+
+import math
 from typing import NamedTuple
 
 import torch
@@ -26,6 +31,8 @@ class MovingBoxes(NamedTuple):
     half_size_m: Float[Tensor, "A 3"]
     present: Bool[Tensor, "A K"]
     """True where a pose is defined."""
+    hold_s: float = math.inf
+    """Time around a single key time for which boxes are there, s."""
 
 
 class Crossings(NamedTuple):
@@ -52,7 +59,8 @@ def cross_boxes(
 
     Between key times the centres move linearly and rotations are about one axis, as in
     `rendering.tracks.poses_at`. A box is there between two key times at which it is present. Before the first
-    and after the last key time its motion continues. With a single key time it stands still.
+    and after the last key time its motion continues for at most one step between key times. With a single key
+    time it stands still.
 
     The distances and the rays in the boxes' frames are differentiable in the rays and in the poses. Which
     pairs there are is not.
@@ -79,6 +87,7 @@ def cross_boxes(
             pair = _crossing_pairs(key_poses(*plain, shown))
         else:
             pair = crossing_pairs_reference(*plain, shown)
+        pair = pair[_near(boxes, t_s.detach(), share)[pair[:, 0]]]
         return _crossings(pair, origin, direction, t_s, segment, boxes)
 
 
@@ -124,6 +133,13 @@ def _segments(
     return after - 1, (t_s - before_s) / (key_t_s[after] - before_s)
 
 
+def _near(boxes: MovingBoxes, t_s: Float[Tensor, "R"], share: Float[Tensor, "R"]) -> Bool[Tensor, "R"]:
+    """Return which times are near enough to the key times that boxes are there."""
+    if len(boxes.key_t_s) == 1:
+        return (t_s - boxes.key_t_s).abs() <= boxes.hold_s
+    return (share >= -1) & (share <= 2)
+
+
 def _both(present: Bool[Tensor, "A K"]) -> Bool[Tensor, "A S"]:
     return present[:, :-1] & present[:, 1:]
 
@@ -154,10 +170,11 @@ def _pose(
     T: Float[Tensor, "A K 4 4"], box: Int[Tensor, "P"] | int, segment: Int[Tensor, "P"], share: Tensor
 ) -> Float[Tensor, "P 4 4"]:
     """Return the poses of boxes in given segments of time."""
-    before = T[box, segment]
+    poses, first = T.flatten(0, 1).flatten(1), box * T.shape[1] + segment
+    before = poses.index_select(0, first).unflatten(1, (4, 4))
     if T.shape[1] == 1:
         return before
-    after = T[box, segment + 1]
+    after = poses.index_select(0, first + 1).unflatten(1, (4, 4))
     turn = log_so3(before[:, :3, :3].transpose(-1, -2) @ after[:, :3, :3])
     turned = before @ exp_se3(torch.cat([torch.zeros_like(turn), share[:, None] * turn], dim=-1))
     moved = before[:, :, 3] + share[:, None] * (after - before)[:, :, 3]
@@ -189,13 +206,13 @@ def _crossings(
     ray, box = pair.unbind(-1)
     keys, at = boxes.key_t_s, segment[ray]
     if len(keys) == 1:
-        share = torch.zeros_like(t_s[ray])
+        share = t_s.new_zeros(len(ray))
     else:
-        share = (t_s[ray] - keys[at]) / (keys[at + 1] - keys[at])
+        share = (t_s.index_select(0, ray) - keys[at]) / (keys[at + 1] - keys[at])
     pose = _pose(boxes.T_scene_box, box, at, share)
     R_box_scene = pose[:, :3, :3].transpose(-1, -2)
-    start = (R_box_scene @ (origin[ray] - pose[:, :3, 3])[..., None])[..., 0]
-    way = (R_box_scene @ direction[ray][..., None])[..., 0]
+    start = (R_box_scene @ (origin.index_select(0, ray) - pose[:, :3, 3])[..., None])[..., 0]
+    way = (R_box_scene @ direction.index_select(0, ray)[..., None])[..., 0]
     enter, leave = _span(start, way, boxes.half_size_m[box])
     return Crossings(ray, box, enter, leave, start, way)
 

@@ -17,7 +17,7 @@ from foredrive.rendering.field.config import FieldConfig, GridConfig, GridsConfi
 from foredrive.rendering.field.contraction import contract
 
 _FIRST_FEATURE = 1e-3
-"""Bound of the initial features of a grid (Müller et al. 2022, §4); NeuRAD's is the same."""
+"""Bound of the initial features of a grid, as in nerfstudio's PyTorch grid. Müller et al. begin with 1e-4."""
 _MAX_LOG_DENSITY = 15.0
 _FIRST_LOG_DENSITY = math.log(0.02)
 """Initial logarithm of a density, 1/m: a ray passes through tens of metres."""
@@ -60,7 +60,7 @@ class HashGrid(nn.Module):
 
 
 class Grids(nn.Module):
-    """The grid of what stands, and a grid that all actors share (NeuRAD, §3.2)."""
+    """The grid of what stands, and a grid that all actors share, as in NeuRAD."""
 
     def __init__(self, config: GridsConfig, field: FieldConfig, actors: int) -> None:
         super().__init__()
@@ -112,7 +112,7 @@ def affine(layer: nn.Module, x: Float[Tensor, "C N"]) -> Float[Tensor, "D N"]:
 
 
 class FieldLayers(nn.Module):
-    """The layers of the field: geometry and features from a grid's features and directions (NeuRAD, §3.1)."""
+    """The layers of the field: geometry and features from a grid's features and directions, as in NeuRAD."""
 
     def __init__(self, config: FieldConfig, features: int) -> None:
         super().__init__()
@@ -155,22 +155,22 @@ class FieldLayers(nn.Module):
             direction: directions of the rays.
             moving: samples in boxes; their directions are those in the box' frame.
         """
-        turned = affine_direction(self.first_direction, direction)  # [D R]
+        turned = self.first_direction.weight @ harmonics(direction)  # [D R]
         if self.shading == "samples":
             hidden = affine(self.first, embedding.flatten(1)).unflatten(1, weight.shape) + turned[..., None]
-            hidden = self._turned_back(hidden.flatten(1), turned, moving, weight, sums=False)
+            hidden = self._turned_back(hidden.flatten(1), direction, moving, weight, sums=False)
             feature = embedding + self.rest(hidden.relu_()).unflatten(1, weight.shape)
             return (feature * weight).sum(-1)
         # The first layer is linear, so it can be applied to the sums.
         embedded = (embedding * weight).sum(-1)
         hidden = affine(self.first, embedded) + turned
-        hidden = self._turned_back(hidden, turned, moving, weight, sums=True)
+        hidden = self._turned_back(hidden, direction, moving, weight, sums=True)
         return embedded + self.rest(hidden.relu())
 
     def _turned_back(
         self,
         hidden: Float[Tensor, "D M"],
-        turned: Float[Tensor, "D R"],
+        direction: Float[Tensor, "R 3"],
         moving: ActorSamples | None,
         weight: Float[Tensor, "R S"],
         sums: bool,
@@ -179,7 +179,8 @@ class FieldLayers(nn.Module):
         if moving is None or len(moving.sample) == 0:
             return hidden
         ray = moving.sample // weight.shape[1]
-        change = affine_direction(self.first_direction, moving.direction) - turned[:, ray]
+        along_ray = harmonics(direction.index_select(0, ray))  # see `ops.ray_boxes` on index_select
+        change = self.first_direction.weight @ (harmonics(moving.direction) - along_ray)
         if sums:
             return hidden.index_add(1, ray, change * weight.flatten()[moving.sample])
         return hidden.index_add(1, moving.sample, change)
@@ -190,11 +191,6 @@ class FieldLayers(nn.Module):
         if self.beta is not None:
             return torch.sigmoid(-(self.beta.abs() + 1e-4) * geometry)
         return opacity_of_density(geometry, length_m)
-
-
-def affine_direction(layer: nn.Linear, direction: Float[Tensor, "R 3"]) -> Float[Tensor, "D R"]:
-    """Return a linear layer of the spherical harmonics of directions."""
-    return layer.weight @ harmonics(direction)
 
 
 def opacity_of_density(

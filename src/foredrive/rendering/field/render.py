@@ -12,7 +12,7 @@ from foredrive.rendering.field.config import FieldConfig
 from foredrive.rendering.field.network import ActorSamples, FieldLayers, Grids, ProposalDensity
 from foredrive.rendering.field.rays import FieldRays
 from foredrive.rendering.field.sampling import first_borders, resampled_borders, to_distance
-from foredrive.rendering.tracks import ActorTracks
+from foredrive.rendering.tracks import MAX_HOLD_S, ActorTracks
 
 
 class FieldActors(NamedTuple):
@@ -55,7 +55,7 @@ class SeenAlongRays(NamedTuple):
     alpha: Float[Tensor, "R"]
     """Probability that the ray ends before the sky."""
     median_m: Float[Tensor, "R"]
-    """Distance by which half of the rays that end have ended; infinite where alpha is below 0.5."""
+    """Distance at which a ray has ended with probability 0.5; infinite where alpha is below 0.5."""
     intervals: Intervals
     proposals: list[Intervals]
 
@@ -124,7 +124,7 @@ class NeuralField(nn.Module):
     def _crossings(self, rays: FieldRays, actors: FieldActors) -> Crossings:
         tracks = actors.tracks
         half = 0.5 * tracks.size_lwh + tracks.size_lwh.new_tensor(self.config.actor_margin_m)
-        boxes = MovingBoxes(tracks.t_s, tracks.T_scene_actor, half, tracks.present)
+        boxes = MovingBoxes(tracks.t_s, tracks.T_scene_actor, half, tracks.present, MAX_HOLD_S)
         return cross_boxes(rays.origin, rays.direction, rays.t_s, boxes)
 
     def _samples(
@@ -161,8 +161,8 @@ def _in_boxes(
     mine = owner[sample] == pair
     pair, place, sample = pair[mine], place[mine], sample[mine]
     box = crossings.box[pair]
-    direction = crossings.direction_box[pair]
-    point = crossings.origin_box[pair] + direction * along[pair, place][:, None]
+    direction = crossings.direction_box.index_select(0, pair)
+    point = crossings.origin_box.index_select(0, pair) + direction * along[pair, place][:, None]
     if actors.mirror is not None:
         sign = torch.ones_like(point)
         sign[:, 1] = torch.where(actors.mirror[box], -1.0, 1.0)
