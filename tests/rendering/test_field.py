@@ -370,6 +370,17 @@ def test_a_ray_of_a_patch_stands_for_the_nine_pixels_about_it() -> None:
     assert bool(differs[3:6, 6:9].all())
 
 
+def test_settings_of_which_no_ray_can_be_made_are_refused() -> None:
+    with pytest.raises(ValueError, match="1 proposals and 2 numbers of proposal_samples"):
+        dataclasses.replace(SMALL, proposal_samples=(24, 12))
+    with pytest.raises(ValueError, match="0 proposals and 0 numbers"):
+        dataclasses.replace(SMALL, proposals=(), proposal_samples=())
+    with pytest.raises(ValueError, match="two samples or more"):
+        dataclasses.replace(SMALL, samples=1)
+    with pytest.raises(ValueError, match="kernel of 4 pixels"):
+        PatchDecoderConfig(kernel=4)
+
+
 def test_actors_may_not_have_more_features_than_what_stands() -> None:
     with pytest.raises(ValueError, match="actors have 8 features, more than the static part's 4"):
         GridsConfig(GridConfig(2, 2, 8, 16, 10), GridConfig(4, 2, 8, 16, 10))

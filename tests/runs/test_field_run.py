@@ -23,7 +23,9 @@ from foredrive.rendering.scene_graph import STATIC, SceneGraph
 from foredrive.runs.rebuild.rebuilt_run import open_rebuilt
 from foredrive.runs.rebuild.reconstruct import Reconstruction, reconstruct
 from foredrive.training import loop
+from foredrive.training.field_training import FieldTraining
 from foredrive.training.learning_rates import Rate
+from foredrive.training.rebuilding import SensorViews
 
 STEPS = 6
 
@@ -150,6 +152,26 @@ def test_the_sizes_of_neurad() -> None:
     assert sizes.proposal_samples == (128, 64)
     assert field_base().representation.learning_gib(1080 * 1920) > 8
     assert field_tiny().representation.learning_gib(270 * 480) < 2
+
+
+def test_wrong_settings_and_a_log_of_which_a_step_sees_nothing_are_refused(
+    run: Reconstruction, log: LogPath, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = ["reconstruct", str(log.folder), "--out", str(tmp_path / "run"), "--recipe", "field_tiny"]
+    wrong = "representation.scene.network.proposal_samples=[32, 16]"
+    assert main([*command, "--set", wrong]) == 2
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    assert "representation.scene.network: " in line
+    assert "1 proposals and 2 numbers of proposal_samples" in line
+    schedule = recipe().representation.schedule
+    with pytest.raises(ValueError, match="a step needs patches, or beams of sweeps"):
+        dataclasses.replace(schedule, patches=0, sweeps=0)
+    no_beams = dataclasses.replace(run.train.sweeps[0], beams=run.train.sweeps[0].beams[:0])
+    assert isinstance(run.scene, FieldScene)
+    with pytest.raises(InputError, match="nothing to learn from"):
+        FieldTraining(run.scene, SensorViews([], [no_beams]), schedule)
+    beside = FieldTraining(run.scene, SensorViews([], [no_beams, run.train.sweeps[0]]), schedule)
+    assert bool(beside.losses(0, torch.Generator().manual_seed(0)).losses["loss"].isfinite())
 
 
 def test_the_method_names_the_recipe(

@@ -1,4 +1,4 @@
-"""Losses of neural fields: where along a ray its weight should lie (Tonderski et al., "NeuRAD", 2024, §3.5).
+"""Losses of neural fields: where along a ray its weight should lie (Tonderski et al., "NeuRAD", 2024).
 
 A ray has S intervals between positions `border`, with the probabilities `weight` that the ray ends in each.
 """
@@ -18,7 +18,7 @@ def interlevel_loss(
     proposal_weight: Float[Tensor, "R P"],
     pulse: float,
 ) -> Float[Tensor, ""]:
-    """Return by how much a proposal's weights are less than the field's (Barron et al., "Zip-NeRF", §3.1).
+    """Return by how much a proposal's weights are less than the field's (Barron et al., "Zip-NeRF", 2023).
 
     The field's histogram is blurred by a box of half width `pulse` and compared on the proposal's intervals:
     Σ max(0, w - ŵ)² / ŵ. Only the proposal gets a gradient.
@@ -90,7 +90,10 @@ def carving_loss(
     margin_m: float,
     free_m: float,
 ) -> Float[Tensor, ""]:
-    """Return Σ w² over the samples of beams where nothing should be, mean over the beams (NeuRAD, eq. 9).
+    """Return Σ w² over the samples of beams where nothing should be, mean over the beams.
+
+    It is NeuRAD's loss, but for beams that did not return: the reference implementation penalises only what
+    lies beyond `free_m`, we what lies before it.
 
     Args:
         middle_m, weight: the samples without the sky.

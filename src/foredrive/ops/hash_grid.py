@@ -2,7 +2,7 @@
 
 A level divides the unit cube into cells³ and keeps a row of features for each vertex of the cells. Where a
 level has more vertices than its table has rows, a hash of the vertex' coordinates gives the row. A grid may
-serve several actors: then the actor's index is a fourth coordinate (Tonderski et al., "NeuRAD", 2024, §3.2).
+serve several actors: then the actor's index is a fourth coordinate (Tonderski et al., "NeuRAD", 2024).
 """
 
 import math
@@ -80,8 +80,7 @@ def read_hash_grid(
     """Return the features at points in the unit cube, interpolated trilinearly in each level.
 
     A level is scaled by min(1, 1 / (2 · cells · footprint)): levels that are finer than what a sample stands
-    for fade (NeuRAD, §3.3, as in its reference implementation). The result is differentiable in `table` and
-    `points`.
+    for fade, as in NeuRAD's reference implementation. The result is differentiable in `table` and `points`.
 
     Args:
         table: rows of all levels. Levels other than `levels` may use other rows.

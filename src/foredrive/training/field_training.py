@@ -91,6 +91,13 @@ class FieldSchedule:
     checkpoint_every: int = 500
     seed: int = 0
 
+    def __post_init__(self) -> None:
+        """Check that a step looks at something."""
+        if min(self.patches, self.beams, self.sweeps) < 0 or self.patch < 1:
+            raise ValueError("patches, beams and sweeps cannot be negative, and patch must be 1 or more")
+        if not self.patches and not (self.beams and self.sweeps):
+            raise ValueError("a step needs patches, or beams of sweeps")
+
 
 class FieldTraining:
     """The `SceneTraining` of a field.
@@ -105,15 +112,16 @@ class FieldTraining:
     """
 
     def __init__(self, scene: FieldScene, views: SensorViews, schedule: FieldSchedule) -> None:
-        if not views.cameras and not views.sweeps:
-            raise InputError("there is nothing to learn from: neither images nor sweeps")
+        beams = [(view, scene.prepare_sweep(view)) for view in views.sweeps]
+        self._sweeps = [(view, rays) for view, rays in beams if len(rays.t_s)] if schedule.beams else []
+        if not (views.cameras and schedule.patches) and not (self._sweeps and schedule.sweeps):
+            raise InputError("there is nothing to learn from: neither images nor sweeps that a step looks at")
         self.scene, self.views, self.schedule = scene, views, schedule
         self.steps, self.checkpoint_every, self.seed = (
             schedule.steps,
             schedule.checkpoint_every,
             schedule.seed,
         )
-        self._beams = [scene.prepare_sweep(view) for view in views.sweeps]
 
     def parameter_groups(self) -> list[ParameterGroup]:
         """Return one group per kind of parameter, named as in `FieldRates`."""
@@ -193,11 +201,8 @@ class FieldTraining:
 
     def _some_beams(self, generator: torch.Generator) -> list["_Beams"]:
         schedule, found = self.schedule, []
-        for _ in range(schedule.sweeps if self.views.sweeps else 0):
-            number = _draw(len(self.views.sweeps), generator)
-            view, rays = self.views.sweeps[number], self._beams[number]
-            if not len(rays.t_s):
-                continue
+        for _ in range(schedule.sweeps if self._sweeps else 0):
+            view, rays = self._sweeps[_draw(len(self._sweeps), generator)]
             count = max(schedule.beams // schedule.sweeps, 1)
             chosen = torch.randint(len(rays.t_s), (count,), generator=generator)
             beams = view.beams

@@ -77,3 +77,13 @@ class FieldConfig:
     feature_layers: int = 3
     appearance: int = 16
     """Size of a sensor's appearance code."""
+
+    def __post_init__(self) -> None:
+        """Check that each round of proposals has a number of samples, and that rays have samples."""
+        rounds, given = len(self.proposals), len(self.proposal_samples)
+        if not rounds or rounds != given:
+            raise ValueError(
+                f"{rounds} proposals and {given} numbers of proposal_samples: one for each, 1 or more"
+            )
+        if min(*self.proposal_samples, self.samples) < 2:
+            raise ValueError("a ray needs two samples or more in each round: the last one is the sky")

@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 UPSAMPLING = 3
-"""Pixels along a side for which one ray stands (NeuRAD, §3.1)."""
+"""Pixels along a side for which one ray stands, as in NeuRAD's reference implementation."""
 
 
 @dataclass(frozen=True)
@@ -23,6 +23,11 @@ class PatchDecoderConfig:
     coarse_blocks: int = 2
     fine_blocks: int = 2
     batch_norm: bool = True
+
+    def __post_init__(self) -> None:
+        """Check that images keep their size."""
+        if self.kernel % 2 == 0:
+            raise ValueError(f"a kernel of {self.kernel} pixels has no middle: its size must be odd")
 
 
 class PatchDecoder(nn.Module):
@@ -74,7 +79,7 @@ class _Block(nn.Module):
 
 
 class BeamDecoder(nn.Module):
-    """An MLP from a beam's feature to intensity and ray drop (NeuRAD, §3.3)."""
+    """An MLP from a beam's feature to intensity and ray drop, as in NeuRAD."""
 
     def __init__(self, features: int, appearance: int, width: int = 32) -> None:
         super().__init__()

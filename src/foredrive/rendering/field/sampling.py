@@ -1,7 +1,7 @@
 """Where along their rays a field is sampled.
 
 Positions on a ray are s in 0 to 1, with t = spacing · s / (1 - s): uniform near the sensor, and uniform in
-inverse distance far away. This is the power spacing of Barron et al., "Zip-NeRF", 2023, eq. 29, with λ = -1.
+inverse distance far away. This is the power spacing of Barron et al., "Zip-NeRF", 2023, with λ = -1.
 """
 
 import torch
