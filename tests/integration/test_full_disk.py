@@ -83,7 +83,7 @@ def test_a_checkpoint_and_the_metrics_of_training(
     with files_up_to(20_000):
         code, err = foredrive(*arguments)
     assert (code, err) == (2, f"foredrive: {run}/pretrain/checkpoints/step_0000003: {FULL}\n")
-    begun = {"config.yaml", "logs.json", "made_by.json", ".lock"}
+    begun = {"config.yaml", "logs.json", "made_by.json", "rigs.yaml", ".lock"}
     assert all_files(run) == {*begun, "pretrain/metrics.jsonl", "pretrain/conditions.json"}
     with files_up_to(200):
         code, err = foredrive(*arguments)

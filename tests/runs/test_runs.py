@@ -47,7 +47,7 @@ def test_what_training_leaves_on_disk(trained: Run) -> None:
         for name in ("model.safetensors", "optimizer.safetensors", "progress.json")
     }
     of_a_stage = {"metrics.jsonl", "conditions.json", "model.safetensors"} | checkpoint
-    expected = {"config.yaml", "logs.json", "made_by.json", ".lock"}
+    expected = {"config.yaml", "logs.json", "made_by.json", "rigs.yaml", ".lock"}
     expected |= {f"{stage}/{name}" for stage in STAGES for name in of_a_stage}
     assert set(files(trained.folder)) == expected
     assert open_run(trained.folder) == trained

@@ -207,12 +207,12 @@ def test_what_a_log_lacks_trains_nothing() -> None:
 
 
 def test_heads_learn_one_scene() -> None:
-    """Boxes, futures, lines, raster and voxels of one frame, after a few dozen steps."""
+    """Boxes, futures, lines, raster and voxels of one frame, after 120 steps."""
     batch, heads = stack_records([scene()]), small_heads()
     objective = ProbeObjective(heads, SPEC, TaskWeights())
     optimizer = torch.optim.AdamW(parameter_groups(objective, 1e-2), 5e-3)
     generator = torch.Generator()
-    for _ in range(60):
+    for _ in range(120):
         optimizer.zero_grad()
         objective(batch, generator)["loss"].backward()
         torch.nn.utils.clip_grad_norm_(objective.parameters(), 10.0)
