@@ -6,9 +6,13 @@ from pathlib import Path
 
 import pytest
 
+from foredrive.cli.arguments import chosen_rig
+from foredrive.data.cameras import rig_of_log
+from foredrive.data.logs import Log
+from foredrive.errors import InputError
 from foredrive.runs.drive.recording import RecordingResult, is_recorded, record_drives, record_plan
 from foredrive.runs.fan_out import fan_out
-from foredrive.sensors.rigs import SURROUND
+from foredrive.sensors.rigs import DRIVING, SURROUND, TELE, Mount, RigPlan, same_rig, told_rig
 from foredrive.towns.campaign import DrivePlan
 
 RIG = SURROUND.of_size((36, 64))
@@ -67,6 +71,20 @@ def test_a_log_of_another_length_rate_or_size_does_not_count(recorded: Recording
     assert not is_recorded(plan, root, SURROUND.of_size((72, 128)))
     for other in ({"seconds": 2.0}, {"rate_hz": 1.0, "seconds": 2.0}, {"seed": 7}):
         assert not is_recorded(DrivePlan(**(vars(plan) | other)), root, RIG)
+
+
+def test_cameras_keep_their_names(tmp_path: Path) -> None:
+    """Two look ahead and one behind, under names that do not follow from the directions."""
+    ahead = Mount((1.7, 0.0, 1.6), 0.0, 70.0)
+    rig = RigPlan(
+        (36, 64), {"PCAM_L2": ahead, TELE: DRIVING.cameras[TELE], "PCAM_R0": Mount((0, 0, 1), 180, 90)}
+    )
+    plan = DrivePlan("Town02", 1, None, 0, 0, 0.5, 2.0)
+    assert same_rig(rig_of_log(Log(record_plan(plan, tmp_path, rig))), rig)
+    assert is_recorded(plan, tmp_path, rig)
+    with pytest.raises(InputError, match="123D has no camera 'FRONT'"):
+        (tmp_path / "rig.yaml").write_text(told_rig(RigPlan((36, 64), {"FRONT": ahead})))
+        chosen_rig(str(tmp_path / "rig.yaml"), None)
 
 
 def test_a_refusing_disk_ends_it_all(tmp_path: Path) -> None:

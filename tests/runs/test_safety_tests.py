@@ -1,5 +1,6 @@
 """The verb for safety tests, in a small log that was rebuilt: scenarios, runs that are kept, report."""
 
+import shutil
 from pathlib import Path
 
 import pytest
@@ -8,14 +9,18 @@ from small_rebuild import SMALLEST
 
 from foredrive.cli.main import main
 from foredrive.data import find_logs
+from foredrive.errors import InputError
 from foredrive.evaluation.summary import read_summary
-from foredrive.runs.drive.in_ncap import SafetyTests
+from foredrive.runs.drive.in_ncap import SafetyTests, _folders, _place, propose_scenarios
 from foredrive.runs.drive.in_rebuilt import opened_rebuilt
 from foredrive.runs.drive.suite import DriveSuite, drive_suite
+from foredrive.runs.rebuild.rebuilt_run import open_run_log
 from foredrive.runs.rebuild.reconstruct import reconstruct
 from foredrive.simulation.ncap.outcome import Outcome
+from foredrive.simulation.ncap.rules import RULES
+from foredrive.simulation.ncap.running import set_up_run
 from foredrive.simulation.ncap.scenario import Jitter, Polyline, SafetyScenario, ScenarioActor
-from foredrive.simulation.ncap.scenario_file import save_scenarios
+from foredrive.simulation.ncap.scenario_file import load_scenarios, save_scenarios
 from foredrive.simulation.threats import Threat
 
 
@@ -91,3 +96,36 @@ def test_log_replay_crashes_and_wrong_input_is_one_line(
     assert "scenarios.yaml: exists already" in capsys.readouterr().err
     assert main(["ncap", str(rebuilt), "--scenarios", str(scenarios)]) == 2
     assert "needs --agent and --out" in capsys.readouterr().err
+    assert main(["ncap", "--scenarios", str(scenarios), *out]) == 2
+    assert "name at least one reconstruction" in capsys.readouterr().err
+
+
+def test_other_scenarios_in_the_same_file_are_another_suite(
+    rebuilt: Path, scenarios: Path, tmp_path: Path
+) -> None:
+    changed = tmp_path / "changed.yaml"
+    changed.write_text(scenarios.read_text())
+    suite = DriveSuite("stop", SafetyTests((str(rebuilt),), str(changed), "ours", 1), sensors=False)
+    drive_suite(suite, tmp_path / "out")
+    changed.write_text(scenarios.read_text().replace("length_s: 6.0", "length_s: 5.5"))
+    with pytest.raises(InputError, match="another suite"):
+        drive_suite(suite, tmp_path / "out")
+
+
+def test_reconstructions_of_one_name_are_an_error(rebuilt: Path, tmp_path: Path) -> None:
+    """A second reconstruction of the log: its own name tells it apart, that of the log does not."""
+    for folder in (tmp_path / "other", tmp_path / "same" / rebuilt.name):
+        shutil.copytree(rebuilt, folder)
+    with pytest.raises(InputError, match=f"two reconstructions have the name '{rebuilt.name}'"):
+        propose_scenarios((str(rebuilt), str(tmp_path / "same" / rebuilt.name)), tmp_path / "new", "ours", 1)
+    (log,) = {open_run_log(rebuilt)[1].folder.name}
+    assert log in _folders((str(rebuilt),))
+    assert set(_folders((str(rebuilt), str(tmp_path / "other")))) == {rebuilt.name, "other"}
+
+
+def test_an_agent_that_sees_more_of_the_past_than_the_log_has_is_told_so(
+    rebuilt: Path, scenarios: Path
+) -> None:
+    place, (test, _) = _place(str(rebuilt)), load_scenarios(scenarios)
+    with pytest.raises(InputError, match=r"stationary-.*: run 0 begins to drive at .* sees 20 earlier"):
+        set_up_run(place, test, 0, RULES["ours"], sensors=False, past_frames=20)

@@ -91,7 +91,8 @@ def test_the_narrow_camera_shows_a_lamp_at_40_m() -> None:
         ("image_hw: [9, 16]\ncameras: {A: {xyz_m: [0, 0, 1], yaw_deg: 0, fov_deg: 190}}", "fov_deg must be"),
         ("image_hw: [9, 16]\ncameras: {A: {xyz_m: [0, 0, .nan], yaw_deg: 0, fov_deg: 60}}", "finite"),
         ("image_hw: [9, 16]\ncameras: {A: {xyz_m: [0, 0], yaw_deg: 0, fov_deg: 60}}", "cameras.A.xyz_m"),
-        ("image_hw: [9, 16]\ncameras: {A: {xyz_m: [0, 0, 1], yaw: 0, fov_deg: 60}}", "yaw"),
+        ("image_hw: [9, 16]\ncameras: {A: {xyz_m: [0, 0, 1], yaw: 0, fov_deg: 60}}", "A.yaw: Unexpected"),
+        ("", "the file: Input should be a dictionary$"),
         ("[", "not YAML"),
     ],
 )

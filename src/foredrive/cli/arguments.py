@@ -68,12 +68,20 @@ def chosen_rig(rig: str, image_hw: tuple[int, int] | None) -> "RigPlan":
     """Return the rig of --rig, with images of --image-size if that is given.
 
     Raises:
-        InputError: there is no such rig.
+        InputError: there is no such rig, its images are too large, or 123D has no camera of a name.
     """
+    from foredrive.data.camera_streams import CAMERA_NAMES
     from foredrive.sensors.rigs import find_rig
 
     plan = find_rig(rig)
-    return plan if image_hw is None else plan.of_size(image_hw)
+    if image_hw is not None:
+        plan = plan.of_size(image_hw)
+    if max(plan.image_hw) > MAX_IMAGE_PX:
+        raise InputError(f"{rig}: image_hw must be 1 to {MAX_IMAGE_PX} px, got {list(plan.image_hw)}")
+    for name in plan.cameras:
+        if name not in CAMERA_NAMES:
+            raise InputError(f"{rig}: 123D has no camera {name!r}; it has {', '.join(CAMERA_NAMES)}")
+    return plan
 
 
 def check_out_folder(folder: Path | None) -> None:

@@ -42,6 +42,8 @@ def ncap(
     check_out_folder(out)
     check_number("--runs", runs, low=1)
     check_number("--films", films, low=0)
+    if not rebuilt:
+        raise InputError("name at least one reconstruction (REBUILT)")
     for folder in rebuilt:
         check_rebuilt(folder)
     folders = tuple(str(folder.absolute()) for folder in rebuilt)

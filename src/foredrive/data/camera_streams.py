@@ -23,6 +23,8 @@ DEPTH_STEP_M = 0.01
 _DEPTH_CODES = 2**16 - 2
 """Number of depth values. Code 0 means "no depth"."""
 
+CAMERA_NAMES = tuple(CameraID.__members__)
+"""123D's names of cameras."""
 _CAMERA_IDS_LEFT = (CameraID.PCAM_L0, CameraID.PCAM_L1, CameraID.PCAM_L2)
 _CAMERA_IDS_RIGHT = (CameraID.PCAM_R0, CameraID.PCAM_R1, CameraID.PCAM_R2)
 _CAMERA_IDS_SPARE = (CameraID.PCAM_STEREO_L, CameraID.PCAM_STEREO_R, CameraID.PCAM_D0)
@@ -82,17 +84,19 @@ def camera_metadata(spec: CameraSpec, camera_id: CameraID) -> RollingCameraMetad
 
 
 def camera_ids(cameras: list[CameraSpec]) -> list[tuple[CameraSpec, CameraID]]:
-    """Assign a 123D id to each camera by its viewing direction.
+    """Assign a 123D id to each camera: that of its name if it has one, else one by its viewing direction.
 
-    The ids are front, back, and left and right, numbered from front to back.
+    The ids by direction are front, back, and left and right, numbered from front to back.
     """
     azimuth = {c.name: float(np.arctan2(c.T_ego_cam[1, 2], c.T_ego_cam[0, 2])) for c in cameras}
     spare = [*_CAMERA_IDS_SPARE, *_CAMERA_IDS_LEFT[::-1], *_CAMERA_IDS_RIGHT[::-1]]
     if len(azimuth) < len(cameras):
         raise InputError(f"camera names are not unique: {[c.name for c in cameras]}")
-    taken: dict[CameraID, CameraSpec] = {}
+    by_name = CameraID.__members__
+    taken = {by_name[camera.name]: camera for camera in cameras if camera.name in by_name}
+    unnamed = [camera for camera in cameras if camera.name not in by_name]
     left_over = []
-    for camera in sorted(cameras, key=lambda c: abs(azimuth[c.name])):
+    for camera in sorted(unnamed, key=lambda c: abs(azimuth[c.name])):
         angle = azimuth[camera.name]
         if abs(angle) <= _AHEAD_RAD:
             wanted: tuple[CameraID, ...] = (CameraID.PCAM_F0,)

@@ -101,9 +101,12 @@ def find_rig(name: str) -> RigPlan:
     try:
         return TypeAdapter(RigPlan).validate_python(written, extra="forbid")
     except ValidationError as error:
-        first = error.errors()[0]
+        first = min(
+            error.errors(), key=lambda each: each["type"] == "missing"
+        )  # a mistyped entry is missing too
         where = ".".join(str(part) for part in first["loc"]) or "the file"
-        raise InputError(f"{path}: {where}: {first['msg']}") from error
+        why = first["msg"].removeprefix("Value error, ").removesuffix(" or an instance of RigPlan")
+        raise InputError(f"{path}: {where}: {why}") from error
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
 
@@ -143,7 +146,7 @@ def rig_of_cameras(rig: CameraRig) -> RigPlan:
     for i, name in enumerate(rig.names):
         T = rig.T_ego_cam[i].double()
         x, y, z = T[:3, 3].tolist()
-        right, _, ahead = (T[:3, :3] @ torch.eye(3, dtype=T.dtype)).unbind(dim=1)
+        right, _, ahead = T[:3, :3].unbind(dim=1)
         yaw = math.atan2(ahead[1], ahead[0])
         level = torch.tensor([math.sin(yaw), -math.cos(yaw), 0.0], dtype=T.dtype)
         roll = math.atan2(-right[2], math.hypot(ahead[0], ahead[1]) * (right @ level))

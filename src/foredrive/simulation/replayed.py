@@ -12,6 +12,7 @@ from foredrive.simulation.road_users import Box, RoadUsers
 
 def users_at(tracks: ActorTracks, T_world_scene: Float64[Tensor, "4 4"], t_s: float) -> RoadUsers:
     """Return all actors at a time, one slot each. The track id of an absent actor is -1."""
+    tracks = tracks.map_tensors(lambda tensor: tensor.detach().cpu())
     states = states_at(tracks, t_s)
     T_world_actor = T_world_scene @ states.T_scene_actor.double()
     half_height = 0.5 * tracks.size_lwh[:, 2:].double()

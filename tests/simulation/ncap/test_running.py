@@ -206,6 +206,15 @@ def test_every_kind_is_proposed_where_the_way_is_free() -> None:
     assert tested.passed == tuple(first)
 
 
+def test_proposals_read_boxes_that_the_reconstruction_has_refined() -> None:
+    """Refined boxes are parameters, which still have a gradient."""
+    here = place(parked_m=(10.0, 8.0))
+    refined = here.graph.tracks.T_scene_actor.clone().requires_grad_()
+    tracks = dataclasses.replace(here.graph.tracks, T_scene_actor=refined)
+    there = dataclasses.replace(here, graph=dataclasses.replace(here.graph, tracks=tracks))
+    assert propose(there, "log") == propose(here, "log")
+
+
 def test_nothing_is_proposed_where_something_stands_in_the_way() -> None:
     assert propose(place(parked_m=(45.0, 0.0)), "log") == []
     with pytest.raises(InputError, match="no car of the log was seen"):

@@ -2,6 +2,7 @@
 
 import contextlib
 import functools
+import hashlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -39,8 +40,10 @@ class SafetyTests:
     grows = ("count",)
 
     def noted(self) -> Mapping[str, object]:
-        """Return the fields, and the scenarios as the routes."""
+        """Return the fields, a hash of the scenarios, and their path as the routes."""
+        told = repr(load_scenarios(Path(self.scenarios)))
         return {
+            "scenarios_sha256": hashlib.sha256(told.encode()).hexdigest(),
             "runs": list(self.runs),
             "scenarios": self.scenarios,
             "rules": self.rules,
@@ -105,11 +108,11 @@ def propose_scenarios(runs: Sequence[str], file: Path, rules: str, count: int) -
         The result of the self-test.
 
     Raises:
-        InputError: the file exists, or no scenario is feasible.
+        InputError: the file exists, two folders have one name, or no scenario is feasible.
     """
     if file.exists():
         raise InputError(f"{file}: exists already; proposed scenarios are written to a new file")
-    places = {Path(run).name: run for run in runs}
+    places = _by_name(runs)
     found = [each for scene, run in places.items() for each in propose(_place(run), scene)]
     if not found:
         raise InputError("no scenario is feasible in these logs: they are too short, too slow or too full")
@@ -126,15 +129,30 @@ def _rules(name: str) -> Rules:
     return RULES[name]
 
 
-def _folders(runs: Sequence[str]) -> dict[str, str]:
-    """Return the folder of each run by its own name and by the name of its log."""
+def _by_name(runs: Sequence[str]) -> dict[str, str]:
+    """Return the folder of each run by its name.
+
+    Raises:
+        InputError: two folders have one name.
+    """
     folders: dict[str, str] = {}
     for run in runs:
-        names = {Path(run).name}
-        with contextlib.suppress(InputError):
-            names.add(open_run_log(Path(run))[1].folder.name)
-        folders |= dict.fromkeys(names, run)
+        if folders.setdefault(Path(run).name, run) != run:
+            raise InputError(f"two reconstructions have the name {Path(run).name!r}, so a scene is ambiguous")
     return folders
+
+
+def _folders(runs: Sequence[str]) -> dict[str, str]:
+    """Return the folder of each run by its own name, and by the name of its log if no other run has it.
+
+    Raises:
+        InputError: two folders have one name.
+    """
+    by_log: dict[str, list[str]] = {}
+    for run in runs:
+        with contextlib.suppress(InputError):
+            by_log.setdefault(open_run_log(Path(run))[1].folder.name, []).append(run)
+    return {log: of_log[0] for log, of_log in by_log.items() if len(of_log) == 1} | _by_name(runs)
 
 
 @functools.lru_cache(maxsize=2)
@@ -144,7 +162,7 @@ def _tested(source: SafetyTests) -> SelfTest:
     def place_of(scenario: SafetyScenario) -> Place:
         if scenario.scene not in folders:
             raise InputError(
-                f"its scene {scenario.scene!r} is none of the reconstructions ({', '.join(folders)})"
+                f"its scene {scenario.scene!r} names no reconstruction, or several ({', '.join(folders)})"
             )
         return _place(folders[scenario.scene])
 

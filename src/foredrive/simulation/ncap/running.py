@@ -74,6 +74,12 @@ def set_up_run(
             f"{scenario.label}: run {number} lasts to {start_s + length_s:g} s, but the log ends at "
             f"{drive.end_s:.1f} s"
         )
+    first_s = drive.first_s + FRAME_DT_S * past_frames
+    if start_s < first_s - STEP_S:
+        raise InputError(
+            f"{scenario.label}: run {number} begins to drive at {start_s:g} s, but the agent sees {past_frames} "
+            f"earlier key frames, which this log has from {first_s:.1f} s on"
+        )
     graph = place_actors(place.graph, drawn, T_world_scene, place.track_ids, others_stay=rules.others_stay)
     simulator = RebuiltSimulator(place.renderer(graph), graph.tracks, drive, place.lanes)
     start = RebuiltScenario(

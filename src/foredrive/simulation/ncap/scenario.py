@@ -16,12 +16,19 @@ Point = tuple[float, float, float]
 """x, y, z, m, world frame."""
 
 
+def check_finite(what: str, *numbers: float) -> None:
+    """Check the numbers of a part of a scenario. Raise `InputError` if one is not finite."""
+    if not all(map(math.isfinite, numbers)):
+        raise InputError(f"{what} needs finite numbers, got {', '.join(f'{number:g}' for number in numbers)}")
+
+
 @dataclass(frozen=True)
 class Polyline:
     """A way through points, each at its time. It is continued straight before the first and after the last.
 
     Raises:
-        InputError: there are fewer than two points, times do not ascend, or their number differs.
+        InputError: there are fewer than two points, their number differs from that of the times, times do not
+            ascend, or a number is not finite.
     """
 
     t_s: tuple[float, ...]
@@ -37,11 +44,16 @@ class Polyline:
             )
         if any(not later > before for before, later in zip(self.t_s, self.t_s[1:], strict=False)):
             raise InputError(f"the times of a way must ascend, got {list(self.t_s)}")
+        check_finite("a way", *self.t_s, *(number for point in self.xyz_m for number in point))
 
 
 @dataclass(frozen=True)
 class Rectilinear:
-    """A straight way at constant speed."""
+    """A straight way at constant speed.
+
+    Raises:
+        InputError: a number is not finite.
+    """
 
     at_m: Point
     """Position at `at_s`: middle of the actor's box on the ground."""
@@ -50,6 +62,9 @@ class Rectilinear:
     """Direction of motion in the world frame, counter-clockwise from x."""
     speed_mps: float = 0.0
     kind: Literal["rectilinear"] = "rectilinear"
+
+    def __post_init__(self) -> None:
+        check_finite("a way", *self.at_m, self.at_s, self.yaw_rad, self.speed_mps)
 
     def polyline(self) -> Polyline:
         """Return the same way through two points, 1 s apart."""
@@ -63,6 +78,9 @@ class Jitter:
     """Half ranges of the random changes of an actor's way in each run.
 
     Draws are uniform between minus and plus the half range, or normal with it as the standard deviation.
+
+    Raises:
+        InputError: a number is not finite, or a half range is negative.
     """
 
     along_rad: float = 0.0
@@ -74,13 +92,19 @@ class Jitter:
     """Change of the heading of an actor that stands. A moving actor heads where it moves."""
     uniform: bool = True
 
+    def __post_init__(self) -> None:
+        half_ranges = (self.longitudinal_m, self.lateral_m, self.yaw_rad)
+        check_finite("a jitter", self.along_rad, *half_ranges)
+        if min(half_ranges) < 0:
+            raise InputError(f"half ranges of a jitter must not be negative, got {min(half_ranges):g}")
+
 
 @dataclass(frozen=True)
 class ScenarioActor:
     """An actor of the scenario: a copy of one of the log's actors on a way of its own.
 
     Raises:
-        InputError: no actor of the log is named.
+        InputError: no actor of the log is named, or the heading is not finite.
     """
 
     names: tuple[str, ...]
@@ -97,6 +121,7 @@ class ScenarioActor:
     def __post_init__(self) -> None:
         if not self.names:
             raise InputError("an actor needs the name of at least one of the log's tracks")
+        check_finite("an actor", self.yaw_rad)
 
 
 @dataclass(frozen=True)
