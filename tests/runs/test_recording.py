@@ -75,15 +75,23 @@ def test_a_log_of_another_length_rate_or_size_does_not_count(recorded: Recording
 
 def test_cameras_keep_their_names(tmp_path: Path) -> None:
     """Two look ahead and one behind, under names that do not follow from the directions."""
-    ahead = Mount((1.7, 0.0, 1.6), 0.0, 70.0)
-    rig = RigPlan(
-        (36, 64), {"PCAM_L2": ahead, TELE: DRIVING.cameras[TELE], "PCAM_R0": Mount((0, 0, 1), 180, 90)}
-    )
+    ahead, behind = Mount((1.7, 0.0, 1.6), 0.0, 70.0), Mount((0.0, 0.0, 1.6), 180.0, 90.0)
+    rig = RigPlan((36, 64), {"PCAM_L2": ahead, TELE: DRIVING.cameras[TELE], "PCAM_R0": behind})
     plan = DrivePlan("Town02", 1, None, 0, 0, 0.5, 2.0)
     assert same_rig(rig_of_log(Log(record_plan(plan, tmp_path, rig))), rig)
     assert is_recorded(plan, tmp_path, rig)
-    with pytest.raises(InputError, match="123D has no camera 'FRONT'"):
-        (tmp_path / "rig.yaml").write_text(told_rig(RigPlan((36, 64), {"FRONT": ahead})))
+
+
+@pytest.mark.parametrize(
+    ("rig", "message"),
+    [
+        (RigPlan((36, 64), {"FRONT": Mount((0.0, 0.0, 0.0), 0.0, 90.0)}), "123D has no camera 'FRONT'"),
+        (SURROUND.of_size((36, 20_000)), "image_hw must be 1 to 16384 px"),
+    ],
+)
+def test_a_rig_that_cannot_be_recorded_is_told_at_once(rig: RigPlan, message: str, tmp_path: Path) -> None:
+    (tmp_path / "rig.yaml").write_text(told_rig(rig))
+    with pytest.raises(InputError, match=message):
         chosen_rig(str(tmp_path / "rig.yaml"), None)
 
 

@@ -101,9 +101,8 @@ def find_rig(name: str) -> RigPlan:
     try:
         return TypeAdapter(RigPlan).validate_python(written, extra="forbid")
     except ValidationError as error:
-        first = min(
-            error.errors(), key=lambda each: each["type"] == "missing"
-        )  # a mistyped entry is missing too
+        # The right name of a mistyped entry is missing. The mistyped one tells more.
+        first = min(error.errors(), key=lambda each: each["type"] == "missing")
         where = ".".join(str(part) for part in first["loc"]) or "the file"
         why = first["msg"].removeprefix("Value error, ").removesuffix(" or an instance of RigPlan")
         raise InputError(f"{path}: {where}: {why}") from error

@@ -77,8 +77,8 @@ def set_up_run(
     first_s = drive.first_s + FRAME_DT_S * past_frames
     if start_s < first_s - STEP_S:
         raise InputError(
-            f"{scenario.label}: run {number} begins to drive at {start_s:g} s, but the agent sees {past_frames} "
-            f"earlier key frames, which this log has from {first_s:.1f} s on"
+            f"{scenario.label}: run {number} begins to drive at {start_s:g} s, but the agent sees "
+            f"{past_frames} earlier key frames, which this log has from {first_s:.1f} s on"
         )
     graph = place_actors(place.graph, drawn, T_world_scene, place.track_ids, others_stay=rules.others_stay)
     simulator = RebuiltSimulator(place.renderer(graph), graph.tracks, drive, place.lanes)
