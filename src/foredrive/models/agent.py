@@ -10,7 +10,6 @@ from torch import Tensor, nn
 from foredrive.geometry.precision import full_precision
 from foredrive.models.ego_mlp import ego_motion, route_target
 from foredrive.models.planner import VolumePlanner
-from foredrive.models.tasks.carried import CarriedAgents
 from foredrive.models.tasks.heads import HeadOutput, TaskHeads, volumes_of
 from foredrive.scene import Belief, Clip, Decoded, Trajectory, WorldModel
 
@@ -55,17 +54,15 @@ class PlanningAgent(nn.Module, Generic[W]):
         now = self.world_model.observe(clip)
         return [now, *self.world_model.imagine(now, steps)] if steps else [now]
 
-    def perceive(
-        self, now: Belief, sequences: Clip | None = None, carried: CarriedAgents | None = None
-    ) -> HeadOutput | None:
+    def perceive(self, now: Belief, sequences: Clip | None = None) -> HeadOutput | None:
         """Return the output of the agent's task heads for a belief about now; None without heads.
 
-        Heads compute in 32 bits, because positions in 16 are off by tenths of a cell.
+        Heads compute in 32 bits, because positions in 16 are off by tenths of a cell. No planner reads
+        instances, so nothing is imagined for them.
 
         Args:
             now: belief about now.
             sequences: the clips, if they are the sequences in which heads that carry agents on are trained.
-            carried: agents of the frame before.
         """
         if self.heads is None:
             return None
@@ -75,9 +72,7 @@ class PlanningAgent(nn.Module, Generic[W]):
         read = volumes_of(self.world_model, now, self.heads.config.tasks)
         with full_precision(now.volume):
             cast = {id(volume): volume.map_tensors(Tensor.float) for volume in read.values()}
-            found: HeadOutput = self.heads(
-                {task: cast[id(volume)] for task, volume in read.items()}, steps, carried
-            )
+            found: HeadOutput = self.heads({task: cast[id(volume)] for task, volume in read.items()}, steps)
         return found
 
     def tokens(self, now: Belief, found: HeadOutput | None = None) -> Float[Tensor, "b N C"] | None:

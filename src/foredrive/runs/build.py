@@ -41,7 +41,11 @@ def _heads(recipe: Recipe[Any, Any], channels: int) -> TaskHeads | None:
     if recipe.clips.tasks is None:
         raise InputError(f"{recipe.name}: it has task heads, but clips.tasks reads no truth for them")
     return TaskHeads(
-        recipe.tasks.heads, recipe.clips.voxels, channels=channels, raster=recipe.clips.tasks.raster
+        recipe.tasks.heads,
+        recipe.clips.voxels,
+        channels=channels,
+        raster=recipe.clips.tasks.raster,
+        instance_grid=recipe.clips.tasks.instances,
     )
 
 

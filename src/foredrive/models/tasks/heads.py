@@ -191,7 +191,8 @@ class TaskHeads(nn.Module):
         """Return the output of every head. Tasks that share one volume share its planes.
 
         Args:
-            volumes: for each of `config.tasks`, the volume of `WorldModel.volume_for`.
+            volumes: for each of `config.tasks`, the volume of `WorldModel.volume_for`. Without imagined ones,
+                there are no instances.
             steps: ego motion, if the items are sequences of frames, in which agents are carried on.
             carried: agents of the frame before, for items that are single frames.
         """
@@ -216,7 +217,7 @@ class TaskHeads(nn.Module):
         if self.voxels is not None:
             voxels = self.voxels(volumes["occupancy"].now, planes_of("occupancy"))
         instances = None
-        if self.instances is not None and agents is not None:
+        if self.instances is not None and agents is not None and volumes["detection"].later is not None:
             instances = self._imagined(
                 self.instances, agents[-1], volumes["detection"], planes_of("detection")
             )
