@@ -5,8 +5,11 @@ from pathlib import Path
 from typing import Any
 
 import synthetic_log
+from flat_street import street
 
 from foredrive.data import ClipConfig, LogPath, find_logs
+from foredrive.data.logs import Log
+from foredrive.data.maps import write_map
 from foredrive.models.backbone import BackboneConfig
 from foredrive.models.bev import BevConfig
 from foredrive.models.driveworld import DriveWorldConfig
@@ -117,6 +120,11 @@ def write_log(root: Path, name: str = "flat", frames: int = 51) -> LogPath:
     """Write a log at 10 Hz, 5 s long by default, with two cameras, lidar and boxes."""
     (log,) = find_logs(synthetic_log.write(root, frames=frames, name=name))
     return log
+
+
+def with_map(log: LogPath, root: Path) -> LogPath:
+    """The same log with the map of a street."""
+    return LogPath(log.folder, write_map(street(), str(Log(log).metadata.location), root))
 
 
 def shrunk(recipe: Recipe) -> Recipe:

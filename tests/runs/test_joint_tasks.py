@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 from joint_heads import ALL, small_heads, with_small_heads
-from miniature import STEPS, miniature, miniature_driveworld, with_steps
+from miniature import STEPS, miniature, miniature_driveworld, with_map, with_steps
 from safetensors.torch import load_file
 
 from foredrive.data import LogPath, collate
@@ -89,8 +89,9 @@ def test_an_interrupted_joint_run_goes_on_to_the_same_bits(
 
 def test_a_planner_attends_to_frozen_heads_of_a_probe(trained: Run, log: LogPath, tmp_path: Path) -> None:
     """World model and heads stay as they are, statistics of norms too; the plan depends on what is found."""
-    probe = probe_run(trained.recipe, [log], tmp_path / "probe", trained.cache_dir, trained.folder)
-    heads = train_heads(probe, small_heads(("detection", "motion", "map")))
+    logs = [with_map(log, tmp_path)]
+    probe = probe_run(trained.recipe, logs, tmp_path / "probe", trained.cache_dir, trained.folder)
+    heads = train_heads(probe, small_heads(("detection", "motion", "map", "instances")))
     planner = dataclasses.replace(trained.recipe.planner, attends=("agents", "map"))
     recipe = dataclasses.replace(trained.recipe, transfer="frozen", planner=planner)
     run = train_run(recipe, [log], tmp_path / "run", trained.cache_dir, probe.folder)
@@ -112,7 +113,7 @@ def test_a_planner_attends_to_frozen_heads_of_a_probe(trained: Run, log: LogPath
         assert (agent.act(clip).xy - plan.xy).abs().max() > 1e-5
     summary = evaluate_run(run, [log], tmp_path / "evaluated", views=False).summary
     assert summary["failed"] == 0
-    assert "detection.nuscenes.map" in summary
+    assert {"detection.nuscenes.map", "occupancy.uniad.vpq_near_pct"} <= summary.keys()
 
 
 def test_the_graph_of_an_agent_that_attends_is_the_agent(trained: Run, log: LogPath) -> None:

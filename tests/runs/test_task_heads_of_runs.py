@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 import torch
 from joint_heads import ALL, small_heads
-from miniature import miniature, miniature_driveworld
+from miniature import miniature, miniature_driveworld, with_map
 from safetensors.torch import load_file
 
 from foredrive.data import LogPath
@@ -27,7 +27,8 @@ from foredrive.training import read_metrics, save_weights
 def test_heads_of_a_run_are_trained_continued_and_evaluated(
     trained: Run, log: LogPath, tmp_path: Path
 ) -> None:
-    run = probe_run(trained.recipe, [log], tmp_path / "probe", trained.cache_dir, trained.folder)
+    logs = [with_map(log, tmp_path)]
+    run = probe_run(trained.recipe, logs, tmp_path / "probe", trained.cache_dir, trained.folder)
     before = load_file(run.weights)
     found = train_heads(run, small_heads(("detection", "motion", "map", "occupancy", "instances")))
     assert len(read_metrics(run.folder / TASKS / "metrics.jsonl")) == 2
@@ -42,6 +43,13 @@ def test_heads_of_a_run_are_trained_continued_and_evaluated(
     assert all(torch.equal(one, other) for one, other in weights)
     with pytest.raises(InputError, match="holds other heads"):
         train_heads(run, small_heads(("detection", "motion"), steps=3))
+
+
+def test_a_probe_needs_the_truth_of_its_tasks(trained: Run, log: LogPath, tmp_path: Path) -> None:
+    run = probe_run(trained.recipe, [log], tmp_path / "probe", trained.cache_dir, trained.folder)
+    with pytest.raises(InputError, match=r"no log can train the task 'map'; .*flat: it has no map"):
+        train_heads(run, small_heads(("detection", "map")))
+    assert not (run.folder / TASKS).exists()
 
 
 def test_instances_of_agents_that_are_carried_on(trained: Run, log: LogPath, tmp_path: Path) -> None:
@@ -103,7 +111,7 @@ def test_heads_on_a_driveworld_read_a_volume_for_each_prompt(
         agent.world_model.prompt.encodings.normal_()
     (start / "finetune").mkdir()
     save_weights(agent, start / "finetune" / WEIGHTS)
-    run = probe_run(recipe, [log], tmp_path / "probe", cache, start)
+    run = probe_run(recipe, [with_map(log, tmp_path)], tmp_path / "probe", cache, start)
     train_heads(run, small_heads((*ALL, "tracking")))
     kept = [load_file(file) for file in (cache / "volumes").rglob("*.safetensors")]
     assert {len(each["volume"]) for each in kept} == {volumes}

@@ -126,7 +126,8 @@ def train_run(
     claim = _folder_of(run)
     claim.check()
     dataset = open_clips(run.logs, recipe.clips, run.cache_dir)
-    check_truth(recipe, run.logs)
+    if recipe.tasks is not None and kept is None:
+        check_truth(recipe.tasks.heads, run.logs)
     pretrained = None if start is None or kept is not None else _pretrained(start)
     if recipe.planner.attends or recipe.tasks is not None:
         build_agent(recipe, fetch=False)  # heads that do not fit the rest must not create a run

@@ -2,7 +2,6 @@
 
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -17,7 +16,7 @@ from foredrive.errors import InputError
 from foredrive.evaluation.task_priors import TaskPriors
 from foredrive.files import atomic_path
 from foredrive.losses.semantics import class_weights
-from foredrive.recipes.config import Recipe
+from foredrive.models.tasks.heads import TaskHeadsConfig
 from foredrive.scene.semantics import VOXEL_CLASSES
 from foredrive.scene.task_truth import TaskTruth
 
@@ -46,15 +45,12 @@ def load_priors(path: Path) -> TaskPriors:
         raise InputError(f"{path}: cannot be read as baselines: {error}") from error
 
 
-def check_truth(recipe: Recipe[Any, Any], logs: Sequence[LogPath]) -> None:
-    """Check that at least one log has the truth of each task that the recipe trains a head for.
+def check_truth(heads: TaskHeadsConfig, logs: Sequence[LogPath]) -> None:
+    """Check that at least one log has the truth of each task that heads are trained for.
 
     Raises:
         InputError: none has. The message names the task and the reason.
     """
-    if recipe.tasks is None or recipe.transfer == "frozen":
-        return
-    heads = recipe.tasks.heads
     asked = (*heads.tasks, "tracking") if heads.frames > 1 else heads.tasks
     missing: dict[str, str] = dict.fromkeys(asked, "")
     for log in logs:

@@ -19,7 +19,14 @@ from foredrive.runs.folder import CONFIG, WEIGHTS
 from foredrive.runs.train.kept_volumes import KeptVolumes, collate_kept
 from foredrive.runs.train.run import Run, begin_run, load_agent, open_run
 from foredrive.runs.train.sequences import in_sequences
-from foredrive.runs.train.task_priors import PRIORS, TASKS, load_priors, save_priors, semantic_weights
+from foredrive.runs.train.task_priors import (
+    PRIORS,
+    TASKS,
+    check_truth,
+    load_priors,
+    save_priors,
+    semantic_weights,
+)
 from foredrive.training import load_weights, save_weights, train
 from foredrive.training.task_probe import ProbeObjective
 
@@ -65,7 +72,8 @@ def train_heads(run: Run, heads: TaskHeadsRecipe) -> TrainedHeads:
     """Train heads on the frozen world model of a run, or continue. Volumes are computed once and kept.
 
     Raises:
-        InputError: the run holds other heads, has not finished, or a log cannot be read.
+        InputError: the run holds other heads, has not finished, a log cannot be read, or no log has the truth
+            of a task.
     """
     from foredrive.training import make_fabric  # the import takes seconds
 
@@ -73,9 +81,10 @@ def train_heads(run: Run, heads: TaskHeadsRecipe) -> TrainedHeads:
     if (folder / CONFIG).is_file() and load_task_heads(folder / CONFIG) != heads:
         raise InputError(f"{folder}: holds other heads; choose another folder for the run")
     if not (folder / WEIGHTS).is_file():
+        _check_later(run, heads)
+        check_truth(heads.heads, run.logs)
         agent = load_agent(run)
         clips = dataclasses.replace(run.recipe.clips, tasks=heads.truth, now_stride_s=heads.now_stride_s)
-        _check_later(run, heads)
         sizes = heads.heads
         dataset = KeptVolumes(agent, run.logs, clips, sizes.tasks, run.cache_dir, sizes.later)
         if not (folder / CONFIG).is_file():
