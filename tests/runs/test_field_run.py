@@ -102,6 +102,23 @@ def test_an_interrupted_run_goes_on_to_the_same_bits(
     assert [name for name in whole if not torch.equal(whole[name], halves[name])] == []
 
 
+def test_the_depth_of_an_image_is_along_the_axis_of_a_camera_that_turns(run: Reconstruction) -> None:
+    """The camera turns by 0.4 rad while the image is read out: each row has its own axis."""
+    scene, view = run.scene, run.held_out.cameras[0]
+    assert isinstance(scene, FieldScene)
+    twist = torch.tensor([0.0, 0, 0, 0, 4, 0])
+    view = dataclasses.replace(view, twist_cam=twist, readout_s=0.1, dist=torch.zeros(5))
+    (height, width), corner = view.size_hw, torch.zeros(2, dtype=torch.int64)
+    with torch.no_grad():
+        image = scene.camera(scene.graph, view)
+        rays = scene.rays_of_pixels(view, corner, torch.tensor([width // 3, height // 3]))
+        seen = scene.look(scene.graph, rays)
+    middle = torch.tensor([[3 * u + 1.5, 3 * v + 1.5] for v in range(height // 3) for u in range(width // 3)])
+    x, y = ((middle - view.K[:2, 2]) / view.K.diagonal()[:2]).unbind(-1)
+    expected = seen.depth_m / seen.alpha / (1 + x * x + y * y).sqrt()
+    torch.testing.assert_close(image.range_m[1::3, 1::3].flatten(), expected, rtol=1e-4, atol=1e-4)
+
+
 def test_edits_move_places_and_never_weights(run: Reconstruction) -> None:
     scene = run.scene
     before = {name: value.clone() for name, value in scene.state_dict().items()}

@@ -31,7 +31,7 @@ class GridsConfig:
 
 @dataclass(frozen=True)
 class FieldConfig:
-    """Parts of a `NeuralField`. The defaults are those of NeuRAD's paper and reference implementation."""
+    """Parts of a `NeuralField`. The defaults are NeuRAD's sizes; docs/architecture.md lists what differs."""
 
     grids: GridsConfig = field(
         default_factory=lambda: GridsConfig(

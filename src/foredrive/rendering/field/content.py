@@ -50,7 +50,7 @@ class FieldContent(Record):
         """
         if not isinstance(source, FieldContent):
             raise InputError("an actor that is not part of a field does not fit into a field")
-        if source.table.shape != self.table.shape or not torch.equal(source.table, self.table):
+        if source.table.shape != self.table.shape or not torch.equal(source.table.to(self.table), self.table):
             raise InputError("an actor of another field does not fit: only this field's decoder can read it")
         slot = torch.cat([self.slot, source.slot[source_row : source_row + 1].to(self.slot)])
         return FieldContent(slot, self.shown.with_copy(source.shown, source_row, row), self.table)

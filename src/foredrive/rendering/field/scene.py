@@ -12,6 +12,7 @@ from safetensors.torch import load_file
 from torch import Tensor, nn
 
 from foredrive.errors import InputError
+from foredrive.geometry.projection import pixels_to_rays
 from foredrive.rendering.field.config import FieldConfig
 from foredrive.rendering.field.content import FieldContent, field_of
 from foredrive.rendering.field.decoders import UPSAMPLING, BeamDecoder, PatchDecoder, PatchDecoderConfig
@@ -129,22 +130,21 @@ class FieldScene(RebuiltScene):
             corner_uv: upper left pixel.
             size: numbers of rays along u and v.
         """
-        width, height = size.tolist()
-        v, u = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
-        uv = corner_uv + UPSAMPLING * (torch.stack([u, v], dim=-1).flatten(0, 1) + 0.5)
-        exposed = self.corrected_camera(view)
-        return pixel_rays(view, exposed, uv.to(view.K), float(UPSAMPLING), self.config.rolling)
+        uv = _pixels_of_rays(corner_uv, size).to(view.K)
+        return pixel_rays(view, self.corrected_camera(view), uv, float(UPSAMPLING), self.config.rolling)
 
     def camera(self, graph: SceneGraph, view: CameraView) -> RenderedImage:
         """Render an image. One ray stands for 3 × 3 pixels; the last ones may reach beyond the image."""
         high, wide = (-(-side // UPSAMPLING) for side in view.size_hw)
-        rays = self.rays_of_pixels(view, torch.zeros(2, dtype=torch.int64), torch.tensor([wide, high]))
+        corner_uv, size = torch.zeros(2, dtype=torch.int64), torch.tensor([wide, high])
+        rays = self.rays_of_pixels(view, corner_uv, size)
         seen = self._in_parts(graph, rays)
         feature = seen["feature"].view(1, high, wide, -1)
         rgb = self.camera_decoder(feature, view.sensor)[0, :, : view.size_hw[0], : view.size_hw[1]]
-        along = (rays.direction @ self.corrected_camera(view).T_scene_cam[:3, 2]).view(high, wide)
+        # The camera's axis is that of the row's own time: it turns during the read-out.
+        along = pixels_to_rays(_pixels_of_rays(corner_uv, size).to(view.K), view.K, view.dist)[:, 2]
         alpha = seen["alpha"].view(high, wide)
-        range_m = seen["depth_m"].view(high, wide) / alpha.clamp_min(_LEAST_ALPHA) * along
+        range_m = seen["depth_m"].view(high, wide) / alpha.clamp_min(_LEAST_ALPHA) * along.view(high, wide)
         return RenderedImage(rgb, _enlarged(range_m, view.size_hw), _enlarged(alpha, view.size_hw))
 
     def prepare_sweep(self, view: SweepView) -> FieldRays:
@@ -174,6 +174,13 @@ class FieldScene(RebuiltScene):
             for name, values in found.items():
                 values.append(getattr(seen, name))
         return {name: torch.cat(values) for name, values in found.items()}
+
+
+def _pixels_of_rays(corner_uv: Int[Tensor, "2"], size: Int[Tensor, "2"]) -> Float[Tensor, "R 2"]:
+    """Return the middles of the squares of pixels that the rays of a patch stand for, row by row."""
+    width, height = size.tolist()
+    v, u = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
+    return corner_uv + UPSAMPLING * (torch.stack([u, v], dim=-1).flatten(0, 1) + 0.5)
 
 
 def _enlarged(rays: Float[Tensor, "h w"], size_hw: tuple[int, int]) -> Float[Tensor, "H W"]:
