@@ -12,6 +12,7 @@ from foredrive.losses.masked import masked_mean
 from foredrive.losses.motion import motion_losses
 from foredrive.models.tasks.agents import AGENT_CLASSES, AgentSet
 from foredrive.models.tasks.carried import Lineage
+from foredrive.models.tasks.plane import cell_middles
 from foredrive.models.tasks.proposals import CentreMap
 from foredrive.scene import Boxes, VoxelSpec
 from foredrive.scene.task_truth import TaskTruth
@@ -109,8 +110,7 @@ def _cell_losses(centres: CentreMap, targets: AgentTargets, spec: VoxelSpec) -> 
     lower = centres.xy.new_tensor(spec.lower_m[:2])
     cell_m = spec.voxel_m
     state, label = targets.boxes.state.to(centres.z), targets.boxes.label
-    y, x = (torch.arange(size, device=lower.device) + 0.5 for size in (rows, columns))
-    middle = lower + cell_m * torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1)
+    middle = cell_middles(spec.lower_m[:2], cell_m, (rows, columns)).view(rows, columns, 2).to(lower)
     spread = (SPREAD * state[:, 3:5].exp().mean(-1)).clamp_min(0.7 * cell_m)
     target = centre_target(state[:, :2], label, spread, middle, cell_m, len(AGENT_CLASSES))
     # Each box trains the cell of its centre and the eight around it.

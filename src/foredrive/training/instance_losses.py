@@ -7,6 +7,7 @@ from torch import Tensor
 from foredrive.losses.semantics import raster_loss
 from foredrive.models.tasks.agents import AGENT_CLASSES, AgentSet
 from foredrive.models.tasks.instances import InstanceSet, instance_logits
+from foredrive.models.tasks.plane import cell_middles
 from foredrive.scene import Boxes, VoxelSpec
 from foredrive.scene.boxes import VEHICLES
 from foredrive.scene.map_elements import InstanceRaster, PlaneSpec
@@ -31,17 +32,9 @@ def instance_loss(
     Each vehicle that matches an agent's box has its cells of the truth as the mask, at all steps that the log
     annotates. Cells outside of the volume's plane do not count.
     """
-    wanted = _inside(truth.spec, spec)
-    points = torch.stack(
-        torch.meshgrid(
-            *(
-                truth.spec.lower_m[axis] + (torch.arange(size) + 0.5)[wanted[1 - axis]] * truth.spec.cell_m
-                for axis, size in ((0, truth.spec.shape_yx[1]), (1, truth.spec.shape_yx[0]))
-            ),
-            indexing="xy",
-        ),
-        dim=-1,
-    ).to(instances.embedding)
+    grid, wanted = truth.spec, _inside(truth.spec, spec)
+    middle = cell_middles(grid.lower_m, grid.cell_m, grid.shape_yx).unflatten(0, grid.shape_yx)
+    points = middle[wanted[0]][:, wanted[1]].to(instances.embedding)
     losses = []
     for item in boxes_valid.nonzero()[:, 0].tolist():
         targets = agent_targets(boxes[item], None, spec, 0)
