@@ -119,6 +119,28 @@ def test_the_depth_of_an_image_is_along_the_axis_of_a_camera_that_turns(run: Rec
     torch.testing.assert_close(image.range_m[1::3, 1::3].flatten(), expected, rtol=1e-4, atol=1e-4)
 
 
+@pytest.mark.parametrize("log_opacity", [-20.0, -200.0])
+def test_beams_that_end_in_the_sky_do_not_return_from_the_sensor(
+    run: Reconstruction, log_opacity: float
+) -> None:
+    """Almost nothing, then nothing at all stops the beams, and the decoder takes all of them to return."""
+    scene = open_rebuilt(run.folder).scene
+    assert isinstance(scene, FieldScene)
+    geometry, last = scene.field.layers.geometry.linear[-1], scene.lidar_decoder.net[-1]
+    assert isinstance(geometry, torch.nn.Linear)
+    assert isinstance(last, torch.nn.Linear)
+    with torch.no_grad():
+        geometry.weight[0], last.weight[1], last.bias[1] = 0, 0, -5
+        scene.field.layers.beta = torch.nn.Parameter(torch.tensor(1.0))
+        geometry.bias[0] = -log_opacity
+        sweep = run.held_out.sweeps[0]
+        seen = scene.sweep(scene.graph, scene.prepare_sweep(sweep), sweep.t_s)
+    assert not bool(seen.returned.any())
+    assert bool(seen.range_m.isfinite().all())
+    if log_opacity == -20:
+        assert seen.range_m.min() > 5  # not at the sensor
+
+
 def test_edits_move_places_and_never_weights(run: Reconstruction) -> None:
     scene = run.scene
     before = {name: value.clone() for name, value in scene.state_dict().items()}
@@ -187,6 +209,9 @@ def test_wrong_settings_and_a_log_of_which_a_step_sees_nothing_are_refused(
     assert isinstance(run.scene, FieldScene)
     with pytest.raises(InputError, match="nothing to learn from"):
         FieldTraining(run.scene, SensorViews([], [no_beams]), schedule)
+    tiny = dataclasses.replace(run.train.cameras[0], size_hw=(2, 96))
+    with pytest.raises(InputError, match="need 3 pixels a side"):
+        FieldTraining(run.scene, SensorViews([tiny], []), schedule)
     beside = FieldTraining(run.scene, SensorViews([], [no_beams, run.train.sweeps[0]]), schedule)
     assert bool(beside.losses(0, torch.Generator().manual_seed(0)).losses["loss"].isfinite())
 

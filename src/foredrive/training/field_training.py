@@ -108,7 +108,7 @@ class FieldTraining:
         schedule: length, rates and losses.
 
     Raises:
-        InputError: there are neither images nor sweeps.
+        InputError: there are neither images nor sweeps that a step looks at, or images are too small.
     """
 
     def __init__(self, scene: FieldScene, views: SensorViews, schedule: FieldSchedule) -> None:
@@ -116,6 +116,8 @@ class FieldTraining:
         self._sweeps = [(view, rays) for view, rays in beams if len(rays.t_s)] if schedule.beams else []
         if not (views.cameras and schedule.patches) and not (self._sweeps and schedule.sweeps):
             raise InputError("there is nothing to learn from: neither images nor sweeps that a step looks at")
+        if any(min(view.size_hw) < UPSAMPLING for view in views.cameras):
+            raise InputError(f"images of a field need {UPSAMPLING} pixels a side or more")
         self.scene, self.views, self.schedule = scene, views, schedule
         self.steps, self.checkpoint_every, self.seed = (
             schedule.steps,

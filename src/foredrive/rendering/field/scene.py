@@ -28,7 +28,8 @@ from foredrive.rendering.views import CameraView, SweepView
 
 RAYS_AT_ONCE = 4096
 """Rays of an image or a sweep that are rendered together. More take memory and are not faster."""
-_LEAST_ALPHA = 1e-6
+_LEAST_ALPHA, _TINY = 1e-6, 1e-12
+"""Opacity below which nothing stops a beam, and the least divisor of expected distances."""
 
 
 @dataclass(frozen=True)
@@ -144,7 +145,7 @@ class FieldScene(RebuiltScene):
         # The camera's axis is that of the row's own time: it turns during the read-out.
         along = pixels_to_rays(_pixels_of_rays(corner_uv, size).to(view.K), view.K, view.dist)[:, 2]
         alpha = seen["alpha"].view(high, wide)
-        range_m = seen["depth_m"].view(high, wide) / alpha.clamp_min(_LEAST_ALPHA) * along.view(high, wide)
+        range_m = seen["depth_m"].view(high, wide) / alpha.clamp_min(_TINY) * along.view(high, wide)
         return RenderedImage(rgb, _enlarged(range_m, view.size_hw), _enlarged(alpha, view.size_hw))
 
     def prepare_sweep(self, view: SweepView) -> FieldRays:
@@ -154,15 +155,16 @@ class FieldScene(RebuiltScene):
     def sweep(self, graph: SceneGraph, points: FieldRays, t_s: float) -> RenderedSweep:
         """Render a sweep. The beams' own times count, not `t_s`.
 
-        Beams that end beyond the reach do not return.
+        Beams that end beyond the reach do not return, nor those that nothing stops.
         """
         rays = FieldRays(*(tensor.to(self.device) for tensor in points))
         seen = self._in_parts(graph, rays)
         intensity, drop_logit = self.lidar_decoder(seen["feature"])
-        range_m = seen["depth_m"] / seen["alpha"].clamp_min(_LEAST_ALPHA)
+        range_m = seen["depth_m"] / seen["alpha"].clamp_min(_TINY)
         median_m = seen["median_m"]
         beyond = torch.where(median_m.isfinite(), median_m, range_m) > self.reach_m
-        drop_logit = torch.where(beyond, drop_logit.abs() + 1, drop_logit)
+        nothing = seen["alpha"] < _LEAST_ALPHA
+        drop_logit = torch.where(beyond | nothing, drop_logit.abs() + 1, drop_logit)
         return RenderedSweep(range_m, median_m, intensity, drop_logit, seen["alpha"], None)
 
     def _in_parts(self, graph: SceneGraph, rays: FieldRays) -> Mapping[str, Tensor]:
