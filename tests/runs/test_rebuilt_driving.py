@@ -118,6 +118,8 @@ def test_the_verb_drives_against_a_threat(
     assert "--in RUN" in capsys.readouterr().err
     assert main([*command[:2], "expert", "--out", str(tmp_path / "other"), *command[5:]]) == 2
     assert "can drive only there" in capsys.readouterr().err
+    assert main([*command, "--rig", "driving"]) == 2
+    assert "do not go with --in: the cameras are the log's" in capsys.readouterr().err
 
 
 def test_scores_of_threats_stand_in_the_summary(run: Path, tmp_path: Path) -> None:

@@ -41,6 +41,10 @@ def drive(
     check_out_folder(out)
     for options in (planning, towns, rebuilt):
         options.check()
+    if rebuilt.rebuilt is not None and (
+        towns.rig is not None or towns.other_rig or towns.image_size is not None
+    ):
+        raise InputError("--rig, --other-rig and --image-size do not go with --in: the cameras are the log's")
     with importing():
         from foredrive.runs.drive.suite import DriveSuite, drive_suite
 
