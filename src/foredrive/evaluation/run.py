@@ -105,7 +105,8 @@ def evaluate(
     if model.items == 0:
         first = f"all {failed} items failed, {model.failures[0].reason}" if failed else "no items"
         raise InputError(f"there is nothing to evaluate: {first}")
-    summary = _summary(model, planners) | _command_figures(command_source or {})
+    summary = _figures(model, planners) | _command_figures(command_source or {})
+    summary |= {"items": model.items + failed, "failed": failed}
     summary |= {"peak_rss_gib": peak_rss_gib(), "wall_s": time.perf_counter() - started}
     return EvaluationResult(summary, tuple(model.failures))
 
@@ -180,13 +181,12 @@ class _EvaluatedMethod:
                 yield chosen[good], prediction[good]
 
 
-def _summary(model: _EvaluatedMethod, planners: Mapping[str, _EvaluatedMethod]) -> Figures:
-    """Return the figures of the model and of its baselines, and how many items failed."""
+def _figures(model: _EvaluatedMethod, planners: Mapping[str, _EvaluatedMethod]) -> Figures:
+    """Return the figures of the model and of its baselines."""
     summary = model.figures()
     for name, method in planners.items():
         summary |= method.figures(f"{name}.") | {f"planning.{name}.failed": len(method.failures)}
-    failed = len(model.failures)
-    return summary | {"items": model.items + failed, "failed": failed}
+    return summary
 
 
 def _load(
