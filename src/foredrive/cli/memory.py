@@ -1,4 +1,4 @@
-"""How the process keeps its memory."""
+"""Settings of the process' memory."""
 
 import ctypes
 import os

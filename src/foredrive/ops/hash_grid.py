@@ -45,7 +45,7 @@ class Level(NamedTuple):
     rows: int
     """Number of rows: of all actors' vertices if `dense`, else a power of two."""
     dense: bool
-    """Whether every vertex has its own row."""
+    """True if every vertex has its own row."""
 
 
 def grid_levels(

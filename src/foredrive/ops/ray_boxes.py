@@ -1,4 +1,4 @@
-"""Where rays pass through the boxes of moving actors, each ray at its own time.
+"""Intersections of rays with the boxes of moving actors, each ray at its own time.
 
 Rows that get gradients are gathered by `index_select`: the gradient of a[index] is added up in the order of
 threads, which changes the last bits from run to run.
@@ -92,7 +92,7 @@ def cross_boxes(
 
 
 class KeyPoses(NamedTuple):
-    """What the kernels read: rays with their segments of time, and the boxes' motion in each segment."""
+    """Inputs of the kernels: rays with their segments of time, and the boxes' motion in each segment."""
 
     origin: Float[Tensor, "R 3"]
     direction: Float[Tensor, "R 3"]

@@ -34,7 +34,7 @@ class RebuildRecipe(Generic[R]):
     name: str
     image_hw: tuple[int, int]
     representation: R
-    """What the scene is made of, and how it is trained: a row of `REPRESENTATIONS`."""
+    """Recipe of the scene's content and of its training; its kind is a row of `REPRESENTATIONS`."""
     cameras: tuple[str, ...] | None = None
     """Names of cameras, their own or 123D's; None takes all."""
     hold_out_every: int = 2

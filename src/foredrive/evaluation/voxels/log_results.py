@@ -35,7 +35,7 @@ GRID_FILE = "grid.json"
 
 @dataclass(frozen=True)
 class VoxelGridOfResults:
-    """What the arrays of a folder mean."""
+    """The meaning of the arrays in a folder: their grid and their classes."""
 
     taxonomy: Taxonomy
     spec: VoxelSpec

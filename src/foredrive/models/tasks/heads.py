@@ -140,9 +140,9 @@ class HeadOutput:
     voxels: Float[Tensor, "b C Z Y X"] | None = None
     """Logits."""
     lineage: Lineage | None = None
-    """Where the agents come from in the frame before; of heads that carry agents on."""
+    """Origin of each agent in the frame before. Only heads that carry agents have it."""
     instances: InstanceSet | None = None
-    """Where the agents are, now and later."""
+    """Occupancy of single vehicles, now and later."""
 
 
 class TaskHeads(nn.Module):
