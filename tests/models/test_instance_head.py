@@ -156,6 +156,26 @@ def test_the_loss_falls_as_features_learn_another_motion() -> None:
     assert float(right) < 0.5 * losses[0]  # boxes that drive as the truth does need no correction
 
 
+@pytest.mark.parametrize(("row", "column"), [(100, 96), (101, 110), (92, 121), (83, 87)])
+def test_every_cell_is_judged_by_one_of_four_items(row: int, column: int) -> None:
+    found = agents([(2.0, 2.0, 0.3, 4.0)])
+    truth = truth_of(found)
+    changed = truth.track_id.clone()
+    changed[:, 0, row, column] = torch.where(changed[:, 0, row, column] == 6, 0, 6)
+
+    def losses(track_id: torch.Tensor) -> list[float]:
+        batch = dataclasses.replace(truth, track_id=track_id)[[0] * 4]
+        instances, four, boxes = (each[[0] * 4] for each in (untrained(1), found, boxes_of(found)))
+        valid = torch.eye(4, dtype=torch.bool)
+        return [
+            float(instance_loss(instances, four, boxes, one, batch, SPEC, MatchingLossConfig()))
+            for one in valid
+        ]
+
+    differs = [new != old for new, old in zip(losses(changed), losses(truth.track_id), strict=True)]
+    assert sum(differs) == 1
+
+
 def test_pedestrians_and_frames_without_annotation_train_nothing() -> None:
     found = agents([(2.0, 2.0, 0.3, 4.0)])
     walkers = dataclasses.replace(boxes_of(found), category=torch.full((1, 1), int(Category.PEDESTRIAN)))
