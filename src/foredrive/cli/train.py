@@ -37,8 +37,9 @@ def train(
             its world model and planner as they are. With --set transfer=frozen, keep its world model and its
             heads as they are and train the planner alone.
         tasks: Tasks to train heads for, separated by commas: detection, tracking, map, motion, occupancy.
-            Fine-tuning trains them together with the world model. With --probe also instances: the vehicles'
-            cells now and in imagined key frames.
+            Fine-tuning trains them together with the world model, and also affordances: the next light, the
+            lead vehicle and who will cross. With --probe also instances: the vehicles' cells now and in
+            imagined key frames.
         probe: Train the heads of --tasks on the frozen world model instead. Its volumes are computed once and
             kept.
         set: Entries of the recipe to replace, such as finetune.schedule.lr=1e-3; `foredrive recipes RECIPE`

@@ -48,8 +48,11 @@ def target_at(log: Log, frame: int) -> Float64[np.ndarray, "2"] | None:
     Raises:
         InputError: the route cannot be read.
     """
-    route = _route_at(log, frame)
-    return None if route is None else route_target(*route, log.T_world_ego[frame])
+    route = route_at(log, frame)
+    if route is None:
+        return None
+    arc_m, xyz, progress_m = route
+    return route_target(arc_m, xyz[:, :2], progress_m, log.T_world_ego[frame])
 
 
 def route_target(
@@ -74,14 +77,20 @@ def route_target(
 
 def _route_offset_m(log: Log, frame: int) -> float | None:
     """Return `route_offset_m` at a frame, or None without a provided route."""
-    route = _route_at(log, frame)
-    return None if route is None else route_offset_m(*route)
+    route = route_at(log, frame)
+    return None if route is None else route_offset_m(route[0], route[1][:, :2], route[2])
 
 
-def _route_at(
+def route_at(
     log: Log, frame: int
-) -> tuple[Float64[np.ndarray, "K"], Float64[np.ndarray, "K 2"], float] | None:
-    """Return arc length and points of the route, and the ego's progress along it (m)."""
+) -> tuple[Float64[np.ndarray, "K"], Float64[np.ndarray, "K 3"], float] | None:
+    """Return arc length and points of the route, and the ego's progress along it (m).
+
+    Return None without a provided route.
+
+    Raises:
+        InputError: the route cannot be read.
+    """
     metadata = log.scene.get_modality_metadata(ModalityType.ROUTE_POSITION)
     if not isinstance(metadata, RouteMetadata) or metadata.source != "provided":
         return None
@@ -89,7 +98,7 @@ def _route_at(
         progress_m = log.scene.get_route_progress_at_iteration(log.iteration(frame))
         if progress_m is None:
             return None
-        return metadata.polyline_arc_m, metadata.polyline_xyz[:, :2], float(progress_m)
+        return metadata.polyline_arc_m, metadata.polyline_xyz, float(progress_m)
 
 
 def route_offset_m(

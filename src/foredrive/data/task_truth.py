@@ -15,6 +15,7 @@ from py123d.common.utils.msgpack_utils import msgpack_decode_with_numpy, msgpack
 from py123d.datatypes import PinholeCameraMetadata
 from torch import Tensor
 
+from foredrive.data.affordances import read_affordances
 from foredrive.data.agent_futures import read_futures, read_instances
 from foredrive.data.logs import Log
 from foredrive.data.map_elements import read_map_elements, read_map_raster
@@ -31,6 +32,8 @@ from foredrive.scene.task_truth import TaskTruth
 TRUTH_VERSION = 1
 """Version in every cache key. Increase it when the truth changes."""
 
+NOT_CACHED = ("rays", "affordances")
+"""Parts that are read anew each time."""
 UNIAD_RASTER = PlaneSpec((-51.2, -51.2), 0.512, (200, 200))
 UNIAD_INSTANCES = PlaneSpec((-50.0, -50.0), 0.5, (200, 200))
 """UniAD's grids, but centred on the rear axle."""
@@ -61,10 +64,12 @@ class TaskTruthConfig:
     instance_dt_s: float = 0.5
     rays: bool = False
     """Read the lidar's places and the velocities of voxels, which metrics of rays need."""
+    affordances: bool = False
+    """Read the next light, the lead vehicle and who will cross."""
 
 
 class TaskTruthStore:
-    """A reader of task truth with a disk cache of most parts. Futures and rays are faster to read anew.
+    """A reader of task truth with a disk cache of most parts. The others are faster to read anew.
 
     The name of an entry is a hash of everything that it depends on: the log's files and its map (name, size,
     modification time), the frame's time, the cameras, the configuration, the voxel grid and `TRUTH_VERSION`.
@@ -91,7 +96,8 @@ class TaskTruthStore:
                     temporary.write_bytes(_encode(truth))
         futures = read_futures(log, frame, self.config.future_steps, self.config.future_dt_s)
         rays = read_rays(log, frame, self.voxels) if self.config.rays else None
-        return dataclasses.replace(truth, futures=futures, rays=rays)
+        affordances = read_affordances(log, frame) if self.config.affordances else None
+        return dataclasses.replace(truth, futures=futures, rays=rays, affordances=affordances)
 
     def _make(self, log: Log, frame: int, cameras: Sequence[PinholeCameraMetadata]) -> TaskTruth:
         made, config = TaskTruth(), self.config
@@ -118,7 +124,7 @@ class TaskTruthStore:
         stat = None if shared is None else (str(shared), shared.stat().st_size, shared.stat().st_mtime_ns)
         names = [camera.modality_key for camera in cameras]
         now_us = int(log.t_us[frame])
-        kept = {name: value for name, value in vars(self.config).items() if name != "rays"}
+        kept = {name: value for name, value in vars(self.config).items() if name not in NOT_CACHED}
         key = (TRUTH_VERSION, log.fingerprint, stat, now_us, names, kept, self.voxels)
         name = hashlib.blake2b(repr(key).encode(), digest_size=16).hexdigest()
         return self._folder / name[:2] / f"{name}.truth"

@@ -10,12 +10,21 @@ from foredrive.errors import InputError
 from foredrive.recipes.config import Recipe, is_recipe_file, load_recipe, overridden, recipe_from
 from foredrive.recipes.driveworld import driveworld_base, driveworld_tiny, driveworld_town
 from foredrive.recipes.driveworld_ablations import driveworld_ablations
-from foredrive.recipes.nemo import BASE_BEV, TOWN_BEV, nemo_base, nemo_drive, nemo_tiny, nemo_town
+from foredrive.recipes.nemo import (
+    BASE_BEV,
+    TOWN_BEV,
+    nemo_base,
+    nemo_drive,
+    nemo_drive_tele,
+    nemo_tiny,
+    nemo_town,
+)
 from foredrive.recipes.nemo_ablations import nemo_ablations
 
 RECIPES: dict[str, Recipe[Any, Any]] = {
     "nemo_tiny": nemo_tiny(),
     "nemo_drive": nemo_drive(),
+    "nemo_drive_tele": nemo_drive_tele(),
     **nemo_ablations(nemo_town(), TOWN_BEV),
     **nemo_ablations(nemo_base(), BASE_BEV),
     "driveworld_tiny": driveworld_tiny(),

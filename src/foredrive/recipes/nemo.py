@@ -3,6 +3,7 @@
 import dataclasses
 
 from foredrive.data import ClipConfig
+from foredrive.data.task_truth import TaskTruthConfig
 from foredrive.models.backbone import BackboneConfig
 from foredrive.models.bev import BevConfig
 from foredrive.models.ego_mlp import EgoMLPConfig
@@ -10,9 +11,13 @@ from foredrive.models.lifting import LiftingConfig
 from foredrive.models.nemo import MotionConfig, NemoConfig, RendererConfig
 from foredrive.models.plane_context import PlaneContextConfig
 from foredrive.models.planner import PathCorrectionConfig, PlannerConfig
+from foredrive.models.tasks.affordances import AffordanceHeadConfig
+from foredrive.models.tasks.heads import TaskHeadsConfig
 from foredrive.recipes.config import Recipe, rescheduled
 from foredrive.scene import VoxelSpec
+from foredrive.sensors.rigs import DRIVING
 from foredrive.training import AugmentConfig, NemoStage, NemoWeights, PathFit, Schedule
+from foredrive.training.joint_tasks import JointTasks
 
 NemoRecipe = Recipe[NemoConfig, NemoStage]
 
@@ -139,6 +144,28 @@ def nemo_drive() -> NemoRecipe:
         about="nemo_town to drive in closed loop, trained on DAgger demonstrations",
         clips=dataclasses.replace(town.clips, future_source="expert"),
         planner=dataclasses.replace(town.planner, history=0, target=True),
+    )
+
+
+def nemo_drive_tele() -> NemoRecipe:
+    """Return `nemo_drive` for the rig with a narrow front camera, with supervised affordances.
+
+    In towns the next light, the lead vehicle and people who cross are known, and the planner attends to what
+    the head has found of them. Images are as large as the rig records them: a lamp is 4 px wide at 40 m.
+    """
+    drive = nemo_drive()
+    heads = TaskHeadsConfig(
+        agents=None, elements=None, raster=None, voxels=None, affordances=AffordanceHeadConfig()
+    )
+    truth = TaskTruthConfig(elements_lw_m=None, raster=None, semantics=None, instances=None, affordances=True)
+    return dataclasses.replace(
+        drive,
+        name="nemo_drive_tele",
+        about="nemo_drive for the rig `driving`: sees lights, the lead vehicle and who will cross",
+        clips=dataclasses.replace(drive.clips, image_hw=DRIVING.image_hw, tasks=truth),
+        tasks=JointTasks(heads, weight=1.0),
+        planner=dataclasses.replace(drive.planner, attends=("affordances",)),
+        finetune=rescheduled(drive.finetune, steps=1500, warmup_steps=60),
     )
 
 

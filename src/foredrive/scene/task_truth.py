@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+from foredrive.scene.affordances import Affordances
 from foredrive.scene.agent_futures import AgentFutures
 from foredrive.scene.map_elements import InstanceRaster, MapElements, MapRaster
 from foredrive.scene.record import Record
@@ -18,3 +19,4 @@ class TaskTruth(Record):
     semantics: SemanticVoxels | None = None
     instances: InstanceRaster | None = None
     rays: RayTruth | None = None
+    affordances: Affordances | None = None

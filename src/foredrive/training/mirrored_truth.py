@@ -40,7 +40,14 @@ def mirrored_truth(truth: TaskTruth, chosen: Bool[Tensor, "b"]) -> TaskTruth:
             camera_mask=_flipped(semantics.camera_mask, chosen),
             lidar_mask=_flipped(semantics.lidar_mask, chosen),
         )
-    return TaskTruth(futures, elements, raster, semantics, instances)
+    affordances = truth.affordances
+    if affordances is not None:
+        affordances = dataclasses.replace(
+            affordances,
+            path_xy=_negated_y(affordances.path_xy, chosen),
+            crossing_xy=_negated_y(affordances.crossing_xy, chosen),
+        )
+    return TaskTruth(futures, elements, raster, semantics, instances, affordances=affordances)
 
 
 def _negated_y(points: Shaped[Tensor, "b *n 2"], chosen: Bool[Tensor, "b"]) -> Tensor:

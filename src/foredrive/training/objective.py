@@ -214,14 +214,14 @@ class NemoObjective(nn.Module):
         looks_back = self.tasks is not None  # heads read the past of all items
         items = slice(None if looks_back else stage.imagined_items)
         frames = last_frames(observed, world.past_frames if steps or looks_back else 0)
-        present = lift_frames(frames[:, -1:], world.backbone, world.encoder)
-        now = Belief(volume=present[:, -1])
+        present, images = lift_frames(frames[:, -1:], world.backbone, world.encoder)
+        now = Belief(volume=present[:, -1], images=images)
         if steps == 0 and not looks_back:
             return [now]
         with torch.set_grad_enabled(stage.past_gradient and torch.is_grad_enabled()):
-            past = lift_frames(frames[items, :-1], world.backbone, world.encoder)
+            past, _ = lift_frames(frames[items, :-1], world.backbone, world.encoder)
         history = torch.cat([past, present[items]], dim=1)
-        believed = world.believe(frames[items], history)
+        believed = world.believe(frames[items], history, images[items])
         imagined = world.imagine(believed, steps) if steps else []
         return [believed if looks_back else now, *imagined]
 

@@ -14,6 +14,7 @@ from foredrive.scene import Boxes, VoxelSpec
 from foredrive.scene.map_elements import MapElements
 from foredrive.scene.semantics import SemanticVoxels
 from foredrive.scene.task_truth import TaskTruth
+from foredrive.training.affordance_losses import AffordanceLossWeights, affordance_losses
 from foredrive.training.agent_losses import AgentLossWeights, agent_losses
 from foredrive.training.instance_losses import instance_loss
 from foredrive.training.task_targets import map_targets
@@ -28,6 +29,7 @@ class TaskWeights:
     raster: float = 1.0
     voxels: float = 1.0
     instances: float = 1.0
+    affordances: AffordanceLossWeights = field(default_factory=AffordanceLossWeights)
     map: MapLossWeights = field(default_factory=MapLossWeights)
 
 
@@ -85,6 +87,8 @@ def task_losses(
             spec,
             weights.agents.boxes,
         )
+    if output.affordances is not None and truth.affordances is not None:
+        losses |= affordance_losses(output.affordances, truth.affordances, weights.affordances)
     return losses | {"loss": torch.stack(list(losses.values())).sum()}
 
 

@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor, nn
 
+from foredrive.models.tasks.affordances import AffordanceHead, AffordanceHeadConfig, AffordanceSet
 from foredrive.models.tasks.agents import AgentHead, AgentHeadConfig, AgentSet
 from foredrive.models.tasks.carried import (
     CarriedAgents,
@@ -22,6 +23,7 @@ from foredrive.models.tasks.plane import PlanePyramid, Planes
 from foredrive.models.tasks.proposals import CentreMap
 from foredrive.models.tasks.voxels import VoxelHead, VoxelHeadConfig
 from foredrive.scene import Belief, Task, VoxelSpec, WorldModel
+from foredrive.scene.image_features import ImageFeatures
 from foredrive.scene.map_elements import PlaneSpec
 from foredrive.scene.record import Record
 
@@ -41,6 +43,8 @@ class TaskHeadsConfig:
     voxels: VoxelHeadConfig | None = field(default_factory=VoxelHeadConfig)
     instances: InstanceHeadConfig | None = None
     """Needs agents, and beliefs that the world model imagines."""
+    affordances: AffordanceHeadConfig | None = None
+    """Reads the image features of now, which only heads within an agent have."""
 
     @property
     def tasks(self) -> tuple[Task, ...]:
@@ -52,6 +56,8 @@ class TaskHeadsConfig:
             found.append("map")
         if self.voxels is not None:
             found.append("occupancy")
+        if self.affordances is not None:
+            found.append("planning")
         return tuple(found)
 
     @property
@@ -88,6 +94,8 @@ class TaskVolume(Record):
     """Volumes of K imagined key frames, each in its own ego frame, for heads that read them."""
     T_now_later: Float[Tensor, "b K 4 4"] | None = None
     """The ego frames of these -> the ego frame at now."""
+    images: ImageFeatures | None = None
+    """Features of the images at now, for heads that read them."""
 
 
 def volumes_of(
@@ -108,7 +116,8 @@ def volumes_of(
     for task in tasks:
         volume = world.volume_for(belief, task)
         found[task] = made.setdefault(
-            id(volume), TaskVolume(volume, past, belief.T_past_now, imagined, T_now_later)
+            id(volume),
+            TaskVolume(volume, past, belief.T_past_now, imagined, T_now_later, belief.images),
         )
     return found
 
@@ -143,6 +152,7 @@ class HeadOutput:
     """Origin of each agent in the frame before. Only heads that carry agents have it."""
     instances: InstanceSet | None = None
     """Occupancy of single vehicles, now and later."""
+    affordances: AffordanceSet | None = None
 
 
 class TaskHeads(nn.Module):
@@ -181,6 +191,9 @@ class TaskHeads(nn.Module):
         self.voxels: VoxelHead | None = None
         if config.voxels is not None:
             self.voxels = VoxelHead(planes, channels, spec.shape_zyx[0], config.voxels)
+        self.affordances: AffordanceHead | None = None
+        if config.affordances is not None:
+            self.affordances = AffordanceHead(planes, channels, config.affordances)
 
     def forward(
         self,
@@ -221,7 +234,10 @@ class TaskHeads(nn.Module):
             instances = self._imagined(
                 self.instances, agents[-1], volumes["detection"], planes_of("detection")
             )
-        return HeadOutput(agents, centres, elements, raster, voxels, lineage, instances)
+        affordances = None
+        if self.affordances is not None:
+            affordances = self.affordances(volumes["planning"].images, planes_of("planning").fine)
+        return HeadOutput(agents, centres, elements, raster, voxels, lineage, instances, affordances)
 
     def _imagined(
         self, head: InstanceHead, agents: AgentSet, volume: TaskVolume, planes: Planes

@@ -1,0 +1,219 @@
+"""Reading of affordances: the light, the lead vehicle and the people on the path, from a log alone.
+
+Logs of towns have the states of lights by the lanes behind their stop lines, so nothing else is recorded for
+this. Other logs have no lights, and their path is the driven one.
+"""
+
+import functools
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Float64, Int64
+from py123d.datatypes import Lane, MapLayer, TrafficLightStatus
+from torch import Tensor
+
+from foredrive.data.agent_futures import read_futures
+from foredrive.data.arrow_files import reading
+from foredrive.data.boxes import read_boxes
+from foredrive.data.commands import route_at
+from foredrive.data.logs import Log
+from foredrive.data.recorded import read_traffic_lights
+from foredrive.geometry.path_frame import along_path, path_headings
+from foredrive.geometry.polylines import arc_lengths, points_at
+from foredrive.scene import Boxes
+from foredrive.scene.affordances import (
+    CROSSING_RANGE_M,
+    CROSSING_S,
+    LEAD_RANGE_M,
+    LIGHT_RANGE_M,
+    Affordances,
+)
+from foredrive.scene.boxes import VEHICLES, Category
+from foredrive.scene.traffic_light import LightState
+
+POINTS = 72
+"""Points of the path, a metre apart."""
+PASSED_M = 2.0
+"""A light counts until the front bumper is this far beyond its line."""
+BESIDE_M = 1.75
+ALIGNED_COS = 0.5
+LEVEL_M = 2.5
+"""A stop line is on the path if its lane begins at most this far beside it, at most 60° turned, at its
+height."""
+IN_WAY_M = 1.2
+"""A vehicle is in the path if a part of it is at most this far beside it: half the ego vehicle and a margin.
+"""
+ENTERED_M = 1.7
+"""A person has entered the path at this distance from it."""
+STATE_OF_STATUS = {
+    TrafficLightStatus.RED: LightState.RED,
+    TrafficLightStatus.YELLOW: LightState.YELLOW,
+    TrafficLightStatus.GREEN: LightState.GREEN,
+}
+
+
+class _Path(NamedTuple):
+    """The path ahead in the ego frame."""
+
+    xy: Float[Tensor, "R 2"]
+    z: Float64[np.ndarray, "R"]
+    valid: Bool[Tensor, "R"]
+    front_m: float
+    """Distance along the path of the front bumper."""
+    given: bool
+    """It is a route that was provided. Beyond its end, nothing matters."""
+
+
+class _StopLines(NamedTuple):
+    """Begins of the lanes behind lights."""
+
+    lane: Int64[np.ndarray, "L"]
+    xyz: Float64[np.ndarray, "L 3"]
+    ahead: Float64[np.ndarray, "L 3"]
+
+
+def read_affordances(log: Log, frame: int) -> Affordances:
+    """Read the affordances at a frame, unbatched. What the log lacks is not known.
+
+    Raises:
+        InputError: the route, the map, the lights or the boxes cannot be read.
+    """
+    path = _path(log, frame)
+    light, light_m, light_known = _light(log, frame, path)
+    boxes = read_boxes(log, frame)
+    lead, lead_m, lead_mps, lead_known = _lead(boxes, path)
+    crossing, crossing_known = _crossing(log, frame, boxes, path)
+    return Affordances(
+        path_xy=path.xy,
+        path_valid=path.valid,
+        light=torch.tensor(int(light)),
+        light_m=torch.tensor(light_m),
+        light_known=torch.tensor(light_known),
+        lead=torch.tensor(lead),
+        lead_m=torch.tensor(lead_m),
+        lead_mps=torch.tensor(lead_mps),
+        lead_known=torch.tensor(lead_known),
+        crossing_xy=crossing,
+        crossing=torch.ones(len(crossing), dtype=torch.bool),
+        crossing_known=torch.tensor(crossing_known),
+    )
+
+
+def _path(log: Log, frame: int) -> _Path:
+    """Return the route from beside the rear axle on, or the driven path where there is no route."""
+    route = route_at(log, frame)
+    if route is None:
+        xyz = log.T_world_ego[frame:, :3, 3]
+        arc_m, progress_m = arc_lengths(xyz), 0.0
+    else:
+        arc_m, xyz, progress_m = route
+    at_m = np.arange(POINTS, dtype=np.float64)
+    there = at_m <= arc_m[-1] - progress_m
+    ahead = points_at(xyz, arc_m, progress_m + at_m)
+    ahead = _in_ego_frame(ahead, log, frame) * there[:, None]
+    centre, size = log.ego_box
+    return _Path(
+        torch.from_numpy(ahead[:, :2]).float(),
+        ahead[:, 2],
+        torch.from_numpy(there & (there.sum() > 1)),
+        float(centre[0] + 0.5 * size[0]),
+        route is not None,
+    )
+
+
+def _light(log: Log, frame: int, path: _Path) -> tuple[LightState, float, bool]:
+    """Return state and distance of the next light on the path, and whether the log tells."""
+    shown, lines = read_traffic_lights(log, frame), _stop_lines(log)
+    if shown is None or lines is None or not path.given or not bool(path.valid.any()):
+        return LightState.NONE, 0.0, False
+    if not len(lines.lane):
+        return LightState.NONE, 0.0, True
+    at = _in_ego_frame(lines.xyz, log, frame)
+    along_m, left_m = along_path(torch.from_numpy(at[:, :2]).float(), path.xy, path.valid)
+    heading = path_headings(along_m, path.xy, path.valid).double().numpy()
+    ahead = (lines.ahead @ log.T_world_ego[frame, :3, :3])[:, :2]
+    distance_m = along_m.double().numpy() - path.front_m
+    height_m = np.interp(along_m.numpy(), np.arange(POINTS), path.z)
+    on_path = (
+        (left_m.abs().numpy() < BESIDE_M)
+        & ((heading * ahead).sum(-1) > ALIGNED_COS)
+        & (np.abs(at[:, 2] - height_m) < LEVEL_M)
+        & (distance_m > -PASSED_M)
+        & (distance_m <= LIGHT_RANGE_M)
+    )
+    for row in sorted(np.flatnonzero(on_path).tolist(), key=distance_m.__getitem__):
+        state = STATE_OF_STATUS.get(shown.get(int(lines.lane[row]), TrafficLightStatus.UNKNOWN))
+        if state is not None:
+            return state, float(distance_m[row]), True
+    return LightState.NONE, 0.0, True
+
+
+@functools.lru_cache(maxsize=64)
+def _stop_lines(log: Log) -> _StopLines | None:
+    """Return the lanes that lights of the log guard. None without lights or map."""
+    shown = read_traffic_lights(log, 0)
+    with reading(log.path.folder, "its map"):
+        api = log.scene.get_map_api()
+        if shown is None or api is None:
+            return None
+        found = {name: api.get_map_object_in_layer(name, MapLayer.LANE) for name in shown}
+    lanes = {name: lane for name, lane in found.items() if isinstance(lane, Lane)}
+    starts = [np.asarray(lane.centerline_3d.array, dtype=np.float64)[:2] for lane in lanes.values()]
+    two = np.array(starts).reshape(-1, 2, 3)
+    ahead = two[:, 1] - two[:, 0]
+    length_m = np.linalg.norm(ahead, axis=-1, keepdims=True)
+    return _StopLines(np.array(list(lanes), dtype=np.int64), two[:, 0], ahead / np.maximum(length_m, 1e-9))
+
+
+def _lead(boxes: Boxes | None, path: _Path) -> tuple[bool, float, float, bool]:
+    """Return whether a vehicle is in the path, its gap and its speed, and whether the log tells."""
+    if boxes is None or not bool(path.valid.any()):
+        return False, 0.0, 0.0, False
+    vehicles = torch.isin(boxes.category, torch.tensor([int(kind) for kind in VEHICLES]))
+    chosen = boxes[vehicles & boxes.valid]
+    points = _points_of(chosen)
+    along_m, left_m = along_path(points.flatten(0, 1), path.xy, path.valid)
+    gap_m = (along_m - path.front_m).view(points.shape[:2])
+    in_way = (left_m.view(points.shape[:2]).abs() < IN_WAY_M) & (gap_m > -1.0)
+    nearest_m = gap_m.masked_fill(~in_way, torch.inf).amin(-1)
+    if len(nearest_m) and float(nearest_m.min()) <= LEAD_RANGE_M:
+        row = int(nearest_m.argmin())
+        gap = float(nearest_m[row])
+        direction = path_headings(torch.tensor([gap + path.front_m]), path.xy, path.valid)[0]
+        speed_mps = float((chosen.velocity[row] * direction).sum())
+        return True, max(gap, 0.0), speed_mps, True
+    reach_m = float(path.valid.sum()) - 1.0 - path.front_m
+    return False, 0.0, 0.0, path.given or reach_m >= LEAD_RANGE_M
+
+
+def _crossing(log: Log, frame: int, boxes: Boxes | None, path: _Path) -> tuple[Float[Tensor, "K 2"], bool]:
+    """Return where people are who will cross the path, and whether the log tells."""
+    lasts_s = float(log.t_us[-1] - log.t_us[frame]) * 1e-6
+    if boxes is None or not bool(path.valid.any()) or lasts_s < CROSSING_S - 0.05:
+        return torch.zeros(0, 2), False
+    future = read_futures(log, frame, round(CROSSING_S / 0.5), 0.5)
+    at = torch.cat([boxes.centre[:, None, :2], future.xy], dim=1)  # [M S+1 2]
+    there = torch.cat([torch.ones_like(future.valid[:, :1]), future.valid], dim=1)
+    along_m, left_m = along_path(at.flatten(0, 1), path.xy, path.valid)
+    ahead_m = (along_m - path.front_m).view(there.shape)
+    entered = (left_m.view(there.shape).abs() < ENTERED_M) & (ahead_m > -1.0) & (ahead_m < CROSSING_RANGE_M)
+    person = (boxes.category == int(Category.PEDESTRIAN)) & boxes.valid
+    return boxes.centre[person & (entered & there).any(-1), :2], True
+
+
+def _points_of(boxes: Boxes) -> Float[Tensor, "M P 2"]:
+    """Return points all over the footprints of boxes."""
+    share = torch.cartesian_prod(torch.linspace(-0.5, 0.5, 7), torch.linspace(-0.5, 0.5, 3))
+    local = share * boxes.size_lwh[:, None, :2]
+    cos, sin = boxes.yaw.cos()[:, None], boxes.yaw.sin()[:, None]
+    turned = torch.stack(
+        [cos * local[..., 0] - sin * local[..., 1], sin * local[..., 0] + cos * local[..., 1]], dim=-1
+    )
+    return boxes.centre[:, None, :2] + turned
+
+
+def _in_ego_frame(xyz: Float64[np.ndarray, "N 3"], log: Log, frame: int) -> Float64[np.ndarray, "N 3"]:
+    T_ego_world = np.linalg.inv(log.T_world_ego[frame])
+    moved: Float64[np.ndarray, "N 3"] = xyz @ T_ego_world[:3, :3].T + T_ego_world[:3, 3]
+    return moved

@@ -1,0 +1,62 @@
+"""What a driver must see: the next traffic light, the lead vehicle, people who will cross."""
+
+from dataclasses import dataclass
+
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from foredrive.scene.record import Record
+
+LIGHT_RANGE_M = 60.0
+LEAD_RANGE_M = 50.0
+CROSSING_RANGE_M = 25.0
+"""Distances along the path up to which a light, a lead vehicle and people who cross are told, m."""
+CROSSING_S = 4.0
+"""Someone crosses who enters the path within this time, s."""
+
+
+@dataclass(frozen=True)
+class Affordances(Record):
+    """Ground truth of what decides about braking (the affordances of Sauer et al. 2018), at now.
+
+    Distances are from the front bumper along the path: the route, or the driven path where the log has no
+    route. Entries whose `known` is False, and padding, hold zeros.
+    """
+
+    path_xy: Float[Tensor, "*b R 2"]
+    """Path from the point beside the rear axle on, one point a metre, ego frame, m."""
+    path_valid: Bool[Tensor, "*b R"]
+    light: Int[Tensor, "*b"]
+    """`LightState` of the next light on the path; NONE if none is within `LIGHT_RANGE_M`."""
+    light_m: Float[Tensor, "*b"]
+    """Distance of its stop line. It is negative while the bumper is less than 2 m beyond the line."""
+    light_known: Bool[Tensor, "*b"]
+    lead: Bool[Tensor, "*b"]
+    """Whether a vehicle stands or drives in the path within `LEAD_RANGE_M`."""
+    lead_m: Float[Tensor, "*b"]
+    """Gap to the nearest one."""
+    lead_mps: Float[Tensor, "*b"]
+    """Its speed along the path."""
+    lead_known: Bool[Tensor, "*b"]
+    crossing_xy: Float[Tensor, "*b K 2"]
+    """Positions at now of the people who enter the path within `CROSSING_S` and `CROSSING_RANGE_M`."""
+    crossing: Bool[Tensor, "*b K"]
+    """False for padding."""
+    crossing_known: Bool[Tensor, "*b"]
+
+
+@dataclass(frozen=True)
+class AffordanceEstimate(Record):
+    """The prediction of `Affordances`."""
+
+    light: Float[Tensor, "*b 4"]
+    """Probability of each `LightState`."""
+    light_m: Float[Tensor, "*b"]
+    lead: Float[Tensor, "*b"]
+    """Probability of a lead vehicle."""
+    lead_m: Float[Tensor, "*b"]
+    lead_mps: Float[Tensor, "*b"]
+    crossing_xy: Float[Tensor, "*b K 2"]
+    """Places of the K most probable people who cross, the first most probable."""
+    crossing: Float[Tensor, "*b K"]
+    """Their probabilities."""
