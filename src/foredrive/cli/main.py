@@ -13,6 +13,7 @@ import tyro
 
 import foredrive
 from foredrive.cli.bench import bench
+from foredrive.cli.compare import compare
 from foredrive.cli.convert import convert
 from foredrive.cli.demo import demo
 from foredrive.cli.drive import drive
@@ -44,6 +45,7 @@ VERBS: dict[str, Callable[..., Any]] = {
     "train": train,
     "evaluate": evaluate,
     "drive": drive,
+    "compare": compare,
     "ncap": ncap,
     "score": score,
     "search": search,

@@ -1,0 +1,226 @@
+"""Comparison of agents over the same routes: paired differences, and the routes that separate them."""
+
+import dataclasses
+import statistics
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from foredrive.errors import InputError
+from foredrive.metrics.bootstrap import BootstrapMean, bootstrap_mean
+from foredrive.runs.drive.records import read_drive, read_suite
+from foredrive.runs.folder import DRIVES
+from foredrive.simulation.drive_record import DriveRecord
+from foredrive.simulation.scores import Ending, InfractionKind
+
+COLLISIONS = (
+    InfractionKind.COLLISION_PEDESTRIAN,
+    InfractionKind.COLLISION_VEHICLE,
+    InfractionKind.COLLISION_STATIC,
+)
+METRICS = (
+    "driving_score_1_0",
+    "driving_score_2_1",
+    "completion",
+    "red_lights",
+    "collisions",
+    "stop_signs",
+    "speed_mps",
+)
+"""Values of a drive. The first three are in %, infractions are counts."""
+SAME_WORLD = ("routes", "seed", "conditions", "vehicles", "people", "scenarios")
+"""Settings of a suite in which two drives must agree to have met the same traffic."""
+Key = tuple[str, int, int]
+"""Route, place of the folder among those of its agent, repetition."""
+
+
+@dataclass(frozen=True)
+class ComparedAgent:
+    """An agent and its drives."""
+
+    name: str
+    folders: tuple[Path, ...]
+    drives: Mapping[Key, DriveRecord]
+
+    def values(self, metric: str, keys: Sequence[Key]) -> list[float]:
+        """Return the values of a metric for some drives."""
+        return [values_of(self.drives[key])[metric] for key in keys]
+
+
+@dataclass(frozen=True)
+class RouteRow:
+    """One route: the mean driving score of each agent, and what happened."""
+
+    route: str
+    scores: tuple[float, ...]
+    happened: tuple[str, ...]
+    """Infractions and endings of each agent, in words."""
+
+    @property
+    def spread(self) -> float:
+        """Return the difference of the best and the worst score."""
+        return max(self.scores) - min(self.scores)
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Agents over the drives that all of them have."""
+
+    agents: tuple[ComparedAgent, ...]
+    keys: tuple[Key, ...]
+    """The drives that are compared."""
+    left_out: int
+    """Drives that not all agents have."""
+    differences: Mapping[str, Mapping[str, BootstrapMean]]
+    """By metric and by agent but the first: the value minus that of the first agent."""
+    routes: tuple[RouteRow, ...]
+    """Those that separate the agents most come first."""
+    unlike: tuple[str, ...]
+    """Settings in which the folders differ, so that drives of a pair did not meet the same traffic."""
+
+
+def values_of(drive: DriveRecord) -> dict[str, float]:
+    """Return the values of a drive that are compared, see `METRICS`."""
+    kinds = [infraction.kind for infraction in drive.score.infractions]
+    return {
+        "driving_score_1_0": drive.driving_score_1_0,
+        "driving_score_2_1": drive.driving_score_2_1,
+        "completion": 100.0 * drive.score.completion,
+        "red_lights": float(kinds.count(InfractionKind.RED_LIGHT)),
+        "collisions": float(sum(kind in COLLISIONS for kind in kinds)),
+        "stop_signs": float(kinds.count(InfractionKind.STOP_SIGN)),
+        "speed_mps": drive.score.driven_m / max(drive.score.duration_s, 1e-9),
+    }
+
+
+def read_agent(given: str) -> ComparedAgent:
+    """Read the drives of an agent.
+
+    Args:
+        given: FOLDER, FOLDER,FOLDER for suites that count as one agent, such as those of several training
+            seeds, or NAME=FOLDER,…
+
+    Raises:
+        InputError: a folder holds no drives.
+    """
+    name, equals, rest = given.partition("=")
+    folders = tuple(Path(part) for part in (rest if equals else given).split(","))
+    drives: dict[Key, DriveRecord] = {}
+    for place, folder in enumerate(folders):
+        files = sorted((folder / DRIVES).glob("*.json"))
+        if not files:
+            raise InputError(f"{folder}: no drives to compare (no {DRIVES}/*.json)")
+        for file in files:
+            drive = read_drive(file)
+            drives[drive.score.route, place, drive.score.repetition] = drive
+    return ComparedAgent(name if equals else folders[0].absolute().name, folders, drives)
+
+
+def compare(agents: Sequence[ComparedAgent], seed: int = 0, resamples: int = 10_000) -> Comparison:
+    """Compare agents with the first one, on the drives that all have.
+
+    Intervals are those of a bootstrap over routes: repetitions of one route resemble each other.
+
+    Args:
+        agents: at least two, of different names.
+        seed: seed of the bootstrap.
+        resamples: number of resampled sets of routes.
+
+    Raises:
+        InputError: there are fewer than two agents, two have one name, or no drive is common to all.
+    """
+    if len(agents) < 2:
+        raise InputError("a comparison needs at least two folders of drives")
+    names = [agent.name for agent in agents]
+    if len(set(names)) < len(names):
+        raise InputError(f"two agents have the same name ({', '.join(names)}): write NAME=FOLDER")
+    common = set.intersection(*(set(agent.drives) for agent in agents))
+    if not common:
+        raise InputError("the folders have no route and repetition in common, so nothing can be compared")
+    keys = tuple(sorted(common, key=_order))
+    routes = [route for route, *_ in keys]
+    differences: dict[str, dict[str, BootstrapMean]] = {}
+    for metric in METRICS:
+        first = np.array(agents[0].values(metric, keys))
+        differences[metric] = {
+            agent.name: bootstrap_mean(
+                np.array(agent.values(metric, keys)) - first,
+                routes,
+                np.random.default_rng(seed),
+                resamples=resamples,
+            )
+            for agent in agents[1:]
+        }
+    everything = set.union(*(set(agent.drives) for agent in agents))
+    return Comparison(
+        tuple(agents),
+        keys,
+        len(everything) - len(keys),
+        differences,
+        _rows(agents, keys),
+        _unlike(agents),
+    )
+
+
+def figures_of(comparison: Comparison) -> dict[str, float | int | str | None]:
+    """Return a comparison as flat dotted keys."""
+    first = comparison.agents[0].name
+    out: dict[str, float | int | str | None] = {
+        "first": first,
+        "drives": len(comparison.keys),
+        "routes": len(comparison.routes),
+        "left_out": comparison.left_out,
+        "unlike": ", ".join(comparison.unlike) or None,
+    }
+    for agent in comparison.agents:
+        for metric in METRICS:
+            out[f"{agent.name}.{metric}"] = statistics.fmean(agent.values(metric, comparison.keys))
+    for metric, of_agents in comparison.differences.items():
+        for name, found in of_agents.items():
+            for part, value in dataclasses.asdict(found).items():
+                out[f"{name}.{metric}.difference.{part}"] = None if np.isnan(value) else value
+    return out
+
+
+def _rows(agents: Sequence[ComparedAgent], keys: Sequence[Key]) -> tuple[RouteRow, ...]:
+    rows = []
+    for route in dict.fromkeys(route for route, *_ in keys):
+        mine = [key for key in keys if key[0] == route]
+        scores = tuple(statistics.fmean(agent.values("driving_score_1_0", mine)) for agent in agents)
+        rows.append(RouteRow(route, scores, tuple(_happened(agent, mine) for agent in agents)))
+    return tuple(sorted(rows, key=lambda row: -row.spread))
+
+
+def _happened(agent: ComparedAgent, keys: Sequence[Key]) -> str:
+    """Return infractions and early ends of some drives of one route, with their counts."""
+    found: list[str] = []
+    for key in keys:
+        score = agent.drives[key].score
+        found += [str(infraction.kind) for infraction in score.infractions]
+        if score.ending is not Ending.COMPLETED:
+            found.append(str(score.ending))
+    counts = {name: found.count(name) for name in dict.fromkeys(found)}
+    return ", ".join(
+        name.replace("_", " ") + (f" ({count})" if count > 1 else "") for name, count in counts.items()
+    )
+
+
+def _unlike(agents: Sequence[ComparedAgent]) -> tuple[str, ...]:
+    """Return the settings in which folders at the same place among those of their agents differ."""
+    suites = [[read_suite(folder) for folder in agent.folders] for agent in agents]
+    unlike = []
+    for setting in SAME_WORLD:
+        for of_place in zip(*suites, strict=False):
+            values = {str(suite.get(setting)) for suite in of_place}
+            if len(values) > 1:
+                unlike.append(f"{setting} ({' or '.join(sorted(values))})")
+                break
+    return tuple(unlike)
+
+
+def _order(key: Key) -> tuple[int, str, int, int]:
+    """Sort numbered routes by their numbers."""
+    route, place, repetition = key
+    return (int(route) if route.isdigit() else 0, route, place, repetition)

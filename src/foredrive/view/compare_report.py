@@ -1,0 +1,140 @@
+"""The report on a comparison of agents over the same routes."""
+
+import statistics
+from pathlib import Path
+
+import matplotlib as mpl
+import numpy as np
+from markupsafe import Markup
+from matplotlib.figure import Figure
+
+from foredrive.metrics.bootstrap import BootstrapMean
+from foredrive.runs.drive.compare import METRICS, Comparison
+from foredrive.view.html import INK_MARK, inline_svg, style_axes, write_page
+from foredrive.view.table import MISSING, Cell, Column, Row, Section, Table, number, simple_table
+
+REPORT = "report.html"
+TITLES = {
+    "driving_score_1_0": "Driving score, leaderboard 1.0",
+    "driving_score_2_1": "Driving score, leaderboard 2.1",
+    "completion": "Route completion, %",
+    "red_lights": "Red lights, per drive",
+    "collisions": "Collisions, per drive",
+    "stop_signs": "Stop signs, per drive",
+    "speed_mps": "Mean speed, m/s",
+}
+WORSE_IF_MORE = ("red_lights", "collisions", "stop_signs")
+DIGITS = {"red_lights": 2, "collisions": 2, "stop_signs": 2, "speed_mps": 2}
+NEUTRAL = ("speed_mps",)
+
+
+def means_table(comparison: Comparison) -> Table:
+    """Return the mean of each metric for each agent, and its difference from the first agent."""
+    first, *others = comparison.agents
+    columns = [Column(align="left"), Column(first.name, wraps=False)]
+    for agent in others:
+        columns += [Column("mean", agent.name), Column("difference", agent.name, wraps=False)]
+    rows = []
+    for metric in METRICS:
+        digits = DIGITS.get(metric, 1)
+        cells: list[Cell | str | float | None] = [TITLES[metric]]
+        cells.append(number(statistics.fmean(first.values(metric, comparison.keys)), digits))
+        for agent in others:
+            mean = statistics.fmean(agent.values(metric, comparison.keys))
+            cells.append(number(mean, digits))
+            cells.append(_difference(metric, comparison.differences[metric][agent.name], digits))
+        rows.append(Row(cells))
+    notes = [
+        f"{len(comparison.keys)} drives of {len(comparison.routes)} routes that all agents have. "
+        f"Differences from {first.name} with 95 % intervals (paired bootstrap over routes); coloured where "
+        "the interval leaves out 0."
+    ]
+    if comparison.left_out:
+        notes.append(f"{comparison.left_out} drives are left out: not all agents have them.")
+    if comparison.unlike:
+        notes.append(
+            f"The folders differ in {'; '.join(comparison.unlike)}: the drives of a pair did not meet the "
+            "same traffic."
+        )
+    return Table(columns, [Section(rows)], "Agents side by side", notes)
+
+
+def routes_table(comparison: Comparison, shown: int | None = None) -> Table:
+    """Return the routes, those that separate the agents most first, with what happened on them."""
+    columns = [Column("route", align="left")]
+    for agent in comparison.agents:
+        columns += [Column("score", agent.name, digits=0), Column("events", agent.name, align="left")]
+    rows = []
+    for row in comparison.routes[:shown]:
+        cells: list[Cell | str | float | None] = [row.route]
+        best = max(row.scores)
+        for score, happened in zip(row.scores, row.happened, strict=True):
+            cells += [Cell(score, "best" if score == best and row.spread > 0 else ""), happened or MISSING]
+        rows.append(cells)
+    title = "Routes that separate the agents" if shown else "All routes, the most separating first"
+    return simple_table(columns, rows, title)
+
+
+def drives_table(comparison: Comparison) -> Table:
+    """Return route × repetition with the score and completion of each agent."""
+    columns = [Column("route", align="left"), Column("repetition")]
+    for agent in comparison.agents:
+        columns += [Column("score", agent.name, digits=1), Column("completion, %", agent.name, digits=1)]
+    several = any(len(agent.folders) > 1 for agent in comparison.agents)
+    rows = []
+    for key in comparison.keys:
+        route, place, repetition = key
+        cells: list[Cell | str | float | None] = [route, f"{place}.{repetition}" if several else repetition]
+        for agent in comparison.agents:
+            drive = agent.drives[key]
+            cells += [drive.driving_score_1_0, 100.0 * drive.score.completion]
+        rows.append(cells)
+    return simple_table(columns, rows, "Every drive")
+
+
+def write_compare_report(path: Path, comparison: Comparison) -> None:
+    """Write the page of a comparison."""
+    write_page(
+        path,
+        "compare_report.html.j2",
+        title=", ".join(agent.name for agent in comparison.agents),
+        means=means_table(comparison),
+        scatters=[_scatter(comparison, other) for other in range(1, len(comparison.agents))],
+        routes=routes_table(comparison),
+        drives=drives_table(comparison),
+    )
+
+
+def _difference(metric: str, found: BootstrapMean, digits: int) -> Cell:
+    text = f"{found.mean:+z.{digits}f}"
+    if np.isnan(found.low):
+        return Cell(text)
+    text += f" [{found.low:z.{digits}f}, {found.high:z.{digits}f}]"
+    if found.low <= 0 <= found.high or metric in NEUTRAL:
+        return Cell(text)
+    better = (found.mean > 0) != (metric in WORSE_IF_MORE)
+    return Cell(text, "good" if better else "bad")
+
+
+def _scatter(comparison: Comparison, other: int) -> Markup:
+    """Draw the score of each route for the first agent and another one."""
+    first, second = comparison.agents[0], comparison.agents[other]
+    with mpl.rc_context({"font.family": "DejaVu Sans"}):
+        figure = Figure(figsize=(4.2, 4.0), layout="constrained")
+        ax = figure.add_subplot()
+        scores = np.array([[row.scores[0], row.scores[other]] for row in comparison.routes])
+        ax.plot([0, 100], [0, 100], color=INK_MARK, alpha=0.3, linewidth=1)
+        ax.scatter(scores[:, 0], scores[:, 1], s=36, alpha=0.45, color="#2a78c8", linewidths=0)
+        for row in comparison.routes[:5]:
+            if row.spread > 0:
+                ax.annotate(
+                    row.route,
+                    (row.scores[0], row.scores[other]),
+                    xytext=(5, 3),
+                    textcoords="offset points",
+                    fontsize=8,
+                    color=INK_MARK,
+                )
+        style_axes(ax, "Driving score of each route", first.name, second.name)
+        ax.set(xlim=(-4, 104), ylim=(-4, 104), aspect="equal")
+        return inline_svg(figure)

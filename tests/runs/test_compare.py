@@ -1,0 +1,137 @@
+"""Agents side by side: paired differences by hand, drives that are missing, names from outside."""
+
+import json
+from pathlib import Path
+
+import pytest
+from html_pages import EVIL, assert_harmless
+
+from foredrive.cli.main import main
+from foredrive.errors import InputError
+from foredrive.evaluation.summary import read_summary
+from foredrive.runs.drive.compare import compare, figures_of, read_agent
+from foredrive.view.compare_report import means_table, routes_table
+
+Given = dict[tuple[str, int], tuple[float, list[str], str]]
+"""By route and repetition: completion, kinds of infractions, ending."""
+
+
+def suite(folder: Path, drives: Given, **settings: object) -> Path:
+    (folder / "drives").mkdir(parents=True)
+    (folder / "suite.json").write_text(json.dumps({"agent": folder.name, "routes": "r.xml", **settings}))
+    factors = {"red_light": 0.7, "collision_vehicle": 0.6}
+    for (route, repetition), (completion, kinds, ending) in drives.items():
+        score = 100 * completion
+        for kind in kinds:
+            score *= factors[kind]
+        record = {
+            "town": None,
+            "length_m": 10.0,
+            "score": {
+                "route": route,
+                "repetition": repetition,
+                "completion": completion,
+                "outside_lanes": 0.0,
+                "ending": ending,
+                "infractions": [{"kind": kind, "t_s": 1.0, "xy_world": [0.0, 0.0]} for kind in kinds],
+                "driven_m": 10.0 * completion,
+                "duration_s": 2.0,
+            },
+            "driving_score_1_0": score,
+            "driving_score_2_1": score,
+            "error": "",
+            "events": [],
+            "comfort": None,
+            "nearest_s": [],
+            "act_s": [],
+            "route_xy": [],
+            "track": {"t_s": [], "xy": [], "yaw_rad": [], "speed_mps": []},
+            "wall_s": 1.0,
+            "log": "logs/one",
+        }
+        (folder / "drives" / f"{abs(hash(route))}_{repetition}.json").write_text(json.dumps(record))
+    return folder
+
+
+DONE = "completed"
+BLIND: Given = {
+    ("1", 0): (1.0, ["red_light"], DONE),
+    ("2", 0): (1.0, [], DONE),
+    ("10", 0): (0.5, ["collision_vehicle"], "blocked"),
+    ("10", 1): (1.0, [], DONE),
+}
+SEEING: Given = {
+    ("1", 0): (1.0, [], DONE),
+    ("2", 0): (1.0, [], DONE),
+    ("10", 0): (1.0, [], DONE),
+    ("11", 0): (1.0, [], DONE),
+}
+
+
+def test_differences_by_hand(tmp_path: Path) -> None:
+    """Three drives are common: 70, 100 and 30 against 100 each."""
+    agents = [read_agent(str(suite(tmp_path / name, given))) for name, given in (("b", BLIND), ("s", SEEING))]
+    found = compare(agents, resamples=500)
+    assert [route for route, *_ in found.keys] == ["1", "2", "10"]
+    assert found.left_out == 2
+    score = found.differences["driving_score_1_0"]["s"]
+    assert score.mean == pytest.approx((30 + 0 + 70) / 3)
+    assert 0 <= score.low < score.mean < score.high <= 70
+    assert found.differences["red_lights"]["s"].mean == pytest.approx(-1 / 3)
+    assert found.differences["collisions"]["s"].mean == pytest.approx(-1 / 3)
+    assert found.differences["speed_mps"]["s"].mean == pytest.approx((5 - 2.5) / 3)
+    assert [row.route for row in found.routes] == ["10", "1", "2"]
+    assert found.routes[0].happened == ("collision vehicle, blocked", "")
+    assert figures_of(found)["b.completion"] == pytest.approx(250 / 3)
+    assert found.unlike == ()
+    assert "s" in str(means_table(found).columns)
+    assert len(routes_table(found, 2).sections[0].rows) == 2
+
+
+def test_repetitions_of_a_route_are_drawn_together(tmp_path: Path) -> None:
+    """With one route there is nothing to draw from, however many repetitions there are."""
+    one = {("1", k): (1.0, [], DONE) for k in range(5)}
+    other = {("1", k): (0.5, [], DONE) for k in range(5)}
+    found = compare([read_agent(str(suite(tmp_path / n, d))) for n, d in (("a", one), ("b", other))])
+    assert found.differences["completion"]["b"].mean == -50
+    assert found.differences["completion"]["b"].low != found.differences["completion"]["b"].low
+
+
+def test_suites_of_several_seeds_are_one_agent(tmp_path: Path) -> None:
+    folders = [suite(tmp_path / f"{n}{k}", d) for n, d in (("b", BLIND), ("s", SEEING)) for k in (0, 1)]
+    blind = read_agent(f"blind={folders[0]},{folders[1]}")
+    found = compare([blind, read_agent(f"seeing={folders[2]},{folders[3]}")], resamples=100)
+    assert len(found.keys) == 6
+    assert len(found.routes) == 3
+    assert found.differences["driving_score_1_0"]["seeing"].mean == pytest.approx(100 / 3)
+
+
+def test_other_traffic_is_told(tmp_path: Path) -> None:
+    one = suite(tmp_path / "day", SEEING, seed=0, conditions=None)
+    other = suite(tmp_path / "night", SEEING, seed=1, conditions="night")
+    found = compare([read_agent(str(one)), read_agent(str(other))], resamples=10)
+    assert found.unlike == ("seed (0 or 1)", "conditions (None or night)")
+    assert "did not meet the same traffic" in " ".join(means_table(found).notes)
+
+
+def test_the_verb_writes_a_page_of_harmless_names(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    evil = {(EVIL, 0): (1.0, ["red_light"], DONE), ("2", 0): (1.0, [], DONE)}
+    fine = {(EVIL, 0): (1.0, [], DONE), ("2", 0): (1.0, [], DONE)}
+    given = [str(suite(tmp_path / "a", evil)), f"other={suite(tmp_path / 'b', fine)}"]
+    assert main(["compare", *given, "--out", str(tmp_path / "out")]) == 0
+    assert "+15.0" in capsys.readouterr().out
+    assert read_summary(tmp_path / "out" / "summary.json")["other.red_lights.difference.mean"] == -0.5
+    assert_harmless((tmp_path / "out" / "report.html").read_text(), times=3)
+
+
+def test_what_cannot_be_compared_is_one_line(tmp_path: Path) -> None:
+    one = read_agent(str(suite(tmp_path / "one", BLIND)))
+    with pytest.raises(InputError, match="at least two folders"):
+        compare([one])
+    with pytest.raises(InputError, match="the same name"):
+        compare([one, one])
+    with pytest.raises(InputError, match="no drives to compare"):
+        read_agent(str(tmp_path))
+    other = read_agent(str(suite(tmp_path / "far", {("99", 0): (1.0, [], DONE)})))
+    with pytest.raises(InputError, match="no route and repetition in common"):
+        compare([one, other])
