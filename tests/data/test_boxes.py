@@ -13,8 +13,8 @@ from py123d.datatypes.detections.box_detection_label import BOX_DETECTION_LABEL_
 
 from foredrive.data.boxes import category_of, read_boxes
 from foredrive.data.log_paths import LogPath, find_logs
-from foredrive.data.log_writer import LABEL_OF_CATEGORY
 from foredrive.data.logs import Log
+from foredrive.data.written_boxes import LABEL_OF_CATEGORY
 from foredrive.errors import InputError
 from foredrive.scene import Category
 

@@ -6,17 +6,34 @@ from foredrive.lazy import defer_imports, defer_package, on_demand
 
 if TYPE_CHECKING:
     from foredrive.data.batches import collate
+    from foredrive.data.camera_streams import CameraSpec
     from foredrive.data.clips import ClipConfig, ClipDataset
     from foredrive.data.log_paths import LogPath, find_all_logs, find_logs, find_one_log
+    from foredrive.data.own_logs import Box, Points, Vehicle, write_log
 
-__all__ = ["ClipConfig", "ClipDataset", "LogPath", "collate", "find_all_logs", "find_logs", "find_one_log"]
+__all__ = [
+    "Box",
+    "CameraSpec",
+    "ClipConfig",
+    "ClipDataset",
+    "LogPath",
+    "Points",
+    "Vehicle",
+    "collate",
+    "find_all_logs",
+    "find_logs",
+    "find_one_log",
+    "write_log",
+]
 
 __getattr__ = on_demand(
     __name__,
     {
         "batches": ("collate",),
+        "camera_streams": ("CameraSpec",),
         "clips": ("ClipConfig", "ClipDataset"),
         "log_paths": ("LogPath", "find_all_logs", "find_logs", "find_one_log"),
+        "own_logs": ("Box", "Points", "Vehicle", "write_log"),
     },
 )
 

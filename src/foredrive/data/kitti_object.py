@@ -33,8 +33,8 @@ from py123d.parser.base_dataset_parser import BaseLogParser, ModalitiesSync
 from py123d.parser.kitti360.utils.kitti360_constants import KITTI360_EGO_STATE_SE3_METADATA
 from py123d.parser.registry import NuScenesBoxDetectionLabel
 
-from foredrive.data.log_writer import LABEL_OF_CATEGORY
 from foredrive.data.modalities import attributes_modality
+from foredrive.data.written_boxes import LABEL_OF_CATEGORY
 from foredrive.scene import Attribute, Category
 from foredrive.scene.boxes import UNKNOWN
 

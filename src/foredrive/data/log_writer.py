@@ -23,9 +23,6 @@ from py123d.api.utils.arrow_metadata_utils import (
     get_metadata_from_arrow_schema,
 )
 from py123d.datatypes import (
-    BoxDetectionAttributes,
-    BoxDetectionSE3,
-    BoxDetectionsSE3,
     Camera,
     DefaultLidarSegmentationLabel,
     DynamicStateSE3,
@@ -44,12 +41,10 @@ from py123d.datatypes import (
     TrafficLightStatus,
 )
 from py123d.datatypes.custom.custom_modality import CustomModality, CustomModalityMetadata
-from py123d.datatypes.detections.box_detections_metadata import BoxDetectionsSE3Metadata
 from py123d.datatypes.modalities.base_modality import BaseModality
 from py123d.datatypes.sensors.base_camera import BaseCameraMetadata
-from py123d.geometry import BoundingBoxSE3, PoseSE3, Vector3D
+from py123d.geometry import PoseSE3, Vector3D
 from py123d.parser.base_dataset_parser import ModalitiesSync
-from py123d.parser.registry import NuScenesBoxDetectionLabel as Label
 
 from foredrive.data.camera_streams import (
     CameraSpec,
@@ -65,7 +60,6 @@ from foredrive.data.modalities import (
     LIDAR_BEAMS,
     SETTING,
     FullOccupancy,
-    attributes_modality,
     occupancy_metadata,
     pack_beams,
     pack_occupancy,
@@ -73,11 +67,11 @@ from foredrive.data.modalities import (
     visibility_modality,
 )
 from foredrive.data.setting import Setting, pack_setting
+from foredrive.data.written_boxes import box_modalities
 from foredrive.errors import InputError
 from foredrive.files import atomic_path
-from foredrive.geometry.se3 import log_so3, matrix_from_yaw
-from foredrive.scene import Boxes, Category, LidarSweep, Trajectory, VoxelSpec
-from foredrive.scene.boxes import UNKNOWN
+from foredrive.geometry.se3 import log_so3
+from foredrive.scene import Boxes, LidarSweep, Trajectory, VoxelSpec
 
 DATASET = "foredrive"
 """123D dataset name of all logs written here. Maps are at maps/foredrive/foredrive_LOCATION.arrow."""
@@ -93,22 +87,6 @@ EGO_VEHICLE = EgoStateSE3Metadata(
 )
 """The recording vehicle: CARLA's Lincoln MKZ. Its frame is on the ground below the rear axle."""
 
-LABEL_OF_CATEGORY = {
-    Category.CAR: Label.VEHICLE_CAR,
-    Category.TRUCK: Label.VEHICLE_TRUCK,
-    Category.BUS: Label.VEHICLE_BUS_RIGID,
-    Category.TRAILER: Label.VEHICLE_TRAILER,
-    Category.CONSTRUCTION_VEHICLE: Label.VEHICLE_CONSTRUCTION,
-    Category.MOTORCYCLE: Label.VEHICLE_MOTORCYCLE,
-    Category.BICYCLE: Label.VEHICLE_BICYCLE,
-    Category.PEDESTRIAN: Label.HUMAN_PEDESTRIAN_ADULT,
-    Category.ANIMAL: Label.ANIMAL,
-    Category.TRAFFIC_CONE: Label.MOVABLE_OBJECT_TRAFFICCONE,
-    Category.BARRIER: Label.MOVABLE_OBJECT_BARRIER,
-    Category.OTHER: Label.MOVABLE_OBJECT_DEBRIS,
-}
-"""nuScenes labels. They distinguish all categories, and py123d can read them without Foredrive."""
-
 
 @dataclass(frozen=True)
 class Frame:
@@ -122,9 +100,15 @@ class Frame:
     """RGB by camera name. A camera may be missing."""
     sweep: LidarSweep | None
     """Unbatched, in the ego frame at `t_us`, with the misses."""
-    boxes: Boxes
-    """Unbatched, in the ego frame at `t_us`. Their `visibility` is not written, but that of the frame is."""
+    boxes: Boxes | None
+    """Unbatched, in the ego frame at `t_us`; None if the frame is not annotated. Their `visibility` is not
+    written, but that of the frame is."""
     _: KW_ONLY
+    exposed: dict[str, tuple[int, Float64[np.ndarray, "4 4"]]] = field(default_factory=dict)
+    """Time (µs) and ego pose of the images that were not taken at `t_us`, by camera name."""
+    misses_known: bool = True
+    """Whether `sweep` has the beams that did not return. Otherwise the origins of its beams are not written
+    either: they follow from the vehicle's path."""
     occupancy: FullOccupancy | None = None
     visibility: Float[np.ndarray, "M"] | None = None
     """For each of `boxes`, the visible area relative to the area without occlusion, 0 to 1."""
@@ -158,6 +142,8 @@ class LogWriter:
         map_dir: root/maps with the map of `location` (`maps.write_map`). None if the log has no map.
         location: town name, or None.
         route_xyz: route to follow, world frame, m, or None.
+        vehicle: the recording vehicle.
+        dataset: 123D name of the data set.
 
     Raises:
         InputError: the split is invalid, there are too many cameras, the map is missing, a frame does not
@@ -173,11 +159,15 @@ class LogWriter:
         map_dir: Path | None,
         location: str | None,
         route_xyz: Float[np.ndarray, "M 3"] | None,
+        *,
+        vehicle: EgoStateSE3Metadata = EGO_VEHICLE,
+        dataset: str = DATASET,
     ) -> None:
         if not re.fullmatch(r"[a-z0-9-]+_(train|val|test)", split):
             raise InputError(f"split {split!r} must be lower case and end in _train, _val or _test")
         self.folder = Path(root) / "logs" / split / log_name
-        self._metadata = LogMetadata(DATASET, split, log_name, location, _map_metadata(map_dir, location))
+        self._metadata = LogMetadata(dataset, split, log_name, location, _map_metadata(map_dir, location))
+        self._vehicle = vehicle
         self._cameras = {spec.name: (spec, camera_metadata(spec, id_)) for spec, id_ in camera_ids(cameras)}
         self._route_xyz = route_xyz
         self._stack = contextlib.ExitStack()
@@ -222,14 +212,13 @@ class LogWriter:
             raise InputError(
                 f"{self.folder}: time runs backwards, {frame.t_us} µs after {self._previous.t_us} µs"
             )
-        modalities = [self._ego_state(frame), _boxes(frame), *self._images(frame), *self._label_images(frame)]
+        modalities = [self._ego_state(frame), *self._images(frame), *self._label_images(frame)]
+        if frame.boxes is not None:
+            modalities += box_modalities(frame.boxes, frame.T_world_ego, frame.t_us)
         if frame.sweep is not None:
             modalities += self._sweep(frame, frame.sweep)
         if frame.occupancy is not None:
             modalities.append(self._occupancy(frame.t_us, frame.occupancy))
-        attribute = frame.boxes.attribute[frame.boxes.valid].tolist()
-        if any(known != UNKNOWN for known in attribute):
-            modalities.append(attributes_modality(attribute, Timestamp.from_us(frame.t_us)))
         if frame.visibility is not None:
             shares = frame.visibility.tolist()
             modalities.append(visibility_modality(shares, Timestamp.from_us(frame.t_us)))
@@ -252,7 +241,7 @@ class LogWriter:
             turn_rate = log_so3(turned).numpy() / ((frame.t_us - self._previous.t_us) * 1e-6)
         return EgoStateSE3.from_rear_axle(
             rear_axle_se3=_pose(frame.T_world_ego),
-            metadata=EGO_VEHICLE,
+            metadata=self._vehicle,
             timestamp=Timestamp.from_us(frame.t_us),
             dynamic_state_se3=DynamicStateSE3(
                 velocity=Vector3D.from_array(frame.velocity_ego_mps.astype(np.float64)),
@@ -289,8 +278,8 @@ class LogWriter:
 
     def _camera(self, frame: Frame, metadata: BaseCameraMetadata, image: np.ndarray) -> Camera:
         spec, _ = self._cameras[metadata.camera_name]
-        pose = _pose(frame.T_world_ego @ spec.T_ego_cam)
-        return Camera(metadata, image, pose, Timestamp.from_us(frame.t_us))
+        t_us, T_world_ego = frame.exposed.get(spec.name, (frame.t_us, frame.T_world_ego))
+        return Camera(metadata, image, _pose(T_world_ego @ spec.T_ego_cam), Timestamp.from_us(t_us))
 
     def _sweep(self, frame: Frame, sweep: LidarSweep) -> list[BaseModality]:
         t_us, kept = frame.t_us, sweep.valid & sweep.returned
@@ -321,7 +310,7 @@ class LogWriter:
             point_cloud_3d=returns.points_ego.numpy().astype(np.float32),
             point_cloud_features=features,
         )
-        return [lidar, _custom(frame, LIDAR_BEAMS, pack_beams(sweep))]
+        return [lidar, _custom(frame, LIDAR_BEAMS, pack_beams(sweep))] if frame.misses_known else [lidar]
 
     def _occupancy(self, t_us: int, occupancy: FullOccupancy) -> CustomModality:
         self._spec = self._spec or occupancy.spec
@@ -329,29 +318,6 @@ class LogWriter:
             raise InputError(f"{self.folder}: the occupancy grid changes within the log")
         metadata = occupancy_metadata(occupancy.spec)
         return CustomModality(pack_occupancy(occupancy), metadata, Timestamp.from_us(t_us))
-
-
-def _boxes(frame: Frame) -> BoxDetectionsSE3:
-    metadata = BoxDetectionsSE3Metadata(Label)
-    R_world_ego = frame.T_world_ego[:3, :3]
-    boxes = frame.boxes[frame.boxes.valid]
-    points = [None if count == UNKNOWN else count for count in boxes.num_points.tolist()]
-    T_ego_box = matrix_from_yaw(boxes.yaw.double(), boxes.centre.double()).numpy()
-    detections = []
-    for T, size, velocity, track, category, hits in zip(
-        frame.T_world_ego @ T_ego_box,
-        boxes.size_lwh.tolist(),
-        boxes.velocity.double().numpy(),
-        boxes.track_id.tolist(),
-        boxes.category.tolist(),
-        points,
-        strict=True,
-    ):
-        known = np.isfinite(velocity).all()
-        over_ground = Vector3D.from_array(R_world_ego @ [*velocity, 0.0]) if known else None
-        attributes = BoxDetectionAttributes(LABEL_OF_CATEGORY[Category(category)], str(track), hits)
-        detections.append(BoxDetectionSE3(attributes, BoundingBoxSE3(_pose(T), *size), over_ground))
-    return BoxDetectionsSE3(detections, Timestamp.from_us(frame.t_us), metadata)
 
 
 def _custom(frame: Frame, kind: str, data: dict[str, Any]) -> CustomModality:

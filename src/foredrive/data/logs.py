@@ -9,9 +9,9 @@ from jaxtyping import Bool, Float, Float64, Int64
 from py123d.api.scene.arrow.arrow_scene_api import ArrowSceneAPI
 from py123d.api.scene.arrow.modalities.sync_utils import get_modality_table, get_sync_table
 from py123d.datatypes import EgoStateSE3Metadata, ModalityType
-from scipy.spatial.transform import Rotation, Slerp
 
 from foredrive.data.arrow_files import check_whole, column_array, fixed_lists, pose_matrices, reading
+from foredrive.data.ego_path import interpolated_poses
 from foredrive.data.log_paths import LogPath
 from foredrive.errors import InputError
 from foredrive.scene import Trajectory
@@ -133,21 +133,12 @@ class Log:
         A pose is valid if the log has close poses before and after it. The vehicle stands still before and
         after the log.
         """
-        at, T = self._drive_t_us, self._drive_T
+        at = self._drive_t_us
         if len(at) < 2 or len(t_us) == 0:
-            return np.repeat(T[:1], len(t_us), axis=0), np.zeros(len(t_us), dtype=bool)
-        out = np.tile(np.eye(4), (len(t_us), 1, 1))
+            return np.repeat(self._drive_T[:1], len(t_us), axis=0), np.zeros(len(t_us), dtype=bool)
         after = np.searchsorted(at, t_us).clip(1, len(at) - 1)
-        gap_us = at[after] - at[after - 1]
-        valid = (t_us >= at[0]) & (t_us <= at[-1]) & (gap_us <= _MAX_GAP_S * 1e6)
-        inside = t_us.clip(at[0], at[-1])
-        span = slice(after.min() - 1, after.max() + 1)
-        since_s = (at[span] - at[span][0]) * 1e-6
-        turn = Slerp(since_s, Rotation.from_matrix(T[span, :3, :3]))
-        out[:, :3, :3] = turn((inside - at[span][0]) * 1e-6).as_matrix()
-        for axis in range(3):
-            out[:, axis, 3] = np.interp(inside, at[span], T[span, axis, 3])
-        return out, valid
+        valid = (t_us >= at[0]) & (t_us <= at[-1]) & (at[after] - at[after - 1] <= _MAX_GAP_S * 1e6)
+        return interpolated_poses(at, self._drive_T, t_us), valid
 
     def _read_ego(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return times [E] (µs), poses [E 4 4] and logged speeds [E] (NaN if missing) of all ego states."""

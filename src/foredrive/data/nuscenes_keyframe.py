@@ -38,9 +38,9 @@ from py123d.parser.nuscenes.utils.nuscenes_constants import (
 )
 from scipy.spatial import KDTree
 
-from foredrive.data.log_writer import LABEL_OF_CATEGORY
 from foredrive.data.modalities import attributes_modality, visibility_modality
 from foredrive.data.safe_pickle import load_pickle
+from foredrive.data.written_boxes import LABEL_OF_CATEGORY
 from foredrive.scene import Attribute, Category
 from foredrive.scene.boxes import UNKNOWN
 

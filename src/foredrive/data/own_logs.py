@@ -1,0 +1,291 @@
+"""Logs from sensor data of one's own: images, calibration, poses, sweeps and boxes.
+
+The frame of the ego vehicle is on the ground below the middle of the rear axle: x ahead, y to the left, z up.
+Camera frames have x to the right, y down and z ahead. The world frame is any frame with z up.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float64, Shaped, UInt8
+from PIL import Image, UnidentifiedImageError
+from py123d.datatypes import EgoStateSE3Metadata
+from py123d.geometry import PoseSE3
+
+from foredrive.data.camera_streams import CameraSpec
+from foredrive.data.ego_path import interpolated_poses
+from foredrive.data.log_paths import LogPath
+from foredrive.data.log_writer import Frame, LogWriter
+from foredrive.errors import InputError
+from foredrive.scene import Boxes, Category, LidarSweep
+from foredrive.scene.boxes import unlabelled
+
+Num = Shaped[np.ndarray, "..."]
+RGB = UInt8[np.ndarray, "H W 3"]
+DATASET = "own"
+
+
+@dataclass(frozen=True)
+class Vehicle:
+    """The recording vehicle. The default is a car of middle size."""
+
+    length_m: float = 4.6
+    width_m: float = 1.85
+    height_m: float = 1.5
+    wheelbase_m: float = 2.75
+    axle_to_centre_m: float = 1.35
+    """Distance from the rear axle to the middle of the vehicle."""
+
+
+@dataclass(frozen=True)
+class Points:
+    """The returns of one sweep, [N] values each. `write_log` checks their shapes."""
+
+    xyz_m: Num
+    """[N, 3] in the ego frame: that of the frame's time if they are compensated, else of their own time."""
+    intensity: Num | None = None
+    """0 to 1."""
+    dt_s: Num | None = None
+    """Time of each point relative to that of the frame. None: all are measured at once."""
+    channel: Num | None = None
+    """Number of the laser, 0 to 255."""
+    compensated: bool = True
+    """Whether the vehicle's motion within the sweep has been removed. Otherwise `write_log` removes it."""
+
+
+@dataclass(frozen=True)
+class Box:
+    """One labelled object."""
+
+    category: str
+    """A name of `foredrive.scene.Category`, in any case."""
+    track_id: int
+    """Constant for one object within the log."""
+    centre_m: tuple[float, float, float]
+    """Centre of the box (not of its bottom) in the ego frame."""
+    size_lwh_m: tuple[float, float, float]
+    yaw_rad: float
+    """Heading about z; 0 is ahead, counter-clockwise."""
+    velocity_mps: tuple[float, float] | None = None
+    """Velocity over ground along the ego axes. None: it follows from the track."""
+
+
+def write_log(
+    out: Path | str,
+    name: str,
+    t_s: Num,
+    T_world_ego: Num,
+    *,
+    cameras: Sequence[CameraSpec] = (),
+    images: Mapping[str, Sequence[Path | str | Num | None]] | None = None,
+    image_t_s: Mapping[str, Num] | None = None,
+    sweeps: Sequence[Points | None] | None = None,
+    lidar_position_m: tuple[float, float, float] = (0.0, 0.0, 1.8),
+    boxes: Sequence[Sequence[Box] | None] | None = None,
+    vehicle: Vehicle = Vehicle(),
+    split: str = "own_train",
+) -> LogPath:
+    """Write sensor data as a 123D log. An existing log of the same name is replaced.
+
+    All sequences have one entry for each of T frames, and None where a frame lacks it. They are read one
+    entry at a time, so a sequence that loads its entries keeps the memory flat. Velocities and accelerations
+    are differences to the frame before, so that they know nothing of later frames. Images are stored as JPEG.
+
+    Args:
+        out: 123D data root; the log is out/logs/SPLIT/NAME.
+        name: of the log.
+        t_s: [T] time of each frame, increasing.
+        T_world_ego: [T, 4, 4] pose of the vehicle at these times.
+        cameras: their calibration, at most 11.
+        images: by camera: image files, or uint8 RGB arrays [H, W, 3].
+        image_t_s: by camera: time at which the middle row of each image was exposed. Default: that of the
+            frame. Poses between frames are interpolated.
+        sweeps: points of the lidar. Beams that did not return are unknown.
+        lidar_position_m: of the lidar, in the ego frame.
+        boxes: labels at each frame. None where a frame is not annotated, empty where nothing is there.
+        vehicle: size of the recording vehicle.
+        split: a name that ends in _train, _val or _test.
+
+    Raises:
+        InputError: numbers of entries differ, times do not increase, an image cannot be read or has another
+            size than its camera, an array has another shape, a value is not finite, a category is unknown.
+    """
+    drive = _Drive.of(name, np.asarray(t_s, np.float64), np.asarray(T_world_ego, np.float64))
+    images, image_t_s = images or {}, image_t_s or {}
+    given: dict[str, Sequence[Any] | np.ndarray | None] = {"sweeps": sweeps, "boxes": boxes, **image_t_s}
+    for what, values in (given | {f"images of {camera}": rows for camera, rows in images.items()}).items():
+        if values is not None and len(values) != len(drive.t_us):
+            raise InputError(f"{name}: {len(values)} entries in {what}, but {len(drive.t_us)} frames")
+    exposed = {camera: drive.exposures(np.asarray(times)) for camera, times in image_t_s.items()}
+    place = (Path(out), split, name, list(cameras), None, None, None)
+    with LogWriter(*place, vehicle=_metadata(vehicle), dataset=DATASET) as writer:
+        for frame in range(len(drive.t_us)):
+            where = f"{name}, frame {frame}"
+            points = None if sweeps is None else sweeps[frame]
+            labels = None if boxes is None else boxes[frame]
+            shown = {camera: rows[frame] for camera, rows in images.items()}
+            sensed = Frame(
+                t_us=int(drive.t_us[frame]),
+                T_world_ego=drive.T_world_ego[frame],
+                velocity_ego_mps=drive.velocity_ego_mps[frame],
+                acceleration_ego_mps2=drive.acceleration_ego_mps2[frame],
+                images={name: _rgb(image, where) for name, image in shown.items() if image is not None},
+                sweep=None if points is None else _sweep(points, drive, frame, lidar_position_m, where),
+                boxes=None if labels is None else _boxes(labels, where),
+                exposed={camera: times[frame] for camera, times in exposed.items()},
+                misses_known=False,
+            )
+            writer.write(sensed)
+    return LogPath(writer.folder.absolute(), Path(out).absolute() / "maps")
+
+
+@dataclass(frozen=True)
+class _Drive:
+    """Times and motion of the vehicle."""
+
+    t_us: np.ndarray
+    T_world_ego: Float64[np.ndarray, "T 4 4"]
+    velocity_ego_mps: Float64[np.ndarray, "T 3"]
+    acceleration_ego_mps2: Float64[np.ndarray, "T 3"]
+
+    @classmethod
+    def of(cls, name: str, t_s: Num, T_world_ego: Num) -> "_Drive":
+        """Check times and poses, and derive the motion."""
+        if t_s.ndim != 1 or T_world_ego.shape != (len(t_s), 4, 4) or not len(t_s):
+            shapes = f"{list(t_s.shape)} and {list(T_world_ego.shape)}"
+            raise InputError(f"{name}: t_s must be [T] and T_world_ego [T, 4, 4]; they are {shapes}")
+        if not (np.isfinite(t_s).all() and np.isfinite(T_world_ego).all()):
+            raise InputError(f"{name}: a time or a pose is not finite")
+        if (np.diff(t_s) < 1e-6).any():
+            raise InputError(f"{name}: times must increase, by a microsecond at least")
+        R = T_world_ego[:, :3, :3]
+        if not np.allclose(R @ R.mT, np.eye(3), atol=1e-3) or (np.linalg.det(R) < 0).any():
+            raise InputError(f"{name}: T_world_ego holds a rotation that is none")
+        velocity = _rates(T_world_ego[:, :3, 3], t_s)
+        acceleration = _rates(velocity, t_s)
+        return cls(
+            np.round(t_s * 1e6).astype(np.int64),
+            T_world_ego,
+            np.einsum("tji,tj->ti", R, velocity),
+            np.einsum("tji,tj->ti", R, acceleration),
+        )
+
+    def poses_at(self, t_us: Float64[np.ndarray, "N"]) -> Float64[np.ndarray, "N 4 4"]:
+        """Return poses between the frames, and by the last step's motion beyond them."""
+        at, T = self.t_us, self.T_world_ego
+        if len(at) == 1:
+            return np.repeat(T, len(t_us), axis=0)
+        before, after = T[0] @ np.linalg.inv(T[1]) @ T[0], T[-1] @ np.linalg.inv(T[-2]) @ T[-1]
+        at = np.concatenate([[2 * at[0] - at[1]], at, [2 * at[-1] - at[-2]]])
+        return interpolated_poses(at, np.concatenate([before[None], T, after[None]]), t_us)
+
+    def exposures(self, t_s: Float64[np.ndarray, "T"]) -> list[tuple[int, Float64[np.ndarray, "4 4"]]]:
+        """Return time (µs) and pose at times at which images were taken."""
+        t_us = np.round(t_s * 1e6)
+        return list(zip(t_us.astype(np.int64).tolist(), self.poses_at(t_us), strict=True))
+
+
+def _rates(values: Float64[np.ndarray, "T 3"], t_s: Float64[np.ndarray, "T"]) -> Float64[np.ndarray, "T 3"]:
+    """Return the rate of change since the frame before; the first frame's is that of the second."""
+    if len(t_s) == 1:
+        return np.zeros_like(values)
+    rate = np.diff(values, axis=0) / np.diff(t_s)[:, None]
+    return np.concatenate([rate[:1], rate])
+
+
+def _metadata(vehicle: Vehicle) -> EgoStateSE3Metadata:
+    return EgoStateSE3Metadata(
+        vehicle_name="own",
+        length=vehicle.length_m,
+        width=vehicle.width_m,
+        height=vehicle.height_m,
+        wheel_base=vehicle.wheelbase_m,
+        center_to_imu_se3=PoseSE3(vehicle.axle_to_centre_m, 0.0, vehicle.height_m / 2, 1.0, 0.0, 0.0, 0.0),
+        rear_axle_to_imu_se3=PoseSE3.identity(),
+    )
+
+
+def _rgb(image: Path | str | Num, where: str) -> RGB:
+    """Return an image, read from its file if it is one."""
+    if isinstance(image, np.ndarray):
+        if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3:
+            raise InputError(
+                f"{where}: an image must be uint8 [H, W, 3], not {image.dtype} {list(image.shape)}"
+            )
+        return image
+    try:
+        with Image.open(image) as opened:
+            return np.asarray(opened.convert("RGB"))
+    except (OSError, UnidentifiedImageError, Image.DecompressionBombError) as error:
+        raise InputError(f"{image}: cannot read the image: {error}") from error
+
+
+def _sweep(
+    points: Points, drive: _Drive, frame: int, position_m: tuple[float, float, float], where: str
+) -> LidarSweep:
+    """Return a sweep of returns in the ego frame at the frame's time."""
+    xyz = np.asarray(points.xyz_m, np.float64)
+    count = len(xyz)
+    columns = {
+        "intensity": np.zeros(count) if points.intensity is None else np.asarray(points.intensity),
+        "dt_s": np.zeros(count) if points.dt_s is None else np.asarray(points.dt_s, np.float64),
+        "channel": np.full(count, -1) if points.channel is None else np.asarray(points.channel),
+    }
+    if xyz.shape != (count, 3) or any(values.shape != (count,) for values in columns.values()):
+        shapes = {"xyz_m": xyz.shape} | {name: values.shape for name, values in columns.items()}
+        raise InputError(f"{where}: points must be [N, 3] with [N] values each; they are {shapes}")
+    if not np.isfinite(xyz).all() or not all(np.isfinite(values).all() for values in columns.values()):
+        raise InputError(f"{where}: a point is not finite")
+    if (columns["intensity"] < 0).any() or (columns["intensity"] > 1).any():
+        raise InputError(f"{where}: intensity must be between 0 and 1")
+    if not points.compensated and points.dt_s is not None:
+        xyz = _compensated(xyz, columns["dt_s"], drive, frame)
+    origin = torch.tensor(position_m).expand(count, 3)
+    along = torch.from_numpy(xyz).float() - origin
+    range_m = along.norm(dim=-1)
+    return LidarSweep(
+        origin_ego=origin,
+        dir_ego=along / range_m.clamp_min(1e-6)[:, None],
+        range_m=range_m,
+        returned=torch.ones(count, dtype=torch.bool),
+        intensity=torch.from_numpy(columns["intensity"]).float(),
+        dt_s=torch.from_numpy(columns["dt_s"]).float(),
+        beam=torch.from_numpy(columns["channel"]).long(),
+        valid=torch.ones(count, dtype=torch.bool),
+    )
+
+
+def _compensated(
+    xyz_m: Float64[np.ndarray, "N 3"], dt_s: Float64[np.ndarray, "N"], drive: _Drive, frame: int
+) -> Float64[np.ndarray, "N 3"]:
+    """Move points from the ego frame at their own times to that at the frame's time."""
+    times_us, which = np.unique(np.round(dt_s * 1e6), return_inverse=True)
+    T = np.linalg.inv(drive.T_world_ego[frame]) @ drive.poses_at(drive.t_us[frame] + times_us)
+    return np.einsum("nij,nj->ni", T[which, :3, :3], xyz_m) + T[which, :3, 3]
+
+
+def _boxes(labels: Sequence[Box], where: str) -> Boxes:
+    for box in labels:
+        numbers = (*box.centre_m, *box.size_lwh_m, box.yaw_rad, *(box.velocity_mps or ()))
+        if not np.isfinite(numbers).all() or min(box.size_lwh_m) <= 0:
+            raise InputError(f"{where}: box {box.track_id} is not finite or has no size")
+        if box.category.upper() not in Category.__members__:
+            known = ", ".join(category.name.lower() for category in Category)
+            raise InputError(f"{where}: unknown category {box.category!r}; there are: {known}")
+    if len({box.track_id for box in labels}) < len(labels):
+        raise InputError(f"{where}: two boxes have the same track_id")
+    unknown = (float("nan"), float("nan"))
+    return Boxes(
+        centre=torch.tensor([box.centre_m for box in labels]).reshape(-1, 3),
+        size_lwh=torch.tensor([box.size_lwh_m for box in labels]).reshape(-1, 3),
+        yaw=torch.tensor([float(box.yaw_rad) for box in labels]),
+        velocity=torch.tensor([box.velocity_mps or unknown for box in labels]).reshape(-1, 2),
+        track_id=torch.tensor([box.track_id for box in labels], dtype=torch.long),
+        category=torch.tensor([int(Category[box.category.upper()]) for box in labels], dtype=torch.long),
+        valid=torch.ones(len(labels), dtype=torch.bool),
+        **unlabelled(len(labels)),
+    )
