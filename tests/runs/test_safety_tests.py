@@ -4,48 +4,17 @@ import shutil
 from pathlib import Path
 
 import pytest
-import synthetic_log as world
-from small_rebuild import SMALLEST
 
 from foredrive.cli.main import main
-from foredrive.data import find_logs
 from foredrive.errors import InputError
 from foredrive.evaluation.summary import read_summary
 from foredrive.runs.drive.in_ncap import SafetyTests, _folders, _place, propose_scenarios
-from foredrive.runs.drive.in_rebuilt import opened_rebuilt
 from foredrive.runs.drive.suite import DriveSuite, drive_suite
 from foredrive.runs.rebuild.rebuilt_run import open_run_log
-from foredrive.runs.rebuild.reconstruct import reconstruct
 from foredrive.simulation.ncap.outcome import Outcome
 from foredrive.simulation.ncap.rules import RULES
 from foredrive.simulation.ncap.running import set_up_run
-from foredrive.simulation.ncap.scenario import Jitter, Polyline, SafetyScenario, ScenarioActor
-from foredrive.simulation.ncap.scenario_file import load_scenarios, save_scenarios
-from foredrive.simulation.threats import Threat
-
-
-@pytest.fixture(scope="module")
-def rebuilt(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("tested_in")
-    (log,) = find_logs(world.write(folder, frames=67))
-    reconstruct(SMALLEST, log, folder / "run")
-    return folder / "run"
-
-
-@pytest.fixture(scope="module")
-def scenarios(rebuilt: Path) -> Path:
-    """A car stands on the logged path 5 s on, and in a second scenario far beside it."""
-    vehicle = opened_rebuilt(str(rebuilt)).vehicle
-    spot = vehicle.T_world_scene @ vehicle.at(5.0).T_scene_ego.double()
-    x, y, z = spot[:3, 3].tolist()
-    car = str(opened_rebuilt(str(rebuilt)).scene.graph.tracks.track_id.tolist()[0])
-    found = []
-    for name, aside_m in (("on", 0.0), ("beside", 30.0)):
-        point = (x - aside_m * float(spot[1, 0]), y + aside_m * float(spot[0, 0]), z)
-        actor = ScenarioActor((car,), Polyline((0.0, 9.0), (point, point)), jitter=Jitter(lateral_m=0.3))
-        found.append(SafetyScenario(name, Threat.STATIONARY, "run", 1, 6.0, (actor,), 1))
-    save_scenarios(found, rebuilt.parent / "scenarios.yaml")
-    return rebuilt.parent / "scenarios.yaml"
+from foredrive.simulation.ncap.scenario_file import load_scenarios
 
 
 def test_the_verb_tests_keeps_and_reports(

@@ -33,9 +33,10 @@ def drive(
     Args:
         agent: A run folder; expert (it has privileged information); constant-velocity (straight on at 5 m/s);
             stop (stands still); or ego-mlp:RUN, the MLP that sees only the ego status, fitted to the training
-            data of a run. Two more record DAgger demonstrations, with the expert's plan at each key frame in
-            the logs. disturbed is the expert while it is steered aside and slowed. student:RUN is a run in
-            alternation with the expert.
+            data of a run. http://HOST:PORT is a planner in another process that speaks neuro-ncap's model
+            server protocol; ?timeout=S behind it changes the 60 s in which it has to answer. Two more record
+            DAgger demonstrations, with the expert's plan at each key frame in the logs. disturbed is the
+            expert while it is steered aside and slowed. student:RUN is a run in alternation with the expert.
         out: Folder of the suite: summary.json, report.html, drives, logs.
     """
     check_out_folder(out)

@@ -31,6 +31,7 @@ from foredrive.cli.search import search, search_page
 from foredrive.cli.search_caption import search_caption, search_train_captions
 from foredrive.cli.search_evaluate import search_evaluate
 from foredrive.cli.search_index import search_index, search_train
+from foredrive.cli.serve import serve
 from foredrive.cli.train import train
 from foredrive.cli.view import view
 from foredrive.errors import InputError
@@ -47,6 +48,7 @@ VERBS: dict[str, Callable[..., Any]] = {
     "drive": drive,
     "compare": compare,
     "ncap": ncap,
+    "serve": serve,
     "score": score,
     "search": search,
     "search index": search_index,

@@ -20,6 +20,8 @@ from foredrive.scene import Agent, Clip, Trajectory
 from foredrive.sensors.rigs import SURROUND, RigPlan
 from foredrive.simulation.demonstrations import AlternatingStudent, DisturbedExpert
 from foredrive.simulation.observation import FRAME_DT_S
+from foredrive.simulation.remote.json_http import read_address
+from foredrive.simulation.remote.planner_client import HttpPlanner, check_planner
 from foredrive.simulation.restarts import RestartingAgent
 from foredrive.simulation.simple_agents import StraightAgent
 from foredrive.simulation.town import TownSimulator
@@ -27,6 +29,10 @@ from foredrive.simulation.town_expert import TownExpert
 
 CRUISE_MPS = 5.0
 EXPERT, STOP, CONSTANT_VELOCITY, EGO_MLP = "expert", "stop", "constant-velocity", "ego-mlp:"
+REPLAY = "log"
+"""The agent that repeats the logged drive (log replay); `in_rebuilt` makes it."""
+HTTP = "http://"
+"""Beginning of the address of a planner behind neuro-ncap's model server protocol."""
 DISTURBED, STUDENT = "disturbed", "student:"
 OLD_STUDENT = "pupil:"
 """The prefix of `STUDENT` in earlier versions, still accepted."""
@@ -66,10 +72,14 @@ def inputs_of(agent: str) -> AgentInputs:
         agent: "expert", "stop", "constant-velocity", a run folder, or "ego-mlp:RUN": the MLP that sees only
             the ego status, fitted to the training data of the run. For DAgger demonstrations: "disturbed",
             the expert under disturbances, or "student:RUN", a run that drives in alternation with the expert.
+            "http://HOST:PORT" is a planner in another process (`HttpPlanner`).
 
     Raises:
         InputError: there is no such agent, or it was trained on another frame interval.
     """
+    if agent.startswith(HTTP):
+        read_address(agent)
+        return AgentInputs(cameras=True, lidar=False, past_frames=1)
     if agent in (EXPERT, STOP, CONSTANT_VELOCITY, DISTURBED):
         return AgentInputs(cameras=False, lidar=False, past_frames=1)
     clips = open_run(_run_folder(agent)).recipe.clips
@@ -97,7 +107,7 @@ def check_rig_of(agent: str, rig: RigPlan) -> None:
 
 
 def _rigs_of(agent: str) -> TrainedRigs | None:
-    if agent in (EXPERT, STOP, CONSTANT_VELOCITY, DISTURBED) or agent.startswith(EGO_MLP):
+    if agent in (EXPERT, STOP, CONSTANT_VELOCITY, DISTURBED) or agent.startswith((EGO_MLP, HTTP)):
         return None
     return read_rigs(_run_folder(agent))
 
@@ -122,10 +132,27 @@ def make_agent(
         return DisturbedExpert(_expert(town), clock, seed)
     if agent in (STOP, CONSTANT_VELOCITY):
         return StraightAgent(CRUISE_MPS if agent == CONSTANT_VELOCITY else 0.0)
+    if agent.startswith(HTTP):
+        return HttpPlanner(read_address(agent), clock)
     folder = _run_folder(agent)
     if agent.startswith((STUDENT, OLD_STUDENT)):
         return AlternatingStudent(_seeing(folder), _expert(town), clock, seed)
     return RestartingAgent(_fitted(folder) if agent.startswith(EGO_MLP) else _seeing(folder), clock)
+
+
+def is_remote(agent: str) -> bool:
+    """Return whether an agent is in another process. It remembers the frames that it was sent."""
+    return agent.startswith(HTTP)
+
+
+def check_ready(agent: str) -> None:
+    """Wait until an agent in another process is alive.
+
+    Raises:
+        InputError: it is not.
+    """
+    if is_remote(agent):
+        check_planner(read_address(agent))
 
 
 def _expert(town: TownSimulator | None) -> TownExpert:
@@ -139,7 +166,8 @@ def _run_folder(agent: str) -> Path:
     folder = run_folder(Path(agent.removeprefix(prefix)))
     if not folder.is_dir():
         known = (
-            f"{EXPERT}, {STOP}, {CONSTANT_VELOCITY}, a run folder, {EGO_MLP}RUN, {DISTURBED} or {STUDENT}RUN"
+            f"{EXPERT}, {STOP}, {CONSTANT_VELOCITY}, a run folder, {EGO_MLP}RUN, {HTTP}HOST:PORT, "
+            f"{DISTURBED} or {STUDENT}RUN, and in a reconstruction {REPLAY}"
         )
         raise InputError(f"unknown agent {agent!r}; the agents are {known}")
     return folder

@@ -54,7 +54,8 @@ class CarlaRoutes(RouteSource):
         """Set up a drive on the server; restore the server's state afterwards."""
         route, inputs = self.route_of(job), inputs_of(suite.agent)
         seed = self.seed + job.repetition
-        rig = camera_rig(plan=self.rig) if inputs.lidar or suite.sensors else None
+        sensed = inputs.cameras or inputs.lidar or suite.sensors
+        rig = camera_rig(plan=self.rig) if sensed else None
         scenario = RouteScenario(
             town=route.town,
             route_xyz=route.xyz,

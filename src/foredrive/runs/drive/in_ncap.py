@@ -11,6 +11,7 @@ from foredrive.data.boxes import read_track_ids
 from foredrive.data.logs import Log
 from foredrive.errors import InputError
 from foredrive.rendering.renderer import RebuiltRenderer
+from foredrive.runs.drive.agents import is_remote
 from foredrive.runs.drive.in_rebuilt import agent_in, lanes_of, opened_rebuilt, past_frames_of, renders_for
 from foredrive.runs.drive.suite import DriveJob, DriveSetup, DriveSuite
 from foredrive.runs.rebuild.rebuilt_run import open_run_log
@@ -80,7 +81,7 @@ class SafetyTests:
             job.repetition,
             rules,
             sensors=sensors,
-            past_frames=past_frames_of(suite.agent),
+            past_frames=_past_frames(suite.agent, scenario),
         )
         simulator, start = run.simulator, run.scenario
         rig = simulator.renderer.rig if sensors else None
@@ -121,6 +122,11 @@ def propose_scenarios(runs: Sequence[str], file: Path, rules: str, count: int) -
         raise InputError(f"no scenario passes the self-test: {tested.told}")
     save_scenarios(tested.passed, file)
     return tested
+
+
+def _past_frames(agent: str, scenario: SafetyScenario) -> int:
+    """Return the number of earlier key frames that an agent observes; a remote one observes the priming."""
+    return scenario.priming_frames if is_remote(agent) else past_frames_of(agent)
 
 
 def _rules(name: str) -> Rules:

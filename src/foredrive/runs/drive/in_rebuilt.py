@@ -12,7 +12,7 @@ from foredrive.data.maps import read_lane_outlines
 from foredrive.errors import InputError
 from foredrive.rendering.edits import Edit, load_edits
 from foredrive.rendering.renderer import RebuiltRenderer
-from foredrive.runs.drive.agents import inputs_of, make_agent
+from foredrive.runs.drive.agents import REPLAY, inputs_of, make_agent
 from foredrive.runs.drive.suite import DriveJob, DriveSetup, DriveSuite
 from foredrive.runs.rebuild.rebuilt_run import (
     OpenedReconstruction,
@@ -31,9 +31,6 @@ from foredrive.simulation.rebuilt import RebuiltScenario, RebuiltSimulator
 from foredrive.simulation.route_progress import RouteLine
 from foredrive.simulation.simple_agents import ReplayAgent
 from foredrive.simulation.threats import Threat, reference_mps, send_threat
-
-REPLAY = "log"
-"""The agent that repeats the logged drive (log replay)."""
 
 
 @dataclass(frozen=True)
@@ -114,7 +111,10 @@ def opened_rebuilt(run: str) -> OpenedReconstruction:
 
 def renders_for(suite: DriveSuite) -> bool:
     """Return whether cameras and lidar are rendered: if they are asked for, or the agent is a learned one."""
-    return suite.sensors or (suite.agent != REPLAY and inputs_of(suite.agent).lidar)
+    if suite.sensors or suite.agent == REPLAY:
+        return suite.sensors
+    inputs = inputs_of(suite.agent)
+    return inputs.cameras or inputs.lidar
 
 
 def _edits_of(file: str | None) -> list[Edit]:

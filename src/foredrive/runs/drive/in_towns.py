@@ -61,7 +61,7 @@ class TownRoutes(RouteSource):
     def scenario_of(self, route: DriveRoute, repetition: int, suite: DriveSuite) -> TownScenario:
         """Return the set-up of one drive."""
         inputs, seed = inputs_of(suite.agent), self.seed + repetition
-        sensed = inputs.lidar or suite.sensors
+        sensed = inputs.cameras or inputs.lidar or suite.sensors
         return TownScenario(
             town=route.town,
             route_xyz=route.xyz,

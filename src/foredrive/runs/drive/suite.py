@@ -23,6 +23,7 @@ from foredrive.data.log_writer import Frame, LogWriter
 from foredrive.errors import InputError
 from foredrive.evaluation.summary import write_summary
 from foredrive.files import atomic_path
+from foredrive.runs.drive.agents import check_ready
 from foredrive.runs.drive.records import read_drive, read_suite, summarise, write_drive
 from foredrive.runs.fan_out import fan_out, reason
 from foredrive.runs.folder import DRIVES, SUITE, SUMMARY, RunFolder
@@ -152,8 +153,9 @@ def drive_suite(
         tick: called after each drive with its record, or None if the drive broke.
 
     Raises:
-        InputError: there is no such agent or there are no drives; the folder holds another suite, or another
-            process drives into it; a drive of a source with `in_turn` cannot be set up.
+        InputError: there is no such agent, it is in another process and not alive, or there are no drives;
+            the folder holds another suite, or another process drives into it; a drive of a source with
+            `in_turn` cannot be set up.
         OSError: the disk is full.
     """
     jobs, in_turn = suite.jobs(), suite.source.in_turn
@@ -167,6 +169,8 @@ def drive_suite(
                 tick(job, drives[job])
         skipped = len(drives)
         todo = [job for job in jobs if job not in drives]
+        if todo:
+            check_ready(suite.agent)
         if not in_turn:
             start_fork_server(preload=type(suite.source).__module__)  # workers share the imported modules
         results = _in_turn(todo, work) if in_turn else fan_out(todo, work, workers, on_ray=on_ray)

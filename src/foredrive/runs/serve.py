@@ -1,0 +1,50 @@
+"""Servers of runs for other programs: a reconstruction as a renderer, an agent as a planner."""
+
+import contextlib
+from collections.abc import Mapping
+from pathlib import Path
+
+from foredrive.data.boxes import read_track_ids
+from foredrive.data.logs import Log
+from foredrive.errors import InputError
+from foredrive.runs.drive.agents import inputs_of, make_agent
+from foredrive.runs.folder import CONFIG, LOG
+from foredrive.runs.rebuild.rebuilt_run import open_rebuilt, open_run_log
+from foredrive.simulation.remote.json_http import Answer
+from foredrive.simulation.remote.planner_server import PlannerNeeds, PlannerService
+from foredrive.simulation.remote.render_server import RenderService
+
+Answers = Mapping[tuple[str, str], Answer]
+
+
+def is_reconstruction(folder: Path) -> bool:
+    """Return whether a folder holds a reconstruction, finished or not."""
+    return (folder / CONFIG).is_file() and (folder / LOG).is_file()
+
+
+def renderer_of(folder: Path) -> Answers:
+    """Return the answers of a reconstruction as neuro-ncap's renderer server.
+
+    Names of actors and the time of the start are those of the log if it is still there. Without it, actors
+    have their numbers as names, and the log starts at 0.
+
+    Raises:
+        InputError: the folder holds no finished reconstruction.
+    """
+    opened, names, start_us = open_rebuilt(folder), dict[int, str](), 0
+    with contextlib.suppress(InputError):
+        log = Log(open_run_log(folder)[1])
+        names, start_us = {number: token for token, number in read_track_ids(log).items()}, int(log.t_us[0])
+    return RenderService(opened.scene, opened.vehicle, names, start_us).answers()
+
+
+def planner_of(agent: str) -> Answers:
+    """Return the answers of an agent of `foredrive drive` as neuro-ncap's model server.
+
+    Raises:
+        InputError: there is no such agent, or it reads the state of a town.
+    """
+    inputs = inputs_of(agent)
+    cameras = None if inputs.camera_names is None else tuple(name.lower() for name in inputs.camera_names)
+    needs = PlannerNeeds(inputs.past_frames, cameras if inputs.cameras else ())
+    return PlannerService(lambda clock: make_agent(agent, clock), needs).answers()

@@ -1,0 +1,1 @@
+"""Planners and renderers of other programs, over HTTP and gRPC: both ends of their protocols."""

@@ -1,0 +1,41 @@
+"""A rebuilt log for tests that drive in one."""
+
+from pathlib import Path
+
+import pytest
+
+
+@pytest.fixture(scope="session")
+def rebuilt(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A small log that was rebuilt, in `run` beside the log."""
+    import synthetic_log as world
+    from small_rebuild import SMALLEST
+
+    from foredrive.data import find_logs
+    from foredrive.runs.rebuild.reconstruct import reconstruct
+
+    folder = tmp_path_factory.mktemp("tested_in")
+    (log,) = find_logs(world.write(folder, frames=67))
+    reconstruct(SMALLEST, log, folder / "run")
+    return folder / "run"
+
+
+@pytest.fixture(scope="session")
+def scenarios(rebuilt: Path) -> Path:
+    """A car stands on the logged path 5 s on, and in a second scenario far beside it."""
+    from foredrive.runs.drive.in_rebuilt import opened_rebuilt
+    from foredrive.simulation.ncap.scenario import Jitter, Polyline, SafetyScenario, ScenarioActor
+    from foredrive.simulation.ncap.scenario_file import save_scenarios
+    from foredrive.simulation.threats import Threat
+
+    vehicle = opened_rebuilt(str(rebuilt)).vehicle
+    spot = vehicle.T_world_scene @ vehicle.at(5.0).T_scene_ego.double()
+    x, y, z = spot[:3, 3].tolist()
+    car = str(opened_rebuilt(str(rebuilt)).scene.graph.tracks.track_id.tolist()[0])
+    found = []
+    for name, aside_m in (("on", 0.0), ("beside", 30.0)):
+        point = (x - aside_m * float(spot[1, 0]), y + aside_m * float(spot[0, 0]), z)
+        actor = ScenarioActor((car,), Polyline((0.0, 9.0), (point, point)), jitter=Jitter(lateral_m=0.3))
+        found.append(SafetyScenario(name, Threat.STATIONARY, "run", 1, 6.0, (actor,), 1))
+    save_scenarios(found, rebuilt.parent / "scenarios.yaml")
+    return rebuilt.parent / "scenarios.yaml"
