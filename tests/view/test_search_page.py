@@ -1,5 +1,6 @@
 """The page that asks an index: what it answers, and what a browser makes of it."""
 
+import http.client
 import json
 import shutil
 import subprocess
@@ -76,6 +77,42 @@ def test_a_text_has_hits_with_pictures(page: SearchPage) -> None:
 def test_what_cannot_be_asked_is_said(page: SearchPage, asked: dict[str, str], why: str) -> None:
     assert why in fetch(page, "/find", **asked)["error"]
     assert "error" in fetch(page, "/nowhere")
+
+
+@pytest.mark.parametrize(
+    ("headers", "body", "status"),
+    [
+        ({"Host": "evil.example:80"}, None, 403),  # a name of somebody else that points here
+        ({"Origin": "http://evil.example"}, None, 403),
+        ({"Origin": "http://evil.example"}, b'{"name": "x", "asked": {"text": "car"}}', 403),
+        ({"Origin": "null"}, b'{"name": "x", "asked": {"text": "car"}}', 403),
+        ({"Content-Length": "-1"}, b"{}", 413),
+        ({"Content-Length": str(2**40)}, b"{}", 413),
+        ({"Content-Length": "many"}, b"{}", 413),
+        ({}, b"[" * 100_000, 400),
+        ({}, b"{", 400),
+    ],
+)
+def test_other_sites_and_long_or_broken_requests_are_refused(
+    page: SearchPage, headers: dict[str, str], body: bytes | None, status: int
+) -> None:
+    before = fetch(page, "/queries")
+    connection = http.client.HTTPConnection(urllib.parse.urlsplit(page.url).netloc, timeout=20)
+    connection.request("GET" if body is None else "POST", "/queries", body, headers)
+    answer = connection.getresponse()
+    assert answer.status == status
+    assert json.loads(answer.read())["error"]
+    connection.close()
+    assert fetch(page, "/queries") == before
+
+
+def test_the_pages_own_requests_are_answered(page: SearchPage) -> None:
+    netloc = urllib.parse.urlsplit(page.url).netloc
+    for name in (netloc, netloc.replace("localhost", "127.0.0.1")):
+        connection = http.client.HTTPConnection(netloc, timeout=20)
+        connection.request("GET", "/queries", headers={"Host": name, "Origin": f"http://{name}"})
+        assert connection.getresponse().status == 200
+        connection.close()
 
 
 def test_scenes_in_a_lasso_are_shown_tagged_and_listed(page: SearchPage, tmp_path: Path) -> None:

@@ -28,6 +28,8 @@ from foredrive.view.html import render_page
 JPEG_QUALITY = 85
 MAX_SHOWN = 60
 """Maximum number of scenes shown from a lasso."""
+MAX_BODY_BYTES = 2**20
+LOOPBACK = ("127.0.0.1", "localhost", "[::1]")
 Key = tuple[str, str]
 """A moment's key and a view; together they identify a row."""
 
@@ -109,11 +111,12 @@ class SearchPage:
 
         class Handler(BaseHTTPRequestHandler):
             def do_GET(self) -> None:
-                page._answer(self, None)
+                if page._is_allowed(self):
+                    page._answer(self, None)
 
             def do_POST(self) -> None:
-                length = int(self.headers.get("Content-Length") or 0)
-                page._answer(self, self.rfile.read(length))
+                if page._is_allowed(self):
+                    page._answer(self, self.rfile.read(int(self.headers["Content-Length"])))
 
             def log_message(self, format: str, *args: object) -> None:
                 """Print nothing."""
@@ -132,6 +135,29 @@ class SearchPage:
         """Stop serving."""
         self._server.shutdown()
         self._server.server_close()
+
+    def _is_allowed(self, request: BaseHTTPRequestHandler) -> bool:
+        """Refuse requests that pages of other sites make through the user's browser, and long bodies.
+
+        A page of another site has its own name in Origin. A name that its owner points to this machine (DNS
+        rebinding) stands in Host.
+        """
+        host, origin = request.headers.get("Host", ""), request.headers.get("Origin")
+        served = self._server.server_address[0]
+        if served == "127.0.0.1" and host.rpartition(":")[0] not in LOOPBACK:
+            _send_json(request, {"error": f"this page is not at {host}"}, HTTPStatus.FORBIDDEN)
+        elif origin is not None and origin != f"http://{host}":
+            _send_json(request, {"error": f"{origin} may not ask this page"}, HTTPStatus.FORBIDDEN)
+        elif request.command == "GET":
+            return True
+        else:
+            length = request.headers.get("Content-Length", "")
+            if length.isascii() and length.isdigit() and int(length) <= MAX_BODY_BYTES:
+                return True
+            told = f"a request needs a Content-Length of at most {MAX_BODY_BYTES} bytes"
+            request.close_connection = True  # its body is not read
+            _send_json(request, {"error": told}, HTTPStatus.REQUEST_ENTITY_TOO_LARGE)
+        return False
 
     def _answer(self, request: BaseHTTPRequestHandler, body: bytes | None) -> None:
         url = urlsplit(request.path)
@@ -157,7 +183,7 @@ class SearchPage:
             if body is not None and url.path in post:
                 return _send_json(request, post[url.path](json.loads(body)))
             _send_json(request, {"error": f"{url.path}: no such page"}, HTTPStatus.NOT_FOUND)
-        except (InputError, ValueError, LookupError, TypeError) as error:
+        except (InputError, ValueError, LookupError, TypeError, RecursionError) as error:
             _send_json(request, {"error": " ".join(str(error).split())}, HTTPStatus.BAD_REQUEST)
 
     def _find(self, asked: Mapping[str, str]) -> ShownHits:
@@ -243,5 +269,6 @@ def _send(
     request.send_response(status)
     request.send_header("Content-Type", kind)
     request.send_header("Content-Length", str(len(body)))
+    request.send_header("X-Content-Type-Options", "nosniff")
     request.end_headers()
     request.wfile.write(body)
