@@ -7,13 +7,16 @@ import msgpack
 import pyarrow as pa
 
 
-def rewrite_column(file: Path, column: str, change: Callable[[list], list]) -> None:
-    """Replace the values of one column of an Arrow file, keeping its schema."""
+def rewrite_column(
+    file: Path, column: str, change: Callable[[list], list], type_: pa.DataType | None = None
+) -> None:
+    """Replace the values of one column of an Arrow file, keeping its schema, but for a new type if given."""
     with pa.OSFile(str(file)) as source:
         table = pa.ipc.open_file(source).read_all()
-    values = pa.array(change(table[column].to_pylist()), type=table.schema.field(column).type)
     index = table.schema.get_field_index(column)
-    table = table.set_column(index, table.schema.field(column), values)
+    field = table.schema.field(column) if type_ is None else table.schema.field(column).with_type(type_)
+    values = pa.array(change(table[column].to_pylist()), type=field.type)
+    table = table.set_column(index, field, values)
     with pa.OSFile(str(file), "wb") as sink, pa.ipc.new_file(sink, table.schema) as writer:
         writer.write_table(table)
 

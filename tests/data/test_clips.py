@@ -1,14 +1,20 @@
 """Clips of the synthetic log: what is in them agrees with its geometry, what is missing is masked."""
 
+import contextlib
 import os
 import shutil
+import struct
+import zlib
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
+import pyarrow as pa
 import pytest
 import synthetic_log as world
 import torch
 from arrow_surgery import rewrite_column, rewrite_metadata
+from PIL import Image
 from py123d.datatypes import CameraID, FisheyeMEICameraMetadata
 from py123d.geometry import PoseSE3
 from torch.utils.data import DataLoader
@@ -314,6 +320,44 @@ def test_a_corrupt_jpeg_is_named(flat_log: Path, tmp_path: Path) -> None:
     rewrite_column(file, "camera.pcam_f0.data", lambda rows: [b"no image" for _ in rows])
     with pytest.raises(InputError, match=r"camera\.pcam_f0\.arrow: cannot read the image at frame 0"):
         ClipDataset([copy_of(path.folder, tmp_path / "b")], config(), None)[0]
+
+
+def test_an_image_that_claims_to_be_huge_is_named(flat_log: Path, tmp_path: Path) -> None:
+    path = copy_of(flat_log, tmp_path)
+    chunks = [
+        (b"IHDR", struct.pack(">IIBBBBB", 60_000, 60_000, 8, 2, 0, 0, 0)),
+        (b"IDAT", b""),
+        (b"IEND", b""),
+    ]
+    written = [
+        struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+        for kind, data in chunks
+    ]
+    bomb = b"\x89PNG\r\n\x1a\n" + b"".join(written)
+    rewrite_column(
+        path.folder / "camera.pcam_f0.arrow", "camera.pcam_f0.data", lambda rows: [bomb for _ in rows]
+    )
+    with pytest.raises(InputError, match=r"cannot read the image at frame 0: Image size \(3600000000 pixels"):
+        ClipDataset([path], config(), None)[0]
+
+
+@pytest.mark.parametrize("inside", [True, False])
+def test_images_beside_a_log_are_inside_of_the_data_sets_folder(
+    inside: bool, flat_log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, root = copy_of(flat_log, tmp_path), tmp_path / "sensors"
+    root.mkdir()
+    for folder in (root, tmp_path):
+        Image.new("RGB", (96, 48)).save(folder / "image.png")
+    monkeypatch.setattr(
+        "foredrive.data.cameras.get_dataset_paths", lambda: SimpleNamespace(get_sensor_root=lambda _: root)
+    )
+    named = "image.png" if inside else "../image.png"
+    for file in path.folder.glob("camera.pcam_*.arrow"):
+        rewrite_column(file, f"{file.stem}.data", lambda rows: [named] * len(rows), pa.string())
+    outside = pytest.raises(InputError, match="is outside of the data set's folder")
+    with contextlib.nullcontext() if inside else outside:
+        ClipDataset([path], config(), None)[0]
 
 
 def test_a_sweep_without_points_loads(flat_log: Path, tmp_path: Path) -> None:

@@ -9,10 +9,20 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 from jaxtyping import Float64
+from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from foredrive.errors import InputError
 
+_DAMAGED = (
+    pa.ArrowException,
+    ValueError,
+    LookupError,
+    AssertionError,
+    EOFError,
+    zlib.error,
+    Image.DecompressionBombError,
+)
 _REFUSES_WRITING = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
 
 
@@ -30,7 +40,7 @@ def reading(file: Path, what: str) -> Iterator[None]:
         if error.errno in _REFUSES_WRITING:
             raise
         raise InputError(_said(file, what, error)) from error
-    except (pa.ArrowException, ValueError, LookupError, AssertionError, EOFError, zlib.error) as error:
+    except _DAMAGED as error:
         raise InputError(_said(file, what, error)) from error
 
 

@@ -5,7 +5,7 @@ import io
 import logging
 from collections.abc import Iterable
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePath
 
 import numpy as np
 import torch
@@ -210,6 +210,8 @@ def _open_image(
                 f"{log.file(metadata.modality_key)}: the images lie outside the log; set the environment "
                 f"variable of the {log.metadata.dataset} folder, or convert the log with its images in it"
             )
+        if PurePath(data).is_absolute() or ".." in PurePath(data).parts:
+            raise ValueError(f"the image {data!r} is outside of the data set's folder")
         return Image.open(Path(root) / data)
     camera = log.scene.get_camera_at_iteration(log.iteration(frame), metadata.camera_id)
     return Image.fromarray(camera.image)
