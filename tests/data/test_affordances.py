@@ -30,6 +30,8 @@ FRAME = 10
 """The rear axle is at x = 5 then."""
 LIGHTS = {5: TrafficLightStatus.RED, 4: TrafficLightStatus.GREEN}
 """Lane 5 begins at the line; lane 4 leads the other way."""
+STATES = (TrafficLightStatus.RED, TrafficLightStatus.GREEN)
+"""Before and from frame 30 on, two seconds after `FRAME`."""
 
 
 def actors(t_s: float) -> tuple[np.ndarray, np.ndarray]:
@@ -64,7 +66,9 @@ def frame(index: int) -> world.Frame:
         valid=torch.ones(5, dtype=torch.bool),
         **unlabelled(5),
     )
-    return dataclasses.replace(plain, T_world_ego=pose, boxes=boxes, traffic_lights=LIGHTS)
+    return dataclasses.replace(
+        plain, T_world_ego=pose, boxes=boxes, traffic_lights=LIGHTS | {5: STATES[index >= 30]}
+    )
 
 
 def written(root: Path, route: np.ndarray | None) -> LogPath:
@@ -89,6 +93,7 @@ def test_light_lead_vehicle_and_people_on_the_route(log: Log) -> None:
     """Distances run along the route, whichever way the vehicle points."""
     found = read_affordances(log, FRAME // 5)
     assert (bool(found.light_known), LightState(int(found.light))) == (True, LightState.RED)
+    assert found.light_later.tolist() == [LightState.RED] * 3 + [LightState.GREEN] * 3
     assert float(found.light_m) == pytest.approx(LINE_X - front_x(log), abs=0.02)
     assert bool(found.lead & found.lead_known)
     assert float(found.lead_m) == pytest.approx(LEAD_REAR_X - front_x(log), abs=0.02)

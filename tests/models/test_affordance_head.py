@@ -36,6 +36,7 @@ def truth(light: list[int], known: bool = True) -> Affordances:
         light=torch.tensor(light),
         light_m=torch.full((b,), 25.0),
         light_known=yes,
+        light_later=torch.tensor(light)[:, None].expand(b, 6),
         lead=torch.tensor([k % 2 == 0 for k in range(b)]),
         lead_m=torch.full((b,), 12.0),
         lead_mps=torch.full((b,), 4.0),

@@ -25,6 +25,8 @@ from foredrive.scene import Boxes
 from foredrive.scene.affordances import (
     CROSSING_RANGE_M,
     CROSSING_S,
+    LATER_DT_S,
+    LATER_STEPS,
     LEAD_RANGE_M,
     LIGHT_RANGE_M,
     Affordances,
@@ -80,7 +82,7 @@ def read_affordances(log: Log, frame: int) -> Affordances:
         InputError: the route, the map, the lights or the boxes cannot be read.
     """
     path = _path(log, frame)
-    light, light_m, light_known = _light(log, frame, path)
+    light, light_m, light_known, lane = _light(log, frame, path)
     boxes = read_boxes(log, frame)
     lead, lead_m, lead_mps, lead_known = _lead(boxes, path)
     crossing, crossing_known = _crossing(log, frame, boxes, path)
@@ -90,6 +92,7 @@ def read_affordances(log: Log, frame: int) -> Affordances:
         light=torch.tensor(int(light)),
         light_m=torch.tensor(light_m),
         light_known=torch.tensor(light_known),
+        light_later=torch.tensor(_later(log, frame, lane, light)),
         lead=torch.tensor(lead),
         lead_m=torch.tensor(lead_m),
         lead_mps=torch.tensor(lead_mps),
@@ -122,13 +125,13 @@ def _path(log: Log, frame: int) -> _Path:
     )
 
 
-def _light(log: Log, frame: int, path: _Path) -> tuple[LightState, float, bool]:
-    """Return state and distance of the next light on the path, and whether the log tells."""
+def _light(log: Log, frame: int, path: _Path) -> tuple[LightState, float, bool, int | None]:
+    """Return state and distance of the next light on the path, whether the log tells, and its lane."""
     shown, lines = read_traffic_lights(log, frame), _stop_lines(log)
     if shown is None or lines is None or not path.given or not bool(path.valid.any()):
-        return LightState.NONE, 0.0, False
+        return LightState.NONE, 0.0, False, None
     if not len(lines.lane):
-        return LightState.NONE, 0.0, True
+        return LightState.NONE, 0.0, True, None
     at = _in_ego_frame(lines.xyz, log, frame)
     along_m, left_m = along_path(torch.from_numpy(at[:, :2]).float(), path.xy, path.valid)
     heading = path_headings(along_m, path.xy, path.valid).double().numpy()
@@ -143,10 +146,22 @@ def _light(log: Log, frame: int, path: _Path) -> tuple[LightState, float, bool]:
         & (distance_m <= LIGHT_RANGE_M)
     )
     for row in sorted(np.flatnonzero(on_path).tolist(), key=distance_m.__getitem__):
-        state = STATE_OF_STATUS.get(shown.get(int(lines.lane[row]), TrafficLightStatus.UNKNOWN))
+        lane = int(lines.lane[row])
+        state = STATE_OF_STATUS.get(shown.get(lane, TrafficLightStatus.UNKNOWN))
         if state is not None:
-            return state, float(distance_m[row]), True
-    return LightState.NONE, 0.0, True
+            return state, float(distance_m[row]), True, lane
+    return LightState.NONE, 0.0, True, None
+
+
+def _later(log: Log, frame: int, lane: int | None, light: LightState) -> list[int]:
+    """Return the later states of the light of a lane."""
+    states, state = [], light
+    t_us = log.t_us[frame] + 1e6 * LATER_DT_S * np.arange(1, LATER_STEPS + 1)
+    for later, there in zip(*log.nearest_frames(t_us), strict=True):
+        if lane is not None and there and (shown := read_traffic_lights(log, int(later))) is not None:
+            state = STATE_OF_STATUS.get(shown.get(lane, TrafficLightStatus.UNKNOWN), state)
+        states.append(int(state))
+    return states
 
 
 @functools.lru_cache(maxsize=64)

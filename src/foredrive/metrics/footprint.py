@@ -41,14 +41,14 @@ def polygon_hits(
 ) -> tuple[Bool[Tensor, "b T"], Bool[Tensor, "b T"]]:
     """Return whether the ego rectangle, and whether the path's point, touches a valid box.
 
-    Touching edges count. Two rectangles are apart if and only if an edge direction of one separates them.
+    Touching edges count.
     """
     centre, size_lw, yaw = _seen_from_above(boxes)
     direction = torch.stack([heading.cos(), heading.sin()], dim=-1)
     ego_size = torch.tensor(protocol.ego_size_lw_m).to(path_xy).expand_as(path_xy)
     ego = rectangle(path_xy + protocol.centre_forward_m * direction, ego_size, heading)[:, :, None]
     other = rectangle(centre, size_lw, yaw)  # [b, T, M, 4, 2]
-    apart = _apart_along(heading[..., None], ego, other) | _apart_along(yaw, ego, other)
+    apart = ~overlapping(heading[..., None], ego, yaw, other)
     inside = (_turn(path_xy[:, :, None] - centre, -yaw).abs() <= 0.5 * size_lw).all(dim=-1)
     return (~apart & boxes.valid).any(dim=-1), (inside & boxes.valid).any(dim=-1)
 
@@ -140,9 +140,22 @@ def _seen_from_above(boxes: Boxes) -> tuple[Tensor, Tensor, Tensor]:
     return boxes.centre[..., :2].double(), boxes.size_lwh[..., :2].double(), boxes.yaw.double()
 
 
+def overlapping(
+    yaw: Float[Tensor, "*#n"],
+    corners: Float[Tensor, "*#n 4 2"],
+    other_yaw: Float[Tensor, "*#n"],
+    other_corners: Float[Tensor, "*#n 4 2"],
+) -> Bool[Tensor, "*#n"]:
+    """Return whether rectangles overlap or touch others, broadcast.
+
+    Two rectangles are apart if and only if an edge direction of one separates them.
+    """
+    return ~(_apart_along(yaw, corners, other_corners) | _apart_along(other_yaw, corners, other_corners))
+
+
 def _apart_along(
-    yaw: Float[Tensor, "b T *M"], ego: Float[Tensor, "b T 1 4 2"], other: Float[Tensor, "b T M 4 2"]
-) -> Bool[Tensor, "b T M"]:
+    yaw: Float[Tensor, "*#n"], ego: Float[Tensor, "*#n 4 2"], other: Float[Tensor, "*#n 4 2"]
+) -> Bool[Tensor, "*#n"]:
     """Return whether two rectangles are apart along either axis of a frame turned by `yaw`."""
     ego_seen, other_seen = _turn(ego, -yaw[..., None]), _turn(other, -yaw[..., None])
     gap = torch.maximum(

@@ -1,7 +1,7 @@
 """A driving agent: a world model with a planner on top."""
 
 from collections.abc import Sequence
-from typing import Generic, NamedTuple, TypeVar
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import torch
 from jaxtyping import Float
@@ -9,6 +9,7 @@ from torch import Tensor, nn
 
 from foredrive.geometry.precision import full_precision
 from foredrive.models.ego_mlp import ego_motion, route_target
+from foredrive.models.plan_scorer import ScoredPlans
 from foredrive.models.planner import VolumePlanner
 from foredrive.models.tasks.heads import HeadOutput, TaskHeads, volumes_of
 from foredrive.scene import Belief, Clip, Decoded, Trajectory, WorldModel
@@ -97,20 +98,28 @@ class PlanningAgent(nn.Module, Generic[W]):
             beliefs: about now and about the next key frames.
             found: output of `perceive`, if it is known.
         """
-        now = clip.now
+        plan: Trajectory = self.planner(*self._told(clip, beliefs, found))
+        return plan
+
+    def score(self, clip: Clip, beliefs: Sequence[Belief], found: HeadOutput | None = None) -> ScoredPlans:
+        """Return the scored plans of a planner with a vocabulary. The arguments are those of `plan`."""
+        plans: ScoredPlans = self.planner.score(*self._told(clip, beliefs, found))
+        return plans
+
+    def _told(self, clip: Clip, beliefs: Sequence[Belief], found: HeadOutput | None) -> tuple[Any, ...]:
+        """Return the arguments of the planner."""
         poses, speeds = ego_motion(clip, self.planner.history)
-        plan: Trajectory = self.planner(
+        return (
             self.planner_volume(beliefs[0]),
             self.planner_volume(beliefs[1]) if self.planner.imagined_frames else None,
             clip.command,
             clip.command_valid,
             speeds[:, -1],
-            clip.ego_speed_valid[:, now],
+            clip.ego_speed_valid[:, clip.now],
             torch.cat([poses, speeds[:, :-1, None]], dim=-1),
             route_target(clip) if self.planner.target else None,
             self.tokens(beliefs[0], found),
         )
-        return plan
 
     def planner_volume(self, belief: Belief) -> Float[Tensor, "b D Z Y X"]:
         """Return the volume that the planner reads."""

@@ -9,9 +9,12 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
+from foredrive.errors import InputError
 from foredrive.geometry.precision import full_precision
 from foredrive.models.ego_mlp import EgoMLP, EgoMLPConfig, status_vector
 from foredrive.models.few_queries import FewQueriesDecoderLayer
+from foredrive.models.plan_scorer import PlanScorer, PlanScorerConfig, ScoredPlans
+from foredrive.models.plan_vocabulary import plan_vocabulary
 from foredrive.models.tasks.heads import TaskHeadsConfig
 from foredrive.models.tasks.scene_tokens import Attended, SceneTokens
 from foredrive.ops.volume import sample_volume
@@ -63,6 +66,8 @@ class PlannerConfig:
     """Outputs of the task heads that the decoder attends to beside the plane, as in VAD and UniAD."""
     path: PathCorrectionConfig | None = None
     """Also sample the volume along the initial plan. Not in the paper."""
+    scorer: PlanScorerConfig | None = None
+    """Score a vocabulary of plans and choose one, in place of regressing waypoints. It needs the target."""
     feed_forward: float = 2.0
     """Hidden width of the feed-forward networks of the decoder, as a multiple of C."""
     dropout: float = 0.1
@@ -224,7 +229,7 @@ class VolumePlanner(nn.Module):
         heads: sizes of the task heads, if the planner attends to what they find.
 
     Raises:
-        InputError: the planner attends to what no head finds.
+        InputError: the planner attends to what no head finds, or scores plans without a target point.
     """
 
     def __init__(
@@ -267,6 +272,24 @@ class VolumePlanner(nn.Module):
         self.speed = nn.Sequential(nn.Linear(inputs, width), nn.ReLU(), nn.Linear(width, width))
         self.plan = nn.Parameter(0.02 * torch.randn(width))
         self.fuse_query = nn.Sequential(nn.Linear(3 * width, width), nn.ReLU(), nn.Linear(width, width))
+        self.scorer: PlanScorer | None = None
+        if config.scorer is None:
+            self._build_regression(config, horizon_steps)
+        else:
+            self.scorer = self._scorer(config, config.scorer, spec, horizon_steps)
+        status = 0 if self.ego_mlp is None else len(self.ego_mlp.status_mean)
+        self.path: PathCorrection | None = None
+        if config.path is not None:
+            self.path = PathCorrection(
+                config.path, spec, channels=channels, status=status, steps=horizon_steps
+            )
+        self.scene: SceneTokens | None = None
+        if config.attends:  # built last, so that the other weights start as without it
+            self.scene = SceneTokens(config.attends, heads, spec, width)
+
+    def _build_regression(self, config: PlannerConfig, horizon_steps: int) -> None:
+        """Build the decoder of one query and the MLP of waypoints."""
+        width = config.width
         # Pre-norm keeps a direct path for speed and command, which determine most of a plan.
         layer = FewQueriesDecoderLayer(
             width, config.heads, round(config.feed_forward * width), config.dropout
@@ -278,15 +301,25 @@ class VolumePlanner(nn.Module):
         )
         if self.ego_mlp is not None:  # the MLP's plan is good already: start from no correction
             _set_to_zero(self.waypoints[-1])
-        status = 0 if self.ego_mlp is None else len(self.ego_mlp.status_mean)
-        self.path: PathCorrection | None = None
-        if config.path is not None:
-            self.path = PathCorrection(
-                config.path, spec, channels=channels, status=status, steps=horizon_steps
+
+    @staticmethod
+    def _scorer(
+        config: PlannerConfig, scorer: PlanScorerConfig, spec: VoxelSpec, horizon_steps: int
+    ) -> PlanScorer:
+        if not config.target or config.path is not None or config.ego_mlp is not None:
+            raise InputError(
+                "planner.scorer scores plans to the target point: set planner.target to true, and "
+                "planner.path and planner.ego_mlp, which correct a regressed plan, to null"
             )
-        self.scene: SceneTokens | None = None
-        if config.attends:  # built last, so that the other weights start as without it
-            self.scene = SceneTokens(config.attends, heads, spec, width)
+        return PlanScorer(
+            scorer,
+            spec,
+            width=config.width,
+            heads=config.heads,
+            feed_forward=round(config.feed_forward * config.width),
+            dropout=config.dropout,
+            steps=horizon_steps,
+        )
 
     @property
     def imagined_frames(self) -> int:
@@ -316,14 +349,77 @@ class VolumePlanner(nn.Module):
             target: see `route_target`; required if the config's `target` is set.
             tokens: output of `scene`; required if the config's `attends` is not empty.
         """
-        fused = self._fuse(now, future)
-        plane = self.fold(fused.permute(0, 3, 4, 2, 1).flatten(3))  # [b, Y, X, C]
-        memory = (plane + self.row + self.column).flatten(1, 2)
-        if self.scene is not None:
-            if tokens is None:
-                raise ValueError("this planner needs tokens of agents or map elements")
+        if self.scorer is not None:
+            chosen: Trajectory = self.score(
+                now, future, command, command_valid, speed_mps, speed_valid, past, target, tokens
+            ).best()
+            return chosen
+        plane, query = self._read(
+            now, future, command, command_valid, speed_mps, speed_valid, past, target, tokens
+        )
+        memory = plane.flatten(1, 2)
+        if tokens is not None and self.scene is not None:
             memory = torch.cat([memory, tokens.to(memory)], dim=1)
         initial_xy, ego_status = self.initial_plan(command, command_valid, speed_mps, past, target)
+        query = query[:, None]
+        for layer in self.decoder:
+            query = layer(query, memory)
+        change = self.waypoints(self.final_norm(query[:, 0])).float().unflatten(1, (self.horizon_steps, 2))
+        change = self.config.step_scale_m * change
+        if self.path is not None:
+            change = change + self.path(self.path.sample(now, initial_xy), ego_status)
+        xy = (initial_xy + change.cumsum(dim=1))[:, None]
+        return Trajectory(
+            xy=xy,
+            yaw=_headings(xy),
+            valid=torch.ones_like(xy[..., 0], dtype=torch.bool),
+            log_prob=torch.zeros_like(xy[..., 0, 0]),
+            dt_s=self.dt_s,
+        )
+
+    def score(
+        self,
+        now: Float[Tensor, "b D Z Y X"],
+        future: Float[Tensor, "b D Z Y X"] | None,
+        command: Int[Tensor, "b"],
+        command_valid: Bool[Tensor, "b"],
+        speed_mps: Float[Tensor, "b"],
+        speed_valid: Bool[Tensor, "b"],
+        past: Float[Tensor, "b P 4"],
+        target: Float[Tensor, "b 3"] | None = None,
+        tokens: Float[Tensor, "b _N C"] | None = None,
+    ) -> ScoredPlans:
+        """Return the plans of the vocabulary with their logits. The arguments are those of `forward`."""
+        assert self.scorer is not None, "this planner regresses"
+        assert target is not None, "this planner needs the target point of the route"
+        plane, query = self._read(
+            now, future, command, command_valid, speed_mps, speed_valid, past, target, tokens
+        )
+        config = self.scorer.config
+        with full_precision(speed_mps, target) as (speed, at):
+            plans = plan_vocabulary(config.vocabulary, speed, at, self.horizon_steps, self.dt_s)
+        logits = self.scorer(plans, query, plane, tokens)
+        return ScoredPlans(*plans, logits[..., :-1], logits[..., -1], self.dt_s, config.choice)
+
+    def _read(
+        self,
+        now: Float[Tensor, "b D Z Y X"],
+        future: Float[Tensor, "b D Z Y X"] | None,
+        command: Int[Tensor, "b"],
+        command_valid: Bool[Tensor, "b"],
+        speed_mps: Float[Tensor, "b"],
+        speed_valid: Bool[Tensor, "b"],
+        past: Float[Tensor, "b P 4"],
+        target: Float[Tensor, "b 3"] | None,
+        tokens: Float[Tensor, "b _N C"] | None,
+    ) -> tuple[Float[Tensor, "b Y X C"], Float[Tensor, "b C"]]:
+        """Return the plane of the fused volumes, and the query of what the planner is told."""
+        if self.scene is not None and tokens is None:
+            raise ValueError("this planner needs tokens of agents or map elements")
+        if self.target and target is None:
+            raise ValueError("this planner needs the target point of the route")
+        fused = self._fuse(now, future)
+        plane = self.fold(fused.permute(0, 3, 4, 2, 1).flatten(3)) + self.row + self.column
         command = torch.where(command_valid, command, len(Command))
         sizes = self.config
         measured_mps = torch.where(speed_valid, speed_mps, 0.0)
@@ -336,21 +432,7 @@ class VolumePlanner(nn.Module):
         query = torch.cat(
             [self.command(command), self.speed(status), self.plan.expand(len(command), -1)], dim=-1
         )
-        query = self.fuse_query(query)[:, None]
-        for layer in self.decoder:
-            query = layer(query, memory)
-        change = self.waypoints(self.final_norm(query[:, 0])).float().unflatten(1, (self.horizon_steps, 2))
-        change = sizes.step_scale_m * change
-        if self.path is not None:
-            change = change + self.path(self.path.sample(now, initial_xy), ego_status)
-        xy = (initial_xy + change.cumsum(dim=1))[:, None]
-        return Trajectory(
-            xy=xy,
-            yaw=_headings(xy),
-            valid=torch.ones_like(xy[..., 0], dtype=torch.bool),
-            log_prob=torch.zeros_like(xy[..., 0, 0]),
-            dt_s=self.dt_s,
-        )
+        return plane, self.fuse_query(query)
 
     @torch.no_grad()
     def initial_plan(

@@ -15,7 +15,7 @@ from foredrive.recipes.nemo import (
     TOWN_BEV,
     nemo_base,
     nemo_drive,
-    nemo_drive_tele,
+    nemo_drive_rows,
     nemo_tiny,
     nemo_town,
 )
@@ -24,7 +24,7 @@ from foredrive.recipes.nemo_ablations import nemo_ablations
 RECIPES: dict[str, Recipe[Any, Any]] = {
     "nemo_tiny": nemo_tiny(),
     "nemo_drive": nemo_drive(),
-    "nemo_drive_tele": nemo_drive_tele(),
+    **nemo_drive_rows(),
     **nemo_ablations(nemo_town(), TOWN_BEV),
     **nemo_ablations(nemo_base(), BASE_BEV),
     "driveworld_tiny": driveworld_tiny(),

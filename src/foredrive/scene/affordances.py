@@ -13,6 +13,7 @@ CROSSING_RANGE_M = 25.0
 """Distances along the path up to which a light, a lead vehicle and people who cross are told, m."""
 CROSSING_S = 4.0
 """Someone crosses who enters the path within this time, s."""
+LATER_STEPS, LATER_DT_S = 6, 0.5
 
 
 @dataclass(frozen=True)
@@ -31,6 +32,9 @@ class Affordances(Record):
     light_m: Float[Tensor, "*b"]
     """Distance of its stop line. It is negative while the bumper is less than 2 m beyond the line."""
     light_known: Bool[Tensor, "*b"]
+    light_later: Int[Tensor, "*b S"]
+    """`LightState` of the same light at `LATER_STEPS` times, `LATER_DT_S` apart; the last known one beyond
+    the end of the log."""
     lead: Bool[Tensor, "*b"]
     """Whether a vehicle stands or drives in the path within `LEAD_RANGE_M`."""
     lead_m: Float[Tensor, "*b"]

@@ -9,13 +9,14 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from foredrive.losses import masked_mean, occupancy_loss, waypoint_loss
+from foredrive.losses import masked_mean, occupancy_loss
 from foredrive.models.agent import PlanningAgent
 from foredrive.models.driveworld import DriveWorld, Unrolled, actions_of, balanced_kl
 from foredrive.scene import Belief, Boxes, Clip, Example, last_frames
 from foredrive.training.joint_tasks import TaskTerms
 from foredrive.training.loop import Schedule
 from foredrive.training.objective import set_planner_trainable
+from foredrive.training.plan_losses import plan_losses
 
 
 @dataclass(frozen=True)
@@ -107,13 +108,14 @@ class DriveWorldObjective(nn.Module):
             found = None if self.tasks is None else self.agent.perceive(now, clip)
             if stage.weights.wpts > 0:
                 future = world.imagine(now, 1) if self.agent.planner.imagined_frames else []
-                plan = self.agent.plan(observed, [now, *future], found)
-                losses["wpts"] = waypoint_loss(plan, clip.future)
+                parts = plan_losses(self.agent, observed, [now, *future], found, example)
+                losses["wpts"] = parts.pop("wpts")
+                terms |= parts
             if self.tasks is not None and found is not None:
-                terms = self.tasks(found, example)
+                terms |= self.tasks(found, example)
         weighted = [getattr(stage.weights, name) * value for name, value in losses.items()]
         total = torch.stack(weighted).sum()
-        return losses | terms | {"loss": total + terms["tasks"] if terms else total}
+        return losses | terms | {"loss": total + terms["tasks"] if "tasks" in terms else total}
 
     def _latent_losses(self, unrolled: Unrolled, clip: Clip) -> dict[str, Float[Tensor, ""]]:
         """Return the divergence of prior and posterior and the errors of the policy and the velocities."""

@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from foredrive.errors import InputError
-from foredrive.losses import ego_motion_loss, l1_loss, occupancy_loss, perceptual_loss, waypoint_loss
+from foredrive.losses import ego_motion_loss, l1_loss, occupancy_loss, perceptual_loss
 from foredrive.losses.reconstruction import ImageFeatures
 from foredrive.models.agent import PlanningAgent
 from foredrive.models.lifting import lift_frames
@@ -18,6 +18,7 @@ from foredrive.scene import Belief, Clip, Example, last_frames
 from foredrive.training.augmentation import AugmentConfig, augmented
 from foredrive.training.joint_tasks import TaskTerms
 from foredrive.training.loop import Schedule
+from foredrive.training.plan_losses import plan_losses
 from foredrive.training.rays import averaged_rays, thinned_rays
 
 
@@ -135,7 +136,6 @@ class NemoObjective(nn.Module):
         steps = self.steps if self._imagines_now() else 0
         beliefs = self._rollout(observed, max(steps, needed))
         found = None if self.tasks is None else self.agent.perceive(beliefs[0], clip)
-        plan = self.agent.plan(observed, beliefs, found) if weights.wpts > 0 else None
         decoded = [world.decode(belief) for belief in beliefs[: steps + 1]]
 
         losses = {name: clip.t_s.new_zeros(()) for name in ("l1", "perc", "occ")}
@@ -174,8 +174,8 @@ class NemoObjective(nn.Module):
             losses["loss"] = losses["loss"] + weights.ego * losses["ego"]
         if len(beliefs) == 1 and self.steps > 0:
             losses["loss"] = losses["loss"] + self._no_change()
-        if plan is not None:
-            losses["wpts"] = waypoint_loss(plan, clip.future)
+        if weights.wpts > 0:
+            losses |= plan_losses(self.agent, observed, beliefs, found, example)
             losses["loss"] = losses["loss"] + weights.wpts * losses["wpts"]
         if self.tasks is not None and found is not None:
             losses |= self.tasks(found, example)

@@ -6,14 +6,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from foredrive.losses import waypoint_loss
 from foredrive.models.agent import PlanningAgent
 from foredrive.scene import Example
 from foredrive.training.objective import set_planner_trainable
+from foredrive.training.plan_losses import plan_losses
 
 
 class PlannerObjective(nn.Module):
-    """The mapping from a batch to the waypoint loss. World model and heads are frozen, in evaluation mode.
+    """The mapping from a batch to the loss of the plan. World model and heads are frozen, in evaluation mode.
 
     Args:
         agent: of any world model.
@@ -38,5 +38,5 @@ class PlannerObjective(nn.Module):
         with torch.no_grad():
             beliefs = agent.rollout(observed, agent.planner.imagined_frames)
             found = agent.perceive(beliefs[0], observed)
-        loss = waypoint_loss(agent.plan(observed, beliefs, found), example.clip.future)
-        return {"wpts": loss, "loss": loss}
+        losses = plan_losses(agent, observed, beliefs, found, example)
+        return losses | {"loss": losses["wpts"]}
