@@ -13,6 +13,7 @@ import tyro
 
 import foredrive
 from foredrive.cli.bench import bench
+from foredrive.cli.check import check
 from foredrive.cli.compare import compare
 from foredrive.cli.convert import convert
 from foredrive.cli.demo import demo
@@ -42,6 +43,7 @@ VERBS: dict[str, Callable[..., Any]] = {
     "demo": demo,
     "record": record,
     "convert": convert,
+    "check": check,
     "recipes": recipes,
     "train": train,
     "evaluate": evaluate,

@@ -35,6 +35,7 @@ def read_drive(
     image_hw: tuple[int, int],
     cameras: tuple[str, ...] | None = None,
     cache_dir: Path | None = None,
+    max_frames: int | None = None,
 ) -> Clip:
     """Read all frames of a log with sweeps and boxes. Now is the first frame, so all times are >= 0.
 
@@ -46,6 +47,7 @@ def read_drive(
         image_hw: height and width of the resized images, px.
         cameras: camera names, the log's own or 123D's, in this order. None selects all.
         cache_dir: folder for resized images. None disables the cache.
+        max_frames: number of frames to read, from the middle of the log. None reads all.
 
     Raises:
         InputError: the log cannot be read, or it lacks a requested camera.
@@ -57,11 +59,13 @@ def read_drive(
     for name, camera in zip(names, chosen, strict=True):
         if camera is None:
             raise InputError(f"{path.folder}: no camera {name!r}; there are: {told_cameras(there.values())}")
-    frames = list(range(len(log)))
+    count = len(log) if max_frames is None else min(len(log), max_frames)
+    first = (len(log) - count) // 2
+    frames = list(range(first, first + count))
     store = FrameStore(cache_dir, image_hw, names)
     seen = [store.read(log, frame, chosen) for frame in frames]
     sweeps = [_read_beams(log, frame) for frame in frames]
-    return assemble_clip(log, frames, 0, seen, sweeps, log.driven_future(0, 0, log.period_s))
+    return assemble_clip(log, frames, 0, seen, sweeps, log.driven_future(first, 0, log.period_s))
 
 
 def _read_beams(log: Log, frame: int) -> tuple[LidarSweep, bool] | None:

@@ -1,0 +1,42 @@
+"""`foredrive check`."""
+
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from foredrive.lazy import importing
+
+
+def check(
+    logs: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="LOG")],
+    json: bool = False,
+) -> None:
+    """Check 123D logs: what is in them, and what looks wrong.
+
+    Gaps in time, poses that jump, speeds that do not fit them, clocks that are off, black or frozen images,
+    empty sweeps, an ego frame that does not stand on the ground, boxes without points, and calibrations by
+    which lidar points do not fit the images. The exit code is 0; problems are told.
+
+    Args:
+        logs: Logs, folders of logs, or lists of clips.
+        json: Print JSON: one object for each log.
+    """
+    with importing():
+        import dataclasses
+        from json import dumps
+
+        from rich.console import Console
+
+        from foredrive.data import find_all_logs
+        from foredrive.runs.check import check_with_calibration
+        from foredrive.view.check_table import check_table
+        from foredrive.view.table import print_table
+
+    found = []
+    for path in find_all_logs(logs):
+        found.append(check_with_calibration(path))
+        if not json:
+            print_table(check_table(found[-1]), Console())
+    if json:
+        print(dumps([dataclasses.asdict(each) for each in found], indent=2))

@@ -1,0 +1,277 @@
+"""A check of a log: what is in it, and what in it looks wrong."""
+
+import functools
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float, Float64
+
+from foredrive.data.boxes import read_boxes, read_tracks, with_counted_points
+from foredrive.data.cameras import pinhole_cameras, read_camera
+from foredrive.data.lidar import read_sweep
+from foredrive.data.log_paths import LogPath
+from foredrive.data.logs import Log
+from foredrive.errors import InputError
+from foredrive.scene import Boxes
+
+Level = Literal["problem", "note"]
+SAMPLES = 12
+"""Images and sweeps that are opened, evenly over the log."""
+CHECK_HW = (135, 240)
+"""Size at which sampled images are compared, px."""
+MAX_ACCELERATION_MPS2, MAX_TURN_RADPS, MAX_TILT_RAD = 15.0, 1.5, 0.35
+"""Limits of what a road vehicle does."""
+SPEED_DIFFERS_MPS, SPEED_DIFFERS_SHARE = 1.0, 0.1
+GAP = 1.5
+"""A gap is longer than this many times the sensor's usual period."""
+MAX_GROUND_M, NEAR_GROUND_M = 0.3, (4.0, 12.0)
+"""Largest height of the ground in the ego frame, and the distances at which it is looked for."""
+MIN_GROUND_POINTS = 200
+NEAR_BOX_M, MAX_EMPTY_SHARE = 25.0, 0.3
+MAX_BOX_MPS = 60.0
+DARK, SAME = 4.0, 0.5
+"""An image is black below this mean value; two images are the same below this mean difference (of 255)."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing that was noticed."""
+
+    level: Level
+    """problem: results will be wrong or a verb will refuse; note: good to know."""
+    subject: str
+    text: str
+
+
+@dataclass(frozen=True)
+class Stream:
+    """One sensor or kind of label."""
+
+    name: str
+    count: int
+    """Number of frames that have it."""
+    period_s: float | None
+    """Usual time between two of them; None for fewer than two."""
+    detail: str
+
+
+@dataclass(frozen=True)
+class LogCheck:
+    """The content of a log, and what was noticed."""
+
+    log: str
+    frames: int
+    duration_s: float
+    driven_m: float
+    streams: Sequence[Stream]
+    findings: Sequence[Finding]
+
+
+def check_log(path: LogPath) -> LogCheck:
+    """Check times, poses, images, sweeps and boxes of a log.
+
+    Raises:
+        InputError: the log cannot be opened, or has no ego poses.
+    """
+    log = Log(path)
+    streams = list(_streams(log))
+    checks: tuple[Callable[[Log], Iterator[Finding]], ...] = (_poses, _images, _sweeps, _boxes)
+    findings = [*_gaps(log, streams)]
+    for check in checks:
+        findings += check(log)
+    step_m = np.linalg.norm(np.diff(log.T_world_ego[:, :3, 3], axis=0), axis=-1)
+    duration_s = float(log.t_us[-1] - log.t_us[0]) * 1e-6
+    return LogCheck(path.name, len(log), duration_s, float(step_m.sum()), streams, findings)
+
+
+def _streams(log: Log) -> Iterator[Stream]:
+    cameras = pinhole_cameras(log)
+    for key, metadata in log.scene.get_all_modality_metadatas().items():
+        frames, _ = log.rows(key)
+        detail = ""
+        for name, camera in cameras.items():
+            if camera is metadata:
+                detail = f"{name}, {camera.width} x {camera.height} px"
+        yield Stream(key, len(frames), _period_s(log, frames), detail)
+
+
+def _period_s(log: Log, frames: np.ndarray) -> float | None:
+    return float(np.median(np.diff(log.t_us[frames]))) * 1e-6 if len(frames) > 1 else None
+
+
+def _gaps(log: Log, streams: Sequence[Stream]) -> Iterator[Finding]:
+    """Find times without poses or sensors, beyond the usual period of each."""
+    for stream in streams:
+        frames, _ = log.rows(stream.name)
+        if not len(frames):
+            yield Finding("note", stream.name, "declared, but no frame has it")
+            continue
+        if stream.period_s is None:
+            continue
+        since_s = np.diff(log.t_us[frames]) * 1e-6
+        gaps = np.flatnonzero(since_s > GAP * stream.period_s)
+        if len(gaps):
+            longest = int(gaps[since_s[gaps].argmax()])
+            at_s = float(log.t_us[frames[longest]] - log.t_us[0]) * 1e-6
+            yield Finding(
+                "note",
+                stream.name,
+                f"{len(gaps)} gaps; the longest lasts {since_s[longest]:.2f} s, from {at_s:.2f} s "
+                f"(usually {stream.period_s:.3f} s)",
+            )
+
+
+def _poses(log: Log) -> Iterator[Finding]:
+    """Find motion that no road vehicle makes, and speeds that do not fit the poses."""
+    if len(log) < 3:
+        return
+    t_s = (log.t_us - log.t_us[0]) * 1e-6
+    dt_s = np.diff(t_s)
+    velocity = np.diff(log.T_world_ego[:, :3, 3], axis=0) / dt_s[:, None]
+    acceleration = np.linalg.norm(np.diff(velocity, axis=0), axis=-1) / (0.5 * (dt_s[1:] + dt_s[:-1]))
+    yield from _jumps(acceleration > MAX_ACCELERATION_MPS2, acceleration, t_s[1:-1], "accelerates by", "m/s²")
+    turn = np.diff(np.unwrap(np.arctan2(log.T_world_ego[:, 1, 0], log.T_world_ego[:, 0, 0]))) / dt_s
+    yield from _jumps(np.abs(turn) > MAX_TURN_RADPS, np.abs(turn), t_s[1:], "turns at", "rad/s")
+    tilt = np.arccos(log.T_world_ego[:, 2, 2].clip(-1, 1))
+    yield from _jumps(tilt > MAX_TILT_RAD, tilt, t_s, "is tilted by", "rad; is the world's z up?")
+    ahead = (velocity * log.T_world_ego[:-1, :3, 0]).sum(axis=-1)
+    speed = np.linalg.norm(velocity, axis=-1)
+    moving = speed > 2.0
+    if moving.sum() > 5 and np.median(ahead[moving] / speed[moving]) < 0.8:
+        share = float(np.median(ahead[moving] / speed[moving]))
+        text = f"the vehicle moves along its own x axis by {share:.0%} only; x should be ahead"
+        yield Finding("problem", "ego poses", text)
+    differs = np.abs(log.speed_mps[1:] - speed)
+    limit = SPEED_DIFFERS_MPS + SPEED_DIFFERS_SHARE * speed
+    wrong = np.isfinite(differs) & (differs > limit)
+    if wrong.mean() > 0.05:
+        most = float(differs[wrong].max())
+        text = f"logged speed and poses differ at {wrong.mean():.0%} of the frames, by up to {most:.1f} m/s"
+        yield Finding("problem", "ego speed", text)
+
+
+def _jumps(
+    wrong: np.ndarray, value: Float64[np.ndarray, "N"], t_s: Float64[np.ndarray, "N"], verb: str, unit: str
+) -> Iterator[Finding]:
+    if wrong.any():
+        worst = int(value.argmax())
+        text = f"the vehicle {verb} {value[worst]:.1f} {unit} at {t_s[worst]:.2f} s"
+        yield Finding("problem", "ego poses", f"{text} ({int(wrong.sum())} frames like this)")
+
+
+def _images(log: Log) -> Iterator[Finding]:
+    """Find images that cannot be decoded, are black or frozen, and clocks that are off."""
+    for name, camera in pinhole_cameras(log).items():
+        frames, _ = log.rows(camera.modality_key)
+        if not len(frames):
+            continue
+        read = functools.partial(read_camera, log, metadata=camera, image_hw=CHECK_HW, with_image=True)
+        dark, frozen, offset_s = [], [], []
+        for frame in _sampled(frames):
+            try:
+                shown = read(frame=int(frame))
+                following = read(frame=int(frame) + 1) if int(frame) + 1 < len(log) else None
+            except InputError as error:
+                yield Finding("problem", name, str(error))
+                continue
+            if shown.image is None:
+                continue
+            dark.append(float(shown.image.float().mean()) < DARK)
+            offset_s.append(shown.exposed_dt_s)
+            if following is not None and following.image is not None and log.speed_mps[frame] > 1.0:
+                frozen.append(float((following.image.float() - shown.image.float()).abs().mean()) < SAME)
+        if any(dark):
+            yield Finding("note", name, f"{sum(dark)} of {len(dark)} sampled images are black")
+        if any(frozen):
+            text = f"{sum(frozen)} of {len(frozen)} sampled images do not change while driving"
+            yield Finding("problem", name, text)
+        yield from _clock(name, np.array(offset_s), log.period_s)
+
+
+def _clock(name: str, offset_s: Float[np.ndarray, "N"], period_s: float) -> Iterator[Finding]:
+    if not len(offset_s):
+        return
+    if np.abs(offset_s).max() > max(period_s, 0.05):
+        text = f"exposed up to {np.abs(offset_s).max():.3f} s from the frame's time; is it another clock?"
+        yield Finding("problem", name, text)
+    elif offset_s.max() - offset_s.min() > 0.02:
+        text = f"its time varies by {offset_s.max() - offset_s.min():.3f} s against the frames'"
+        yield Finding("note", name, text)
+
+
+def _sweeps(log: Log) -> Iterator[Finding]:
+    """Find empty sweeps, missing point times, and a ground that is not where the ego frame says."""
+    ground_m, empty, untimed, read = [], 0, 0, 0
+    for frame in _sampled(np.arange(len(log))):
+        try:
+            found = read_sweep(log, int(frame))
+        except InputError as error:
+            yield Finding("problem", "lidar", str(error))
+            continue
+        if found is None:
+            continue
+        read += 1
+        sweep = found[0][found[0].returned & found[0].valid]
+        if not len(sweep.range_m):
+            empty += 1
+            continue
+        untimed += not bool(sweep.dt_s.any())
+        points = sweep.points_ego.numpy()
+        distance_m = np.hypot(points[:, 0], points[:, 1])
+        near = points[(distance_m > NEAR_GROUND_M[0]) & (distance_m < NEAR_GROUND_M[1])]
+        if len(near) > MIN_GROUND_POINTS:
+            ground_m.append(_ground_level(near))
+    if empty:
+        yield Finding("problem", "lidar", f"{empty} of {read} sampled sweeps are empty")
+    if untimed:
+        text = "points have no times of their own: the motion within a sweep is unknown"
+        yield Finding("note", "lidar", text)
+    if ground_m and abs(np.median(ground_m)) > MAX_GROUND_M:
+        text = f"the ground is at z = {np.median(ground_m):.2f} m in the ego frame, which should stand on it"
+        yield Finding("problem", "lidar", text)
+
+
+def _ground_level(points_m: Float[np.ndarray, "N 3"]) -> float:
+    """Return the height at which most columns of 1 m have their lowest point: roads are flat."""
+    _, column = np.unique(np.floor(points_m[:, :2]), axis=0, return_inverse=True)
+    lowest_m = np.full(column.max() + 1, np.inf)
+    np.minimum.at(lowest_m, column.reshape(-1), points_m[:, 2])
+    count, edges = np.histogram(lowest_m, bins=np.arange(lowest_m.min(), lowest_m.max() + 0.4, 0.2))
+    return float(edges[count.argmax()]) + 0.1
+
+
+def _boxes(log: Log) -> Iterator[Finding]:
+    """Find boxes without points, with impossible speeds, and tracks that stand twice in a frame."""
+    try:
+        tracks = read_tracks(log)
+    except InputError as error:
+        yield Finding("problem", "boxes", str(error))
+        return
+    if tracks is None:
+        return
+    speed = np.linalg.norm(tracks.velocity, axis=-1)
+    fast = np.isfinite(speed) & (speed > MAX_BOX_MPS)
+    if fast.any():
+        text = f"{len(set(tracks.track_id[fast].tolist()))} tracks move at up to {speed[fast].max():.0f} m/s"
+        yield Finding("problem", "boxes", text)
+    rows = np.repeat(np.arange(len(tracks.row_t_us)), np.diff(tracks.first_row))
+    twice = len(rows) - len(np.unique(np.stack([rows, tracks.track_id]), axis=1).T)
+    if twice:
+        yield Finding("problem", "boxes", f"{twice} boxes have the track of another box of their frame")
+    near, bare = 0, 0
+    for frame in _sampled(np.arange(len(log))):
+        boxes, found = read_boxes(log, int(frame)), read_sweep(log, int(frame))
+        if boxes is None or found is None:
+            continue
+        counted: Boxes = with_counted_points(boxes, found[0])
+        close = counted.centre.norm(dim=-1) < NEAR_BOX_M
+        near, bare = near + int(close.sum()), bare + int((close & (counted.num_points == 0)).sum())
+    if near and bare / near > MAX_EMPTY_SHARE:
+        text = f"{bare} of {near} sampled boxes within {NEAR_BOX_M:.0f} m have no lidar point in them"
+        yield Finding("problem", "boxes", text)
+
+
+def _sampled(frames: np.ndarray) -> np.ndarray:
+    return frames[np.unique(np.linspace(0, len(frames) - 1, min(SAMPLES, len(frames))).round().astype(int))]
