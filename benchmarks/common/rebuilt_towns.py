@@ -93,7 +93,7 @@ class TownTruth:
     def __init__(self, drive: TownDrive) -> None:
         self.drive = drive
         town = load_town_map(drive.town)
-        self._world = World(town, drive.seed)
+        self.world = World(town, drive.seed)
         traffic = Traffic(
             town, drive.seed, drive.background_traffic.vehicles + 1, drive.background_traffic.pedestrians
         )
@@ -114,7 +114,7 @@ class TownTruth:
         actors, T_ego_shifted = _edited(moment.actors, edits)
         T_world_ego = moment.T_world_ego @ T_ego_shifted.numpy()
         twist_ego = sensor_twist(T_ego_shifted, torch.from_numpy(moment.twist_ego))
-        picture = self._world.render(
+        picture = self.world.render(
             actors, sensors, T_world_ego, twist_ego.numpy(), noise_seed=frame, lights=moment.lights
         )
         T_world_scene = torch.from_numpy(self.snapshots[0].T_world_ego)

@@ -1,20 +1,25 @@
 """The verb for safety tests, in a small log that was rebuilt: scenarios, runs that are kept, report."""
 
+import dataclasses
 import shutil
 from pathlib import Path
 
+import numpy as np
 import pytest
+from PIL import Image
 
 from foredrive.cli.main import main
 from foredrive.errors import InputError
 from foredrive.evaluation.summary import read_summary
-from foredrive.runs.drive.in_ncap import SafetyTests, _folders, _place, propose_scenarios
+from foredrive.runs.drive.in_ncap import SafetyTests, _folders, place_in, propose_scenarios
 from foredrive.runs.drive.suite import DriveSuite, drive_suite
 from foredrive.runs.rebuild.rebuilt_run import open_run_log
 from foredrive.simulation.ncap.outcome import Outcome
 from foredrive.simulation.ncap.rules import RULES
 from foredrive.simulation.ncap.running import set_up_run
+from foredrive.simulation.ncap.scenario import Polyline, Rectilinear
 from foredrive.simulation.ncap.scenario_file import load_scenarios
+from foredrive.view.ncap_pictures import write_scenario_picture
 
 
 def test_the_verb_tests_keeps_and_reports(
@@ -95,6 +100,52 @@ def test_reconstructions_of_one_name_are_an_error(rebuilt: Path, tmp_path: Path)
 def test_an_agent_that_sees_more_of_the_past_than_the_log_has_is_told_so(
     rebuilt: Path, scenarios: Path
 ) -> None:
-    place, (test, _) = _place(str(rebuilt)), load_scenarios(scenarios)
+    place, (test, _) = place_in(str(rebuilt)), load_scenarios(scenarios)
     with pytest.raises(InputError, match=r"stationary-.*: run 0 begins to drive at .* sees 20 earlier"):
         set_up_run(place, test, 0, RULES["ours"], sensors=False, past_frames=20)
+
+
+def test_the_expert_hits_nobody(rebuilt: Path, scenarios: Path, tmp_path: Path) -> None:
+    source = SafetyTests((str(rebuilt),), str(scenarios), "ours", 2)
+    drives = drive_suite(DriveSuite("expert", source, sensors=False), tmp_path).drives.values()
+    outcomes = {drive.threat.outcome for drive in drives if drive.threat}
+    assert outcomes <= {Outcome.PASSED, Outcome.STOPPED_SHORT}
+
+
+def test_workers_drive_as_one_process_does(rebuilt: Path, scenarios: Path, tmp_path: Path) -> None:
+    threats = []
+    for spread in (False, True):
+        source = SafetyTests((str(rebuilt),), str(scenarios), "ours", 2, spread=spread)
+        driven = drive_suite(DriveSuite("log", source, sensors=False), tmp_path / str(spread), workers=2)
+        assert not driven.broken
+        threats.append([drive.threat for drive in driven.drives.values()])
+    assert threats[0] == threats[1]
+
+
+def test_an_agent_is_shown_some_sensors_alone_or_told_that_it_cannot(
+    rebuilt: Path, scenarios: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = ["ncap", str(rebuilt), "--scenarios", str(scenarios), "--runs", "1", "--films", "0"]
+    lidar = [*command, "--agent", "lidar-corridor", "--out", str(tmp_path / "lidar")]
+    assert main([*lidar, "--sees", "camera"]) == 2
+    assert "lidar-corridor needs its lidar, which --sees camera hides" in capsys.readouterr().err
+    assert main([*lidar, "--sees", "lidar"]) == 0
+    assert read_summary(tmp_path / "lidar" / "summary.json")["threats.all.failed"] == 0
+    assert main([*command, "--agent", "stop", "--out", str(tmp_path / "stop"), "--sees", "lidar"]) == 2
+    assert "stop does not look at what --sees lidar shows" in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        main(["ncap", "--help"])
+    assert "(default: )" not in capsys.readouterr().out
+
+
+def test_a_picture_shows_a_scenario(rebuilt: Path, scenarios: Path, tmp_path: Path) -> None:
+    test = load_scenarios(scenarios)[0]
+    assert isinstance(test.actors[0].way, Polyline)
+    crossing = Rectilinear(test.actors[0].way.xyz_m[0], 5.0, 1.57, 5.0)
+    test = dataclasses.replace(test, actors=(dataclasses.replace(test.actors[0], way=crossing),))
+    write_scenario_picture(tmp_path / "on.png", place_in(str(rebuilt)), test)
+    with Image.open(tmp_path / "on.png") as picture:
+        pixels = np.asarray(picture.convert("RGB")).astype(int)
+    red = (np.abs(pixels - [255, 77, 79]).sum(axis=2) < 30).sum()
+    assert pixels.shape[1] > 2 * 400
+    assert red > 20  # the actor's way

@@ -12,7 +12,11 @@ from foredrive.lazy import importing
 
 
 def ncap(
-    rebuilt: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="REBUILT")],
+    rebuilt: Annotated[
+        tuple[Path, ...],
+        tyro.conf.Positional,
+        tyro.conf.arg(metavar="REBUILT [REBUILT ...]", help_behavior_hint="(required)"),
+    ],
     scenarios: Path,
     agent: Annotated[str | None, tyro.conf.arg(metavar="RUN|constant-velocity|stop|log|…")] = None,
     out: OptionalPath = None,
@@ -21,6 +25,9 @@ def ncap(
     sensors: bool = True,
     films: int = 6,
     propose: bool = False,
+    sees: Literal["camera", "lidar", "both"] | None = None,
+    workers: int = 1,
+    ray: bool = False,
 ) -> None:
     """Test an agent in safety-critical scenarios in reconstructed logs, after NeuroNCAP.
 
@@ -31,17 +38,24 @@ def ncap(
     Args:
         rebuilt: Folders of reconstructions. A scenario's scene is the name of a folder or of its log.
         scenarios: File or folder of scenarios, ours or neuro-ncap's. With --propose: file to write.
-        agent: As for `foredrive drive --in`. Required without --propose.
+        agent: As for `foredrive drive --in`; lidar-corridor stops if lidar sees something in its corridor.
+            Required without --propose.
         out: Folder of the suite: summary.json, report.html, drives, logs. Required without --propose.
         runs: Number of runs of each scenario; a later call may ask for more.
         rules: Rules of the paper, of its released code, or ours.
         sensors: Render cameras and lidar even if the agent does not need them.
         films: Number of films in the report: of the runs with the lowest scores.
-        propose: Find feasible scenarios in the logs and write them to the file, instead of testing an agent.
+        propose: Find feasible scenarios in the logs and write them to the file, and a picture of each beside
+            it, instead of testing an agent.
+        sees: Show the agent only its cameras, only its lidar, or both; by default all that it takes, and a
+            planner at http://HOST:PORT its cameras.
+        workers: Number of runs at a time. Each worker process opens the reconstructions.
+        ray: Drive on Ray: on the cluster at RAY_ADDRESS, or on a cluster that is started here.
     """
     check_out_folder(out)
     check_number("--runs", runs, low=1)
     check_number("--films", films, low=0)
+    check_number("--workers", workers, low=1)
     if not rebuilt:
         raise InputError("name at least one reconstruction (REBUILT)")
     for folder in rebuilt:
@@ -64,10 +78,12 @@ def ncap(
         from foredrive.view.table import print_table
 
     name = str(Path(agent).absolute()) if Path(agent).is_dir() else agent
-    source = SafetyTests(folders, str(scenarios.absolute()), rules, runs)
+    source = SafetyTests(
+        folders, str(scenarios.absolute()), rules, runs, spread=ray or workers > 1, sees=sees
+    )
     suite = DriveSuite(name, source, sensors, latency_s=RULES[rules].latency_s)
     with DrivesProgress(len(suite.jobs())) as progress:
-        driven = drive_suite(suite, out, tick=progress.tick)
+        driven = drive_suite(suite, out, workers, on_ray=ray, tick=progress.tick)
     check_driven(driven)
     table = safety_table(tested_runs(list(driven.drives.values())), source.tested().left_out)
     print_table(table, Console())
@@ -77,11 +93,14 @@ def ncap(
 def _propose(folders: tuple[str, ...], file: Path, rules: str, runs: int) -> None:
     """Write proposed scenarios and print their names."""
     with importing():
-        from foredrive.runs.drive.in_ncap import propose_scenarios
+        from foredrive.runs.drive.in_ncap import place_in, propose_scenarios
+        from foredrive.view.ncap_pictures import write_scenario_picture
 
     tested = propose_scenarios(folders, file, rules, runs)
+    scenes, pictures = {Path(folder).name: folder for folder in folders}, file.with_suffix("")
     for scenario in tested.passed:
+        write_scenario_picture(pictures / f"{scenario.label}.png", place_in(scenes[scenario.scene]), scenario)
         print(f"{scenario.label}: {scenario.length_s:g} s from key frame {scenario.start_frame}")
     for label, why in tested.left_out.items():
         print(f"left out, {label}: {why}")
-    print(f"{len(tested.passed)} scenarios: {file}")
+    print(f"{len(tested.passed)} scenarios: {file}; a picture of each: {pictures}")

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+import shapely
 from jaxtyping import Float, Float64
 from torch import Tensor
 
@@ -16,6 +17,8 @@ SPEED_OVER_S = 0.2
 """Speeds are averaged from this long before to this long after a time, s, because logged poses are noisy."""
 SPACING_M = 0.5
 """Distance between points of a route, m."""
+BEYOND_M = 100.0
+"""Length of the straight line that continues the logged path, m."""
 STEERS_FROM_MPS = 1.0
 """Below this speed, m/s, the steering angle cannot be derived from the motion and is set to 0."""
 
@@ -83,6 +86,21 @@ class LoggedDrive:
             if np.hypot(*(point - points[-1])[:2]) >= SPACING_M:
                 points.append(point)
         return np.stack(points)
+
+    @cached_property
+    def line(self) -> shapely.LineString:
+        """Return the logged path in the plane, m, world frame. Behind the log's end it goes straight on."""
+        xy, forward = self._poses[:, :2, 3], self._poses[-1, :2, 0]
+        return shapely.LineString(np.vstack([xy, xy[-1] + BEYOND_M * forward / np.linalg.norm(forward)]))
+
+    def path_ahead(self, T_world_ego: Float64[np.ndarray, "4 4"]) -> Float64[np.ndarray, "N 2"]:
+        """Return `line` from beside a vehicle on, in its ego frame, m, at steps of `SPACING_M`."""
+        from_m = self.line.project(shapely.Point(T_world_ego[:2, 3]))
+        at_m = np.arange(from_m, self.line.length, SPACING_M)
+        xy = shapely.get_coordinates(shapely.line_interpolate_point(self.line, at_m))
+        forward = T_world_ego[:2, 0] / np.linalg.norm(T_world_ego[:2, 0])
+        dx, dy = (xy - T_world_ego[:2, 3]).T
+        return np.stack([dx * forward[0] + dy * forward[1], dy * forward[0] - dx * forward[1]], axis=1)
 
     def on_ground(self, ego: BicycleState) -> Float64[np.ndarray, "4 4"]:
         """Return `T_world_ego` of a vehicle beside the logged path.

@@ -175,6 +175,11 @@ class RebuiltSimulator:
         return way_m
 
     @property
+    def tracks(self) -> ActorTracks:
+        """Return the tracks of the actors, those of a test included."""
+        return self._tracks
+
+    @property
     def scenario(self) -> RebuiltScenario:
         """Return the current scenario."""
         return self._scenario

@@ -4,7 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
 
@@ -30,7 +30,11 @@ from foredrive.simulation.town_expert import TownExpert
 CRUISE_MPS = 5.0
 EXPERT, STOP, CONSTANT_VELOCITY, EGO_MLP = "expert", "stop", "constant-velocity", "ego-mlp:"
 REPLAY = "log"
-"""The agent that repeats the logged drive (log replay); `in_rebuilt` makes it."""
+"""The agent that repeats the logged drive (log replay)."""
+CORRIDOR = "lidar-corridor"
+"""The agent that follows the logged path and stops if lidar sees something in its corridor."""
+OF_LOGS = (REPLAY, CORRIDOR)
+"""Agents that need the path of a log; `in_rebuilt` makes them, and another expert."""
 HTTP = "http://"
 """Beginning of the address of a planner behind neuro-ncap's model server protocol."""
 DISTURBED, STUDENT = "disturbed", "student:"
@@ -50,6 +54,26 @@ class AgentInputs:
     past_frames: int
     camera_names: tuple[str, ...] | None = None
     """Names of the required cameras; None: all cameras."""
+
+
+Sees = Literal["camera", "lidar", "both"]
+"""Sensors that an agent is shown."""
+
+
+def check_seeing(agent: str, sees: Sees | None) -> None:
+    """Check that an agent can drive with some sensors alone.
+
+    Raises:
+        InputError: it needs others, or has no use for those.
+    """
+    if sees is None or is_remote(agent):
+        return
+    inputs = inputs_of(agent)
+    if (inputs.cameras and sees == "lidar") or (agent == CORRIDOR and sees == "camera"):
+        needed = "cameras" if inputs.cameras else "lidar"
+        raise InputError(f"{agent} needs its {needed}, which --sees {sees} hides")
+    if (not inputs.cameras and sees == "camera") or not (inputs.cameras or inputs.lidar):
+        raise InputError(f"{agent} does not look at what --sees {sees} shows")
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,6 +96,7 @@ def inputs_of(agent: str) -> AgentInputs:
         agent: "expert", "stop", "constant-velocity", a run folder, or "ego-mlp:RUN": the MLP that sees only
             the ego status, fitted to the training data of the run. For DAgger demonstrations: "disturbed",
             the expert under disturbances, or "student:RUN", a run that drives in alternation with the expert.
+            "log" and "lidar-corridor" follow the path of a reconstructed log.
             "http://HOST:PORT" is a planner in another process (`HttpPlanner`).
 
     Raises:
@@ -80,8 +105,8 @@ def inputs_of(agent: str) -> AgentInputs:
     if agent.startswith(HTTP):
         read_address(agent)
         return AgentInputs(cameras=True, lidar=False, past_frames=1)
-    if agent in (EXPERT, STOP, CONSTANT_VELOCITY, DISTURBED):
-        return AgentInputs(cameras=False, lidar=False, past_frames=1)
+    if agent in (EXPERT, STOP, CONSTANT_VELOCITY, DISTURBED, *OF_LOGS):
+        return AgentInputs(cameras=False, lidar=agent == CORRIDOR, past_frames=1)
     clips = open_run(_run_folder(agent)).recipe.clips
     if abs(clips.frame_dt_s - FRAME_DT_S) > 1e-6:
         raise InputError(f"{agent}: trained on key frames {clips.frame_dt_s} s apart, not {FRAME_DT_S} s")
@@ -107,13 +132,17 @@ def check_rig_of(agent: str, rig: RigPlan) -> None:
 
 
 def _rigs_of(agent: str) -> TrainedRigs | None:
-    if agent in (EXPERT, STOP, CONSTANT_VELOCITY, DISTURBED) or agent.startswith((EGO_MLP, HTTP)):
+    if agent in (EXPERT, STOP, CONSTANT_VELOCITY, DISTURBED, *OF_LOGS) or agent.startswith((EGO_MLP, HTTP)):
         return None
     return read_rigs(_run_folder(agent))
 
 
 def make_agent(
-    agent: str, clock: Callable[[], float], town: TownSimulator | None = None, seed: int = 0
+    agent: str,
+    clock: Callable[[], float],
+    town: TownSimulator | None = None,
+    seed: int = 0,
+    sees: Sees | None = None,
 ) -> Agent:
     """Create the agent of one drive.
 
@@ -122,6 +151,7 @@ def make_agent(
         clock: returns the time of the drive, s.
         town: the town that the expert drives in; the other agents do not need it.
         seed: seed of the random disturbances and turns in a demonstration.
+        sees: what an agent in another process is sent; None: cameras.
 
     Raises:
         InputError: there is no such agent, or it needs the expert and there is no town.
@@ -132,8 +162,14 @@ def make_agent(
         return DisturbedExpert(_expert(town), clock, seed)
     if agent in (STOP, CONSTANT_VELOCITY):
         return StraightAgent(CRUISE_MPS if agent == CONSTANT_VELOCITY else 0.0)
+    if agent in OF_LOGS:
+        raise InputError(
+            f"the agent {agent} follows the path of a log and can drive only in a reconstruction"
+        )
     if agent.startswith(HTTP):
-        return HttpPlanner(read_address(agent), clock)
+        return HttpPlanner(
+            read_address(agent), clock, cameras=sees != "lidar", lidar=sees in ("lidar", "both")
+        )
     folder = _run_folder(agent)
     if agent.startswith((STUDENT, OLD_STUDENT)):
         return AlternatingStudent(_seeing(folder), _expert(town), clock, seed)
@@ -167,7 +203,7 @@ def _run_folder(agent: str) -> Path:
     if not folder.is_dir():
         known = (
             f"{EXPERT}, {STOP}, {CONSTANT_VELOCITY}, a run folder, {EGO_MLP}RUN, {HTTP}HOST:PORT, "
-            f"{DISTURBED} or {STUDENT}RUN, and in a reconstruction {REPLAY}"
+            f"{DISTURBED} or {STUDENT}RUN, and in a reconstruction {REPLAY} or {CORRIDOR}"
         )
         raise InputError(f"unknown agent {agent!r}; the agents are {known}")
     return folder

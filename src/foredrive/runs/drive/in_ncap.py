@@ -11,8 +11,15 @@ from foredrive.data.boxes import read_track_ids
 from foredrive.data.logs import Log
 from foredrive.errors import InputError
 from foredrive.rendering.renderer import RebuiltRenderer
-from foredrive.runs.drive.agents import is_remote
-from foredrive.runs.drive.in_rebuilt import agent_in, lanes_of, opened_rebuilt, past_frames_of, renders_for
+from foredrive.runs.drive.agents import Sees, check_seeing, is_remote
+from foredrive.runs.drive.in_rebuilt import (
+    agent_in,
+    check_lidar_of,
+    lanes_of,
+    opened_rebuilt,
+    past_frames_of,
+    renders_for,
+)
 from foredrive.runs.drive.suite import DriveJob, DriveSetup, DriveSuite
 from foredrive.runs.rebuild.rebuilt_run import open_run_log
 from foredrive.simulation.drive_log import drive_log, log_frame
@@ -22,7 +29,7 @@ from foredrive.simulation.ncap.rules import RULES, Rules
 from foredrive.simulation.ncap.running import Place, set_up_run
 from foredrive.simulation.ncap.scenario import SafetyScenario
 from foredrive.simulation.ncap.scenario_file import load_scenarios, save_scenarios
-from foredrive.simulation.ncap.self_test import SelfTest, self_test
+from foredrive.simulation.ncap.self_test import SelfTest, run_reference, self_test
 
 
 @dataclass(frozen=True)
@@ -36,14 +43,24 @@ class SafetyTests:
     rules: str = "ours"
     count: int = 10
     """Number of runs of each scenario."""
+    spread: bool = False
+    """Whether several processes drive. Each of them opens the scenes."""
+    sees: Sees | None = None
+    """What the agent is shown of what it takes; None: all."""
 
-    in_turn = True
     grows = ("count",)
+
+    @property
+    def in_turn(self) -> bool:
+        """Return whether drives run one after another in this process."""
+        return not self.spread
 
     def noted(self) -> Mapping[str, object]:
         """Return the fields, a hash of the scenarios, and their path as the routes."""
         told = repr(load_scenarios(Path(self.scenarios)))
+        shown = {} if self.sees is None else {"sees": self.sees}
         return {
+            **shown,
             "scenarios_sha256": hashlib.sha256(told.encode()).hexdigest(),
             "runs": list(self.runs),
             "scenarios": self.scenarios,
@@ -55,6 +72,7 @@ class SafetyTests:
     def jobs(self, agent: str) -> Sequence[DriveJob]:
         """Return the runs of all scenarios that pass the self-test."""
         past_frames_of(agent)
+        check_seeing(agent, self.sees)
         jobs = [
             DriveJob(f"{scenario.label}_rep{number}", scenario.label, number)
             for scenario in self.tested().passed
@@ -71,12 +89,14 @@ class SafetyTests:
     @contextlib.contextmanager
     def set_up(self, job: DriveJob, suite: DriveSuite, out: Path) -> Iterator[DriveSetup]:
         """Set up a run in the reconstructed scene."""
-        rules, tested = _rules(self.rules), self.tested()
-        scenario = next(each for each in tested.passed if each.label == job.route)
+        rules = _rules(self.rules)
+        scenario = next(each for each in load_scenarios(Path(self.scenarios)) if each.label == job.route)
         folder = _folders(self.runs)[scenario.scene]
         sensors = renders_for(suite)
+        place = place_in(folder)
+        check_lidar_of(suite.agent, self.sees, place.vehicle, folder)
         run = set_up_run(
-            _place(folder),
+            place,
             scenario,
             job.repetition,
             rules,
@@ -86,12 +106,12 @@ class SafetyTests:
         simulator, start = run.simulator, run.scenario
         rig = simulator.renderer.rig if sensors else None
         route_xyz = simulator.drive.route_from(start.start_s)
-        reference = tested.reference_mps[scenario.label][job.repetition]
+        reference = run_reference(place, scenario, job.repetition, rules)
         with drive_log(out, job.name, route_xyz, rig) as log:
             yield DriveSetup(
                 simulator,
                 start,
-                agent_in(suite.agent, simulator),
+                agent_in(suite.agent, simulator, self.sees),
                 route_xyz,
                 simulator.way_m(start),
                 log,
@@ -114,10 +134,10 @@ def propose_scenarios(runs: Sequence[str], file: Path, rules: str, count: int) -
     if file.exists():
         raise InputError(f"{file}: exists already; proposed scenarios are written to a new file")
     places = _by_name(runs)
-    found = [each for scene, run in places.items() for each in propose(_place(run), scene)]
+    found = [each for scene, run in places.items() for each in propose(place_in(run), scene)]
     if not found:
         raise InputError("no scenario is feasible in these logs: they are too short, too slow or too full")
-    tested = self_test(found, lambda scenario: _place(places[scenario.scene]), count, _rules(rules))
+    tested = self_test(found, lambda scenario: place_in(places[scenario.scene]), count, _rules(rules))
     if not tested.passed:
         raise InputError(f"no scenario passes the self-test: {tested.told}")
     save_scenarios(tested.passed, file)
@@ -170,13 +190,14 @@ def _tested(source: SafetyTests) -> SelfTest:
             raise InputError(
                 f"its scene {scenario.scene!r} names no reconstruction, or several ({', '.join(folders)})"
             )
-        return _place(folders[scenario.scene])
+        return place_in(folders[scenario.scene])
 
     return self_test(load_scenarios(Path(source.scenarios)), place_of, source.count, rules)
 
 
 @functools.lru_cache(maxsize=1)  # consecutive runs share one scene
-def _place(folder: str) -> Place:
+def place_in(folder: str) -> Place:
+    """Return a reconstruction as a place of tests."""
     opened = opened_rebuilt(folder)
     ids = {str(track_id): track_id for track_id in opened.scene.graph.tracks.track_id.tolist()}
     with contextlib.suppress(InputError):  # without its log, actors are known by their numbers alone

@@ -7,12 +7,15 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import torch
+
 from foredrive.data.logs import Log
 from foredrive.data.maps import read_lane_outlines
 from foredrive.errors import InputError
 from foredrive.rendering.edits import Edit, load_edits
 from foredrive.rendering.renderer import RebuiltRenderer
-from foredrive.runs.drive.agents import REPLAY, inputs_of, make_agent
+from foredrive.rendering.vehicle import LoggedVehicle
+from foredrive.runs.drive.agents import CORRIDOR, EXPERT, REPLAY, Sees, inputs_of, is_remote, make_agent
 from foredrive.runs.drive.suite import DriveJob, DriveSetup, DriveSuite
 from foredrive.runs.rebuild.rebuilt_run import (
     OpenedReconstruction,
@@ -22,12 +25,14 @@ from foredrive.runs.rebuild.rebuilt_run import (
     open_run_log,
 )
 from foredrive.scene import Agent, Clip, Trajectory
+from foredrive.simulation.corridor_agent import CorridorAgent
 from foredrive.simulation.drive_log import drive_log, log_frame
 from foredrive.simulation.logged_drive import LoggedDrive
 from foredrive.simulation.logged_lanes import LoggedLanes
 from foredrive.simulation.ncap.outcome import judge
 from foredrive.simulation.observation import FRAME_DT_S
 from foredrive.simulation.rebuilt import RebuiltScenario, RebuiltSimulator
+from foredrive.simulation.replay_expert import ReplayExpert
 from foredrive.simulation.route_progress import RouteLine
 from foredrive.simulation.simple_agents import ReplayAgent
 from foredrive.simulation.threats import Threat, reference_mps, send_threat
@@ -111,10 +116,8 @@ def opened_rebuilt(run: str) -> OpenedReconstruction:
 
 def renders_for(suite: DriveSuite) -> bool:
     """Return whether cameras and lidar are rendered: if they are asked for, or the agent is a learned one."""
-    if suite.sensors or suite.agent == REPLAY:
-        return suite.sensors
     inputs = inputs_of(suite.agent)
-    return inputs.cameras or inputs.lidar
+    return suite.sensors or inputs.cameras or inputs.lidar
 
 
 def _edits_of(file: str | None) -> list[Edit]:
@@ -123,7 +126,7 @@ def _edits_of(file: str | None) -> list[Edit]:
 
 def past_frames_of(agent: str) -> int:
     """Return the number of key frames before now that an agent observes."""
-    return 1 if agent == REPLAY else inputs_of(agent).past_frames
+    return inputs_of(agent).past_frames
 
 
 def lanes_of(folder: Path) -> LoggedLanes | None:
@@ -133,6 +136,40 @@ def lanes_of(folder: Path) -> LoggedLanes | None:
     except InputError:
         return None
     return None if outlines is None else LoggedLanes(outlines)
+
+
+def check_lidar_of(agent: str, sees: Sees | None, vehicle: LoggedVehicle, folder: str) -> None:
+    """Check that a reconstruction has the lidar that an agent cannot drive without.
+
+    Raises:
+        InputError: it has not.
+    """
+    if vehicle.lidar is None and (agent == CORRIDOR or sees in ("lidar", "both")):
+        raise InputError(f"{folder}: the reconstruction has no lidar, which {agent} is to see")
+
+
+@dataclass(frozen=True, eq=False)
+class _BlindedAgent:
+    """An agent that is shown its cameras alone, or its lidar alone."""
+
+    agent: Agent
+    cameras: bool
+
+    def act(self, observation: Clip) -> Trajectory:
+        """Hide the other sensors and return the agent's plan."""
+        if self.cameras:
+            hidden = dataclasses.replace(
+                observation,
+                sweep_valid=torch.zeros_like(observation.sweep_valid),
+                sweeps=observation.sweeps.map_tensors(torch.zeros_like),
+            )
+        else:
+            hidden = dataclasses.replace(
+                observation,
+                image_valid=torch.zeros_like(observation.image_valid),
+                images=torch.zeros_like(observation.images),
+            )
+        return self.agent.act(hidden)
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,11 +184,24 @@ class _SelectedCameras:
         return self.agent.act(observation.through(self.cameras))
 
 
-def agent_in(name: str, simulator: RebuiltSimulator) -> Agent:
-    """Return the agent of a name, which sees only the cameras that it was trained on."""
+def agent_in(name: str, simulator: RebuiltSimulator, sees: Sees | None = None) -> Agent:
+    """Return the agent of a name, which sees only the cameras that it was trained on.
+
+    Args:
+        sees: what it is shown; None: all that it takes.
+    """
+    agent = _agent_in(name, simulator, sees)
+    return agent if sees in (None, "both") or is_remote(name) else _BlindedAgent(agent, sees == "camera")
+
+
+def _agent_in(name: str, simulator: RebuiltSimulator, sees: Sees | None) -> Agent:
     if name == REPLAY:
         return ReplayAgent(simulator.drive, lambda: simulator.scenario.start_s + simulator.state.t_s)
-    agent = make_agent(name, lambda: simulator.state.t_s)
+    if name == EXPERT:
+        return ReplayExpert(simulator.drive)
+    if name == CORRIDOR:
+        return CorridorAgent(simulator.drive)
+    agent = make_agent(name, lambda: simulator.state.t_s, sees=sees)
     there = [camera.lower() for camera in simulator.renderer.rig.names]
     wanted = [camera.lower() for camera in inputs_of(name).camera_names or there]
     return _SelectedCameras(agent, camera_indices(there, wanted)) if wanted != there else agent

@@ -26,8 +26,6 @@ from foredrive.simulation.plans import waypoints_of
 from foredrive.simulation.rebuilt import RebuiltScenario, RebuiltSimulator
 from foredrive.simulation.simple_agents import plan_of
 
-BEYOND_M = 100.0
-"""Length of the straight line that continues the logged path, m."""
 REFERENCE_S = 4.0
 """Time after the first key frame at which the paper takes the speeds, s."""
 
@@ -150,17 +148,12 @@ class ConstantSpeedAgent:
     def act(self, observation: Clip) -> Trajectory:
         """Return points on the path ahead, for a batch of one. Behind the log's end the path is straight."""
         T_world_ego = observation.T_world_ego[0, -1].numpy()
-        line = self._line()
+        line = self.drive.line
         from_m = line.project(shapely.Point(T_world_ego[:2, 3]))
         ahead_m = self.speed_mps * FRAME_DT_S * np.arange(1, HORIZON_STEPS + 1)
         xy = np.array([line.interpolate(from_m + way).coords[0] for way in ahead_m])
         local = (xy - T_world_ego[:2, 3]) @ T_world_ego[:2, :2]
         return plan_of(torch.from_numpy(local).float()[None, None])
-
-    def _line(self) -> shapely.LineString:
-        xy = np.stack([self.drive.pose_at(t_s)[:2, 3] for t_s in self.drive.vehicle.t_s.tolist()])
-        forward = self.drive.pose_at(self.drive.end_s)[:2, 0]
-        return shapely.LineString(np.vstack([xy, xy[-1] + BEYOND_M * forward / np.linalg.norm(forward)]))
 
 
 def drive_without_action(place: Place, scenario: SafetyScenario, number: int, rules: Rules) -> float | None:

@@ -25,8 +25,6 @@ class SelfTest:
     """Result of the self-test."""
 
     passed: tuple[SafetyScenario, ...]
-    reference_mps: Mapping[str, tuple[float, ...]]
-    """Reference speed of each run of each scenario that passed, by its label, m/s."""
     left_out: Mapping[str, str]
     """Reason for each scenario that is left out, by its label."""
 
@@ -47,20 +45,20 @@ def self_test(
     Args:
         place_of: returns the rebuilt log of a scenario; raises InputError if there is none.
     """
-    passed, references, left_out = list[SafetyScenario](), dict[str, tuple[float, ...]](), dict[str, str]()
+    passed, left_out = list[SafetyScenario](), dict[str, str]()
     for scenario in scenarios:
         try:
             place = place_of(scenario)
-            of_runs = tuple(_reference(place, scenario, number, rules) for number in range(count))
+            for number in range(count):
+                run_reference(place, scenario, number, rules)
         except InputError as error:
             left_out[scenario.label] = str(error).removeprefix(f"{scenario.label}: ")
             continue
         passed.append(scenario)
-        references[scenario.label] = of_runs
-    return SelfTest(tuple(passed), references, left_out)
+    return SelfTest(tuple(passed), left_out)
 
 
-def _reference(place: Place, scenario: SafetyScenario, number: int, rules: Rules) -> float:
+def run_reference(place: Place, scenario: SafetyScenario, number: int, rules: Rules) -> float:
     """Return the reference speed of a run, m/s.
 
     Raises:

@@ -1,0 +1,80 @@
+"""Whether a test in a rebuilt world predicts the real one: `foredrive bench ncap-transfer`, hours.
+
+The same safety tests are driven in a town and in the rebuild of a recorded drive there. Actors and traffic
+replay in both, so that they differ in what the sensors show alone. Each agent that looks at its sensors
+drives each test once in each world. `collision_agreement` is the share of the pairs in which both or neither
+end in a collision, and `score_correlation` is that of the scores (Pearson). The arms AGENT_KIND tell where it
+breaks.
+
+Pairs are kept in runs/ncap_transfer, so that an interrupted arm goes on with the next pair.
+"""
+
+import dataclasses
+import functools
+from pathlib import Path
+
+from benchmarks.common.rebuilt_towns import TownDrive
+from benchmarks.common.safety_pairs import Pair, PairedTests, agreement
+from benchmarks.common.safety_suites import SuiteSize, chosen_scenarios, rebuilt_town, safety_drive
+from foredrive.evaluation.bench import Benchmark, study_identity
+from foredrive.recipes.rebuilding import gaussians_tiny
+from foredrive.simulation.ncap.scenario_file import load_scenarios
+from foredrive.simulation.threats import Threat
+
+DRIVES = tuple(safety_drive(town, seed) for town, seed in (("Town10HD", 3), ("Town03", 4), ("Town05", 5)))
+SIZE = SuiteSize(gaussians_tiny(), starts=4, runs=3)
+"""3 towns x 3 kinds x 4 starts x 3 runs: 108 pairs of each agent, if all kinds are feasible four times."""
+AGENTS = {"nemo_cameras": "embedded:nemo_town", "corridor_lidar": "lidar-corridor"}
+CONFIG = {
+    "drives": [dataclasses.asdict(drive) for drive in DRIVES],
+    "size": dataclasses.asdict(SIZE),
+    "agents": AGENTS,
+}
+DECIDED_BY = (
+    "benchmarks.common.safety_pairs",
+    "benchmarks.common.safety_suites",
+    "foredrive.rendering",
+    "foredrive.simulation.collisions",
+    "foredrive.simulation.controller",
+    "foredrive.simulation.dynamics",
+    "foredrive.simulation.ncap",
+    "foredrive.simulation.rebuilt",
+    "foredrive.simulation.town_replay",
+    "foredrive.training.gaussian_training",
+    "foredrive.training.rebuilding",
+)
+WORK = Path("runs/ncap_transfer") / study_identity(CONFIG, DECIDED_BY)
+
+
+@functools.lru_cache(maxsize=1)
+def tests_in(drive: TownDrive) -> PairedTests:
+    """Return the paired tests of one town; the next town replaces it."""
+    return PairedTests(drive, rebuilt_town(drive, SIZE, WORK))
+
+
+def pairs_of(agent: str) -> list[Pair]:
+    """Return the pairs of an agent in all towns; drive those that are missing."""
+    pairs = []
+    for drive in DRIVES:
+        for scenario in load_scenarios(chosen_scenarios(rebuilt_town(drive, SIZE, WORK), SIZE)):
+            for number in range(SIZE.runs):
+                file = WORK / agent / drive.town / f"{scenario.label}_rep{number}.json"
+                pairs.append(tests_in(drive).pair(AGENTS[agent], scenario, number, file))
+    return pairs
+
+
+def transfer(agents: tuple[str, ...], kind: Threat | None, _: int) -> dict[str, float]:
+    """Return the agreement of the pairs of some agents, of one kind or of all."""
+    pairs = [pair for agent in agents for pair in pairs_of(agent)]
+    return agreement([pair for pair in pairs if kind is None or pair.kind == kind.value])
+
+
+BENCHMARK = Benchmark(
+    question="Does a safety test in a rebuilt world predict the same test in the real one?",
+    arms={agent: functools.partial(transfer, (agent,), None) for agent in AGENTS}
+    | {f"{agent}_{kind}": functools.partial(transfer, (agent,), kind) for agent in AGENTS for kind in Threat}
+    | {"all": functools.partial(transfer, tuple(AGENTS), None)},
+    seeds=(0,),
+    config=CONFIG,
+    decided_by=DECIDED_BY,
+)
