@@ -18,11 +18,11 @@ from benchmarks.common.study import pandaset_log
 from benchmarks.rebuild_pandaset import FIGURES
 from benchmarks.rebuild_town import DRIVE, judged_town
 from foredrive.evaluation.bench import Benchmark, study_identity
-from foredrive.recipes.rebuilding import RebuildRecipe, gaussians_tiny, rescheduled_recipe
+from foredrive.recipes.rebuilding import RebuildRecipe, field_tiny, gaussians_tiny, rescheduled_recipe
 from foredrive.runs.rebuild.reconstruct import reconstruct
 
 ROOT = Path("runs/rebuild_compare")
-RECIPES: dict[str, RebuildRecipe[Any]] = {"gaussians": gaussians_tiny()}
+RECIPES: dict[str, RebuildRecipe[Any]] = {"gaussians": gaussians_tiny(), "field": field_tiny()}
 """The smallest recipe of each representation, by the name of its arm."""
 LENGTHS = {"eighth": 1 / 8, "third": 1 / 3, "whole": 1.0}
 """Shares of a recipe's steps."""
@@ -34,14 +34,21 @@ DECIDED_BY = (
     "benchmarks.common.rebuilt_towns",
     "foredrive.evaluation.rendering",
     "foredrive.geometry",
+    "foredrive.losses.field",
     "foredrive.losses.rendering",
     "foredrive.metrics.images",
     "foredrive.metrics.lidar_rendering",
+    "foredrive.ops.hash_grid",
+    "foredrive.ops.hash_grid_kernels",
+    "foredrive.ops.ray_box_kernels",
+    "foredrive.ops.ray_boxes",
     "foredrive.ops.splatting",
     "foredrive.ops.splatting_back_kernels",
     "foredrive.ops.splatting_kernels",
+    "foredrive.recipes.field",
     "foredrive.recipes.gaussians",
     "foredrive.rendering",
+    "foredrive.training.field_training",
     "foredrive.training.gaussian_steps",
     "foredrive.training.gaussian_training",
     "foredrive.training.rebuilding",

@@ -86,6 +86,8 @@ def tiny_field() -> FieldRecipe:
             patch=32,
             beams=1024,
             sweeps=2,
+            poses_every=4,
+            proposals_every=2,
             weights=FieldWeights(hit=0.05),
             rates=FieldRates(
                 grids=Rate(1e-2, warmup_steps=100),

@@ -82,10 +82,14 @@ class FieldSchedule:
     """Samples within this distance of a return count as surface, for carving."""
     hit_m: float = 0.5
     """Distance from a return that counts as near, for `FieldWeights.hit`."""
-    free_m: float = 150.0
-    """Beams that did not return are free up to this distance."""
+    free_m: float | None = None
+    """Beams that did not return are free up to this distance; None: up to the lidar's reach."""
     depth_quantile: float = 0.95
     """Share of the depth errors that count. The worst hit something thin or moving."""
+    poses_every: int = 1
+    """Steps between those that learn poses of actors and cameras: without them a step is cheaper."""
+    proposals_every: int = 1
+    """Steps between those that learn proposals."""
     mirror_share: float = 0.5
     """Probability that a left-right symmetric actor is mirrored in a step."""
     checkpoint_every: int = 500
@@ -138,19 +142,23 @@ class FieldTraining:
         }
         for rate in dataclasses.fields(self.schedule.rates):
             parameters = found.get(rate.name) or [getattr(scene, rate.name)]
-            groups.append(ParameterGroup(rate.name, parameters, getattr(self.schedule.rates, rate.name)))
+            # Fused, the moments of a CNN in channels-last order would be read in another order.
+            fused, its_rate = rate.name == "grids", getattr(self.schedule.rates, rate.name)
+            groups.append(ParameterGroup(rate.name, parameters, its_rate, fused=fused))
         return groups
 
     def losses(self, step: int, generator: torch.Generator) -> StepLosses:
         """Return the losses of patches and beams, rendered together, some actors mirrored."""
         schedule, scene = self.schedule, self.scene
+        propose = step % schedule.proposals_every == 0
         drawn = torch.rand(len(scene.track_id), generator=generator) < schedule.mirror_share
-        mirror = drawn.to(scene.device) & scene.tracks.mirrored
-        patches = self._patches(generator)
+        with torch.set_grad_enabled(step % schedule.poses_every == 0):
+            graph, patches = scene.graph, self._patches(generator)
+        mirror = drawn.to(scene.device) & graph.tracks.mirrored
         beams = self._some_beams(generator)
         rays = [patch.rays for patch in patches] + [beam.rays for beam in beams]
         joined = FieldRays(*(torch.cat(tensors).to(scene.device) for tensors in zip(*rays, strict=True)))
-        seen = scene.look(scene.graph, joined, mirror, generator)
+        seen = scene.look(graph, joined, mirror, generator, propose)
         losses: dict[str, Tensor] = {}
         first = 0
         if patches:
@@ -158,18 +166,8 @@ class FieldTraining:
             losses["rgb"] = self._rgb(patches, seen.feature[:first])
         if beams:
             losses |= self._beam_losses(beams, seen, first)
-        losses["interlevel"] = torch.stack(
-            [
-                interlevel_loss(
-                    seen.intervals.border,
-                    seen.intervals.weight,
-                    proposal.border,
-                    proposal.weight,
-                    PULSES[min(i, len(PULSES) - 1)],
-                )
-                for i, proposal in enumerate(seen.proposals)
-            ]
-        ).sum()
+        if propose:
+            losses["interlevel"] = _interlevel(seen)
         losses["distortion"] = distortion_loss(seen.intervals.border[:, :-1], seen.intervals.weight[:, :-1])
         losses["loss"] = torch.stack([self._weight(name) * loss for name, loss in losses.items()]).sum()
         if patches:
@@ -251,10 +249,8 @@ class FieldTraining:
         losses = {"intensity": intensity_loss(intensity, real_intensity, returned)}
         if all(part.misses_known for part in beams):
             losses["drop"] = drop_loss(drop_logit, returned)
-        for prefix, intervals in (
-            ("", seen.intervals),
-            *(("proposal_", proposal) for proposal in seen.proposals),
-        ):
+        proposals = [("proposal_", proposal) for proposal in seen.proposals if proposal.weight.requires_grad]
+        for prefix, intervals in (("", seen.intervals), *proposals):
             found = self._distance_losses(intervals, first, range_m, returned, quantile=not prefix)
             for name, loss in found.items():
                 losses[prefix + name] = losses.get(prefix + name, 0) + loss
@@ -272,7 +268,7 @@ class FieldTraining:
         schedule = self.schedule
         border_m, weight = intervals.border_m[first:, :-1], intervals.weight[first:, :-1]
         middle_m = intervals.middle_m[first:, :-1]
-        free_m = schedule.free_m
+        free_m = self.scene.reach_m if schedule.free_m is None else schedule.free_m
         losses = {
             "depth": beam_depth_loss(
                 (weight * middle_m).sum(-1),
@@ -287,6 +283,17 @@ class FieldTraining:
         if schedule.weights.hit:
             losses["hit"] = hit_loss(border_m, weight, range_m, returned, schedule.hit_m)
         return losses
+
+
+def _interlevel(seen: SeenAlongRays) -> Float[Tensor, ""]:
+    """Return the sum of the interlevel losses of all proposals."""
+    own = seen.intervals.border, seen.intervals.weight
+    pulses = (*PULSES[:1], *PULSES[1:] * len(seen.proposals))
+    losses = [
+        interlevel_loss(*own, proposal.border, proposal.weight, pulse)
+        for proposal, pulse in zip(seen.proposals, pulses, strict=False)
+    ]
+    return torch.stack(losses).sum()
 
 
 @dataclass(frozen=True)

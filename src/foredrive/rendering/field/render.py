@@ -80,7 +80,11 @@ class NeuralField(nn.Module):
         self.proposals = nn.ModuleList(ProposalDensity(grids, config, actors) for grids in config.proposals)
 
     def forward(
-        self, rays: FieldRays, actors: FieldActors, generator: torch.Generator | None = None
+        self,
+        rays: FieldRays,
+        actors: FieldActors,
+        generator: torch.Generator | None = None,
+        learn_proposals: bool = True,
     ) -> SeenAlongRays:
         """Render rays.
 
@@ -88,6 +92,7 @@ class NeuralField(nn.Module):
             rays: in the scene's frame.
             actors: the actors of the scene.
             generator: for the random places of samples in training; None takes their middles.
+            learn_proposals: whether the proposals' weights get gradients.
         """
         config = self.config
         crossings = self._crossings(rays, actors)
@@ -96,8 +101,9 @@ class NeuralField(nn.Module):
         for i, proposal in enumerate(self.proposals):
             border_m = to_distance(border, config.spacing_m, config.sky_m)
             points, footprint, moving = self._samples(rays, border_m, crossings, actors, learn_poses=False)
-            opacity = proposal(points, footprint, moving, border_m.diff(dim=-1))
-            weight = composite(opacity, opacity.detach()).weights
+            with torch.set_grad_enabled(learn_proposals and torch.is_grad_enabled()):
+                opacity = proposal(points, footprint, moving, border_m.diff(dim=-1))
+                weight = composite(opacity, opacity.detach()).weights
             proposals.append(Intervals(border, border_m, weight))
             last = i + 1 == len(self.proposals)
             count = config.samples if last else config.proposal_samples[i + 1]

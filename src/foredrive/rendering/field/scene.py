@@ -108,6 +108,7 @@ class FieldScene(RebuiltScene):
         rays: FieldRays,
         mirror: Bool[Tensor, "A"] | None = None,
         generator: torch.Generator | None = None,
+        learn_proposals: bool = True,
     ) -> SeenAlongRays:
         """Render features along rays.
 
@@ -116,9 +117,10 @@ class FieldScene(RebuiltScene):
             rays: in the scene's frame.
             mirror: actors whose left and right sides are swapped; None: none.
             generator: for the random places of samples in training.
+            learn_proposals: whether the proposals' weights get gradients.
         """
         actors = FieldActors(graph.tracks, field_of(graph).slot, mirror)
-        seen: SeenAlongRays = self.field(rays, actors, generator)
+        seen: SeenAlongRays = self.field(rays, actors, generator, learn_proposals)
         return seen
 
     def rays_of_pixels(
