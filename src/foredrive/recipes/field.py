@@ -125,4 +125,4 @@ def tiny_field() -> FieldRecipe:
 
 def base_field() -> FieldRecipe:
     """Return NeuRAD in the sizes of its reference implementation."""
-    return FieldRecipe(schedule=FieldSchedule(steps=20_001))
+    return FieldRecipe(schedule=FieldSchedule(steps=20_001, free_m=150.0))

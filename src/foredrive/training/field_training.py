@@ -23,6 +23,7 @@ from foredrive.rendering.field.rays import FieldRays
 from foredrive.rendering.field.render import Intervals, SeenAlongRays
 from foredrive.rendering.field.scene import FieldScene, tables_of
 from foredrive.training.learning_rates import Rate
+from foredrive.training.ranges import check_at_least, check_shares
 from foredrive.training.rebuilding import ParameterGroup, SensorViews, StepLosses
 
 PULSES = (0.03, 0.003)
@@ -96,11 +97,12 @@ class FieldSchedule:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        """Check that a step looks at something."""
-        if min(self.patches, self.beams, self.sweeps) < 0 or self.patch < 1:
-            raise ValueError("patches, beams and sweeps cannot be negative, and patch must be 1 or more")
+        """Check the numbers' ranges, and that a step looks at something."""
+        check_at_least(self, steps=0, patches=0, beams=0, sweeps=0, patch=1, margin_m=0, hit_m=0, free_m=0)
+        check_at_least(self, poses_every=1, proposals_every=1, checkpoint_every=1)
+        check_shares(self, "depth_quantile", "mirror_share")
         if not self.patches and not (self.beams and self.sweeps):
-            raise ValueError("a step needs patches, or beams of sweeps")
+            raise InputError("a step needs patches, or beams of sweeps")
 
 
 class FieldTraining:

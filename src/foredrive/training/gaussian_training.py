@@ -24,6 +24,7 @@ from foredrive.rendering.views import SweepView
 from foredrive.scene import LidarSweep
 from foredrive.training.gaussian_rates import LearningRates
 from foredrive.training.gaussian_steps import grow, relocate
+from foredrive.training.ranges import check_at_least, check_shares
 from foredrive.training.rebuilding import ParameterGroup, SensorViews, StepLosses, ViewOrder
 
 
@@ -74,6 +75,13 @@ class GaussianSchedule:
     """"published": those of SplatAD's reference implementation, see `published_lidar_losses`."""
     checkpoint_every: int = 500
     seed: int = 0
+
+    def __post_init__(self) -> None:
+        """Check the numbers' ranges."""
+        check_at_least(self, steps=0, max_gaussians=1, images_per_sweep=1, beam_stride=1, shrink_steps=0)
+        check_at_least(self, grow_from=0, grow_until=0, grow_every=1, growth=0, walk=0, before_hit_m=0)
+        check_at_least(self, checkpoint_every=1)
+        check_shares(self, "mirror_share")
 
     def shrink_at(self, step: int) -> int:
         """Return the factor by which images are shrunk at a step."""

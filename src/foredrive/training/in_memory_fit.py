@@ -8,6 +8,7 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from foredrive.training.parameter_groups import parameter_groups
+from foredrive.training.ranges import check_at_least
 
 
 @dataclass(frozen=True)
@@ -18,6 +19,10 @@ class FitSchedule:
     batch_size: int
     lr: float
     weight_decay: float
+
+    def __post_init__(self) -> None:
+        """Check the numbers' ranges."""
+        check_at_least(self, steps=0, batch_size=1, lr=0, weight_decay=0)
 
 
 def fit_in_memory(

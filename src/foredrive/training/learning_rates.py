@@ -3,6 +3,8 @@
 import math
 from dataclasses import dataclass
 
+from foredrive.training.ranges import check_at_least
+
 
 @dataclass(frozen=True)
 class Rate:
@@ -15,6 +17,10 @@ class Rate:
     warmup_steps: int = 0
     until_step: int | None = None
     """Step of the final rate, which stays until the end; None: the last step of the training."""
+
+    def __post_init__(self) -> None:
+        """Check the numbers' ranges."""
+        check_at_least(self, first=0, final=0, warmup_steps=0, until_step=0)
 
     def at(self, step: int, steps: int) -> float:
         """Return the rate at a step of a training of `steps` steps."""

@@ -21,6 +21,7 @@ from foredrive.training.checkpoints import latest_checkpoint, load_checkpoint, s
 from foredrive.training.interrupts import end_with_parent, hold_interrupts, start_fork_server
 from foredrive.training.one_cycle import OneCycle
 from foredrive.training.parameter_groups import parameter_groups
+from foredrive.training.ranges import check_at_least
 
 if TYPE_CHECKING:  # slow to import, and not needed to read schedules and metrics
     from lightning_fabric import Fabric
@@ -68,6 +69,11 @@ class Schedule:
     workers: int = 0
     seed: int = 0
     one_cycle: OneCycle | None = None
+
+    def __post_init__(self) -> None:
+        """Check the numbers' ranges. No steps are allowed: then nothing is trained."""
+        check_at_least(self, batch_size=1, lr=0, steps=0, epochs=0, weight_decay=0, warmup_steps=0)
+        check_at_least(self, final_lr_fraction=0, clip_grad_norm=0, checkpoint_every=1, workers=0)
 
     def total_steps(self, items: int, processes: int = 1) -> int:
         """Return the number of steps over a data set of `items` that several processes share."""

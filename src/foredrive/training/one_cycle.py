@@ -3,6 +3,8 @@
 import math
 from dataclasses import dataclass
 
+from foredrive.training.ranges import check_at_least, check_shares
+
 
 @dataclass(frozen=True)
 class OneCycle:
@@ -18,6 +20,11 @@ class OneCycle:
     final_div: float = 1e4
     betas: tuple[float, float] = (0.85, 0.95)
     """Adam's first beta at the maximum of the learning rate, and at both ends."""
+
+    def __post_init__(self) -> None:
+        """Check the numbers' ranges."""
+        check_shares(self, "rise_share")
+        check_at_least(self, initial_div=1, final_div=1, betas=0)
 
     def at(self, step: int, total: int) -> tuple[float, float]:
         """Return the share of the maximum learning rate, and Adam's first beta, at step (from 0) of total."""

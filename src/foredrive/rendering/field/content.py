@@ -1,28 +1,47 @@
-"""What a field knows of a scene graph's actors: where each one is found in the grid of actors."""
+"""What a field knows of a scene graph's actors: the field of each one, and its place in that field's grid."""
 
+import copy
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Int
 from torch import Tensor
 
 from foredrive.errors import InputError
+from foredrive.rendering.field.decoders import BeamDecoder, PatchDecoder
+from foredrive.rendering.field.render import NeuralField
 from foredrive.rendering.gaussians.content import GaussianContent
 from foredrive.rendering.gaussians.gaussians import Gaussians
 from foredrive.rendering.scene_graph import Content, SceneGraph
 from foredrive.scene.record import Record
 
 
+class FieldParts(NamedTuple):
+    """A field and the decoders that alone can read its features."""
+
+    network: NeuralField
+    camera: PatchDecoder
+    lidar: BeamDecoder
+
+    def same_as(self, other: "FieldParts") -> bool:
+        """Return whether both have the same actors: one field, or one that was opened twice."""
+        own, others = (parts.network.grids.actors.table for parts in (self, other))
+        return own is others or (own.shape == others.shape and torch.equal(own, others.to(own)))
+
+
 @dataclass(frozen=True)
 class FieldContent(Record):
-    """The static part and A actors of a field: a `Content`. Edits change places in the grid alone."""
+    """The static part and A actors of a field: a `Content`. Edits change places in grids alone."""
 
     slot: Int[Tensor, "A"]
-    """Place of each actor in the grid of actors. A copy has the place of its original."""
+    """Place of each actor in the grid of actors of its field. A copy has the place of its original."""
+    owner: Int[Tensor, "A"]
+    """Index in `fields` of the field that each actor is a part of."""
     shown: GaussianContent
     """Coloured lidar points of the static part and of the actors, for viewers."""
-    table: Float[Tensor, "R F"]
-    """Table of the grid of actors. Actors of another table cannot be read."""
+    fields: tuple[FieldParts, ...]
+    """The scene's own field, and those of other runs whose actors are inserted."""
 
     @property
     def device(self) -> torch.device:
@@ -40,20 +59,35 @@ class FieldContent(Record):
     def without(self, row: int) -> "FieldContent":
         """Return the content without an actor."""
         others = torch.arange(len(self.slot), device=self.device) != row
-        return FieldContent(self.slot[others], self.shown.without(row), self.table)
+        return FieldContent(self.slot[others], self.owner[others], self.shown.without(row), self.fields)
 
     def with_copy(self, source: Content, source_row: int, row: int) -> "FieldContent":
         """Return the content with one more actor in `row`, which looks like one of `source`.
 
+        An actor of another field stays a part of it: both fields are then rendered, each with its decoders.
+
         Raises:
-            InputError: `source` is no field, or another field: its features have another meaning.
+            InputError: `source` is no field.
         """
         if not isinstance(source, FieldContent):
             raise InputError("an actor that is not part of a field does not fit into a field")
-        if source.table.shape != self.table.shape or not torch.equal(source.table.to(self.table), self.table):
-            raise InputError("an actor of another field does not fit: only this field's decoder can read it")
-        slot = torch.cat([self.slot, source.slot[source_row : source_row + 1].to(self.slot)])
-        return FieldContent(slot, self.shown.with_copy(source.shown, source_row, row), self.table)
+        lender, fields = source.fields[int(source.owner[source_row])], self.fields
+        known = [place for place, parts in enumerate(fields) if parts.same_as(lender)]
+        if not known:
+            fields, known = (*fields, _on(lender, self.device)), [len(fields)]
+        return FieldContent(
+            slot=torch.cat([self.slot, source.slot[source_row : source_row + 1].to(self.slot)]),
+            owner=torch.cat([self.owner, self.owner.new_tensor(known[:1])]),
+            shown=self.shown.with_copy(source.shown, source_row, row),
+            fields=fields,
+        )
+
+
+def _on(parts: FieldParts, device: torch.device) -> FieldParts:
+    """Return a field on a device; one that is elsewhere is copied, because modules move in place."""
+    if parts.network.middle_m.device == device:
+        return parts
+    return FieldParts(*(copy.deepcopy(module).to(device) for module in parts))
 
 
 def field_of(graph: SceneGraph) -> FieldContent:

@@ -85,10 +85,13 @@ class Grids(nn.Module):
         standing = self.static(*contract(points_m, footprint_m, self.scale_m), None)
         if moving is None or len(moving.sample) == 0:
             return standing
+        return standing.index_copy(1, moving.sample, self.of_actors(moving))
+
+    def of_actors(self, moving: ActorSamples) -> Float[Tensor, "C M"]:
+        """Return the features at samples in boxes; those that actors do not have are 0."""
         own = self.actors(*contract(moving.point_m, moving.footprint_m, self.actor_scale_m), moving.slot)
         missing = self.features - len(own)
-        own = torch.cat([own, own.new_zeros(missing, own.shape[1])]) if missing else own
-        return standing.index_copy(1, moving.sample, own)
+        return torch.cat([own, own.new_zeros(missing, own.shape[1])]) if missing else own
 
 
 class Layers(nn.Module):
@@ -217,7 +220,14 @@ class ProposalDensity(nn.Module):
         length_m: Float[Tensor, "R S"],
     ) -> Float[Tensor, "R S"]:
         """Return the opacity of samples."""
-        log_density = self.decoder.weight @ self.grids(points_m, footprint_m, moving)
+        return self._opacity(self.grids(points_m, footprint_m, moving), length_m)
+
+    def of_actors(self, moving: ActorSamples, length_m: Float[Tensor, "R S"]) -> Float[Tensor, "R S"]:
+        """Return the opacity of samples that all lie in boxes."""
+        return self._opacity(self.grids.of_actors(moving), length_m)
+
+    def _opacity(self, grid: Float[Tensor, "C N"], length_m: Float[Tensor, "R S"]) -> Float[Tensor, "R S"]:
+        log_density = self.decoder.weight @ grid
         return opacity_of_density(log_density.view(length_m.shape), length_m)
 
 

@@ -85,6 +85,7 @@ class NeuralField(nn.Module):
         actors: FieldActors,
         generator: torch.Generator | None = None,
         learn_proposals: bool = True,
+        hidden_m: Float[Tensor, "H R 2"] | None = None,
     ) -> SeenAlongRays:
         """Render rays.
 
@@ -93,9 +94,10 @@ class NeuralField(nn.Module):
             actors: the actors of the scene.
             generator: for the random places of samples in training; None takes their middles.
             learn_proposals: whether the proposals' weights get gradients.
+            hidden_m: H spans of each ray, from a distance to another, in which nothing stops it.
         """
         config = self.config
-        crossings = self._crossings(rays, actors)
+        crossings = self.crossings(rays, actors.tracks)
         border = first_borders(len(rays.origin), config.proposal_samples[0], generator, rays.origin)
         proposals: list[Intervals] = []
         for i, proposal in enumerate(self.proposals):
@@ -103,6 +105,7 @@ class NeuralField(nn.Module):
             points, footprint, moving = self._samples(rays, border_m, crossings, actors, learn_poses=False)
             with torch.set_grad_enabled(learn_proposals and torch.is_grad_enabled()):
                 opacity = proposal(points, footprint, moving, border_m.diff(dim=-1))
+                opacity = _without_spans(opacity, border_m, hidden_m)
                 weight = composite(opacity, opacity.detach()).weights
             proposals.append(Intervals(border, border_m, weight))
             last = i + 1 == len(self.proposals)
@@ -112,6 +115,7 @@ class NeuralField(nn.Module):
         points, footprint, moving = self._samples(rays, border_m, crossings, actors, learn_poses=True)
         grid = self.grids(points, footprint, moving)
         opacity, embedding = self.layers.surface(grid, border_m.diff(dim=-1))
+        opacity = _without_spans(opacity, border_m, hidden_m)
         seen = composite(opacity, opacity.detach())
         intervals = Intervals(border, border_m, seen.weights)
         # What is left of a ray sees its last sample, the sky.
@@ -122,13 +126,13 @@ class NeuralField(nn.Module):
             feature=self.layers.seen(embedding, weight, rays.direction, moving).T,
             depth_m=intervals.depth_m,
             alpha=seen.weights[:, :-1].sum(-1),
-            median_m=_median(intervals),
+            median_m=median_distance(intervals),
             intervals=intervals,
             proposals=proposals,
         )
 
-    def _crossings(self, rays: FieldRays, actors: FieldActors) -> Crossings:
-        tracks = actors.tracks
+    def crossings(self, rays: FieldRays, tracks: ActorTracks) -> Crossings:
+        """Return the boxes of actors that rays pass through, with this field's margins."""
         half = 0.5 * tracks.size_lwh + tracks.size_lwh.new_tensor(self.config.actor_margin_m)
         boxes = MovingBoxes(tracks.t_s, tracks.T_scene_actor, half, tracks.present, MAX_HOLD_S)
         return cross_boxes(rays.origin, rays.direction, rays.t_s, boxes)
@@ -146,11 +150,17 @@ class NeuralField(nn.Module):
             middle_m = 0.5 * (border_m[:, 1:] + border_m[:, :-1])
             origin = rays.origin - self.middle_m
             points = origin[:, None] + rays.direction[:, None] * middle_m[..., None]
-            # Half of the interval, as in the reference implementation.
-            volume = rays.area[:, None] * middle_m**2 * (0.5 * border_m.diff(dim=-1))
-            footprint = volume.detach().pow(1 / 3).flatten()
+            footprint = footprints(rays.area, border_m).flatten()
             moving = _in_boxes(crossings, middle_m, footprint, actors) if len(crossings.ray) else None
             return points.flatten(0, 1), footprint, moving
+
+
+def footprints(area: Float[Tensor, "R"], border_m: Float[Tensor, "R S1"]) -> Float[Tensor, "R S"]:
+    """Return the sides of the volumes that samples stand for, from the cones' areas at 1 m."""
+    middle_m = 0.5 * (border_m[:, 1:] + border_m[:, :-1])
+    # Half of the interval, as in the reference implementation.
+    volume = area[:, None] * middle_m**2 * (0.5 * border_m.diff(dim=-1))
+    return volume.detach().pow(1 / 3)
 
 
 def _in_boxes(
@@ -176,8 +186,19 @@ def _in_boxes(
     return ActorSamples(sample, actors.slot[box], point, direction, footprint[sample])
 
 
+def _without_spans(
+    opacity: Float[Tensor, "R S"], border_m: Float[Tensor, "R S1"], hidden_m: Float[Tensor, "H R 2"] | None
+) -> Float[Tensor, "R S"]:
+    """Return opacities that are 0 for samples in hidden spans."""
+    if hidden_m is None or len(hidden_m) == 0:
+        return opacity
+    middle_m = 0.5 * (border_m[:, 1:] + border_m[:, :-1])
+    inside = (middle_m > hidden_m[..., :1]) & (middle_m < hidden_m[..., 1:])
+    return opacity.masked_fill(inside.any(0), 0.0)
+
+
 @torch.no_grad()
-def _median(intervals: Intervals) -> Float[Tensor, "R"]:
+def median_distance(intervals: Intervals) -> Float[Tensor, "R"]:
     """Return the distance at which half of each ray's weight is reached, linear within an interval."""
     passed = intervals.weight[:, :-1].cumsum(-1)
     index = torch.searchsorted(passed.contiguous(), torch.full_like(passed[:, :1], 0.5))

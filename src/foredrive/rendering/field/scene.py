@@ -14,8 +14,16 @@ from torch import Tensor, nn
 from foredrive.errors import InputError
 from foredrive.geometry.projection import pixels_to_rays
 from foredrive.rendering.field.config import FieldConfig
-from foredrive.rendering.field.content import FieldContent, field_of
+from foredrive.rendering.field.content import FieldContent, FieldParts, field_of
 from foredrive.rendering.field.decoders import UPSAMPLING, BeamDecoder, PatchDecoder, PatchDecoderConfig
+from foredrive.rendering.field.guests import (
+    Guest,
+    SeenOfGuest,
+    look_with_guests,
+    split_guests,
+    with_guests_in_image,
+    with_guests_in_sweep,
+)
 from foredrive.rendering.field.rays import FieldRays, beam_rays, pixel_rays
 from foredrive.rendering.field.render import FieldActors, NeuralField, SeenAlongRays
 from foredrive.rendering.gaussians.content import GaussianContent
@@ -94,8 +102,8 @@ class FieldScene(RebuiltScene):
             feature=self.shown_rgb,
         )
         slot = torch.arange(len(self.track_id), device=self.device)
-        table = self.field.grids.actors.table.detach()
-        return FieldContent(slot, GaussianContent(points, self.shown_actor), table)
+        parts = FieldParts(self.field, self.camera_decoder, self.lidar_decoder)
+        return FieldContent(slot, torch.zeros_like(slot), GaussianContent(points, self.shown_actor), (parts,))
 
     @property
     def sizes(self) -> dict[str, int]:
@@ -113,7 +121,7 @@ class FieldScene(RebuiltScene):
         """Render features along rays.
 
         Args:
-            graph: this scene, or an edited version of it.
+            graph: this scene, or an edited version of it without actors of other fields.
             rays: in the scene's frame.
             mirror: actors whose left and right sides are swapped; None: none.
             generator: for the random places of samples in training.
@@ -141,9 +149,12 @@ class FieldScene(RebuiltScene):
         high, wide = (-(-side // UPSAMPLING) for side in view.size_hw)
         corner_uv, size = torch.zeros(2, dtype=torch.int64), torch.tensor([wide, high])
         rays = self.rays_of_pixels(view, corner_uv, size)
-        seen = self._in_parts(graph, rays)
+        seen, guests = self._in_parts(graph, rays)
         feature = seen["feature"].view(1, high, wide, -1)
-        rgb = self.camera_decoder(feature, view.sensor)[0, :, : view.size_hw[0], : view.size_hw[1]]
+        rgb = self.camera_decoder(feature, view.sensor)[0]
+        if guests:
+            rgb = with_guests_in_image(rgb, *guests, view.sensor)
+        rgb = rgb[:, : view.size_hw[0], : view.size_hw[1]]
         # The camera's axis is that of the row's own time: it turns during the read-out.
         along = pixels_to_rays(_pixels_of_rays(corner_uv, size).to(view.K), view.K, view.dist)[:, 2]
         alpha = seen["alpha"].view(high, wide)
@@ -160,8 +171,10 @@ class FieldScene(RebuiltScene):
         Beams that end beyond the reach do not return, nor those that nothing stops.
         """
         rays = FieldRays(*(tensor.to(self.device) for tensor in points))
-        seen = self._in_parts(graph, rays)
+        seen, guests = self._in_parts(graph, rays)
         intensity, drop_logit = self.lidar_decoder(seen["feature"])
+        if guests:
+            intensity, drop_logit = with_guests_in_sweep(intensity, drop_logit, *guests)
         range_m = seen["depth_m"] / seen["alpha"].clamp_min(_TINY)
         median_m = seen["median_m"]
         beyond = torch.where(median_m.isfinite(), median_m, range_m) > self.reach_m
@@ -169,15 +182,29 @@ class FieldScene(RebuiltScene):
         drop_logit = torch.where(beyond | nothing, drop_logit.abs() + 1, drop_logit)
         return RenderedSweep(range_m, median_m, intensity, drop_logit, seen["alpha"], None)
 
-    def _in_parts(self, graph: SceneGraph, rays: FieldRays) -> Mapping[str, Tensor]:
-        """Return the features, distances and opacities of any number of rays."""
+    def _in_parts(
+        self, graph: SceneGraph, rays: FieldRays
+    ) -> tuple[Mapping[str, Tensor], tuple[list[Guest], list[SeenOfGuest]] | None]:
+        """Return the features, distances and opacities of any number of rays, and guests if there are any."""
         found: dict[str, list[Tensor]] = {"feature": [], "depth_m": [], "alpha": [], "median_m": []}
+        own, guests = split_guests(graph.tracks, field_of(graph))
+        of_guests: list[list[SeenOfGuest]] = []
         for first in range(0, max(len(rays.t_s), 1), RAYS_AT_ONCE):
             part = FieldRays(*(tensor[first : first + RAYS_AT_ONCE] for tensor in rays))
-            seen = self.look(graph, part)
+            if guests:
+                seen, parts = look_with_guests(self.field, part, own, guests)
+                of_guests.append(parts)
+            else:
+                seen = self.look(graph, part)
             for name, values in found.items():
                 values.append(getattr(seen, name))
-        return {name: torch.cat(values) for name, values in found.items()}
+        joined = {name: torch.cat(values) for name, values in found.items()}
+        if not guests:
+            return joined, None
+        seen_of = [
+            SeenOfGuest(*map(torch.cat, zip(*parts, strict=True))) for parts in zip(*of_guests, strict=True)
+        ]
+        return joined, (guests, seen_of)
 
 
 def _pixels_of_rays(corner_uv: Int[Tensor, "2"], size: Int[Tensor, "2"]) -> Float[Tensor, "R 2"]:
