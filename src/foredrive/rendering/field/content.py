@@ -87,7 +87,8 @@ def _on(parts: FieldParts, device: torch.device) -> FieldParts:
     """Return a field on a device; one that is elsewhere is copied, because modules move in place."""
     if parts.network.middle_m.device == device:
         return parts
-    return FieldParts(*(copy.deepcopy(module).to(device) for module in parts))
+    network, camera, lidar = (copy.deepcopy(module) for module in parts)
+    return FieldParts(network.to(device), camera.to(device), lidar.to(device))  # type: ignore[arg-type]
 
 
 def field_of(graph: SceneGraph) -> FieldContent:

@@ -18,7 +18,7 @@ from foredrive.ops.compositing import composite
 from foredrive.ops.ray_boxes import Crossings
 from foredrive.rendering.field.content import FieldContent, FieldParts
 from foredrive.rendering.field.decoders import UPSAMPLING
-from foredrive.rendering.field.network import ActorSamples
+from foredrive.rendering.field.network import ActorSamples, ProposalDensity
 from foredrive.rendering.field.rays import FieldRays
 from foredrive.rendering.field.render import (
     FieldActors,
@@ -167,6 +167,7 @@ def _look(guest: Guest, rays: FieldRays, crossings: Crossings) -> _Look:
     border = first_borders(len(ray), _FIRST_SAMPLES, None, rays.origin)
     border_m = enter_m + length_m * border
     proposal = network.proposals[-1]
+    assert isinstance(proposal, ProposalDensity)
     opacity = proposal.of_actors(_samples(guest, rays, crossings, border_m), border_m.diff(dim=-1))
     border = resampled_borders(
         border, composite(opacity, opacity).weights, network.config.samples, generator=None
