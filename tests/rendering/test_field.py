@@ -203,7 +203,7 @@ def small_field(actors: int, **changes: object) -> NeuralField:
 
 def moving_samples(net: NeuralField, rays: FieldRays, actors: FieldActors) -> ActorSamples:
     border = to_distance(first_borders(len(rays.origin), 64, None, rays.origin), 20.0, 20_000.0)
-    _, _, moving = net._samples(rays, border, net._crossings(rays, actors), actors, learn_poses=True)
+    _, _, moving = net._samples(rays, border, net.crossings(rays, actors.tracks), actors, learn_poses=True)
     assert moving is not None
     return moving
 
