@@ -18,8 +18,8 @@ def convert(
     """Convert a raw data set into 123D logs.
 
     Args:
-        dataset: pandaset, av2, nuscenes-keyframe or kitti-object; for other data sets use py123d-conversion
-            of py123d.
+        dataset: pandaset, av2, nuscenes-keyframe, kitti-object or kitti-raw; for other data sets use
+            py123d-conversion of py123d.
         source: Folder of one raw log, or of many.
         out: 123D data root to write to.
     """

@@ -14,6 +14,7 @@ from py123d.parser.base_dataset_parser import BaseLogParser, BaseMapParser
 from foredrive.data.arrow_files import reading
 from foredrive.data.av2_partial import Av2PartialParser
 from foredrive.data.kitti_object import KittiObjectParser
+from foredrive.data.kitti_raw import KittiRawParser
 from foredrive.data.log_paths import LogPath
 from foredrive.data.nuscenes_keyframe import NuScenesKeyframeParser
 from foredrive.data.pandaset import PandasetParser
@@ -114,11 +115,17 @@ def _kitti_object(source: Path) -> LogParsers:
             yield sweep, KittiObjectParser(folder, sweep.stem, split), None
 
 
+def _kitti_raw(source: Path) -> LogParsers:
+    for folder in _folders_with(source, "velodyne_points/data"):
+        yield folder, KittiRawParser(folder, "kitti-raw_train"), None
+
+
 DATASETS: dict[str, Callable[[Path], LogParsers]] = {
     "pandaset": _pandaset,
     "av2": _av2,
     "nuscenes-keyframe": _nuscenes_keyframe,
     "kitti-object": _kitti_object,
+    "kitti-raw": _kitti_raw,
 }
 """Functions that find and parse the raw logs of each dataset. For full nuScenes and all other datasets, use
 py123d's own `py123d-conversion`."""

@@ -1,0 +1,257 @@
+"""A 123D parser for KITTI's raw recordings (Geiger et al., "Vision meets robotics", 2013), without boxes.
+
+A log is one folder DATE_drive_NUMBER_sync ("synced and rectified") with image_02, image_03, velodyne_points
+and oxts. The calibration files are in its parent, the folder of the date.
+
+The lidar's points are in its own frame at the time of each. It turns clockwise, seen from above, begins at
+the rear, and looks ahead when the cameras are exposed. So a point's azimuth gives its time, and the path of
+the vehicle puts it where it was at the time of the frame. The points of a file go round row by row from the
+front, top row first: where their azimuth begins anew, the next channel begins.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float64, Int64
+from PIL import Image
+from py123d.datatypes import (
+    Camera,
+    CameraID,
+    EgoStateSE3,
+    Lidar,
+    LidarID,
+    LidarMetadata,
+    LogMetadata,
+    PinholeCameraMetadata,
+    PinholeIntrinsics,
+    Timestamp,
+)
+from py123d.datatypes.modalities.base_modality import BaseModality
+from py123d.geometry import PoseSE3
+from py123d.parser.base_dataset_parser import BaseLogParser, ModalitiesSync
+from py123d.parser.kitti360.utils.kitti360_constants import KITTI360_EGO_STATE_SE3_METADATA
+from scipy.spatial.transform import Rotation, Slerp
+
+_CAMERAS = {"image_02": ("02", CameraID.PCAM_STEREO_L), "image_03": ("03", CameraID.PCAM_STEREO_R)}
+_EARTH_M = 6_378_137.0
+_PERIOD_US = 103_600
+"""Time of one turn of the lidar, where no file has it."""
+_CHANNELS = 64
+_LIDAR = "velodyne_points"
+
+
+class KittiRawParser(BaseLogParser):
+    """Parser of one drive. The vehicle is that of KITTI-360, which is the same.
+
+    Args:
+        folder: the drive's folder; calib_*.txt are in its parent.
+        split: 123D split, e.g. kitti-raw_train.
+    """
+
+    def __init__(self, folder: Path, split: str) -> None:
+        self._folder, self._split = Path(folder), split
+
+    def get_log_metadata(self) -> LogMetadata:
+        """Return the log's metadata. Its name is that of the folder."""
+        return LogMetadata("kitti-raw", self._split, self._folder.name, location=None)
+
+    def iter_modalities_sync(self) -> Iterator[ModalitiesSync]:
+        """Yield the frames that have a sweep: ego pose, lidar and the colour cameras."""
+        times_us = _times_us(self._folder / _LIDAR / "timestamps.txt")
+        spans_us = self._spans_us(times_us)
+        path = _Path.read(self._folder / "oxts")
+        for sweep in sorted((self._folder / _LIDAR / "data").glob("*.bin")):
+            frame = int(sweep.stem)
+            t_us = int(times_us[frame])
+            now = Timestamp.from_us(t_us)
+            pose = _pose(path.at(np.array([t_us]))[0])
+            found: list[BaseModality] = [
+                EgoStateSE3.from_imu(pose, KITTI360_EGO_STATE_SE3_METADATA, now),
+                self._lidar(sweep, t_us, spans_us[frame], path),
+            ]
+            found += [camera for name in _CAMERAS for camera in self._camera(name, sweep.stem, path)]
+            yield ModalitiesSync(now, found)
+
+    def _lidar(self, file: Path, t_us: int, span_us: Int64[np.ndarray, "2"], path: "_Path") -> Lidar:
+        points = np.fromfile(file, dtype=np.float32).reshape(-1, 4)
+        xyz = points[:, :3].astype(np.float64)
+        azimuth = np.arctan2(xyz[:, 1], xyz[:, 0])
+        share = 0.5 * (1 - azimuth / np.pi)  # 0 at the rear, ½ ahead, clockwise
+        at_us = (span_us[0] + share * (span_us[1] - span_us[0])).astype(np.int64)
+        T_imu_velo = self._calibration.T_imu_velo
+        features = {
+            "intensity": np.round(points[:, 3] * 255).astype(np.uint8),
+            "timestamps": at_us,
+        }
+        channel = _channels(azimuth)
+        if channel is not None:
+            features["channel"] = channel
+        return Lidar(
+            timestamp=Timestamp.from_us(int(span_us[0])),
+            timestamp_end=Timestamp.from_us(int(span_us[1])),
+            metadata=LidarMetadata("velodyne", LidarID.LIDAR_TOP, _pose(T_imu_velo)),
+            point_cloud_3d=path.moved(_transformed(T_imu_velo, xyz), at_us, t_us).astype(np.float32),
+            point_cloud_features=features,
+        )
+
+    def _camera(self, name: str, stem: str, path: "_Path") -> list[Camera]:
+        """Return the camera's image, or nothing if the frame has none."""
+        number, camera_id = _CAMERAS[name]
+        file = self._folder / name / "data" / f"{stem}.png"
+        if not file.is_file():
+            return []
+        with Image.open(file) as opened:
+            image = np.asarray(opened.convert("RGB"))
+        t_us = int(_times_us(self._folder / name / "timestamps.txt")[int(stem)])
+        K, T_imu_cam = self._calibration.camera(number, (image.shape[1], image.shape[0]))
+        metadata = PinholeCameraMetadata(
+            camera_name=name,
+            camera_id=camera_id,
+            intrinsics=PinholeIntrinsics.from_camera_matrix(K),
+            distortion=None,
+            width=image.shape[1],
+            height=image.shape[0],
+            camera_to_imu_se3=_pose(T_imu_cam),
+            is_undistorted=True,
+        )
+        T_world_cam = path.at(np.array([t_us]))[0] @ T_imu_cam
+        return [Camera(metadata, image, _pose(T_world_cam), Timestamp.from_us(t_us))]
+
+    @cached_property
+    def _calibration(self) -> "_Calibration":
+        return _Calibration.read(self._folder.parent)
+
+    def _spans_us(self, times_us: Int64[np.ndarray, "N"]) -> Int64[np.ndarray, "N 2"]:
+        """Return begin and end of each turn of the lidar."""
+        files = [self._folder / _LIDAR / f"timestamps_{end}.txt" for end in ("start", "end")]
+        if all(file.is_file() for file in files):
+            return np.stack([_times_us(file) for file in files], axis=-1)
+        return times_us[:, None] + np.array([-_PERIOD_US // 2, _PERIOD_US // 2])
+
+
+@dataclass(frozen=True)
+class _Path:
+    """Poses of the IMU over time, from OXTS' records: T_world_imu with the origin at the first one."""
+
+    t_us: Int64[np.ndarray, "N"]
+    position_m: Float64[np.ndarray, "N 3"]
+    turn: Slerp
+
+    @classmethod
+    def read(cls, folder: Path) -> "_Path":
+        """Read latitude, longitude, altitude, roll, pitch and yaw of all records.
+
+        Positions are in the Mercator projection at the first latitude, as in KITTI's development kit.
+        """
+        t_us = _times_us(folder / "timestamps.txt")
+        files = sorted((folder / "data").glob("*.txt"))
+        rows = np.array([[float(word) for word in file.read_text().split()[:6]] for file in files])
+        frames = np.array([int(file.stem) for file in files])
+        latitude, longitude = np.radians(rows[:, 0]), np.radians(rows[:, 1])
+        scale_m = np.cos(latitude[0]) * _EARTH_M
+        north_m = scale_m * np.log(np.tan(0.25 * np.pi + 0.5 * latitude))
+        position_m = np.stack([scale_m * longitude, north_m, rows[:, 2]], axis=-1)
+        turn = Rotation.from_euler("ZYX", rows[:, [5, 4, 3]])
+        times_us = t_us[frames]
+        return cls(times_us, position_m - position_m[0], Slerp(times_us, turn))
+
+    def at(self, t_us: Int64[np.ndarray, "M"]) -> Float64[np.ndarray, "M 4 4"]:
+        """Return T_world_imu at times: linear in between, standing still before and after."""
+        t_us = t_us.clip(self.t_us[0], self.t_us[-1])
+        T = np.tile(np.eye(4), (len(t_us), 1, 1))
+        T[:, :3, :3] = self.turn(t_us).as_matrix()
+        for axis in range(3):
+            T[:, axis, 3] = np.interp(t_us, self.t_us, self.position_m[:, axis])
+        return T
+
+    def moved(
+        self, points: Float64[np.ndarray, "P 3"], at_us: Int64[np.ndarray, "P"], t_us: int
+    ) -> Float64[np.ndarray, "P 3"]:
+        """Return points, each in the IMU's frame at its own time, in the frame at one time."""
+        T = self.at(at_us)
+        world = np.einsum("pij,pj->pi", T[:, :3, :3], points) + T[:, :3, 3]
+        return _transformed(np.linalg.inv(self.at(np.array([t_us]))[0]), world)
+
+
+@dataclass(frozen=True)
+class _Calibration:
+    """The calibration of a day. "rect" is the rectified frame of camera 0."""
+
+    T_imu_velo: Float64[np.ndarray, "4 4"]
+    T_imu_rect: Float64[np.ndarray, "4 4"]
+    projections: dict[str, Float64[np.ndarray, "3 4"]]
+    sizes: dict[str, Float64[np.ndarray, "2"]]
+    """Widths and heights for which the projections hold."""
+
+    @classmethod
+    def read(cls, folder: Path) -> "_Calibration":
+        """Read calib_imu_to_velo.txt, calib_velo_to_cam.txt and calib_cam_to_cam.txt."""
+        imu, velo, cameras = (
+            _numbers(folder / f"calib_{name}.txt") for name in ("imu_to_velo", "velo_to_cam", "cam_to_cam")
+        )
+        T_imu_velo = np.linalg.inv(_rigid(imu["R"], imu["T"]))
+        T_rect_velo = _rigid(cameras["R_rect_00"], np.zeros(3)) @ _rigid(velo["R"], velo["T"])
+        numbers = [number for number, _ in _CAMERAS.values()]
+        return cls(
+            T_imu_velo,
+            T_imu_velo @ np.linalg.inv(T_rect_velo),
+            {number: cameras[f"P_rect_{number}"].reshape(3, 4) for number in numbers},
+            {number: cameras[f"S_rect_{number}"] for number in numbers},
+        )
+
+    def camera(
+        self, number: str, size_wh: tuple[int, int]
+    ) -> tuple[Float64[np.ndarray, "3 3"], Float64[np.ndarray, "4 4"]]:
+        """Return K for images of a size, which may be shrunk, and T_imu_cam."""
+        P = self.projections[number]
+        T_cam_rect = np.eye(4)
+        T_cam_rect[:3, 3] = np.linalg.solve(P[:, :3], P[:, 3])
+        K = np.diag([*(size_wh / self.sizes[number]), 1.0]) @ P[:, :3]
+        return K, self.T_imu_rect @ np.linalg.inv(T_cam_rect)
+
+
+def _channels(azimuth: Float64[np.ndarray, "P"]) -> np.ndarray | None:
+    """Return the row of each point, or None if there are more rows than the lidar has channels."""
+    row = np.cumsum(np.diff(azimuth % (2 * np.pi), prepend=0.0) < -np.pi)
+    return row.astype(np.uint8) if not len(row) or row[-1] < _CHANNELS else None
+
+
+def _numbers(file: Path) -> dict[str, Float64[np.ndarray, "K"]]:
+    """Return the entries of a calibration file that are numbers."""
+    found = {}
+    for line in file.read_text().splitlines():
+        name, _, words = line.partition(":")
+        if name.startswith(("R", "T", "P_rect", "S_rect")):
+            found[name] = np.array([float(word) for word in words.split()])
+    return found
+
+
+def _times_us(file: Path) -> Int64[np.ndarray, "N"]:
+    """Return the times of a file with one in each line, with nanoseconds."""
+    found = []
+    for line in file.read_text().split("\n"):
+        if line.strip():
+            whole, _, part = line.strip().partition(".")
+            seconds = datetime.fromisoformat(whole).replace(tzinfo=UTC).timestamp()
+            found.append(round(seconds) * 1_000_000 + int(part.ljust(6, "0")[:6]))
+    return np.array(found, dtype=np.int64)
+
+
+def _rigid(R: Float64[np.ndarray, "9"], t: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, "4 4"]:
+    """Return a pose with its rotation orthonormalised, because the files have only seven digits."""
+    T = np.eye(4)
+    U, _, V = np.linalg.svd(R.reshape(3, 3))
+    T[:3, :3], T[:3, 3] = U @ V, t
+    return T
+
+
+def _transformed(T: Float64[np.ndarray, "4 4"], points: Float64[np.ndarray, "P 3"]) -> np.ndarray:
+    return points @ T[:3, :3].T + T[:3, 3]
+
+
+def _pose(T: Float64[np.ndarray, "4 4"]) -> PoseSE3:
+    return PoseSE3.from_transformation_matrix(T)
