@@ -9,7 +9,7 @@ from safetensors.torch import save_file
 
 from foredrive.errors import InputError
 from foredrive.models.backbone import BackboneConfig, ImageBackbone, normalise_images
-from foredrive.models.vgg import Vgg16Features
+from foredrive.models.vgg import VggFeatures
 
 CONFIG = BackboneConfig(
     embedding_size=8,
@@ -107,7 +107,7 @@ def vgg_state() -> dict[str, torch.Tensor]:
 
 def test_vgg_loads_torchvisions_names_and_taps_four_layers(tmp_path: Path) -> None:
     save_file(vgg_state(), tmp_path / "vgg.safetensors")
-    vgg = Vgg16Features(tmp_path / "vgg.safetensors").train()
+    vgg = VggFeatures(tmp_path / "vgg.safetensors").train()
     assert not vgg.training
     taps = vgg(torch.rand(1, 3, 32, 48))
     assert [tuple(tap.shape[1:]) for tap in taps] == [(64, 32, 48), (128, 16, 24), (256, 8, 12), (512, 4, 6)]
@@ -117,9 +117,28 @@ def test_vgg_loads_torchvisions_names_and_taps_four_layers(tmp_path: Path) -> No
 
 def test_vgg_weights_that_are_not(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no such file"):
-        Vgg16Features(tmp_path / "vgg.safetensors")
+        VggFeatures(tmp_path / "vgg.safetensors")
     state = vgg_state()
     del state["features.21.weight"]
     save_file(state, tmp_path / "vgg.safetensors")
     with pytest.raises(InputError, match=r"lacks features\.21\.weight"):
-        Vgg16Features(tmp_path / "vgg.safetensors")
+        VggFeatures(tmp_path / "vgg.safetensors")
+
+
+def test_vgg_19_taps_the_first_convolution_of_five_blocks_of_images_as_they_are(tmp_path: Path) -> None:
+    """The first tap by hand: a filter that reads the red channel of the pixel itself."""
+    rng, state = torch.Generator().manual_seed(0), {}
+    widths = [3, 64, 64, 128, 128, *[256] * 4, *[512] * 5]
+    for layer, source, target in zip(
+        [0, 2, 5, 7, 10, 12, 14, 16, 19, 21, 23, 25, 28], widths[:-1], widths[1:], strict=True
+    ):
+        state[f"features.{layer}.weight"] = torch.randn(target, source, 3, 3, generator=rng) * 0.05
+        state[f"features.{layer}.bias"] = torch.zeros(target)
+    state["features.0.weight"][5] = 0
+    state["features.0.weight"][5, 0, 1, 1] = 1
+    save_file(state, tmp_path / "vgg.safetensors")
+    image = torch.rand(1, 3, 32, 48)
+    taps = VggFeatures(tmp_path / "vgg.safetensors", 19)(image)
+    assert [tap.shape[1] for tap in taps] == [64, 128, 256, 512, 512]
+    assert [tap.shape[-1] for tap in taps] == [48, 24, 12, 6, 3]
+    torch.testing.assert_close(taps[0][0, 5], image[0, 0])

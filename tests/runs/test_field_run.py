@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 import synthetic_log as world
 import torch
+from safetensors.torch import save_file
 from torch import Tensor
 
 from foredrive.cli.main import main
@@ -26,6 +27,7 @@ from foredrive.training import loop
 from foredrive.training.field_training import FieldTraining
 from foredrive.training.learning_rates import Rate
 from foredrive.training.rebuilding import SensorViews
+from foredrive.view.rebuilt_viewer import RebuiltViewer
 
 STEPS = 6
 
@@ -217,10 +219,45 @@ def test_an_actor_of_another_run_is_seen_by_its_own_decoders(
     assert all(torch.equal(value, after[name]) for name, value in before.items())
 
 
+def test_a_perceptual_loss_where_there_are_weights(run: Reconstruction, tmp_path: Path) -> None:
+    """Equal images have none, others have some; the network is not a part of the scene."""
+    rng, state = torch.Generator().manual_seed(0), {}
+    widths = [3, 64, 64, 128, 128, *[256] * 4, *[512] * 5]
+    for layer, source, target in zip(
+        [0, 2, 5, 7, 10, 12, 14, 16, 19, 21, 23, 25, 28], widths[:-1], widths[1:], strict=True
+    ):
+        state[f"features.{layer}.weight"] = torch.randn(target, source, 3, 3, generator=rng) * 0.05
+        state[f"features.{layer}.bias"] = torch.zeros(target)
+    save_file(state, tmp_path / "vgg.safetensors")
+    schedule, scene = recipe().representation.schedule, run.scene
+    assert isinstance(scene, FieldScene)
+    names = set(scene.state_dict())
+    seen = dataclasses.replace(schedule, perceptual=str(tmp_path / "vgg.safetensors"))
+    losses = FieldTraining(scene, run.train, seen).losses(0, torch.Generator().manual_seed(0)).losses
+    plain = FieldTraining(scene, run.train, schedule).losses(0, torch.Generator().manual_seed(0)).losses
+    assert losses["perceptual"] > 0
+    assert "perceptual" not in plain
+    torch.testing.assert_close(losses["loss"], plain["loss"] + 0.05 * losses["perceptual"])
+    assert set(scene.state_dict()) == names
+    with pytest.raises(InputError, match="no such file of VGG-19 weights"):
+        FieldTraining(scene, run.train, dataclasses.replace(schedule, perceptual="missing.pth"))
+
+
 def test_a_film_of_it_without_an_actor(run: Reconstruction, tmp_path: Path) -> None:
     film = tmp_path / "film.webp"
     assert main(["render", str(run.folder), "--out", str(film), "--remove", "7", "--seconds", "0.2"]) == 0
     assert film.stat().st_size > 0
+
+
+def test_a_page_says_that_the_browser_draws_lidar_points(run: Reconstruction, tmp_path: Path) -> None:
+    page = RebuiltViewer(open_rebuilt(run.folder), [Remove(7)], tmp_path / "edits.json", "localhost", 0)
+    try:
+        assert page.layers["splats"].label == "coloured lidar points"
+        assert "the browser draws coloured lidar points" in page._note.content
+        page.jobs.wait()
+        assert page.pictures.images[0].image.max() > 0
+    finally:
+        page.close()
 
 
 def test_the_sizes_of_neurad() -> None:

@@ -12,7 +12,7 @@ from safetensors.torch import save_file
 from foredrive.errors import InputError
 from foredrive.geometry.projection import project
 from foredrive.geometry.se3 import inverse_se3, transform_points
-from foredrive.models.vgg import Vgg16Features
+from foredrive.models.vgg import VggFeatures
 from foredrive.recipes import find_recipe
 from foredrive.runs.build import build_agent, build_objective
 from foredrive.scene import Example
@@ -144,7 +144,7 @@ def test_a_file_of_vgg_weights_fits_the_recipes_of_towns(stage: str, tmp_path: P
     recipe = find_recipe("nemo_town", (f"{stage}.perceptual={file}",))
     chosen = getattr(recipe, stage)
     height, width = recipe.clips.image_hw
-    features = Vgg16Features(chosen.perceptual)
+    features = VggFeatures(chosen.perceptual)
     taps = features(torch.rand(1, 3, height // chosen.ray_stride, width // chosen.ray_stride))
     assert [tap.shape[1] for tap in taps] == [64, 128, 256]
 

@@ -3,10 +3,14 @@
 A ray has S intervals between positions `border`, with the probabilities `weight` that the ray ends in each.
 """
 
+from collections.abc import Sequence
+
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+OF_LAYERS = (1 / 32, 1 / 16, 1 / 8, 1 / 4, 1.0)
+"""Weights of VGG-19's layers relu1_1 to relu5_1, as in pix2pixHD (Wang et al. 2018)."""
 _LEAST_WEIGHT = 1e-5
 _LEAST_SHARE = 1e-2
 
@@ -153,3 +157,11 @@ def hit_loss(
     part = inside.clamp_min(0) / (high - low).clamp_min(1e-6)
     share = (weight * part).sum(-1)[returned]
     return -(share + _LEAST_SHARE).log().mean()
+
+
+def weighted_feature_loss(
+    seen: Sequence[Float[Tensor, "n _c _h _w"]], real: Sequence[Float[Tensor, "n _c _h _w"]]
+) -> Float[Tensor, ""]:
+    """Return L1 between the features of images, summed over layers with the weights `OF_LAYERS`."""
+    parts = zip(OF_LAYERS, seen, real, strict=False)  # small images have fewer layers
+    return torch.stack([share * (a - b).abs().mean() for share, a, b in parts]).sum()

@@ -12,7 +12,7 @@ from foredrive.models.agent import PlanningAgent
 from foredrive.models.driveworld import DriveWorld, DriveWorldConfig
 from foredrive.models.image_tower import ImageTowerFeatures
 from foredrive.models.nemo import Nemo, NemoConfig
-from foredrive.models.vgg import Vgg16Features
+from foredrive.models.vgg import VggFeatures
 from foredrive.scene import WorldModel
 from foredrive.training import DriveWorldObjective, DriveWorldStage, NemoObjective, NemoStage
 from foredrive.training.joint_tasks import TaskTerms
@@ -56,11 +56,11 @@ def nemo_objective(
         features = ImageTowerFeatures(load_image_tower(SHIPPED))
     elif stage.perceptual == "vgg16":
         try:
-            features = Vgg16Features("download")
+            features = VggFeatures("download")
         except OSError as error:
             warnings.warn(f"the perceptual loss is OFF (weight 0): no VGG-16 weights ({error})", stacklevel=3)
     elif stage.perceptual is not None:
-        features = Vgg16Features(stage.perceptual)
+        features = VggFeatures(stage.perceptual)
     return NemoObjective(agent, stage, steps=clips.future_frames, image_features=features, tasks=tasks)
 
 

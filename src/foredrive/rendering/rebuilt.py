@@ -43,6 +43,8 @@ class RebuiltScene(nn.Module, ABC):
         frame_velocities: learn corrections of the velocity and turn rate of each training image and sweep.
     """
 
+    preview_name = "splats"
+    """What `Content.preview` shows of it, for people."""
     category: Tensor
     key_t_s: Tensor
     present: Tensor

@@ -16,8 +16,10 @@ from foredrive.losses.field import (
     distortion_loss,
     hit_loss,
     interlevel_loss,
+    weighted_feature_loss,
 )
 from foredrive.losses.rendering import drop_loss, intensity_loss
+from foredrive.models.vgg import VggFeatures
 from foredrive.rendering.field.decoders import UPSAMPLING
 from foredrive.rendering.field.rays import FieldRays
 from foredrive.rendering.field.render import Intervals, SeenAlongRays
@@ -36,6 +38,8 @@ class FieldWeights:
 
     rgb: float = 5.0
     """Mean squared error of colours."""
+    perceptual: float = 0.05
+    """L1 of VGG-19's features; needs `FieldSchedule.perceptual`."""
     depth: float = 0.01
     carving: float = 0.01
     hit: float = 0.0
@@ -77,6 +81,8 @@ class FieldSchedule:
     """Beams in a step."""
     sweeps: int = 4
     """Sweeps that the beams of a step are from."""
+    perceptual: str | None = None
+    """File of torchvision's VGG-19 for the perceptual loss, or "download"; None: there is no such loss."""
     weights: FieldWeights = field(default_factory=FieldWeights)
     rates: FieldRates = field(default_factory=FieldRates)
     margin_m: float = 0.1
@@ -114,7 +120,8 @@ class FieldTraining:
         schedule: length, rates and losses.
 
     Raises:
-        InputError: there are neither images nor sweeps that a step looks at, or images are too small.
+        InputError: there are neither images nor sweeps that a step looks at, images are too small, or the
+            weights for the perceptual loss cannot be read.
     """
 
     def __init__(self, scene: FieldScene, views: SensorViews, schedule: FieldSchedule) -> None:
@@ -125,6 +132,8 @@ class FieldTraining:
         if any(min(view.size_hw) < UPSAMPLING for view in views.cameras):
             raise InputError(f"images of a field need {UPSAMPLING} pixels a side or more")
         self.scene, self.views, self.schedule = scene, views, schedule
+        # Not a part of the scene: it is neither trained nor saved.
+        self._vgg = VggFeatures(schedule.perceptual, 19).to(scene.device) if schedule.perceptual else None
         self.steps, self.checkpoint_every, self.seed = (
             schedule.steps,
             schedule.checkpoint_every,
@@ -165,7 +174,7 @@ class FieldTraining:
         first = 0
         if patches:
             first = sum(len(patch.rays.t_s) for patch in patches)
-            losses["rgb"] = self._rgb(patches, seen.feature[:first])
+            losses |= self._image_losses(patches, seen.feature[:first])
         if beams:
             losses |= self._beam_losses(beams, seen, first)
         if propose:
@@ -220,18 +229,24 @@ class FieldTraining:
             )
         return found
 
-    def _rgb(self, patches: list["_Patch"], feature: Float[Tensor, "R D"]) -> Float[Tensor, ""]:
-        """Return the mean squared error over all pixels of the patches."""
+    def _image_losses(self, patches: list["_Patch"], feature: Float[Tensor, "R D"]) -> dict[str, Tensor]:
+        """Return the mean squared error over all pixels of the patches, and the perceptual loss."""
         parts = feature.split([len(patch.rays.t_s) for patch in patches])
         groups: dict[tuple[int, tuple[int, int]], list[tuple[Tensor, Tensor]]] = defaultdict(list)
         for patch, part in zip(patches, parts, strict=True):
             groups[patch.camera, patch.size_hw].append((part.view(*patch.size_hw, -1), patch.rgb))
-        total, count = feature.new_zeros(()), 0
+        squares, likeness, count = feature.new_zeros(()), feature.new_zeros(()), 0
         for (camera, _), alike in groups.items():  # patches of one camera are decoded together
             rgb = self._decoded(torch.stack([part for part, _ in alike]), camera)
             real = torch.stack([real for _, real in alike]).to(rgb)
-            total, count = total + ((rgb - real) ** 2).sum(), count + rgb.numel()
-        return total / count
+            squares, count = squares + ((rgb - real) ** 2).sum(), count + rgb.numel()
+            if self._vgg is not None:
+                with torch.no_grad():
+                    wanted = self._vgg(real)
+                share = len(alike) / len(patches)
+                likeness = likeness + share * weighted_feature_loss(self._vgg(rgb), wanted)
+        found = {"rgb": squares / count}
+        return found if self._vgg is None else found | {"perceptual": likeness}
 
     def _decoded(self, feature: Float[Tensor, "n H W D"], camera: int) -> Float[Tensor, "n 3 H3 W3"]:
         """Decode patches. Batch normalisation counts its statistics here alone, never when a view is seen."""

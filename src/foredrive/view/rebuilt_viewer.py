@@ -98,7 +98,7 @@ class RebuiltViewer(Page):
         super().close()
 
     def _add_controls(self) -> None:
-        gui, vehicle = self.server.gui, self.run.vehicle
+        gui, vehicle, preview = self.server.gui, self.run.vehicle, self.run.scene.preview_name
         first_s, last_s = float(vehicle.t_s[0]), float(vehicle.t_s[-1])
         with gui.add_folder("Time"):
             self.time_s = gui.add_slider("time, s", first_s, max(last_s, first_s + STEP_S), STEP_S, first_s)
@@ -109,19 +109,23 @@ class RebuiltViewer(Page):
                 "render my view",
                 False,
                 disabled=not vehicle.rig.names,
-                hint="by the renderer that cameras use, in the place of splats that the browser draws",
+                hint=f"by the renderer that cameras use, in the place of {preview} that the browser draws",
             )
-            self.layers = {
-                name: gui.add_checkbox(name, True) for name in ("splats", "boxes", "ids", "lidar", "cameras")
-            }
+            labels = {name: name for name in ("splats", "boxes", "ids", "lidar", "cameras")}
+            labels["splats"] = preview
+            self.layers = {name: gui.add_checkbox(label, True) for name, label in labels.items()}
         self.time_s.on_update(lambda _: self.show_now())
         self.own.on_update(lambda _: self._toggle_own())
         for box in self.layers.values():
             box.on_update(lambda _: self._show_layers())
 
     def _count(self) -> str:
-        share = self.nodes.share
-        drawn = "" if share == 1 else f"; the browser draws {share:.0%} of them, those that cover most"
+        share, preview = self.nodes.share, self.run.scene.preview_name
+        drawn = (
+            "" if share == 1 else f"; the browser draws {share:.0%} of the {preview}, those that cover most"
+        )
+        if share == 1 and preview != "splats":
+            drawn = f"; the browser draws {preview}, sensors show the scene itself"
         return f"{self.run.scene.described}, {len(self.run.scene.track_id)} actors{drawn}"
 
     def _show_layers(self) -> None:

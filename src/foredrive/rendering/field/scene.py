@@ -62,6 +62,7 @@ class FieldScene(RebuiltScene):
         middle_m: middle of the part of the scene that is not contracted.
     """
 
+    preview_name = "coloured lidar points"
     shown_mean_m: Tensor
     shown_log_scale: Tensor
     shown_rgb: Tensor
