@@ -15,7 +15,6 @@ from foredrive.evaluation.summary import read_summary
 from foredrive.files import atomic_path
 from foredrive.metrics.protocols import PROTOCOLS
 from foredrive.recipes.config import Recipe, rescheduled
-from foredrive.recipes.nemo import NemoRecipe
 from foredrive.runs.drive.recording import record_drives
 from foredrive.runs.evaluate.run import SUMMARY, evaluate_run
 from foredrive.runs.train.run import train_run
@@ -126,15 +125,6 @@ def shortened(recipe: Recipe) -> Recipe:
     )
 
 
-def occupancy_alone(recipe: NemoRecipe) -> NemoRecipe:
-    """Return a recipe of one stage that learns only the present occupancy, as long as pre-training."""
-    stage = recipe.pretrain
-    assert stage is not None
-    weights = dataclasses.replace(stage.weights, wpts=0.0, recon=0.0)
-    stage = dataclasses.replace(stage, weights=weights, imagine=False)
-    return dataclasses.replace(recipe, pretrain=None, finetune=stage, path=None)
-
-
 def run_arm(
     recipe: Recipe, logs: StudyLogs, folder: Path, cache_dir: Path, start: Path | None = None
 ) -> dict[str, float]:
@@ -142,7 +132,7 @@ def run_arm(
 
     An evaluated arm is not evaluated again: `folder` belongs to one commit and one set of test drives.
 
-    `occupancy_iou` is the present IoU of voxels above the ground. `l2_avg_m` and `collision_avg_pct` follow
+    `occupancy_iou` is the present IoU of voxels above the ground. `l2_m` and `collision_pct` follow
     UniAD's protocol, as NeMo's tables do. Metrics of other protocols, later frames and baselines have longer
     names. `train_s` is the time of the training steps of this run.
     """
@@ -164,8 +154,8 @@ def study_figures(summary: Mapping[str, Any]) -> dict[str, float]:
     headline = f"planning.{HEADLINE}"
     kept = {
         "occupancy_iou": "occupancy.above_ground.iou_now",
-        "l2_avg_m": f"{headline}.l2_avg_m",
-        "collision_avg_pct": f"{headline}.collision_avg_pct",
+        "l2_m": f"{headline}.l2_avg_m",
+        "collision_pct": f"{headline}.collision_avg_pct",
     }
     for scope in ("", "above_ground."):
         prefixes = (f"occupancy.{scope}iou_", f"occupancy.{scope}spread_")

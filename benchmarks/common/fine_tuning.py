@@ -1,0 +1,92 @@
+"""Fine-tunings of NeMo that share one pre-training: drives and steps are those of `learning`'s 30 minutes.
+
+Runs are kept in runs/nemo_fine_tuning, where an interrupted study continues. Arms with the same pre-training
+share one, of one seed; seeds are those of the fine-tuning. The shared one is in nemo_town_pretraining, where
+the run of `learning` can be put.
+"""
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+from benchmarks import learning
+from benchmarks.common.study import StudyLogs, run_arm, seeded, share_of
+from benchmarks.learning_towns import learning_digest
+from foredrive.evaluation.bench import study_identity
+from foredrive.recipes import RECIPES, find_recipe
+from foredrive.recipes.config import Recipe, rescheduled
+from foredrive.runs.folder import WEIGHTS
+from foredrive.runs.train.run import train_run
+from foredrive.training import PathFit
+
+ROOT = Path("runs/nemo_fine_tuning")
+BUDGET = "30min"
+PRETRAINED = "nemo_town"
+PRETRAINING_SEED = 0
+STEPS, WARMUP_STEPS = 600, 50
+PATH_STRIDE_S = 2.0
+"""Time between the clips on which the head along the path is fitted."""
+CONFIG = {
+    "recipes": {name: dataclasses.asdict(RECIPES[name]) for name in RECIPES if name.startswith("nemo_town")},
+    "budget": dataclasses.asdict(learning.BUDGETS[BUDGET]),
+    "pretraining_seed": PRETRAINING_SEED,
+    "steps": STEPS,
+    "path_stride_s": PATH_STRIDE_S,
+    "drives": learning_digest(),
+}
+DECIDED_BY = (
+    *learning.DECIDED_BY,
+    "foredrive.metrics.planning",
+    "foredrive.metrics.protocols",
+    "foredrive.models.planner",
+    "foredrive.runs.train.path_features",
+    "foredrive.training.path_fit",
+)
+IDENTITY = study_identity(CONFIG, DECIDED_BY)
+
+
+def fine_tuned(name: str, seed: int, *, pretrained: bool = True, share: float = 1.0) -> dict[str, float]:
+    """Fine-tune a recipe, evaluate it on the test drives, and return its metrics.
+
+    Args:
+        name: of the recipe.
+        seed: of the fine-tuning.
+        pretrained: whether the recipe's pre-training comes first, if it has one.
+        share: part of the training drives. Pre-training has them all.
+    """
+    logs = StudyLogs(*learning.logs_of(learning.BUDGETS[BUDGET].drives))
+    few = dataclasses.replace(logs, train=share_of(logs.train, share))
+    recipe = _of_the_study(find_recipe(name), seed)
+    start = None
+    if recipe.pretrain is None or not pretrained:
+        recipe = dataclasses.replace(recipe, pretrain=None)
+    else:
+        start = _pretraining(name, logs)
+    arm = f"{name}{'' if pretrained else '_from_scratch'}_{100 * share:.0f}pct_seed{seed}"
+    return run_arm(recipe, few, ROOT / IDENTITY / arm, learning.ROOT / "cache", start)
+
+
+def _of_the_study(recipe: Recipe[Any, Any], seed: int) -> Recipe[Any, Any]:
+    """Return the recipe with the study's lengths: pre-training as in `learning`, then fine-tuning."""
+    recipe = dataclasses.replace(recipe, path=PathFit(stride_s=PATH_STRIDE_S) if recipe.path else None)
+    finetune = rescheduled(recipe.finetune, steps=STEPS, warmup_steps=WARMUP_STEPS, seed=seed)
+    if recipe.pretrain is None:
+        return dataclasses.replace(recipe, finetune=finetune)
+    pretrain = _pretraining_recipe(recipe).pretrain
+    return dataclasses.replace(recipe, pretrain=pretrain, finetune=finetune)
+
+
+def _pretraining_recipe(recipe: Recipe[Any, Any]) -> Recipe[Any, Any]:
+    steps = learning.BUDGETS[BUDGET].steps[PRETRAINED]
+    return seeded(learning.pretraining_alone(recipe, steps), PRETRAINING_SEED)
+
+
+def _pretraining(name: str, logs: StudyLogs) -> Path:
+    """Return the run folder with the pre-training of a row, which may be there already."""
+    recipe, usual = find_recipe(name), find_recipe(PRETRAINED)
+    if (recipe.pretrain, recipe.model, recipe.clips) == (usual.pretrain, usual.model, usual.clips):
+        name, recipe = PRETRAINED, usual
+    folder = ROOT / f"{name}_pretraining"
+    if not (folder / "pretrain" / WEIGHTS).is_file():
+        train_run(_pretraining_recipe(recipe), logs.train, folder, learning.ROOT / "cache")
+    return folder
