@@ -5,13 +5,14 @@ from pathlib import Path
 import numpy as np
 import synthetic_log as world
 import torch
-from py123d.datatypes import BaseMapObject, Crosswalk, Lane, LaneType, RoadEdge, RoadEdgeType
+from py123d.datatypes import BaseMapObject, Crosswalk, Lane, LaneGroup, LaneType, RoadEdge, RoadEdgeType
 from py123d.geometry import Polyline3D
 
 from foredrive.data import ClipConfig, ClipDataset, find_logs
 from foredrive.data.log_writer import LogWriter
 from foredrive.data.logs import Log
 from foredrive.data.maps import RADIUS_M, VERTICES, read_lane_outlines, read_map_patch, write_map
+from foredrive.data.road_maps import read_road_map
 from foredrive.scene import MapKind, MapPatch, VoxelSpec
 
 
@@ -102,3 +103,30 @@ def test_a_map_is_written_once(tmp_path: Path) -> None:
     assert file.stat().st_mtime_ns == before
     again = write_map(objects(), "Flatland", tmp_path / "elsewhere")
     assert next(again.rglob("*.arrow")).read_bytes() == file.read_bytes()
+
+
+def test_roads_have_a_route_and_a_centreline(tmp_path: Path) -> None:
+    """The log drives in the lane along x. A second lane is in its group, a third in another."""
+
+    def lane(number: int, group: int, left: float, right: float) -> Lane:
+        sides, middle = (line(left), line(right)), line(0.5 * (left + right))
+        return Lane(number, LaneType.SURFACE_STREET, *sides, middle, lane_group_id=group)
+
+    def group(number: int, lanes: list[int], left: float, right: float) -> LaneGroup:
+        return LaneGroup(number, lanes, line(left), line(right))
+
+    lanes = [lane(1, 1, 1.75, -1.75), lane(2, 1, 5.25, 1.75), lane(3, 2, 8.75, 5.25)]
+    groups = [group(1, [1, 2], 5.25, -1.75), group(2, [3], 8.75, 5.25)]
+    maps_dir = write_map([*lanes, *groups], "Flatland", tmp_path)
+    with LogWriter(tmp_path, "flat_train", "log", [], maps_dir, "Flatland", None) as writer:
+        for index in range(11):
+            writer.write(world.frame(index, []))
+    roads = read_road_map(Log(find_logs(tmp_path)[0]))
+    assert roads is not None
+    found = zip(roads.lanes, roads.on_route, strict=True)
+    by_side = {round(float(ring[:, 1].max()) + 50.0, 2): on for ring, on in found}
+    assert by_side == {1.75: True, 5.25: True, 8.75: False}
+    np.testing.assert_allclose(roads.centreline[:, 1], -50.0, atol=1e-6)
+    assert roads.centreline[0, 0] < 50.0
+    assert roads.centreline[-1, 0] > 160.0
+    assert len(roads.drivable) == 5

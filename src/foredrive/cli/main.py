@@ -23,6 +23,7 @@ from foredrive.cli.export import export
 from foredrive.cli.imagine import imagine
 from foredrive.cli.memory import keep_freed_memory
 from foredrive.cli.ncap import ncap
+from foredrive.cli.pseudo import pseudo
 from foredrive.cli.recipes import recipes
 from foredrive.cli.reconstruct import reconstruct
 from foredrive.cli.record import record
@@ -50,6 +51,7 @@ VERBS: dict[str, Callable[..., Any]] = {
     "drive": drive,
     "compare": compare,
     "ncap": ncap,
+    "pseudo": pseudo,
     "serve": serve,
     "score": score,
     "search": search,

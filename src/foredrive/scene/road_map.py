@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64
 
-Outline = Float64[np.ndarray, "V 2"]
+Outline = Float64[np.ndarray, "_ 2"]
 """Closed polygon without its last vertex, m, world frame."""
 
 

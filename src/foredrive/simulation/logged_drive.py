@@ -82,7 +82,7 @@ class LoggedDrive:
 
     def _way(self, t_s: float) -> Float64[np.ndarray, "M 3"]:
         points = [self.pose_at(t_s)[:3, 3]]
-        for point in self._poses[self.vehicle.t_s.numpy() > t_s, :3, 3]:
+        for point in self.poses[self.vehicle.t_s.numpy() > t_s, :3, 3]:
             if np.hypot(*(point - points[-1])[:2]) >= SPACING_M:
                 points.append(point)
         return np.stack(points)
@@ -90,7 +90,7 @@ class LoggedDrive:
     @cached_property
     def line(self) -> shapely.LineString:
         """Return the logged path in the plane, m, world frame. Behind the log's end it goes straight on."""
-        xy, forward = self._poses[:, :2, 3], self._poses[-1, :2, 0]
+        xy, forward = self.poses[:, :2, 3], self.poses[-1, :2, 0]
         return shapely.LineString(np.vstack([xy, xy[-1] + BEYOND_M * forward / np.linalg.norm(forward)]))
 
     def path_ahead(self, T_world_ego: Float64[np.ndarray, "4 4"]) -> Float64[np.ndarray, "N 2"]:
@@ -107,8 +107,8 @@ class LoggedDrive:
 
         The vehicle stands on the ground plane of the nearest logged pose.
         """
-        away_m = np.hypot(*(self._poses[:, :2, 3] - [ego.x_m, ego.y_m]).T)
-        near = self._poses[int(np.argmin(away_m))]
+        away_m = np.hypot(*(self.poses[:, :2, 3] - [ego.x_m, ego.y_m]).T)
+        near = self.poses[int(np.argmin(away_m))]
         up = near[:3, 2]
         aside_m = np.array([ego.x_m, ego.y_m]) - near[:2, 3]
         forward = np.array([np.cos(ego.yaw_rad), np.sin(ego.yaw_rad), 0.0])
@@ -120,8 +120,10 @@ class LoggedDrive:
         return T
 
     @cached_property
-    def _poses(self) -> Float64[np.ndarray, "K 4 4"]:
-        return np.stack([self.pose_at(t_s) for t_s in self.vehicle.t_s.tolist()])
+    def poses(self) -> Float64[np.ndarray, "K 4 4"]:
+        """Return `T_world_ego` at the times of the log's frames."""
+        T_scene_ego = (self.vehicle.T_scene_ego @ self.T_ego_shifted).double()
+        return np.asarray((self.vehicle.T_world_scene @ T_scene_ego).numpy())
 
 
 def _yaw(T: Float64[np.ndarray, "4 4"]) -> float:

@@ -68,9 +68,8 @@ class ReplayExpert:
 
     def _logged_mps(self, T_world_ego: Float64[np.ndarray, "4 4"]) -> float:
         """Return the speed of the log at its pose that is nearest to the vehicle, m/s."""
-        times = self.drive.vehicle.t_s.tolist()
-        away_m = [np.hypot(*(self.drive.pose_at(t_s)[:2, 3] - T_world_ego[:2, 3])) for t_s in times]
-        return self.drive.state_at(times[int(np.argmin(away_m))]).speed_mps
+        away_m = np.hypot(*(self.drive.poses[:, :2, 3] - T_world_ego[:2, 3]).T)
+        return self.drive.state_at(float(self.drive.vehicle.t_s[int(np.argmin(away_m))])).speed_mps
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,0 +1,151 @@
+"""Two-stage pseudo-simulation on a straight street, without rendering."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+from test_agents_of_logs import YAW, logged, seen
+
+from foredrive.errors import InputError
+from foredrive.metrics.epdms.world import Roads
+from foredrive.rendering.gaussians import Gaussians
+from foredrive.rendering.gaussians.content import GaussianContent
+from foredrive.rendering.gaussians.scene import GaussianScene
+from foredrive.rendering.renderer import RebuiltRenderer
+from foredrive.rendering.scene_graph import SceneGraph
+from foredrive.rendering.tracks import ActorTracks
+from foredrive.rendering.vehicle import LoggedVehicle
+from foredrive.scene import Category, Clip, Trajectory
+from foredrive.scene.road_map import RoadMap
+from foredrive.simulation.ncap.running import Place
+from foredrive.simulation.pseudo_simulation import (
+    FOLLOW_UPS,
+    PseudoSimulation,
+    figures_of,
+    past_motion,
+    simulated,
+)
+from foredrive.simulation.rebuilt import RebuiltSimulator
+from foredrive.simulation.replay_expert import ReplayExpert
+from foredrive.simulation.simple_agents import StraightAgent, plan_of
+
+SPEED = 8.0
+
+
+def outline(x0: float, x1: float, y0: float, y1: float) -> np.ndarray:
+    corners = np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]])
+    R = np.array([[np.cos(YAW), -np.sin(YAW)], [np.sin(YAW), np.cos(YAW)]])
+    return corners @ R.T + [100.0, -40.0]
+
+
+def roads() -> Roads:
+    lane = outline(-50.0, 200.0, -2.0, 2.0)
+    middle = outline(-50.0, 200.0, 0.0, 0.0)[:2]
+    return Roads(RoadMap((lane,), (True,), (lane, outline(-50, 200, -4, 4)), (), middle))
+
+
+def place(at_x: float | None = None) -> Place:
+    """With a car that stands on the path, or without."""
+    times = torch.arange(0.0, 12.0, 0.5)
+    count = 0 if at_x is None else 1
+    T = torch.eye(4).repeat(count, len(times), 1, 1)
+    T[..., 0, 3] = at_x or 0.0
+    T[..., 2, 3] = 0.8
+    tracks = ActorTracks(
+        torch.arange(count) + 5,
+        torch.full((count,), int(Category.CAR)),
+        torch.tensor([[4.5, 1.9, 1.6]]).repeat(count, 1),
+        times,
+        T,
+        torch.ones(count, len(times), dtype=torch.bool),
+    )
+
+    one = Gaussians(
+        torch.zeros(1, 3), torch.tensor([[1.0, 0, 0, 0]]), torch.zeros(1, 3), torch.zeros(1), torch.ones(1, 5)
+    )
+    graph, vehicle = SceneGraph(tracks, GaussianContent(one, torch.zeros(1, dtype=torch.int64))), long_log()
+    scene = GaussianScene(graph, cameras=1)
+    return Place(graph, vehicle, lambda changed: RebuiltRenderer(scene, changed, vehicle), {})
+
+
+def long_log() -> LoggedVehicle:
+    vehicle = logged(SPEED).vehicle
+    times = torch.arange(0.0, 12.05, 0.1)
+    T = torch.eye(4).repeat(len(times), 1, 1)
+    T[:, 0, 3] = SPEED * times
+    return dataclasses.replace(vehicle, t_s=times, T_scene_ego=T)
+
+
+def run(agent_in: object, at_x: float | None = None, **changes: object) -> PseudoSimulation:
+    chosen = {"follow_ups": FOLLOW_UPS[:2], **changes}
+    return PseudoSimulation(place(at_x), roads(), agent_in, 1, sensors=False, **chosen)  # type: ignore[arg-type]
+
+
+def test_who_drives_on_along_the_lane_has_nearly_all_points() -> None:
+    simulation = run(lambda simulator: StraightAgent(SPEED))
+    starts = simulation.starts_s(1.0)
+    assert starts == [2.0, 3.0, 4.0, 5.0, 6.0]
+    found = simulation.score(starts[0])
+    assert (found.first.nc, found.first.dac, found.first.ttc, found.first.lk) == (1.0, 1.0, 1.0, 1.0)
+    assert found.first.ep == pytest.approx(1.0, abs=0.02)
+    assert found.score == pytest.approx(1.0, abs=0.06)
+    assert len(found.second) == 2 * 2
+
+
+def test_who_stops_has_no_progress_and_who_hits_somebody_no_score() -> None:
+    stops = run(lambda simulator: StraightAgent(0.0)).score(2.0)
+    assert stops.first.nc == 1.0
+    assert stops.first.ep < 0.5
+    hits = run(lambda simulator: StraightAgent(SPEED), at_x=30.0).score(2.0)
+    assert hits.first.nc == 1.0  # the log does the same, so that it is forgiven
+    expert = run(lambda simulator: ReplayExpert(simulator.drive), at_x=64.0).score(2.0)
+    blind = run(lambda simulator: StraightAgent(SPEED), at_x=64.0).score(2.0)
+    assert min(scores.nc for scores in expert.second) == 1.0
+    assert min(scores.nc for scores in blind.second) == 0.0
+
+
+def test_the_second_stage_starts_beside_the_path_with_a_past_of_its_own() -> None:
+    places = list[tuple[float, float]]()
+
+    class Looks:
+        def __init__(self, simulator: RebuiltSimulator) -> None:
+            self.simulator = simulator
+
+        def act(self, observation: Clip) -> Trajectory:
+            pose = observation.T_world_ego[0].numpy()
+            R = np.array([[np.cos(YAW), -np.sin(YAW)], [np.sin(YAW), np.cos(YAW)]])
+            local = (pose[:, :2, 3] - [100.0, -40.0]) @ R
+            places.append((local[-1, 1], local[-1, 0] - local[-2, 0]))
+            return StraightAgent(SPEED).act(observation)
+
+    run(Looks, follow_ups=FOLLOW_UPS[4:6]).score(2.0)
+    aside = sorted({round(float(y), 2) for y, _ in places})
+    assert aside == [-0.8, 0.0, 0.8]
+    np.testing.assert_allclose([moved for _, moved in places], 4.0, atol=0.03)
+
+
+def test_a_plan_is_followed_by_the_regulator() -> None:
+    state = logged(SPEED).state_at(3.0)
+    ego = simulated(StraightAgent(SPEED).act(seen(0.0, SPEED)), state)
+    assert len(ego.yaw_rad) == 31
+    gone = np.hypot(*(ego.xy_m[-1] - ego.xy_m[0]))
+    assert gone == pytest.approx(24.0, abs=0.1)
+    short = plan_of(torch.ones(1, 1, 4, 2))
+    with pytest.raises(InputError, match="a plan of 3 s is needed, got 2 s"):
+        simulated(short, state)
+
+
+def test_the_past_is_that_of_the_log() -> None:
+    past = past_motion(logged(SPEED), 3.0)
+    assert len(past.yaw_rad) == 15
+    np.testing.assert_allclose(past.speed_mps, SPEED, atol=0.02)
+    np.testing.assert_allclose(past.acceleration_mps2, 0.0, atol=0.2)
+
+
+def test_failed_starts_are_counted_and_have_no_share() -> None:
+    found = run(lambda simulator: StraightAgent(SPEED)).score(2.0)
+    figures = figures_of([found], failed=2)
+    assert (figures["starts"], figures["failed"]) == (3, 2)
+    assert figures["epdms"] == found.score
+    assert figures_of([], failed=1)["epdms"] is None
