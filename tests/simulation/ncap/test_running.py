@@ -24,7 +24,7 @@ from foredrive.simulation.ncap.proposing import propose
 from foredrive.simulation.ncap.rules import OURS, PAPER, RELEASED, RULES, Rules
 from foredrive.simulation.ncap.running import Place, drive_without_action, reference_mps, set_up_run
 from foredrive.simulation.ncap.scenario import Jitter, Rectilinear, SafetyScenario, ScenarioActor
-from foredrive.simulation.ncap.self_test import self_test
+from foredrive.simulation.ncap.self_test import run_reference, self_test
 from foredrive.simulation.simple_agents import StraightAgent
 from foredrive.simulation.threats import Threat
 
@@ -176,7 +176,8 @@ def test_scenarios_that_nobody_hits_are_named_and_left_out() -> None:
 
     tested = self_test([aside, STANDING, long, nobody, elsewhere], place_of, 2, OURS)
     assert tested.passed == (STANDING,)
-    assert tested.reference_mps[STANDING.label] == pytest.approx((8.0, 8.0), rel=0.03)
+    references = [run_reference(here, STANDING, number, OURS) for number in range(2)]
+    assert references == pytest.approx([8.0, 8.0], rel=0.03)
     assert set(tested.left_out) == {f"stationary-{name}" for name in ("aside", "long", "nobody", "elsewhere")}
     assert "run 0 passes without any action" in tested.told
     assert "the log ends at 10.0 s" in tested.told
