@@ -116,7 +116,7 @@ def test_the_verb_drives_against_a_threat(
     assert (tmp_path / "suite" / "report.html").is_file()
     assert main(["drive", "--agent", "stop", "--out", str(tmp_path / "other"), "--start", "1"]) == 2
     assert "--in RUN" in capsys.readouterr().err
-    assert main([*command[:2], "expert", "--out", str(tmp_path / "other"), *command[5:]]) == 2
+    assert main([*command[:2], "disturbed", "--out", str(tmp_path / "other"), *command[5:]]) == 2
     assert "can drive only there" in capsys.readouterr().err
     assert main([*command, "--rig", "driving"]) == 2
     assert "do not go with --in: the cameras are the log's" in capsys.readouterr().err
