@@ -24,7 +24,7 @@ from benchmarks.common.study import seeded
 from benchmarks.learning_towns import TEST_TOWNS, learning_digest, plan_learning, record_missing
 from foredrive.data import ClipDataset, LogPath, collate
 from foredrive.evaluation.bench import Benchmark, study_identity
-from foredrive.evaluation.metrics.occupancy import EGO_COMPENSATED, OccupancyMetric
+from foredrive.evaluation.metrics.occupancy import CONTINUED, EGO_COMPENSATED, OccupancyMetric
 from foredrive.evaluation.metrics.vehicles import VehicleMetric
 from foredrive.evaluation.run import evaluate
 from foredrive.recipes import find_recipe
@@ -146,6 +146,7 @@ def judge(run: Run, logs: Sequence[LogPath], budget_name: str) -> dict[str, floa
         figures |= {
             f"iou_{when}": f"{above}_{when}",
             f"iou_{when}_persistence": f"{above}_{when}{EGO_COMPENSATED}",
+            f"iou_{when}_continued": f"{above}_{when}{CONTINUED}",
         }
     named = {f"{key}_{budget_name}": float(found[name]) for key, name in figures.items()}
     return named | {

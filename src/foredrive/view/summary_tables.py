@@ -27,7 +27,7 @@ ABOVE_NOTE = f"Above the ground: voxels more than {ABOVE_GROUND_M:g} m above it.
 BASELINES_NOTE = (
     "Occupancy prior: the fixed grid that scores best on the training logs. Persistence: the predicted "
     "present in place of the future. Ego-compensated persistence: the same, moved along the driven path, "
-    "which the model is not told."
+    "which the model is not told. Persistence, motion continued: moved as if the vehicle went on as measured."
 )
 FUTURES_NOTE = "Best and mean of K: sampled futures."
 BEST_NOTE = "Green: best of its column. The protocols differ: compare values of one column only."
@@ -45,6 +45,7 @@ BASELINE_TITLES = {
     PRIOR: "occupancy prior",
     "copy": "persistence",
     "carried_copy": "ego-compensated persistence",
+    "continued_copy": "persistence, motion continued",
 }
 """Titles of the baselines by their keys in summary.json."""
 TASK_FIGURES = (

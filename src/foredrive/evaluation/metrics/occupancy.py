@@ -10,11 +10,13 @@ from foredrive.evaluation.predictor import Part, Prediction
 from foredrive.geometry.se3 import inverse_se3
 from foredrive.metrics.forecasts import ego_compensated
 from foredrive.metrics.occupancy import OccupancyCounts, above_ground, count_occupancy
-from foredrive.scene import Example, VoxelSpec
+from foredrive.models.nemo.ego_motion import continued_motion
+from foredrive.scene import Clip, Example, VoxelSpec, last_frames
 
-PERSISTENCE, EGO_COMPENSATED = ".copy", ".carried_copy"
-"""Suffixes of persistence: the predicted present in place of the future, and the same moved along the driven
-path."""
+PERSISTENCE, EGO_COMPENSATED, CONTINUED = ".copy", ".carried_copy", ".continued_copy"
+"""Suffixes of persistence: the predicted present in place of the future, the same moved along the driven
+path, and the same moved as if the vehicle went on as measured. A model is told no more than the last."""
+PERSISTENT = (PERSISTENCE, EGO_COMPENSATED, CONTINUED)
 PRIOR = ".best_constant"
 
 
@@ -48,8 +50,12 @@ class OccupancyMetric:
         shown = {"": predicted}
         if frames > 1:
             T_world_ego = clip.T_world_ego[:, clip.now : clip.now + frames]
+            T_now_ego = inverse_se3(T_world_ego[:, :1]) @ T_world_ego
             shown[PERSISTENCE] = predicted[:, :1].expand_as(predicted)
-            shown[EGO_COMPENSATED] = _ego_compensated_frames(predicted[:, 0], T_world_ego, labels.spec)
+            shown[EGO_COMPENSATED] = _moved(predicted[:, 0], T_now_ego, labels.spec)
+            if clip.now > 0:
+                T_now_ego = _continued_path(clip, frames - 1)
+                shown[CONTINUED] = _moved(predicted[:, 0], T_now_ego, labels.spec)
         for scope, region in self._regions.items():
             if scope in self._priors:
                 shown[PRIOR] = self._priors[scope][0].to(predicted.device).expand_as(predicted)
@@ -74,7 +80,7 @@ class OccupancyMetric:
         out: Figures = {}
         for (scope, suffix), counts in self._counts.items():
             names = self._context.frame_names(len(counts.iou))
-            persists = suffix in (PERSISTENCE, EGO_COMPENSATED)
+            persists = suffix in PERSISTENT
             for kind in ("iou",) if persists else ("iou", "precision", "recall"):
                 for name, value in zip(names, getattr(counts, kind).tolist(), strict=True):
                     if not (persists and name == "now"):
@@ -86,10 +92,17 @@ class OccupancyMetric:
         return out
 
 
-def _ego_compensated_frames(
-    now: Bool[Tensor, "b Z Y X"], T_world_ego: Float64[Tensor, "b F 4 4"], spec: VoxelSpec
+def _moved(
+    now: Bool[Tensor, "b Z Y X"], T_now_ego: Float64[Tensor, "b F 4 4"], spec: VoxelSpec
 ) -> Bool[Tensor, "b F Z Y X"]:
-    """Return ego-compensated persistence for each of F driven poses, the first of them now."""
-    T_now_ego = inverse_se3(T_world_ego[:, :1]) @ T_world_ego
-    frames = [ego_compensated(now, T_now_ego[:, k], spec) for k in range(T_world_ego.shape[1])]
+    """Return the present occupancy as seen from F poses."""
+    frames = [ego_compensated(now, T_now_ego[:, k], spec) for k in range(T_now_ego.shape[1])]
     return torch.stack(frames, dim=1)
+
+
+def _continued_path(clip: Clip, steps: int) -> Float64[Tensor, "b F 4 4"]:
+    """Return the poses now and at the next key frames if the vehicle goes on as measured, F = steps + 1."""
+    T = [torch.eye(4, dtype=torch.float64, device=clip.t_s.device).expand(len(clip.t_s), 4, 4)]
+    for T_prev_next in continued_motion(last_frames(clip.observed(), 1), steps).double().unbind(dim=1):
+        T.append(T[-1] @ T_prev_next)
+    return torch.stack(T, dim=1)

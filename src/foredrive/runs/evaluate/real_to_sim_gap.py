@@ -13,7 +13,7 @@ from foredrive.data.logs import Log
 from foredrive.data.resizing import shrink_images
 from foredrive.errors import InputError
 from foredrive.evaluation.metric import Figures
-from foredrive.evaluation.metrics.occupancy import EGO_COMPENSATED, PERSISTENCE
+from foredrive.evaluation.metrics.occupancy import PERSISTENT
 from foredrive.evaluation.predictor import Part, Prediction, Predictor
 from foredrive.evaluation.provenance import collect_provenance
 from foredrive.evaluation.run import evaluate
@@ -161,8 +161,7 @@ class RealToSimComparison:
             found = evaluate(_StoredPredictions(iter(prediction)), truth, frame_dt_s=frame_dt_s).summary
             kinds = (".iou_", ".l2_") if name == AGREEMENT else (".iou_", ".l2_", ".collision_")
             kept = {key: value for key, value in found.items() if any(kind in key for kind in kinds)}
-            persistence = (PERSISTENCE, EGO_COMPENSATED)
-            out |= {f"{name}.{key}": value for key, value in kept.items() if not key.endswith(persistence)}
+            out |= {f"{name}.{key}": value for key, value in kept.items() if not key.endswith(PERSISTENT)}
         return out
 
 
