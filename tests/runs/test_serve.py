@@ -22,7 +22,7 @@ from foredrive.evaluation.summary import read_summary
 from foredrive.runs.drive.in_ncap import SafetyTests
 from foredrive.runs.drive.in_rebuilt import opened_rebuilt
 from foredrive.runs.drive.suite import DriveSuite, drive_suite
-from foredrive.runs.serve import planner_of, renderer_of
+from foredrive.runs.serve import alpasim_server_of, planner_of, renderer_of
 from foredrive.simulation.ncap.outcome import Outcome
 from foredrive.simulation.remote.json_http import Address, JsonServer, ask
 
@@ -197,3 +197,21 @@ def test_the_verb_serves_on_loopback_until_it_is_interrupted(rebuilt: Path) -> N
         process.terminate()
     for unfit in (["serve", "nobody"], ["serve", "expert"]):
         assert main(unfit) == 2
+
+
+def test_a_driver_of_alpasim_drives_as_the_agent_does_here(
+    rebuilt: Path, scenarios: Path, tmp_path: Path
+) -> None:
+    pytest.importorskip("carla_driver_interface")
+    server, port = alpasim_server_of("constant-velocity", "127.0.0.1", 0)
+    server.start()
+    try:
+        remote = suite(f"grpc://127.0.0.1:{port}", rebuilt, scenarios)
+        (over_wire,) = drive_suite(remote, tmp_path / "wire").drives.values()
+    finally:
+        server.stop(grace=1.0).wait()
+    (here,) = drive_suite(suite("constant-velocity", rebuilt, scenarios), tmp_path / "here").drives.values()
+    assert over_wire.threat is not None
+    assert here.threat is not None
+    assert over_wire.threat.outcome is here.threat.outcome is Outcome.COLLIDED
+    assert over_wire.threat.impact_mps == pytest.approx(here.threat.impact_mps, abs=0.01)

@@ -3,11 +3,12 @@
 import contextlib
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 from foredrive.data.boxes import read_track_ids
 from foredrive.data.logs import Log
 from foredrive.errors import InputError
-from foredrive.runs.drive.agents import inputs_of, make_agent
+from foredrive.runs.drive.agents import inputs_of, make_agent, require_alpasim
 from foredrive.runs.folder import CONFIG, LOG
 from foredrive.runs.rebuild.rebuilt_run import open_rebuilt, open_run_log
 from foredrive.simulation.remote.json_http import Answer
@@ -44,7 +45,26 @@ def planner_of(agent: str) -> Answers:
     Raises:
         InputError: there is no such agent, or it reads the state of a town.
     """
+    return PlannerService(lambda clock: make_agent(agent, clock), _needs_of(agent)).answers()
+
+
+def alpasim_server_of(agent: str, host: str, port: int) -> tuple[Any, int]:
+    """Return an agent of `foredrive drive` as a server of AlpaSim's driver contract, and its port.
+
+    The caller starts and stops the server.
+
+    Raises:
+        InputError: there is no such agent, the contract is not installed, or the address cannot be served.
+    """
+    require_alpasim()
+    from foredrive.simulation.remote.alpasim_server import AlpasimDriver, serve_alpasim
+
+    make_agent(agent, lambda: 0.0)  # now, not with the first drive
+    driver = AlpasimDriver(Path(agent).name, lambda clock: make_agent(agent, clock), _needs_of(agent))
+    return serve_alpasim(driver, host, port)
+
+
+def _needs_of(agent: str) -> PlannerNeeds:
     inputs = inputs_of(agent)
     cameras = None if inputs.camera_names is None else tuple(name.lower() for name in inputs.camera_names)
-    needs = PlannerNeeds(inputs.past_frames, cameras if inputs.cameras else ())
-    return PlannerService(lambda clock: make_agent(agent, clock), needs).answers()
+    return PlannerNeeds(inputs.past_frames, cameras if inputs.cameras else ())

@@ -51,7 +51,7 @@ def rig() -> CameraRig:
     T[0, 3] = 1.7
     K = torch.tensor([[8.0, 0.0, 4.0], [0.0, 8.0, 3.0], [0.0, 0.0, 1.0]])
     return CameraRig(
-        torch.stack([K, 2 * K]),
+        torch.stack([K, torch.diag(torch.tensor([2.0, 2.0, 1.0])) @ K]),
         T.repeat(2, 1, 1),
         torch.zeros(2, 5),
         torch.zeros(2),

@@ -1,5 +1,6 @@
 """Agents that can drive a town, by the names that the command line accepts."""
 
+import importlib.util
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
@@ -20,8 +21,8 @@ from foredrive.scene import Agent, Clip, Trajectory
 from foredrive.sensors.rigs import SURROUND, RigPlan
 from foredrive.simulation.demonstrations import AlternatingStudent, DisturbedExpert
 from foredrive.simulation.observation import FRAME_DT_S
-from foredrive.simulation.remote.json_http import read_address
-from foredrive.simulation.remote.planner_client import HttpPlanner, check_planner
+from foredrive.simulation.remote.json_http import Address, read_address
+from foredrive.simulation.remote.planner_client import ALIVE_S, HttpPlanner, check_planner
 from foredrive.simulation.restarts import RestartingAgent
 from foredrive.simulation.simple_agents import StraightAgent
 from foredrive.simulation.town import TownSimulator
@@ -37,6 +38,8 @@ OF_LOGS = (REPLAY, CORRIDOR)
 """Agents that need the path of a log; `in_rebuilt` makes them, and another expert."""
 HTTP = "http://"
 """Beginning of the address of a planner behind neuro-ncap's model server protocol."""
+GRPC = "grpc://"
+"""Beginning of the address of a driver behind AlpaSim's contract."""
 DISTURBED, STUDENT = "disturbed", "student:"
 OLD_STUDENT = "pupil:"
 """The prefix of `STUDENT` in earlier versions, still accepted."""
@@ -66,6 +69,8 @@ def check_seeing(agent: str, sees: Sees | None) -> None:
     Raises:
         InputError: it needs others, or has no use for those.
     """
+    if sees is not None and agent.startswith(GRPC):
+        raise InputError("drivers of AlpaSim are sent cameras alone: leave out --sees")
     if sees is None or is_remote(agent):
         return
     inputs = inputs_of(agent)
@@ -97,13 +102,14 @@ def inputs_of(agent: str) -> AgentInputs:
             the ego status, fitted to the training data of the run. For DAgger demonstrations: "disturbed",
             the expert under disturbances, or "student:RUN", a run that drives in alternation with the expert.
             "log" and "lidar-corridor" follow the path of a reconstructed log.
-            "http://HOST:PORT" is a planner in another process (`HttpPlanner`).
+            "http://HOST:PORT" is a planner in another process (`HttpPlanner`), "grpc://HOST:PORT" a driver of
+            AlpaSim (`GrpcDriver`).
 
     Raises:
         InputError: there is no such agent, or it was trained on another frame interval.
     """
-    if agent.startswith(HTTP):
-        read_address(agent)
+    if is_remote(agent):
+        _address_of(agent)
         return AgentInputs(cameras=True, lidar=False, past_frames=1)
     if agent in (EXPERT, STOP, CONSTANT_VELOCITY, DISTURBED, *OF_LOGS):
         return AgentInputs(cameras=False, lidar=agent == CORRIDOR, past_frames=1)
@@ -132,7 +138,9 @@ def check_rig_of(agent: str, rig: RigPlan) -> None:
 
 
 def _rigs_of(agent: str) -> TrainedRigs | None:
-    if agent in (EXPERT, STOP, CONSTANT_VELOCITY, DISTURBED, *OF_LOGS) or agent.startswith((EGO_MLP, HTTP)):
+    if agent in (EXPERT, STOP, CONSTANT_VELOCITY, DISTURBED, *OF_LOGS) or agent.startswith(
+        (EGO_MLP, HTTP, GRPC)
+    ):
         return None
     return read_rigs(_run_folder(agent))
 
@@ -166,9 +174,14 @@ def make_agent(
         raise InputError(
             f"the agent {agent} follows the path of a log and can drive only in a reconstruction"
         )
+    if agent.startswith(GRPC):
+        require_alpasim()
+        from foredrive.simulation.remote.alpasim_client import GrpcDriver
+
+        return GrpcDriver(_address_of(agent), clock)
     if agent.startswith(HTTP):
         return HttpPlanner(
-            read_address(agent), clock, cameras=sees != "lidar", lidar=sees in ("lidar", "both")
+            _address_of(agent), clock, cameras=sees != "lidar", lidar=sees in ("lidar", "both")
         )
     folder = _run_folder(agent)
     if agent.startswith((STUDENT, OLD_STUDENT)):
@@ -178,7 +191,22 @@ def make_agent(
 
 def is_remote(agent: str) -> bool:
     """Return whether an agent is in another process. It remembers the frames that it was sent."""
-    return agent.startswith(HTTP)
+    return agent.startswith((HTTP, GRPC))
+
+
+def _address_of(agent: str) -> Address:
+    """Return the address of an agent in another process."""
+    return read_address(agent, "grpc" if agent.startswith(GRPC) else "http")
+
+
+def require_alpasim() -> None:
+    """Check that AlpaSim's contract is installed.
+
+    Raises:
+        InputError: it is not.
+    """
+    if importlib.util.find_spec("carla_driver_interface") is None:
+        raise InputError("AlpaSim's driver contract is missing: pip install 'foredrive[alpasim]'")
 
 
 def check_ready(agent: str) -> None:
@@ -187,8 +215,13 @@ def check_ready(agent: str) -> None:
     Raises:
         InputError: it is not.
     """
-    if is_remote(agent):
-        check_planner(read_address(agent))
+    if agent.startswith(GRPC):
+        require_alpasim()
+        from foredrive.simulation.remote.alpasim_client import check_driver
+
+        check_driver(_address_of(agent), ALIVE_S)
+    elif is_remote(agent):
+        check_planner(_address_of(agent))
 
 
 def _expert(town: TownSimulator | None) -> TownExpert:
@@ -203,7 +236,7 @@ def _run_folder(agent: str) -> Path:
     if not folder.is_dir():
         known = (
             f"{EXPERT}, {STOP}, {CONSTANT_VELOCITY}, a run folder, {EGO_MLP}RUN, {HTTP}HOST:PORT, "
-            f"{DISTURBED} or {STUDENT}RUN, and in a reconstruction {REPLAY} or {CORRIDOR}"
+            f"{GRPC}HOST:PORT, {DISTURBED} or {STUDENT}RUN, and in a reconstruction {REPLAY} or {CORRIDOR}"
         )
         raise InputError(f"unknown agent {agent!r}; the agents are {known}")
     return folder

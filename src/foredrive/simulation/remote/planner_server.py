@@ -4,7 +4,9 @@ import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import torch
+from jaxtyping import Float64
 
 from foredrive.data.batches import stack_records
 from foredrive.data.boxes import no_boxes
@@ -79,9 +81,14 @@ class PlannerService:
         return agent.act(stack_records([clip]))
 
 
-def seen_clip(frames: Sequence[KeyFrame], rig: CameraRig | None, command: Command) -> Clip:
+def seen_clip(
+    frames: Sequence[KeyFrame],
+    rig: CameraRig | None,
+    command: Command,
+    target_xy: Float64[np.ndarray, "2"] | None = None,
+) -> Clip:
     """Return what an agent observes of key frames without ground truth. It is unbatched."""
-    clip = make_clip(frames, rig, command)
+    clip = make_clip(frames, rig, command, target_xy)
     return dataclasses.replace(clip, boxes_valid=torch.zeros_like(clip.boxes_valid))
 
 
