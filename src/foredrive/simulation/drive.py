@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 import numpy as np
+from jaxtyping import Float64
 
 from foredrive.data.batches import stack_records
 from foredrive.errors import InputError
@@ -15,7 +16,7 @@ from foredrive.simulation.comfort import JERK_S, Comfort, comfort_of
 from foredrive.simulation.controller import ControllerState, follow
 from foredrive.simulation.dynamics import EGO, STEP_S
 from foredrive.simulation.observation import FRAME_DT_S
-from foredrive.simulation.plans import fixed_in_world
+from foredrive.simulation.plans import fixed_in_world, waypoints_of
 from foredrive.simulation.scores import Ending, RouteScore, infraction_of
 from foredrive.simulation.time_to_collision import MovingBoxes, time_to_collision_s
 
@@ -63,6 +64,8 @@ class Drive:
     """None if the drive is too short to tell."""
     error: str = ""
     """Error of the agent; empty if there was none."""
+    plans: tuple[tuple[int, Float64[np.ndarray, "_ 2"]], ...] = ()
+    """For each plan the step at which it was made, and its points in the ego frame then, m."""
 
 
 @runtime_checkable
@@ -129,13 +132,16 @@ def drive_route(
     clip = simulator.reset(scenario)
     on_frame()
     states, events, nearest, act_s = [simulator.ego()], list[Event](), [_nearest_s(clip)], list[float]()
+    plans = list[tuple[int, np.ndarray]]()
     pilot, ending, error = pilot or FollowingPilot(simulator, pace.latency_s), None, ""
     while ending is None:
         index = len(states) - 1
         if index % pace.steps == 0:
             began = time.perf_counter()
             try:
-                pilot.expect(agent.act(stack_records([clip])), states[-1], index * STEP_S)
+                plan = agent.act(stack_records([clip]))
+                pilot.expect(plan, states[-1], index * STEP_S)
+                plans.append((index, waypoints_of(plan)))
             except Exception as problem:  # any error of an agent ends the drive, but the route still counts
                 ending, error = Ending.CRASHED, f"{type(problem).__name__}: {problem}"
                 break
@@ -154,7 +160,9 @@ def drive_route(
         route, repetition, ending=ending, infractions=infractions, duration_s=duration_s, **progress
     )
     comfort = comfort_of(states) if len(states) * STEP_S > JERK_S + STEP_S else None
-    return Drive(score, tuple(states), tuple(events), tuple(nearest), tuple(act_s), comfort, error)
+    return Drive(
+        score, tuple(states), tuple(events), tuple(nearest), tuple(act_s), comfort, error, tuple(plans)
+    )
 
 
 def _nearest_s(clip: Clip) -> float:

@@ -19,6 +19,11 @@ class LoggedLanes:
     def __init__(self, outlines: Sequence[Float64[np.ndarray, "V 2"]]) -> None:
         self._areas = shapely.STRtree([shapely.make_valid(shapely.Polygon(outline)) for outline in outlines])
 
+    @property
+    def area(self) -> shapely.Geometry:
+        """Return the union of all lanes."""
+        return shapely.union_all(self._areas.geometries)
+
     def outside(self, xy: Float64[np.ndarray, "2"]) -> bool:
         """Return whether a point is outside of all lanes, by CARLA's OutsideRouteLanesTest."""
         near = self._areas.query(shapely.Point(*xy), predicate="dwithin", distance=OUTSIDE_BY_M)

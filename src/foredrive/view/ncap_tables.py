@@ -16,6 +16,7 @@ COLUMNS = (
     Column("impact speed", digits=2),
     Column("TTC, s", digits=1),
     Column("comfort, %", digits=0),
+    Column("HD-Score", digits=2),
     Column("stopped short"),
     Column("left way"),
 )
@@ -55,6 +56,7 @@ def _row(name: str, of: SafetyFigures, is_strong: bool = False) -> Row:
         of.relative_impact_speed,
         of.time_to_collision_s,
         comfort,
+        of.hd_score,
         of.stopped_short,
         of.left_way,
     ]

@@ -5,6 +5,7 @@ import math
 
 import numpy as np
 import pytest
+import shapely
 import torch
 
 from foredrive.errors import InputError
@@ -19,6 +20,7 @@ from foredrive.rendering.vehicle import LoggedVehicle
 from foredrive.scene import CameraRig, Category
 from foredrive.simulation.drive import drive_route
 from foredrive.simulation.ncap.drawing import draw_run
+from foredrive.simulation.ncap.hd import hd_score_of
 from foredrive.simulation.ncap.outcome import Outcome, SafetyResult, judge
 from foredrive.simulation.ncap.proposing import propose
 from foredrive.simulation.ncap.rules import OURS, PAPER, RELEASED, RULES, Rules
@@ -220,3 +222,25 @@ def test_nothing_is_proposed_where_something_stands_in_the_way() -> None:
     assert propose(place(parked_m=(45.0, 0.0)), "log") == []
     with pytest.raises(InputError, match="no car of the log was seen"):
         propose(place(), "log")
+
+
+def test_the_hd_score_of_a_drive_tells_who_plans_through_others() -> None:
+    """At 8 m/s towards a car that stands on the path, or far beside it."""
+    corners = [at(-20.0, -4.0), at(150.0, -4.0), at(150.0, 4.0), at(-20.0, 4.0)]
+    street, found = shapely.Polygon([corner[:2] for corner in corners]), {}
+    aside = scenario(Rectilinear(at(50.0, 12.0), 0.0, YAW), Threat.STATIONARY)
+    for name, test in (("on", STANDING), ("beside", aside)):
+        here = place()
+        run = set_up_run(here, test, 0, OURS, sensors=False, past_frames=0)
+        agent = StraightAgent(SPEED_MPS)
+        drive = drive_route(run.simulator, run.scenario, agent, route=name, pilot=run.pilot)
+        assert len(drive.plans) == len(drive.act_s)
+        tracks, T = run.simulator.tracks, here.vehicle.T_world_scene
+        found[name] = hd_score_of(drive, tracks, T, run.scenario.start_s, street)
+    on, beside = found["on"], found["beside"]
+    assert on is not None
+    assert beside is not None
+    assert (beside.nc, beside.dac, beside.ttc, beside.comfort) == (1.0, 1.0, 1.0, 1.0)
+    assert beside.hd_score == pytest.approx(beside.completion)
+    assert on.nc < 0.9
+    assert on.hd_score < 0.7 * beside.hd_score

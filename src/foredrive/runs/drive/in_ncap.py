@@ -1,6 +1,7 @@
 """Safety tests after NeuroNCAP in reconstructed logs, as a source of drives."""
 
 import contextlib
+import dataclasses
 import functools
 import hashlib
 from collections.abc import Iterator, Mapping, Sequence
@@ -22,11 +23,13 @@ from foredrive.runs.drive.in_rebuilt import (
 )
 from foredrive.runs.drive.suite import DriveJob, DriveSetup, DriveSuite
 from foredrive.runs.rebuild.rebuilt_run import open_run_log
+from foredrive.simulation.drive import Drive
 from foredrive.simulation.drive_log import drive_log, log_frame
-from foredrive.simulation.ncap.outcome import judge
+from foredrive.simulation.ncap.hd import hd_score_of
+from foredrive.simulation.ncap.outcome import SafetyResult, judge
 from foredrive.simulation.ncap.proposing import propose
 from foredrive.simulation.ncap.rules import RULES, Rules
-from foredrive.simulation.ncap.running import Place, set_up_run
+from foredrive.simulation.ncap.running import Place, SafetyRun, set_up_run
 from foredrive.simulation.ncap.scenario import SafetyScenario
 from foredrive.simulation.ncap.scenario_file import load_scenarios, save_scenarios
 from foredrive.simulation.ncap.self_test import SelfTest, run_reference, self_test
@@ -117,9 +120,26 @@ class SafetyTests:
                 log,
                 lambda: log_frame(simulator.state.frames[-1], simulator.state.ego, rig),
                 lanes_known=lanes_of(Path(folder)) is not None,
-                judge=lambda driven: judge(scenario.kind, driven, reference, rules.left_way_score),
+                judge=lambda driven: _judged(driven, scenario, reference, rules, run, place),
                 pilot=run.pilot,
             )
+
+
+def _judged(
+    driven: Drive, scenario: SafetyScenario, reference_mps: float, rules: Rules, run: SafetyRun, place: Place
+) -> SafetyResult:
+    """Return the result of a drive, with its HD-Score if the lanes are known."""
+    result = judge(scenario.kind, driven, reference_mps, rules.left_way_score)
+    if place.lanes is None or result.score is None:
+        return result
+    found = hd_score_of(
+        driven,
+        run.simulator.tracks,
+        place.vehicle.T_world_scene,
+        run.scenario.start_s,
+        place.lanes.area,
+    )
+    return dataclasses.replace(result, hd_score=None if found is None else found.hd_score)
 
 
 def propose_scenarios(runs: Sequence[str], file: Path, rules: str, count: int) -> SelfTest:

@@ -59,6 +59,8 @@ class SafetyFigures:
     time_to_collision_s: float | None
     """Median of the smallest time to collision, s, over the runs that have one."""
     comfortable_share: float | None
+    hd_score: float | None = None
+    """Mean of HUGSIM's HD-Score; None without a map."""
 
 
 def aggregate(
@@ -111,6 +113,7 @@ def _figures(groups: Groups, rng: np.random.Generator) -> SafetyFigures:
         comfortable_share=_mean(
             groups, lambda run: None if run.result.score is None else run.comfortable_share
         ),
+        hd_score=_mean(groups, lambda run: run.result.hd_score),
     )
 
 

@@ -62,6 +62,8 @@ class SafetyResult:
     """0 to 5. None for a failed drive: a failure is counted and never scored."""
     progress: float
     """Share of the way that was driven, 0 to 1."""
+    hd_score: float | None = None
+    """HUGSIM's HD-Score, 0 to 1. None without a map, and for a failed drive."""
 
     @property
     def score_progress(self) -> float | None:
