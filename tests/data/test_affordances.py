@@ -30,6 +30,7 @@ FRAME = 10
 """The rear axle is at x = 5 then."""
 LIGHTS = {5: TrafficLightStatus.RED, 4: TrafficLightStatus.GREEN}
 """Lane 5 begins at the line; lane 4 leads the other way."""
+LAMPS = {5: np.add(world.WORLD_OFFSET, [[20.0, -3.0, 2.5], [20.0, 0.0, 5.0]]), 4: np.zeros((1, 3))}
 STATES = (TrafficLightStatus.RED, TrafficLightStatus.GREEN)
 """Before and from frame 30 on, two seconds after `FRAME`."""
 
@@ -67,7 +68,11 @@ def frame(index: int) -> world.Frame:
         **unlabelled(5),
     )
     return dataclasses.replace(
-        plain, T_world_ego=pose, boxes=boxes, traffic_lights=LIGHTS | {5: STATES[index >= 30]}
+        plain,
+        T_world_ego=pose,
+        boxes=boxes,
+        traffic_lights=LIGHTS | {5: STATES[index >= 30]},
+        signal_lamps=LAMPS,
     )
 
 
@@ -95,6 +100,11 @@ def test_light_lead_vehicle_and_people_on_the_route(log: Log) -> None:
     assert (bool(found.light_known), LightState(int(found.light))) == (True, LightState.RED)
     assert found.light_later.tolist() == [LightState.RED] * 3 + [LightState.GREEN] * 3
     assert float(found.light_m) == pytest.approx(LINE_X - front_x(log), abs=0.02)
+    assert bool(found.lamps_known)
+    ahead = torch.tensor([[15.0, -3.0, 2.5], [15.0, 0.0, 5.0]])
+    back = torch.tensor([[math.cos(YAW), -math.sin(YAW)], [math.sin(YAW), math.cos(YAW)]])
+    in_street = torch.cat([found.lamp_xyz[:, :2] @ back.T, found.lamp_xyz[:, 2:]], dim=-1)
+    torch.testing.assert_close(in_street, ahead, atol=2e-3, rtol=0)
     assert bool(found.lead & found.lead_known)
     assert float(found.lead_m) == pytest.approx(LEAD_REAR_X - front_x(log), abs=0.02)
     assert float(found.lead_mps) == pytest.approx(3.0, abs=0.01)
@@ -112,6 +122,7 @@ def test_lights_behind_and_far_ahead_do_not_count(log: Log) -> None:
 def test_without_a_route_the_driven_path_counts_and_lights_are_unknown(tmp_path: Path) -> None:
     found = read_affordances(Log(written(tmp_path, None)), FRAME // 5)
     assert not bool(found.light_known)
+    assert not bool(found.lamps_known)
     assert bool(found.lead)
     assert int(found.path_valid.sum()) == 23  # 22.5 m are left
 

@@ -15,7 +15,7 @@ from foredrive.models.tasks.affordances import AffordanceHead, AffordanceHeadCon
 from foredrive.models.tasks.heads import TaskHeads, TaskVolume
 from foredrive.models.tasks.plane import Plane, PlanePyramid
 from foredrive.models.tasks.scene_tokens import SceneTokens
-from foredrive.scene import VoxelSpec
+from foredrive.scene import CameraRig, VoxelSpec
 from foredrive.scene.affordances import AffordanceEstimate, Affordances
 from foredrive.scene.image_features import ImageFeatures
 from foredrive.scene.task_truth import TaskTruth
@@ -37,6 +37,9 @@ def truth(light: list[int], known: bool = True) -> Affordances:
         light_m=torch.full((b,), 25.0),
         light_known=yes,
         light_later=torch.tensor(light)[:, None].expand(b, 6),
+        lamp_xyz=torch.tensor([[[20.0, 1.0, 3.0]]]).expand(b, 1, 3),
+        lamp=torch.tensor([[state > 0] for state in light]),
+        lamps_known=yes,
         lead=torch.tensor([k % 2 == 0 for k in range(b)]),
         lead_m=torch.full((b,), 12.0),
         lead_mps=torch.full((b,), 4.0),
@@ -131,6 +134,31 @@ def test_mirrored_truth_crosses_from_the_other_side() -> None:
     assert both.light.tolist() == [1, 1]
 
 
+def test_lamps_are_supervised_in_the_cell_that_they_project_to() -> None:
+    """A camera 4 m up and 90° wide looks ahead: a lamp at (20, 1, 3) lies 1/20 left and below its middle."""
+    pose = torch.tensor([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 4.0], [0, 0, 0, 1]])
+    rig = CameraRig(
+        K=torch.tensor([[4.0, 0, 4.0], [0, 4.0, 3.0], [0, 0, 1.0]]).expand(2, 1, 3, 3),
+        T_ego_cam=pose.expand(2, 1, 4, 4),
+        dist=torch.zeros(2, 1, 5),
+        readout_s=torch.zeros(2, 1),
+        names=("ahead",),
+        size_hw=(6, 8),
+    )
+    lamps = torch.full((2, 1, 6, 8, 3), -6.0)
+    lamps[0, 0, 3, 3, 0] = 6.0  # u = 3.8, v = 3.2
+    one, logits = torch.zeros(2), torch.zeros(2, 16, 24)
+    found = AffordanceSet(
+        torch.zeros(2, 4), lamps, one, one, one, one, logits, one[:, None], (-4.0, -8.0), 1.0, 2
+    )
+    weights = AffordanceLossWeights()
+    red_and_none = truth([1, 0])
+    right = affordance_losses(found, red_and_none, weights, rig)["lamps"]
+    other = affordance_losses(found, truth([3, 0]), weights, rig)["lamps"]
+    assert right < 0.01 < 1.0 < other
+    assert affordance_losses(found, red_and_none, weights)["lamps"] == 0
+
+
 def estimate(light: list[int], crossing_xy: list[list[float]], p: float) -> AffordanceEstimate:
     b = len(light)
     return AffordanceEstimate(
@@ -167,6 +195,8 @@ def test_figures_by_hand() -> None:
 def test_peaks_are_listed_once() -> None:
     logits = torch.full((1, 16, 24), -6.0)
     logits[0, 9, 10], logits[0, 9, 11], logits[0, 2, 3] = 3.0, 2.0, 1.0
-    one = torch.zeros(1)
-    found = AffordanceSet(torch.zeros(1, 4), one, one, one, one, logits, one[:, None], (-4.0, -8.0), 1.0, 2)
+    one, lamps = torch.zeros(1), torch.zeros(1, 1, 2, 2, 3)
+    found = AffordanceSet(
+        torch.zeros(1, 4), lamps, one, one, one, one, logits, one[:, None], (-4.0, -8.0), 1.0, 2
+    )
     assert found.estimate().crossing_xy[0].tolist() == [[6.5, 1.5], [-0.5, -5.5]]

@@ -18,7 +18,7 @@ from foredrive.data.arrow_files import reading
 from foredrive.data.boxes import read_boxes
 from foredrive.data.commands import route_at
 from foredrive.data.logs import Log
-from foredrive.data.recorded import read_traffic_lights
+from foredrive.data.recorded import read_signal_lamps, read_traffic_lights
 from foredrive.geometry.path_frame import along_path, path_headings
 from foredrive.geometry.polylines import arc_lengths, points_at
 from foredrive.scene import Boxes
@@ -83,6 +83,7 @@ def read_affordances(log: Log, frame: int) -> Affordances:
     """
     path = _path(log, frame)
     light, light_m, light_known, lane = _light(log, frame, path)
+    lamps, lamps_known = _lamps(log, frame, lane)
     boxes = read_boxes(log, frame)
     lead, lead_m, lead_mps, lead_known = _lead(boxes, path)
     crossing, crossing_known = _crossing(log, frame, boxes, path)
@@ -93,6 +94,9 @@ def read_affordances(log: Log, frame: int) -> Affordances:
         light_m=torch.tensor(light_m),
         light_known=torch.tensor(light_known),
         light_later=torch.tensor(_later(log, frame, lane, light)),
+        lamp_xyz=lamps,
+        lamp=torch.ones(len(lamps), dtype=torch.bool),
+        lamps_known=torch.tensor(lamps_known and light_known),
         lead=torch.tensor(lead),
         lead_m=torch.tensor(lead_m),
         lead_mps=torch.tensor(lead_mps),
@@ -151,6 +155,14 @@ def _light(log: Log, frame: int, path: _Path) -> tuple[LightState, float, bool, 
         if state is not None:
             return state, float(distance_m[row]), True, lane
     return LightState.NONE, 0.0, True, None
+
+
+def _lamps(log: Log, frame: int, lane: int | None) -> tuple[Float[Tensor, "L 3"], bool]:
+    """Return the places of the lamps for a lane in the ego frame, and whether the log tells."""
+    shown = read_signal_lamps(log, frame)
+    if shown is None or lane is None or lane not in shown:
+        return torch.zeros(0, 3), shown is not None and lane is None
+    return torch.from_numpy(_in_ego_frame(shown[lane], log, frame)).float(), True
 
 
 def _later(log: Log, frame: int, lane: int | None, light: LightState) -> list[int]:

@@ -5,7 +5,7 @@ import dataclasses
 import datetime
 import os
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import KW_ONLY, dataclass, field
 from pathlib import Path
 from types import TracebackType
@@ -59,9 +59,11 @@ from foredrive.data.modalities import (
     EXPERT_PLAN,
     LIDAR_BEAMS,
     SETTING,
+    SIGNAL_LAMPS,
     FullOccupancy,
     occupancy_metadata,
     pack_beams,
+    pack_lamps,
     pack_occupancy,
     pack_plan,
     visibility_modality,
@@ -118,6 +120,8 @@ class Frame:
     """Plan of the expert from here, unbatched, in the ego frame at `t_us`."""
     traffic_lights: dict[int, TrafficLightStatus] | None = None
     """States of the traffic lights, by the map ids of the lanes behind their stop lines."""
+    signal_lamps: Mapping[int, Float[np.ndarray, "_ 3"]] | None = None
+    """Places of the lamps of lights around the vehicle in the world frame, m, by the same ids."""
     depth_m: dict[str, Float[np.ndarray, "_ _"]] = field(default_factory=dict)
     """Depth along the optical axis by camera name; infinite for the sky."""
     semantic: dict[str, UInt8[np.ndarray, "_ _"]] = field(default_factory=dict)
@@ -226,6 +230,8 @@ class LogWriter:
             modalities.append(_custom(frame, SETTING, pack_setting(frame.setting)))
         if frame.caption is not None:
             modalities.append(_custom(frame, CAPTION, {"text": frame.caption}))
+        if frame.signal_lamps is not None:
+            modalities.append(_custom(frame, SIGNAL_LAMPS, pack_lamps(frame.signal_lamps)))
         if frame.expert_plan is not None:
             modalities.append(_custom(frame, EXPERT_PLAN, pack_plan(frame.expert_plan)))
         if frame.traffic_lights is not None:

@@ -5,14 +5,14 @@ and the plans of the expert. All are stored as 123D custom modalities with one r
 compressed separately with zstd, so that a row can be read without its neighbours.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float, Float64, Int
 from py123d.datatypes import Timestamp
 from py123d.datatypes.custom.custom_modality import CustomModality, CustomModalityMetadata
 
@@ -30,6 +30,8 @@ CAPTION = "caption"
 """One text per frame."""
 EXPERT_PLAN = "expert_plan"
 """The plan of the expert from the frame on."""
+SIGNAL_LAMPS = "signal_lamps"
+"""Middles of the lamps of traffic lights around the vehicle, by the lane that each guards."""
 OLD_NAMES = {EXPERT_PLAN: "taught_plan"}
 """Names of modalities in logs of earlier versions. They are read where the present name is absent."""
 
@@ -169,6 +171,19 @@ def unpack_plan(data: dict[str, Any]) -> Trajectory:
         log_prob=torch.zeros(1),
         dt_s=float(data["dt_s"]),
     )
+
+
+def pack_lamps(lamps: Mapping[int, Float[np.ndarray, "_ 3"]]) -> dict[str, Any]:
+    """Pack places in the world frame, in whole millimetres, by the map ids of lanes."""
+    lane = np.repeat(np.array(list(lamps), dtype=np.int64), [len(xyz) for xyz in lamps.values()])
+    xyz = np.concatenate([np.zeros((0, 3)), *lamps.values()])
+    return {"lane": squeeze_array(lane), "xyz_mm": squeeze_array(np.round(xyz * 1e3).astype(np.int32))}
+
+
+def unpack_lamps(data: dict[str, Any]) -> dict[int, Float64[np.ndarray, "_ 3"]]:
+    """Invert `pack_lamps`."""
+    lane, xyz = expand_array(data["lane"]), expand_array(data["xyz_mm"]).astype(np.float64) * 1e-3
+    return {int(name): xyz[lane == name] for name in np.unique(lane)}
 
 
 def squeeze_array(array: np.ndarray) -> dict[str, Any]:

@@ -3,7 +3,8 @@
 from collections.abc import Callable
 from typing import TypeVar
 
-from jaxtyping import Float, Int
+import numpy as np
+from jaxtyping import Float, Float64, Int
 from py123d.datatypes import ModalityType, TrafficLightStatus
 from py123d.datatypes.custom.custom_modality import CustomModality
 from torch import Tensor, from_numpy
@@ -18,8 +19,10 @@ from foredrive.data.modalities import (
     FULL_OCCUPANCY,
     OLD_NAMES,
     SETTING,
+    SIGNAL_LAMPS,
     FullOccupancy,
     unpack_attributes,
+    unpack_lamps,
     unpack_occupancy,
     unpack_plan,
     unpack_visibility,
@@ -94,6 +97,15 @@ def read_traffic_lights(log: Log, frame: int) -> dict[int, TrafficLightStatus] |
     with reading(file, f"the traffic lights at frame {frame}"):
         shown = log.scene.get_traffic_light_detections_at_iteration(log.iteration(frame))
         return None if shown is None else {int(light.lane_id): light.status for light in shown}
+
+
+def read_signal_lamps(log: Log, frame: int) -> dict[int, Float64[np.ndarray, "_ 3"]] | None:
+    """Read the places of lamps (world frame, m) by the lanes that they guard. Return None if not recorded.
+
+    Raises:
+        InputError: the row cannot be read.
+    """
+    return _read(log, frame, SIGNAL_LAMPS, lambda row: unpack_lamps(row.data))
 
 
 def _read(log: Log, frame: int, name: str, unpack: Callable[[CustomModality], T]) -> T | None:

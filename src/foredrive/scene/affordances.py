@@ -35,6 +35,11 @@ class Affordances(Record):
     light_later: Int[Tensor, "*b S"]
     """`LightState` of the same light at `LATER_STEPS` times, `LATER_DT_S` apart; the last known one beyond
     the end of the log."""
+    lamp_xyz: Float[Tensor, "*b L 3"]
+    """Places of the lamps of this light, ego frame, m."""
+    lamp: Bool[Tensor, "*b L"]
+    """False for padding."""
+    lamps_known: Bool[Tensor, "*b"]
     lead: Bool[Tensor, "*b"]
     """Whether a vehicle stands or drives in the path within `LEAD_RANGE_M`."""
     lead_m: Float[Tensor, "*b"]

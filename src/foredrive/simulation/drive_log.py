@@ -15,6 +15,7 @@ from foredrive.towns.map.town_map import load_town_map
 from foredrive.towns.recorder import (
     FIRST_TIME_US,
     camera_specs,
+    lamps_near,
     split_of,
     traffic_light_states,
     write_town_map,
@@ -49,10 +50,12 @@ def town_log_frame(simulator: TownSimulator, expert_plan: Trajectory | None = No
     """
     state, sensors = simulator.state, simulator.scenario.sensors
     lights = simulator.traffic.zone_lights(state.decided.time_s)
+    town = load_town_map(simulator.scenario.town)
     return dataclasses.replace(
         log_frame(state.frames[-1], state.ego, None if sensors is None else sensors.rig),
         expert_plan=None if expert_plan is None else expert_plan[0],
-        traffic_lights=traffic_light_states(load_town_map(simulator.scenario.town), lights),
+        traffic_lights=traffic_light_states(town, lights),
+        signal_lamps=lamps_near(town, simulator.signal_xyz, state.frames[-1].T_world_ego),
     )
 
 

@@ -194,6 +194,11 @@ class TownSimulator:
         return PredictedState(t_s + DECISION_S, after, scenarios, progress)
 
     @property
+    def signal_xyz(self) -> dict[int, Float64[np.ndarray, "_ 3"]]:
+        """Return points on the lamps of each traffic light, by the index of its stop zone."""
+        return self._world.signal_xyz
+
+    @property
     def driven(self) -> EgoPose:
         """Return the current ego vehicle as the traffic sees it."""
         return self._driven(self.state.ego, self.state.z_m)

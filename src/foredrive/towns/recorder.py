@@ -1,13 +1,13 @@
 """Recording of a drive of the expert in a town as a 123D log with exact labels."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Int
+from jaxtyping import Float64, Int
 from py123d.api.map.arrow.arrow_id_utils import ToIntMapping
 from py123d.datatypes import BaseMapObject, Lane, LaneGroup, TrafficLightStatus
 from py123d.parser.opendrive.opendrive_map_parser import OpenDriveMapParser
@@ -70,6 +70,10 @@ class LabelOptions:
     """Track ids as images and for each lidar return."""
     captions: bool = True
     """Captions, with the facts from which they are composed (`Setting`)."""
+
+
+LAMPS_M = 90.0
+"""Distance up to which the lamps of traffic lights are recorded, m."""
 
 
 def split_of(town: str) -> str:
@@ -168,6 +172,27 @@ def traffic_light_states(town: TownMap, lights: Int[np.ndarray, "Z"]) -> dict[in
     }
 
 
+def lamps_near(
+    town: TownMap,
+    signal_xyz: Mapping[int, Float64[np.ndarray, "_ 3"]],
+    T_world_ego: Float64[np.ndarray, "4 4"],
+) -> dict[int, Float64[np.ndarray, "_ 3"]]:
+    """Return the lamps within `LAMPS_M` of the vehicle by the ids of the lanes that they guard.
+
+    Args:
+        town: the map.
+        signal_xyz: points on the lamps of each light by the index of its stop zone.
+        T_world_ego: pose of the vehicle.
+    """
+    id_of = ToIntMapping.from_list([lane.lane_id for lane in town.lanes]).str_to_int
+    found = dict[int, Float64[np.ndarray, "_ 3"]]()
+    for zone, xyz in signal_xyz.items():
+        near = xyz[np.linalg.norm(xyz - T_world_ego[:3, 3], axis=1) < LAMPS_M]
+        if len(near):
+            found |= {id_of[lane]: near for lane in town.stop_zones[zone].lane_ids if lane in id_of}
+    return found
+
+
 class SensedFrame(NamedTuple):
     """A moment of a drive with its sensor data."""
 
@@ -226,6 +251,7 @@ def _frame(
         setting=setting,
         caption=text,
         traffic_lights=traffic_light_states(world.town, snapshot.lights),
+        signal_lamps=lamps_near(world.town, world.signal_xyz, snapshot.T_world_ego),
         **_ray_labels(frame, actors, sensors, labels),
     )
 

@@ -6,13 +6,18 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from foredrive.geometry.projection import project
+from foredrive.geometry.se3 import inverse_se3, transform_points
 from foredrive.losses.affordances import distance_loss, light_loss, presence_loss, speed_loss
 from foredrive.losses.centres import centre_loss, centre_target
 from foredrive.models.tasks.affordances import AffordanceSet
 from foredrive.models.tasks.plane import cell_middles
+from foredrive.scene import CameraRig
 from foredrive.scene.affordances import Affordances
 from foredrive.scene.traffic_light import LightState
 
+BESIDE_LAMP = 0.8
+"""Target of the cells around that of a lamp: a lamp may lie on their border."""
 SPREAD_M = 0.7
 """Standard deviation of the Gaussian around a person in the map of those who cross."""
 
@@ -22,6 +27,8 @@ class AffordanceLossWeights:
     """Weights of the terms of the affordances' losses."""
 
     light: float = 1.0
+    lamps: float = 0.3
+    """Of the lamps in the images, where their places are known."""
     light_m: float = 0.5
     lead: float = 0.5
     lead_m: float = 0.5
@@ -30,19 +37,49 @@ class AffordanceLossWeights:
 
 
 def affordance_losses(
-    found: AffordanceSet, truth: Affordances, weights: AffordanceLossWeights
+    found: AffordanceSet, truth: Affordances, weights: AffordanceLossWeights, rig: CameraRig | None = None
 ) -> dict[str, Float[Tensor, ""]]:
-    """Return weighted losses by name. What the log of an item does not tell trains nothing."""
+    """Return weighted losses by name. What the log of an item does not tell trains nothing.
+
+    Args:
+        found: of b items.
+        truth: of b items.
+        weights: weights of the terms.
+        rig: cameras at now, [b C]. Without it, lamps are not supervised in place.
+    """
     there = truth.light_known & (truth.light != LightState.NONE)
     lead = truth.lead_known & truth.lead
     return {
         "light": weights.light * light_loss(found.light_logits, truth.light, truth.light_known),
+        "lamps": weights.lamps * _lamp_loss(found, truth, rig),
         "light_m": weights.light_m * distance_loss(found.light_m, truth.light_m, there),
         "lead": weights.lead * presence_loss(found.lead_logit, truth.lead, truth.lead_known),
         "lead_m": weights.lead_m * distance_loss(found.lead_m, truth.lead_m, lead),
         "lead_mps": weights.lead_mps * speed_loss(found.lead_mps, truth.lead_mps, lead),
         "crossing": weights.crossing * _crossing_loss(found, truth),
     }
+
+
+def _lamp_loss(found: AffordanceSet, truth: Affordances, rig: CameraRig | None) -> Float[Tensor, ""]:
+    """Return the focal loss of the lamps of the next light in the images, over the items that tell."""
+    items = truth.lamps_known.nonzero()[:, 0].tolist()
+    if not items or rig is None:
+        return 0.0 * found.lamp_logits.sum()
+    b, c, h, w, colours = found.lamp_logits.shape
+    points = truth.lamp_xyz[:, None].expand(b, c, -1, -1)
+    in_camera = transform_points(inverse_se3(rig.T_ego_cam), points)
+    uv, _, inside = project(in_camera, rig.K, rig.dist, rig.size_hw)
+    inside = inside & truth.lamp[:, None]
+    cell = (uv * w / rig.size_hw[1]).floor().long()
+    target = found.lamp_logits.new_zeros(b, c, colours, h, w)
+    for item, camera, lamp in inside.nonzero().tolist():
+        colour = int(truth.light[item]) - 1
+        x, y = cell[item, camera, lamp].tolist()
+        if colour >= 0 and y < h and x < w:
+            around = target[item, camera, colour, max(y - 1, 0) : y + 2, max(x - 1, 0) : x + 2]
+            around.clamp_min_(BESIDE_LAMP)
+            target[item, camera, colour, y, x] = 1.0
+    return centre_loss(found.lamp_logits.permute(0, 1, 4, 2, 3)[items], target[items])
 
 
 def _crossing_loss(found: AffordanceSet, truth: Affordances) -> Float[Tensor, ""]:

@@ -46,6 +46,11 @@ def mirrored_truth(truth: TaskTruth, chosen: Bool[Tensor, "b"]) -> TaskTruth:
             affordances,
             path_xy=_negated_y(affordances.path_xy, chosen),
             crossing_xy=_negated_y(affordances.crossing_xy, chosen),
+            lamp_xyz=_pick(
+                chosen,
+                affordances.lamp_xyz * affordances.lamp_xyz.new_tensor([1.0, -1.0, 1.0]),
+                affordances.lamp_xyz,
+            ),
         )
     return TaskTruth(futures, elements, raster, semantics, instances, affordances=affordances)
 

@@ -10,7 +10,7 @@ from foredrive.losses.map_elements import MapLossWeights, map_element_losses
 from foredrive.losses.semantics import raster_loss, semantic_affinity, voxel_cross_entropy
 from foredrive.models.tasks.heads import HeadOutput
 from foredrive.models.tasks.maps import MapSet
-from foredrive.scene import Boxes, VoxelSpec
+from foredrive.scene import Boxes, CameraRig, VoxelSpec
 from foredrive.scene.map_elements import MapElements
 from foredrive.scene.semantics import SemanticVoxels
 from foredrive.scene.task_truth import TaskTruth
@@ -42,6 +42,7 @@ def task_losses(
     class_weight: Float[Tensor, "C"] | None,
     weights: TaskWeights,
     frames: int = 1,
+    rig: CameraRig | None = None,
 ) -> dict[str, Float[Tensor, ""]]:
     """Return the weighted losses of the heads by name; "loss" is their sum.
 
@@ -54,6 +55,7 @@ def task_losses(
         class_weight: weight of each class of semantic voxels.
         weights: weights of the losses.
         frames: items of a sequence, if the items are sequences.
+        rig: cameras at now, for heads that read images.
     """
     losses: dict[str, Float[Tensor, ""]] = {}
     if output.agents is not None:
@@ -88,7 +90,7 @@ def task_losses(
             weights.agents.boxes,
         )
     if output.affordances is not None and truth.affordances is not None:
-        losses |= affordance_losses(output.affordances, truth.affordances, weights.affordances)
+        losses |= affordance_losses(output.affordances, truth.affordances, weights.affordances, rig)
     return losses | {"loss": torch.stack(list(losses.values())).sum()}
 
 

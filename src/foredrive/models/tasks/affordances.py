@@ -19,6 +19,7 @@ DIRECTION_SCALE = 5.0
 TYPICAL_CELL_RAD = 0.02
 PLACE_SCALE_M = 20.0
 SPEED_SCALE_MPS = 5.0
+COLOURS = (LightState.RED, LightState.YELLOW, LightState.GREEN)
 DISTANCES = 3
 """Numbers that are regressed: distance of the light, gap and speed of the lead vehicle."""
 
@@ -38,7 +39,9 @@ class AffordanceSet(Record):
     """The output of the head."""
 
     light_logits: Float[Tensor, "b 4"]
-    """Of each `LightState`."""
+    """Of each `LightState`: for NONE of the whole, for the others the largest of `lamp_logits`."""
+    lamp_logits: Float[Tensor, "b C h w 3"]
+    """For each cell of each image, whether a red, yellow or green lamp of the next light is there."""
     light_m: Float[Tensor, "b"]
     lead_logit: Float[Tensor, "b"]
     lead_m: Float[Tensor, "b"]
@@ -75,8 +78,9 @@ class AffordanceHead(nn.Module):
     A lamp has a few pixels and lies above the volume, so it is read in the images: an MLP reads the features
     of a pixel together with the direction of its ray, and the maximum over all pixels of all cameras is kept
     for each of its outputs (PointNet, Qi et al. 2017). So a few pixels count as much as a wall, and the rig
-    may change. The same is done with the cells of the plane and their places, for the lead vehicle. People
-    who cross are a map of the plane.
+    may change. The state of the light is where its lamp is most probable: one output a pixel for each colour,
+    which is supervised in place where a log tells the places of lamps. The same is done with the cells of the
+    plane and their places, for the lead vehicle. People who cross are a map of the plane.
 
     Args:
         planes: the module that makes the planes.
@@ -90,7 +94,9 @@ class AffordanceHead(nn.Module):
         self.pixel = _pointwise(channels + 4, hidden)
         self.cell = _pointwise(planes.fine_width + 2, hidden)
         self.together = nn.Sequential(nn.Linear(2 * hidden, 2 * hidden), nn.ReLU())
-        self.numbers = nn.Linear(2 * hidden, len(LightState) + 1 + DISTANCES)
+        self.numbers = nn.Linear(2 * hidden, 2 + DISTANCES)
+        self.lamp = nn.Linear(hidden, len(COLOURS))
+        nn.init.constant_(self.lamp.bias, RARE_LOGIT)
         rare = nn.Conv2d(planes.fine_width, 1, 1)
         assert rare.bias is not None
         nn.init.constant_(rare.bias, RARE_LOGIT)
@@ -110,15 +116,15 @@ class AffordanceHead(nn.Module):
         """
         if images is None:
             raise InputError("affordances are read in the images: this belief has none")
-        feature = torch.cat([self._of_images(images), self._of_plane(plane)], dim=-1)
-        feature = self.together(feature)
+        read, lamps = self._of_images(images)
+        feature = self.together(torch.cat([read, self._of_plane(plane)], dim=-1))
         numbers = self.numbers(feature).float()
-        states = len(LightState)
         light_m, lead_m, lead_mps = numbers[:, -DISTANCES:].unbind(-1)
         return AffordanceSet(
-            light_logits=numbers[:, :states],
+            light_logits=torch.cat([numbers[:, :1], lamps.flatten(1, 3).amax(dim=1)], dim=-1),
+            lamp_logits=lamps,
             light_m=0.5 * LIGHT_RANGE_M * (1 + light_m),
-            lead_logit=numbers[:, states],
+            lead_logit=numbers[:, 1],
             lead_m=0.5 * LEAD_RANGE_M * (1 + lead_m),
             lead_mps=SPEED_SCALE_MPS * (1 + lead_mps),
             crossing_logits=self.crossing(plane.features)[:, 0].float(),
@@ -128,13 +134,16 @@ class AffordanceHead(nn.Module):
             people=self.people,
         )
 
-    def _of_images(self, images: ImageFeatures) -> Float[Tensor, "b F"]:
+    def _of_images(self, images: ImageFeatures) -> tuple[Float[Tensor, "b F"], Float[Tensor, "b C h w 3"]]:
+        """Return the maxima over all pixels, and the logits of lamps in each."""
         b, c, h, w, _ = images.values.shape
         fine = (images.cell_rad / TYPICAL_CELL_RAD).log().view(b, c, 1, 1, 1).expand(b, c, h, w, 1)
         inputs = torch.cat([images.values, DIRECTION_SCALE * images.direction, fine], dim=-1)
-        read = self.pixel(inputs) * images.valid.view(b, c, 1, 1, 1)  # at least 0, where nothing is seen
-        highest: Tensor = read.flatten(1, 3).amax(dim=1)
-        return highest
+        valid = images.valid.view(b, c, 1, 1, 1)
+        read = self.pixel(inputs)
+        lamps = self.lamp(read).float()
+        lamps = torch.where(valid > 0, lamps, 2 * RARE_LOGIT)
+        return (read * valid).flatten(1, 3).amax(dim=1), lamps  # features are at least 0
 
     def _of_plane(self, plane: Plane) -> Float[Tensor, "b F"]:
         place = (plane.middle_m / PLACE_SCALE_M).expand(len(plane.features), -1, -1)
