@@ -13,6 +13,7 @@ from foredrive.data import LogPath
 from foredrive.errors import InputError
 from foredrive.evaluation.summary import read_summary
 from foredrive.runs import Run, evaluate_run, load_agent, open_run, shipped
+from foredrive.runs.drive.agents import inputs_of, rig_of
 from foredrive.runs.ship import MAX_BYTES, ship
 from foredrive.runs.shipped import run_folder
 
@@ -110,3 +111,18 @@ def test_the_models_of_the_package_open(name: str, tmp_path: Path) -> None:
     assert (run.folder / "card.md").read_text().startswith(f"# {name}\n")
     agent = load_agent(run)
     assert all(tensor.isfinite().all() for tensor in agent.state_dict().values())
+
+
+def test_the_driver_of_the_package_drives_with_its_own_rig(
+    models: Path, evaluated: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(shipped, "MODELS", models)
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(InputError, match="comes without a driver; there are tiny"):
+        run_folder(Path("embedded"))
+    shutil.copytree(models / "tiny", models / shipped.DRIVER)
+    try:
+        assert inputs_of("embedded").cameras
+        assert rig_of("embedded") == rig_of(str(evaluated.folder))
+    finally:
+        shutil.rmtree(models / shipped.DRIVER)

@@ -16,7 +16,13 @@ from foredrive.data.boxes import read_boxes
 from foredrive.data.labels import make_labels
 from foredrive.data.log_paths import LogPath
 from foredrive.data.logs import Log
-from foredrive.data.recorded import read_caption, read_setting, read_traffic_lights, read_visibility
+from foredrive.data.recorded import (
+    read_caption,
+    read_setting,
+    read_signal_lamps,
+    read_traffic_lights,
+    read_visibility,
+)
 from foredrive.data.recorded_labels import recorded_labels
 from foredrive.scene import Category, VoxelSpec
 from foredrive.scene.conditions import BackgroundTraffic
@@ -70,6 +76,23 @@ def test_traffic_lights_stand_at_the_lanes_that_they_guard(recording: LogPath, t
             line = api.get_map_object_in_layer(map_id, MapLayer.LANE).centerline.array[[0, -1], :2]
             (lane,) = (i for i in of_lane if np.abs(ends[i] - line).max() < 0.01)
             assert status.name == LightState(shown[of_lane[lane]]).name
+
+
+def test_lamps_hang_behind_the_lines_that_they_guard(recording: LogPath) -> None:
+    """Those near the vehicle are recorded: 2 to 8 m above the road, up to 60 m from the line."""
+    log = Log(recording)
+    api = log.scene.get_map_api()
+    assert api is not None
+    lamps, lights = read_signal_lamps(log, 0), read_traffic_lights(log, 0)
+    assert lamps
+    assert lights is not None
+    assert set(lamps) <= set(lights)
+    for map_id, xyz in lamps.items():
+        start = api.get_map_object_in_layer(map_id, MapLayer.LANE).centerline_3d.array[0]
+        assert ((xyz - start)[:, 2] > 2).all()
+        assert ((xyz - start)[:, 2] < 8).all()
+        assert (np.linalg.norm(xyz - start, axis=1) < 60).all()
+        assert (np.linalg.norm(xyz - log.T_world_ego[0, :3, 3], axis=1) < 90.1).all()
 
 
 def test_lidar_points_tell_hidden_boxes_from_visible_ones(recording: LogPath) -> None:

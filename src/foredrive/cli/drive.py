@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from foredrive.cli.arguments import check_out_folder
-from foredrive.cli.drive_options import InRebuilt, InTowns, Planning
+from foredrive.cli.drive_options import InputFaults, InRebuilt, InTowns, Planning
 from foredrive.cli.failures import listed_failures
 from foredrive.errors import InputError
 from foredrive.lazy import importing
@@ -18,9 +18,10 @@ if TYPE_CHECKING:
 
 
 def drive(
-    agent: Annotated[str, tyro.conf.arg(metavar="RUN|expert|constant-velocity|stop|log|…")],
+    agent: Annotated[str, tyro.conf.arg(metavar="RUN|embedded|expert|constant-velocity|stop|log|…")],
     out: Path,
     planning: tyro.conf.OmitArgPrefixes[Planning],
+    inputs: tyro.conf.OmitArgPrefixes[InputFaults],
     towns: tyro.conf.OmitArgPrefixes[InTowns],
     rebuilt: tyro.conf.OmitArgPrefixes[InRebuilt],
 ) -> None:
@@ -31,16 +32,17 @@ def drive(
     --carla it drives in the towns of a CARLA server.
 
     Args:
-        agent: A run folder; expert (it has privileged information); constant-velocity (straight on at 5 m/s);
-            stop (stands still); or ego-mlp:RUN, the MLP that sees only the ego status, fitted to the training
-            data of a run. http://HOST:PORT is a planner in another process that speaks neuro-ncap's model
-            server protocol; ?timeout=S behind it changes the 60 s in which it has to answer. Two more record
-            DAgger demonstrations, with the expert's plan at each key frame in the logs. disturbed is the
-            expert while it is steered aside and slowed. student:RUN is a run in alternation with the expert.
+        agent: A run folder; embedded, the driver that comes with the package; expert (it has privileged
+            information); constant-velocity (straight on at 5 m/s); stop (stands still); or ego-mlp:RUN, the
+            MLP that sees only the ego status, fitted to the training data of a run. http://HOST:PORT is a
+            planner in another process that speaks neuro-ncap's model server protocol; ?timeout=S behind it
+            changes the 60 s in which it has to answer. Two more record DAgger demonstrations, with the
+            expert's plan at each key frame in the logs. disturbed is the expert while it is steered aside and
+            slowed. student:RUN is a run in alternation with the expert.
         out: Folder of the suite: summary.json, report.html, drives, logs.
     """
     check_out_folder(out)
-    for options in (planning, towns, rebuilt):
+    for options in (planning, inputs, towns, rebuilt):
         options.check()
     if rebuilt.rebuilt is not None and (
         towns.rig is not None or towns.other_rig or towns.image_size is not None
@@ -51,7 +53,9 @@ def drive(
 
     name = str(Path(agent).absolute()) if Path(agent).is_dir() else agent
     source = rebuilt.source() or towns.source(name)
-    suite = DriveSuite(name, source, planning.sensors, planning.period, planning.latency)
+    rig = getattr(source, "rig", None)
+    faults = inputs.faults(() if rig is None else tuple(rig.cameras))
+    suite = DriveSuite(name, source, planning.sensors, planning.period, planning.latency, faults)
     workers = towns.workers or len(os.sched_getaffinity(0))
     with DrivesProgress(len(suite.jobs())) as progress:
         driven = drive_suite(suite, out, workers, on_ray=towns.ray, tick=progress.tick)

@@ -1,5 +1,6 @@
 """Options of `foredrive drive`, in groups: planning, routes through towns, a reconstructed log."""
 
+from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
     from foredrive.runs.drive.in_carla import CarlaRoutes
     from foredrive.runs.drive.in_rebuilt import RebuiltRoutes
     from foredrive.runs.drive.in_towns import TownRoutes
+    from foredrive.simulation.faults import Faults
 
 
 @dataclass(frozen=True)
@@ -45,6 +47,50 @@ class Planning:
 
 
 @dataclass(frozen=True)
+class InputFaults:
+    """Faults of the agent's inputs, to measure how much it depends on them.
+
+    Args:
+        camera_fault: Cameras that fail, KIND:CAMERA or KIND:CAMERA@SECONDS. lost: no image, and the agent is
+            told; black: a black image; frozen: the last image before is repeated.
+        speed_noise: Standard deviation of the speed that the agent is told, m/s.
+        position_noise: Standard deviation of the position from which the target point of the route is
+            computed, m.
+    """
+
+    camera_fault: Annotated[tuple[str, ...], tyro.conf.arg(metavar="KIND:CAMERA[@S] ...")] = ()
+    speed_noise: Annotated[float, tyro.conf.arg(metavar="M/S")] = 0.0
+    position_noise: Annotated[float, tyro.conf.arg(metavar="M")] = 0.0
+
+    def check(self) -> None:
+        """Raise `InputError` if a fault has another form, or a deviation is impossible."""
+        from foredrive.simulation.faults import read_camera_fault
+
+        for text in self.camera_fault:
+            read_camera_fault(text)
+        check_number("--speed-noise", self.speed_noise, low=0)
+        check_number("--position-noise", self.position_noise, low=0)
+
+    def faults(self, cameras: Collection[str]) -> "Faults":
+        """Return the faults.
+
+        Args:
+            cameras: names of the vehicle's cameras; none if they are not known.
+
+        Raises:
+            InputError: the vehicle has no such camera.
+        """
+        from foredrive.simulation.faults import Faults, read_camera_fault
+
+        found = tuple(map(read_camera_fault, self.camera_fault))
+        known = {name.lower() for name in cameras}
+        for fault in found:
+            if known and fault.camera.lower() not in known:
+                raise InputError(f"--camera-fault: no camera {fault.camera}; there are {', '.join(cameras)}")
+        return Faults(found, self.speed_noise, self.position_noise)
+
+
+@dataclass(frozen=True)
 class InTowns:
     """Routes through towns.
 
@@ -61,6 +107,7 @@ class InTowns:
             traffic lights), or a YAML file of image_hw and cameras. By default that of the agent's training
             logs.
         other_rig: Drive with a rig that the agent was not trained with.
+        raise_cameras: Height by which all cameras are higher than in the rig, m. Needs --other-rig.
         image_size: Size of the images (height, width), px; by default the rig's.
         vehicles: Number of vehicles on the road near the ego vehicle.
         people: Number of pedestrians near the ego vehicle.
@@ -76,6 +123,7 @@ class InTowns:
     conditions: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
     rig: Annotated[str | None, tyro.conf.arg(metavar="NAME|FILE.yaml")] = None
     other_rig: bool = False
+    raise_cameras: Annotated[float, tyro.conf.arg(metavar="M")] = 0.0
     image_size: ImageSize | None = None
     vehicles: int = 30
     people: int = 20
@@ -87,6 +135,9 @@ class InTowns:
         """Raise `InputError` if a number is impossible."""
         check_number("--repetitions", self.repetitions, low=1)
         check_number("--seed", self.seed, low=0)
+        check_number("--raise-cameras", self.raise_cameras)
+        if self.raise_cameras and not self.other_rig:
+            raise InputError("--raise-cameras makes a rig that the agent does not know: add --other-rig")
         check_image_size(self.image_size)
         check_number("--vehicles", self.vehicles, low=0)
         check_number("--people", self.people, low=0)
@@ -97,6 +148,7 @@ class InTowns:
         from foredrive.runs.drive.agents import rig_of
 
         rig = rig_of(agent) if self.rig is None else chosen_rig(self.rig, None)
+        rig = rig.raised(self.raise_cameras) if self.raise_cameras else rig
         options: dict[str, Any] = {
             "routes": self.routes,
             "repetitions": self.repetitions,

@@ -157,6 +157,16 @@ class ClipDataset(Dataset[Example]):
             truth=self.truth(index),
         )
 
+    def demonstration(self, index: int) -> tuple[float, Trajectory]:
+        """Read the speed at the now of a clip (0 where unknown) and its future alone.
+
+        Raises:
+            InputError: the future cannot be read.
+        """
+        number, frames = self._clips[index]
+        log, now = self._logs[number], frames[self.config.past_frames]
+        return float(np.nan_to_num(log.speed_mps[now])), self._future(log, now)
+
     def truth(self, index: int) -> TaskTruth | None:
         """Read the truth of a clip alone. Return None if none was asked for.
 

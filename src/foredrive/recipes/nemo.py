@@ -167,6 +167,7 @@ def nemo_drive_tele() -> NemoRecipe:
         tasks=JointTasks(heads, weight=1.0),
         planner=dataclasses.replace(drive.planner, attends=("affordances",)),
         finetune=rescheduled(drive.finetune, steps=1500, warmup_steps=60),
+        balance=0.5,
     )
 
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import shutil
 import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -16,10 +17,12 @@ from foredrive.runs.evaluate.run import evaluate_run
 from foredrive.runs.folder import CONFIG, LOGS, SUMMARY
 from foredrive.runs.shipped import CARD, MODELS
 from foredrive.runs.train.baselines import Baselines, baselines_file, run_baselines
+from foredrive.runs.train.rigs import RIGS
 from foredrive.runs.train.run import Run, load_agent
+from foredrive.runs.train.task_priors import PRIORS, TASKS
 from foredrive.training.small_weights import save_small
 
-MAX_BYTES = 4_000_000
+MAX_BYTES = 6_000_000
 """Maximum size of the weights of one model."""
 FIGURES = {
     "IoU above the ground, now": "occupancy.above_ground.iou_now",
@@ -27,6 +30,9 @@ FIGURES = {
     "IoU above the ground, in 1 s": "occupancy.above_ground.iou_future_1s",
     "— ego-compensated persistence": "occupancy.above_ground.iou_future_1s.carried_copy",
     "recall of columns with a car within 20 m": "vehicles.car_recall_20m",
+    "state of the light within 40 m": "affordances.light_accuracy_40m",
+    "error of the lead vehicle's gap, m": "affordances.lead_error_m",
+    "recall of crossing people at 20 m": "affordances.crossing_recall_20m",
     "L2 of the plan by UniAD's protocol, m": "planning.uniad.l2_avg_m",
     "— ego-only MLP": "planning.ego_mlp.uniad.l2_avg_m",
     "collisions of the plan by UniAD's protocol, %": "planning.uniad.collision_avg_pct",
@@ -60,6 +66,10 @@ def ship(run: Run, name: str, test: Sequence[LogPath], data: str, limits: str, m
             raise InputError(f"{run.folder}: {weights.stat().st_size} bytes of weights; {MAX_BYTES} at most")
         baselines = Baselines(*run_baselines(run.folder, run.logs, run.recipe, run.cache_dir, past))
         save_small(baselines, temporary / baselines_file(past))
+        for file in (RIGS, f"{TASKS}/{PRIORS}"):
+            if (run.folder / file).is_file():
+                (temporary / file).parent.mkdir(exist_ok=True)
+                shutil.copyfile(run.folder / file, temporary / file)
         save_recipe(run.recipe, temporary / CONFIG)
         (temporary / LOGS).write_text(json.dumps({"logs": [], "cache_dir": "cache", "start": None}))
         small = dataclasses.replace(run, folder=temporary, logs=())

@@ -9,6 +9,8 @@ from foredrive.errors import InputError
 from foredrive.files import atomic_path
 
 EMBEDDED = "embedded:"
+DRIVER = "driver"
+"""Name of the model that drives as the agent `embedded`."""
 CONFIG, LOGS, WEIGHTS = "config.yaml", "logs.json", "model.safetensors"
 """As in `runs.folder`, which is slow to import; arguments are checked before."""
 MODELS = Path(__file__).parent / "models"
@@ -31,12 +33,16 @@ def run_folder(run: Path, copies: Path = COPIES) -> Path:
     caches may then write. A copy that is there already is used as it is.
 
     Args:
-        run: a run folder, or `embedded:NAME`.
+        run: a run folder, `embedded:NAME`, or `embedded` for the model that drives best (`DRIVER`).
         copies: folder of the copies.
 
     Raises:
         InputError: there is no such model, or the copy is of another version.
     """
+    if str(run) == EMBEDDED.rstrip(":"):
+        if DRIVER not in shipped_models():
+            raise InputError(f"this version comes without a driver; there are {', '.join(shipped_models())}")
+        run = Path(EMBEDDED + DRIVER)
     if not str(run).startswith(EMBEDDED):
         return run
     name = str(run).removeprefix(EMBEDDED)

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
@@ -62,6 +62,14 @@ class RigPlan:
     def of_size(self, image_hw: tuple[int, int]) -> "RigPlan":
         """Return the same cameras with images of another size."""
         return RigPlan(image_hw, self.cameras)
+
+    def raised(self, height_m: float) -> "RigPlan":
+        """Return the same cameras, all of them higher."""
+        moved = {
+            name: replace(mount, xyz_m=(*mount.xyz_m[:2], mount.xyz_m[2] + height_m))
+            for name, mount in self.cameras.items()
+        }
+        return RigPlan(self.image_hw, moved)
 
 
 SURROUND = RigPlan(

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, TypeVar, runtime_checkable
 
 import torch
+from jaxtyping import Float
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from torch import Tensor, nn
 from torch.utils.data import DataLoader, Dataset
@@ -96,11 +97,19 @@ class Schedule:
         return self.lr * (floor + (1 - floor) * 0.5 * (1 + math.cos(math.pi * progress)))
 
 
-def batch_order(items: int, batch_size: int, seed: int) -> Iterator[list[int]]:
-    """Yield endless batches of indices, a new permutation each epoch, reproducible by `seed`."""
+def batch_order(
+    items: int, batch_size: int, seed: int, weights: Float[Tensor, "N"] | None = None
+) -> Iterator[list[int]]:
+    """Yield endless batches of indices, reproducible by `seed`.
+
+    Each epoch is a new permutation. With weights, it is as many draws with replacement.
+    """
     for epoch in itertools.count():
         generator = torch.Generator().manual_seed(seed * 1_000_003 + epoch)
-        order = torch.randperm(items, generator=generator).tolist()
+        if weights is None:
+            order = torch.randperm(items, generator=generator).tolist()
+        else:
+            order = torch.multinomial(weights, items, replacement=True, generator=generator).tolist()
         for start in range(0, items, batch_size):
             yield order[start : start + batch_size]
 
@@ -112,6 +121,7 @@ def train(
     schedule: Schedule,
     folder: Path,
     fabric: "Fabric",
+    weights: Float[Tensor, "N"] | None = None,
 ) -> None:
     """Train `objective` on `dataset`, continuing from a checkpoint in `folder` if there is one.
 
@@ -119,6 +129,8 @@ def train(
     and `folder/checkpoints/step_N`. An interrupted run that is resumed gives the same losses as an
     uninterrupted one: data order and random numbers follow from the seed and the step. Ctrl-C ends the run
     after the current step, with a checkpoint. A second Ctrl-C ends it at once.
+
+    With `weights`, items are drawn in proportion to them.
 
     Raises:
         InputError: the data set is empty, or a loss is not finite (the message names the batch).
@@ -137,7 +149,7 @@ def train(
     if fabric.is_global_zero:
         write_conditions(folder, fabric)
     loader: Any = fabric.setup_dataloaders(
-        _loader(dataset, collate, schedule, done, total, fabric), use_distributed_sampler=False
+        _loader(dataset, collate, schedule, done, total, fabric, weights), use_distributed_sampler=False
     )
     model.train()
     with step_counter(
@@ -203,11 +215,12 @@ def _loader(
     done: int,
     total: int,
     fabric: "Fabric",
+    weights: Float[Tensor, "N"] | None,
 ) -> DataLoader[B]:
     """Return batches from step `done` on. Each rank takes its share of every global batch."""
     items = len(dataset)  # type: ignore[arg-type]
     batches = itertools.islice(
-        batch_order(items, schedule.batch_size * fabric.world_size, schedule.seed), done, total
+        batch_order(items, schedule.batch_size * fabric.world_size, schedule.seed, weights), done, total
     )
     if schedule.workers:
         start_fork_server(preload=type(dataset).__module__)

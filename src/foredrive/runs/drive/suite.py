@@ -30,6 +30,7 @@ from foredrive.runs.folder import DRIVES, SUITE, SUMMARY, RunFolder
 from foredrive.scene import Agent, Simulator
 from foredrive.simulation.drive import Drive, Pilot, PlanningTiming, drive_route
 from foredrive.simulation.drive_record import DriveRecord, record_of
+from foredrive.simulation.faults import NO_FAULTS, Faults, FaultyAgent
 from foredrive.simulation.ncap.outcome import SafetyResult
 from foredrive.training.interrupts import start_fork_server
 
@@ -105,6 +106,8 @@ class DriveSuite:
     """Whether cameras and lidar are logged even if the agent does not need them."""
     period_s: float = PlanningTiming.period_s
     latency_s: float = PlanningTiming.latency_s
+    faults: Faults = NO_FAULTS
+    """Faults of the agent's inputs."""
 
     def __post_init__(self) -> None:
         PlanningTiming(self.period_s, self.latency_s)
@@ -121,6 +124,10 @@ class DriveSuite:
         """Return the contents of the suite's file."""
         of_all = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
         del of_all["source"]
+        if self.faults == NO_FAULTS:  # as in folders from before there were faults
+            del of_all["faults"]
+        else:
+            of_all["faults"] = dataclasses.asdict(self.faults)
         noted: dict[str, object] = json.loads(json.dumps({**of_all, **self.source.noted()}))
         return noted
 
@@ -201,10 +208,13 @@ def drive_one(job: DriveJob, suite: DriveSuite, out: Path, threads: int | None =
         torch.set_num_threads(threads)
     began = time.perf_counter()
     with suite.source.set_up(job, suite, out) as setup:
+        agent = setup.agent
+        if suite.faults != NO_FAULTS:
+            agent = FaultyAgent(agent, suite.faults, suite.period_s, job.name)
         drive = drive_route(
             setup.simulator,
             setup.scenario,
-            setup.agent,
+            agent,
             route=job.route,
             repetition=job.repetition,
             pace=PlanningTiming(suite.period_s, suite.latency_s),
