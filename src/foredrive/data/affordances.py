@@ -55,7 +55,7 @@ STATE_OF_STATUS = {
 }
 
 
-class _Path(NamedTuple):
+class PathAhead(NamedTuple):
     """The path ahead in the ego frame."""
 
     xy: Float[Tensor, "R 2"]
@@ -85,7 +85,7 @@ def read_affordances(log: Log, frame: int) -> Affordances:
     light, light_m, light_known, lane = _light(log, frame, path)
     lamps, lamps_known = _lamps(log, frame, lane)
     boxes = read_boxes(log, frame)
-    lead, lead_m, lead_mps, lead_known = _lead(boxes, path)
+    lead, lead_m, lead_mps, lead_known = lead_of(boxes, path)
     crossing, crossing_known = _crossing(log, frame, boxes, path)
     return Affordances(
         path_xy=path.xy,
@@ -107,29 +107,49 @@ def read_affordances(log: Log, frame: int) -> Affordances:
     )
 
 
-def _path(log: Log, frame: int) -> _Path:
+def _path(log: Log, frame: int) -> PathAhead:
     """Return the route from beside the rear axle on, or the driven path where there is no route."""
     route = route_at(log, frame)
+    centre, size = log.ego_box
+    front_m = float(centre[0] + 0.5 * size[0])
     if route is None:
         xyz = log.T_world_ego[frame:, :3, 3]
-        arc_m, progress_m = arc_lengths(xyz), 0.0
-    else:
-        arc_m, xyz, progress_m = route
+        return path_ahead(xyz, arc_lengths(xyz), 0.0, log.T_world_ego[frame], front_m, given=False)
+    arc_m, xyz, progress_m = route
+    return path_ahead(xyz, arc_m, progress_m, log.T_world_ego[frame], front_m)
+
+
+def path_ahead(
+    xyz: Float64[np.ndarray, "K 3"],
+    arc_m: Float64[np.ndarray, "K"],
+    progress_m: float,
+    T_world_ego: Float64[np.ndarray, "4 4"],
+    front_m: float,
+    given: bool = True,
+) -> PathAhead:
+    """Return the part of a path ahead of the vehicle.
+
+    Args:
+        xyz: the whole path, world frame, m.
+        arc_m: arc length of each of its points.
+        progress_m: arc length of the point beside the rear axle.
+        T_world_ego: pose of the vehicle.
+        front_m: distance from the rear axle to the front bumper.
+        given: whether it is a route that the vehicle was given.
+    """
     at_m = np.arange(POINTS, dtype=np.float64)
     there = at_m <= arc_m[-1] - progress_m
-    ahead = points_at(xyz, arc_m, progress_m + at_m)
-    ahead = _in_ego_frame(ahead, log, frame) * there[:, None]
-    centre, size = log.ego_box
-    return _Path(
+    ahead = _in_frame(points_at(xyz, arc_m, progress_m + at_m), T_world_ego) * there[:, None]
+    return PathAhead(
         torch.from_numpy(ahead[:, :2]).float(),
         ahead[:, 2],
         torch.from_numpy(there & (there.sum() > 1)),
-        float(centre[0] + 0.5 * size[0]),
-        route is not None,
+        front_m,
+        given,
     )
 
 
-def _light(log: Log, frame: int, path: _Path) -> tuple[LightState, float, bool, int | None]:
+def _light(log: Log, frame: int, path: PathAhead) -> tuple[LightState, float, bool, int | None]:
     """Return state and distance of the next light on the path, whether the log tells, and its lane."""
     shown, lines = read_traffic_lights(log, frame), _stop_lines(log)
     if shown is None or lines is None or not path.given or not bool(path.valid.any()):
@@ -193,8 +213,13 @@ def _stop_lines(log: Log) -> _StopLines | None:
     return _StopLines(np.array(list(lanes), dtype=np.int64), two[:, 0], ahead / np.maximum(length_m, 1e-9))
 
 
-def _lead(boxes: Boxes | None, path: _Path) -> tuple[bool, float, float, bool]:
-    """Return whether a vehicle is in the path, its gap and its speed, and whether the log tells."""
+def lead_of(boxes: Boxes | None, path: PathAhead) -> tuple[bool, float, float, bool]:
+    """Return whether a vehicle is in the path, its gap and its speed, and whether that is known.
+
+    Args:
+        boxes: unbatched, in the frame of the path. None if nobody annotated them.
+        path: the path.
+    """
     if boxes is None or not bool(path.valid.any()):
         return False, 0.0, 0.0, False
     vehicles = torch.isin(boxes.category, torch.tensor([int(kind) for kind in VEHICLES]))
@@ -214,7 +239,9 @@ def _lead(boxes: Boxes | None, path: _Path) -> tuple[bool, float, float, bool]:
     return False, 0.0, 0.0, path.given or reach_m >= LEAD_RANGE_M
 
 
-def _crossing(log: Log, frame: int, boxes: Boxes | None, path: _Path) -> tuple[Float[Tensor, "K 2"], bool]:
+def _crossing(
+    log: Log, frame: int, boxes: Boxes | None, path: PathAhead
+) -> tuple[Float[Tensor, "K 2"], bool]:
     """Return where people are who will cross the path, and whether the log tells."""
     lasts_s = float(log.t_us[-1] - log.t_us[frame]) * 1e-6
     if boxes is None or not bool(path.valid.any()) or lasts_s < CROSSING_S - 0.05:
@@ -241,6 +268,12 @@ def _points_of(boxes: Boxes) -> Float[Tensor, "M P 2"]:
 
 
 def _in_ego_frame(xyz: Float64[np.ndarray, "N 3"], log: Log, frame: int) -> Float64[np.ndarray, "N 3"]:
-    T_ego_world = np.linalg.inv(log.T_world_ego[frame])
+    return _in_frame(xyz, log.T_world_ego[frame])
+
+
+def _in_frame(
+    xyz: Float64[np.ndarray, "N 3"], T_world_ego: Float64[np.ndarray, "4 4"]
+) -> Float64[np.ndarray, "N 3"]:
+    T_ego_world = np.linalg.inv(T_world_ego)
     moved: Float64[np.ndarray, "N 3"] = xyz @ T_ego_world[:3, :3].T + T_ego_world[:3, 3]
     return moved

@@ -199,6 +199,11 @@ class TownSimulator:
         return self._world.signal_xyz
 
     @property
+    def done_m(self) -> float:
+        """Return how far along its route the vehicle has come, m."""
+        return self.state.progress.done_m
+
+    @property
     def driven(self) -> EgoPose:
         """Return the current ego vehicle as the traffic sees it."""
         return self._driven(self.state.ego, self.state.z_m)

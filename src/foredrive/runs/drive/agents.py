@@ -18,8 +18,10 @@ from foredrive.runs.train.baselines import run_baselines
 from foredrive.runs.train.rigs import TrainedRigs, check_rig, read_rigs
 from foredrive.runs.train.run import load_agent, open_run
 from foredrive.scene import Agent, Clip, Trajectory
+from foredrive.scene.affordances import AffordanceEstimate
 from foredrive.sensors.rigs import SURROUND, RigPlan
 from foredrive.simulation.demonstrations import AlternatingStudent, DisturbedExpert
+from foredrive.simulation.idm_agent import IdmAgent
 from foredrive.simulation.observation import FRAME_DT_S
 from foredrive.simulation.remote.json_http import Address, read_address
 from foredrive.simulation.remote.planner_client import ALIVE_S, HttpPlanner, check_planner
@@ -41,6 +43,7 @@ HTTP = "http://"
 GRPC = "grpc://"
 """Beginning of the address of a driver behind AlpaSim's contract."""
 DISTURBED, STUDENT = "disturbed", "student:"
+IDM, IDM_BY_SIGHT = "idm", "idm:"
 OLD_STUDENT = "pupil:"
 """The prefix of `STUDENT` in earlier versions, still accepted."""
 
@@ -104,6 +107,8 @@ def inputs_of(agent: str) -> AgentInputs:
             "log" and "lidar-corridor" follow the path of a reconstructed log.
             "http://HOST:PORT" is a planner in another process (`HttpPlanner`), "grpc://HOST:PORT" a driver of
             AlpaSim (`GrpcDriver`).
+            "idm" follows the route by the intelligent driver model and knows who is ahead and the lights;
+            "idm:RUN" knows of them what the affordances of a run tell.
 
     Raises:
         InputError: there is no such agent, or it was trained on another frame interval.
@@ -111,7 +116,7 @@ def inputs_of(agent: str) -> AgentInputs:
     if is_remote(agent):
         _address_of(agent)
         return AgentInputs(cameras=True, lidar=False, past_frames=1)
-    if agent in (EXPERT, STOP, CONSTANT_VELOCITY, DISTURBED, *OF_LOGS):
+    if agent in (EXPERT, STOP, CONSTANT_VELOCITY, DISTURBED, IDM, *OF_LOGS):
         return AgentInputs(cameras=False, lidar=agent == CORRIDOR, past_frames=1)
     clips = open_run(_run_folder(agent)).recipe.clips
     if abs(clips.frame_dt_s - FRAME_DT_S) > 1e-6:
@@ -138,7 +143,7 @@ def check_rig_of(agent: str, rig: RigPlan) -> None:
 
 
 def _rigs_of(agent: str) -> TrainedRigs | None:
-    if agent in (EXPERT, STOP, CONSTANT_VELOCITY, DISTURBED, *OF_LOGS) or agent.startswith(
+    if agent in (EXPERT, STOP, CONSTANT_VELOCITY, DISTURBED, IDM, *OF_LOGS) or agent.startswith(
         (EGO_MLP, HTTP, GRPC)
     ):
         return None
@@ -183,7 +188,11 @@ def make_agent(
         return HttpPlanner(
             _address_of(agent), clock, cameras=sees != "lidar", lidar=sees in ("lidar", "both")
         )
+    if agent == IDM:
+        return IdmAgent(_town(town))
     folder = _run_folder(agent)
+    if agent.startswith(IDM_BY_SIGHT):
+        return IdmAgent(_town(town), _affordances(folder))
     if agent.startswith((STUDENT, OLD_STUDENT)):
         return AlternatingStudent(_seeing(folder), _expert(town), clock, seed)
     return RestartingAgent(_fitted(folder) if agent.startswith(EGO_MLP) else _seeing(folder), clock)
@@ -225,18 +234,45 @@ def check_ready(agent: str) -> None:
 
 
 def _expert(town: TownSimulator | None) -> TownExpert:
+    return TownExpert(_town(town))
+
+
+def _town(town: TownSimulator | None) -> TownSimulator:
     if town is None:
-        raise InputError("the expert reads the state of an embedded town and can drive only there")
-    return TownExpert(town)
+        raise InputError("the expert and idm read the state of an embedded town and can drive only there")
+    return town
+
+
+def _affordances(folder: Path) -> Callable[[Clip], AffordanceEstimate]:
+    """Return a function from an observation to what a run tells of lights, lead vehicle and people."""
+    run = open_run(folder)
+    heads = None if run.recipe.tasks is None else run.recipe.tasks.heads
+    if heads is None or heads.affordances is None:
+        raise InputError(f"{folder}: {IDM_BY_SIGHT}RUN needs a run with affordances, such as nemo_drive_tele")
+    resizing = _seeing(folder)
+
+    @torch.no_grad()
+    def perceive(observation: Clip) -> AffordanceEstimate:
+        clip = shrink_images(observation, resizing.image_hw).to(resizing.device)
+        found = resizing.agent.perceive(resizing.agent.rollout(clip, 0)[0])
+        assert found is not None
+        assert found.affordances is not None
+        estimate: AffordanceEstimate = found.affordances.estimate().to("cpu")
+        return estimate
+
+    return perceive
 
 
 def _run_folder(agent: str) -> Path:
-    prefix = next((known for known in (EGO_MLP, STUDENT, OLD_STUDENT) if agent.startswith(known)), "")
+    prefix = next(
+        (known for known in (EGO_MLP, STUDENT, OLD_STUDENT, IDM_BY_SIGHT) if agent.startswith(known)), ""
+    )
     folder = run_folder(Path(agent.removeprefix(prefix)))
     if not folder.is_dir():
         known = (
             f"{EXPERT}, {STOP}, {CONSTANT_VELOCITY}, a run folder, {EGO_MLP}RUN, {HTTP}HOST:PORT, "
-            f"{GRPC}HOST:PORT, {DISTURBED} or {STUDENT}RUN, and in a reconstruction {REPLAY} or {CORRIDOR}"
+            f"{GRPC}HOST:PORT, {IDM}, {IDM_BY_SIGHT}RUN, {DISTURBED} or {STUDENT}RUN, and in a "
+            f"reconstruction {REPLAY} or {CORRIDOR}"
         )
         raise InputError(f"unknown agent {agent!r}; the agents are {known}")
     return folder
