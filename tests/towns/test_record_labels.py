@@ -226,7 +226,8 @@ def test_labels_may_be_left_out(tmp_path: Path) -> None:
     log = Log(record("Town02", 1.0, 3, tmp_path, RATE_HZ, sensors, BackgroundTraffic(4, 2), bare))
     assert read_visibility(log, 0) is read_caption(log, 0) is read_setting(log, 0) is None
     written = {file.name for file in log.path.folder.glob("custom.*")}
-    assert written == {"custom.lidar_beams.arrow", "custom.box_attribute.arrow"}
+    names = ("lidar_beams", "box_attribute", "signal_lamps")
+    assert written == {f"custom.{name}.arrow" for name in names}
     boxes = read_boxes(log, 0)
     assert boxes is not None
     assert len(boxes.yaw) > 0

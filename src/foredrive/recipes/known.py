@@ -8,7 +8,12 @@ from typing import Any
 
 from foredrive.errors import InputError
 from foredrive.recipes.config import Recipe, is_recipe_file, load_recipe, overridden, recipe_from
-from foredrive.recipes.driveworld import driveworld_base, driveworld_tiny, driveworld_town
+from foredrive.recipes.driveworld import (
+    driveworld_base,
+    driveworld_drive_tele,
+    driveworld_tiny,
+    driveworld_town,
+)
 from foredrive.recipes.driveworld_ablations import driveworld_ablations
 from foredrive.recipes.nemo import (
     BASE_BEV,
@@ -28,6 +33,7 @@ RECIPES: dict[str, Recipe[Any, Any]] = {
     **nemo_ablations(nemo_town(), TOWN_BEV),
     **nemo_ablations(nemo_base(), BASE_BEV),
     "driveworld_tiny": driveworld_tiny(),
+    "driveworld_drive_tele": driveworld_drive_tele(),
     **driveworld_ablations(driveworld_town()),
     **driveworld_ablations(driveworld_base()),
 }
