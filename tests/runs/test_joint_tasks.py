@@ -188,7 +188,7 @@ def test_a_run_that_has_only_pre_trained_has_no_heads_yet(log: LogPath, tmp_path
 def test_affordances_and_scored_plans_are_trained_and_evaluated(
     trained: Run, log: LogPath, tmp_path: Path
 ) -> None:
-    """With balanced clips. What the flat log does not tell, such as lights, trains nothing."""
+    """With balanced clips. What the flat log does not tell, lights and the map, trains nothing."""
     recipe = with_small_heads(trained.recipe, ("affordances",), attends=("affordances",))
     planner = dataclasses.replace(
         recipe.planner, target=True, ego_mlp=None, path=None, scorer=PlanScorerConfig()
@@ -199,11 +199,12 @@ def test_affordances_and_scored_plans_are_trained_and_evaluated(
     assert recipe.clips.tasks is not None
     truth = dataclasses.replace(recipe.clips.tasks, raster=UNIAD_RASTER)
     recipe = dataclasses.replace(recipe, clips=dataclasses.replace(recipe.clips, tasks=truth))
-    run = train_run(recipe, [with_map(log, tmp_path)], tmp_path / "run", trained.cache_dir, trained.folder)
+    run = train_run(recipe, [log], tmp_path / "run", trained.cache_dir, trained.folder)
     lines = read_metrics(run.folder / "finetune" / "metrics.jsonl")
     assert {"task_light", "task_lamps", "score_no_collision", "score_imitation"} <= lines[0].keys()
     assert lines[0]["task_light"] == 0
-    assert lines[0]["score_drivable"] > 0
+    assert lines[0]["score_drivable"] == 0
+    assert lines[0]["score_no_collision"] > 0
     summary = evaluate_run(run, [log], tmp_path / "evaluated", views=False).summary
     assert summary["failed"] == 0
     assert summary["affordances.lights_counted"] == 0

@@ -235,7 +235,7 @@ def _is_part_complete(part: Record | Tensor) -> Bool[Tensor, "b"]:
     if isinstance(part, Record):
         tensors = [value for value in vars(part).values() if isinstance(value, Tensor)]
         return torch.stack([_is_part_complete(tensor) for tensor in tensors]).all(dim=0)
-    return part.flatten(1).isfinite().all(dim=-1)
+    return part.isfinite().reshape(len(part), -1).all(dim=-1)
 
 
 def _command_figures(counts: Mapping[str, int]) -> Figures:
