@@ -20,7 +20,7 @@ from foredrive.simulation.ncap.scenario import SafetyScenario
 from foredrive.simulation.observation import FRAME_DT_S
 from foredrive.view import palette
 from foredrive.view.bev import draw_boxes, draw_ego, start_bev
-from foredrive.view.image_drawing import Camera, draw_boxes_on_image
+from foredrive.view.image_drawing import Camera, draw_boxes_on_image, resize
 from foredrive.view.sheet import Sheet
 
 BEFORE_S = 1.5
@@ -52,8 +52,9 @@ def write_scenario_picture(path: Path, place: Place, scenario: SafetyScenario) -
     picture = None
     if camera is not None:
         image = seen.images[camera].permute(1, 2, 0).numpy()
-        picture = draw_boxes_on_image(image, boxes[added], Camera.of(renderer.rig, camera))
         width_px = round(HEIGHT_PX * image.shape[1] / image.shape[0])
+        shown = Camera.of(renderer.rig, camera).resized((HEIGHT_PX, width_px))
+        picture = draw_boxes_on_image(resize(image, shown.size_hw), boxes[added], shown)
     above_x = width_px + 2 * MARGIN_PX + AXES_PX
     sheet = Sheet(above_x + HEIGHT_PX + 2 * MARGIN_PX, HEAD_PX + HEIGHT_PX + AXES_PX)
     sheet.head(MARGIN_PX, HEAD_PX, f"{scenario.label}    {BEFORE_S:g} s before the impact", 13.0)
