@@ -26,7 +26,7 @@ from foredrive.runs.rebuild.reconstruct import Reconstruction, reconstruct
 from foredrive.training import loop
 from foredrive.training.field_training import FieldTraining
 from foredrive.training.learning_rates import Rate
-from foredrive.training.rebuilding import SensorViews
+from foredrive.training.rebuilding import SensorViews, make_optimizer
 from foredrive.view.rebuilt_viewer import RebuiltViewer
 
 STEPS = 6
@@ -178,7 +178,7 @@ def test_an_actor_of_gaussians_is_refused_and_one_of_this_field_opened_again_is_
 
 
 def test_an_actor_of_another_run_is_seen_by_its_own_decoders(
-    run: Reconstruction, log: LogPath, tmp_path: Path
+    run: Reconstruction, log: LogPath, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The other field ends every ray in its actors at once, and its decoders show red and no return."""
     scene, other = run.scene, reconstruct(rescheduled_recipe(recipe(1), seed=1), log, tmp_path / "run").scene
@@ -204,6 +204,7 @@ def test_an_actor_of_another_run_is_seen_by_its_own_decoders(
     assert bool(changed[red].all())
     assert (~changed).float().mean() > 0.1
     sweep = run.held_out.sweeps[0]
+    monkeypatch.setattr(scene, "reach_m", torch.inf)  # the decoders alone decide
     with torch.no_grad():
         rays = scene.prepare_sweep(sweep)
         with_guests, without = (scene.sweep(g, rays, sweep.t_s) for g in (graph, scene.graph))
@@ -217,6 +218,32 @@ def test_an_actor_of_another_run_is_seen_by_its_own_decoders(
     assert torch.equal(image(scene, gone, run), plain)
     after = scene.state_dict()
     assert all(torch.equal(value, after[name]) for name, value in before.items())
+
+
+def test_all_beams_return_where_a_log_does_not_tell_which_are_lost(run: Reconstruction) -> None:
+    """Steps of training that learn brightness, and nothing of lost beams."""
+    views = SensorViews([], [dataclasses.replace(view, misses_known=False) for view in run.train.sweeps])
+    representation = recipe().representation
+    scene = representation.begin(views, run.scene.tracks.map_tensors(Tensor.detach), 2, 200.0)
+    training = FieldTraining(scene, views, representation.schedule)
+    optimizer, before = make_optimizer(training), scene.lidar_decoder.net[-1].bias.clone()  # type: ignore[operator]
+    for step in range(3):
+        losses = training.losses(step, torch.Generator().manual_seed(step)).losses
+        assert "drop" not in losses
+        optimizer.zero_grad()
+        losses["loss"].backward()
+        for group in optimizer.param_groups:
+            group["lr"] = 1e-2
+        optimizer.step()
+    after = scene.lidar_decoder.net[-1].bias
+    assert after[0] != before[0]
+    assert after[1] == before[1]
+    view = views.sweeps[0]
+    with torch.no_grad():
+        seen = scene.sweep(scene.graph, scene.prepare_sweep(view), view.t_s)
+    stopped = (seen.alpha > 1e-3) & (seen.hit_range_m < 200)
+    assert bool(stopped.any())
+    assert bool(seen.returned[stopped].all())
 
 
 def test_a_perceptual_loss_where_there_are_weights(run: Reconstruction, tmp_path: Path) -> None:

@@ -9,6 +9,8 @@ from torch import Tensor, nn
 
 UPSAMPLING = 3
 """Pixels along a side for which one ray stands, as in NeuRAD's reference implementation."""
+_FIRST_DROP_LOGIT = -2.0
+"""Initial logit of the probability that a beam does not return."""
 
 
 @dataclass(frozen=True)
@@ -91,6 +93,10 @@ class BeamDecoder(nn.Module):
             nn.ReLU(),
             nn.Linear(width, 2),
         )
+        # All beams return until it is learned which do not: for good, where a log does not tell it.
+        with torch.no_grad():
+            self.net[-1].weight[1] = 0  # type: ignore[operator]
+            self.net[-1].bias[1] = _FIRST_DROP_LOGIT  # type: ignore[operator]
 
     def forward(self, feature: Float[Tensor, "P D"]) -> tuple[Float[Tensor, "P"], Float[Tensor, "P"]]:
         """Return intensity from 0 to 1, and the logit of the probability that the beam does not return."""
