@@ -23,7 +23,8 @@ from foredrive.evaluation.bench import Benchmark
 from foredrive.geometry.boxes import points_in_boxes
 from foredrive.losses import waypoint_loss
 from foredrive.models.ego_mlp import EgoMLP, EgoMLPConfig, ego_motion
-from foredrive.models.planner import PathCorrectionConfig, VolumePlanner
+from foredrive.models.path_correction import PathCorrectionConfig
+from foredrive.models.planner import VolumePlanner
 from foredrive.recipes import find_recipe
 from foredrive.scene import Boxes, Category, Clip, MapKind, MapPatch, Trajectory, VoxelSpec
 from foredrive.training import EgoMLPFit, fit_ego_mlp, read_status

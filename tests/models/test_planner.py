@@ -7,14 +7,8 @@ import pytest
 import torch
 
 from foredrive.models.ego_mlp import EgoMLPConfig
-from foredrive.models.planner import (
-    FutureAttention,
-    PathCorrection,
-    PathCorrectionConfig,
-    PlannerConfig,
-    VolumePlanner,
-    _headings,
-)
+from foredrive.models.path_correction import PathCorrection, PathCorrectionConfig
+from foredrive.models.planner import FutureAttention, PlannerConfig, VolumePlanner, _headings
 from foredrive.scene import VoxelSpec
 
 SPEC = VoxelSpec(lower_m=(-4.0, -4.0, -1.0), voxel_m=1.0, shape_zyx=(2, 8, 8))

@@ -11,7 +11,7 @@ from safetensors.torch import load_file
 from benchmarks.common.study import seeded
 from foredrive.data import LogPath, collate
 from foredrive.models.ego_mlp import EgoMLPConfig
-from foredrive.models.planner import PathCorrectionConfig
+from foredrive.models.path_correction import PathCorrectionConfig
 from foredrive.recipes import Recipe
 from foredrive.runs import Run, evaluate_run, train_run
 from foredrive.runs.export import export_run

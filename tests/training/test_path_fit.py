@@ -5,7 +5,7 @@ import dataclasses
 import pytest
 import torch
 
-from foredrive.models.planner import PathCorrection, PathCorrectionConfig, PathSamples
+from foredrive.models.path_correction import PathCorrection, PathCorrectionConfig, PathSamples
 from foredrive.scene import VoxelSpec
 from foredrive.training import PathDemonstrations, PathFit, fit_path
 

@@ -9,9 +9,10 @@ from foredrive.models.bev import BevConfig
 from foredrive.models.ego_mlp import EgoMLPConfig
 from foredrive.models.lifting import LiftingConfig
 from foredrive.models.nemo import MotionConfig, NemoConfig, RendererConfig
+from foredrive.models.path_correction import PathCorrectionConfig
 from foredrive.models.plan_scorer import PlanScorerConfig
 from foredrive.models.plane_context import PlaneContextConfig
-from foredrive.models.planner import PathCorrectionConfig, PlannerConfig
+from foredrive.models.planner import PlannerConfig
 from foredrive.models.tasks.affordances import AffordanceHeadConfig
 from foredrive.models.tasks.heads import TaskHeadsConfig
 from foredrive.recipes.config import Recipe, named_after, rescheduled

@@ -6,7 +6,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from foredrive.losses import l1_waypoint_loss
-from foredrive.models.planner import PathCorrection, PathSamples
+from foredrive.models.path_correction import PathCorrection, PathSamples
 from foredrive.scene.record import Record
 from foredrive.training.in_memory_fit import FitSchedule, fit_in_memory
 
