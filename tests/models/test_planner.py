@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from foredrive.models.ego_mlp import EgoMLPConfig
-from foredrive.models.path_correction import PathCorrection, PathCorrectionConfig
-from foredrive.models.planner import FutureAttention, PlannerConfig, VolumePlanner, _headings
+from foredrive.models.path_correction import PathCorrection, PathCorrectionConfig, headings
+from foredrive.models.planner import FutureAttention, PlannerConfig, VolumePlanner
 from foredrive.scene import VoxelSpec
 
 SPEC = VoxelSpec(lower_m=(-4.0, -4.0, -1.0), voxel_m=1.0, shape_zyx=(2, 8, 8))
@@ -46,7 +46,7 @@ def path_correction(distances_m: tuple[float, ...], *, status: int, steps: int) 
 
 def test_headings_follow_the_path_and_hold_when_it_stops() -> None:
     xy = torch.tensor([[0.0, 0.0], [2.0, 0.0], [2.0, 2.0], [2.0, 2.01], [2.0, 2.0], [1.0, 2.0]])
-    yaw = _headings(xy[None, None])[0, 0]
+    yaw = headings(xy[None, None])[0, 0]
     torch.testing.assert_close(yaw, torch.tensor([0, 0, math.pi / 2, math.pi / 2, math.pi / 2, math.pi]))
 
 
