@@ -114,6 +114,34 @@ def test_what_a_log_does_not_tell_trains_nothing() -> None:
     assert all(p.grad is None or not p.grad.any() for p in model.parameters())
 
 
+def test_a_lead_vehicle_of_unknown_speed_trains_and_judges_all_but_its_speed() -> None:
+    """Frames 0 and 2 have a lead vehicle at 12 m; the log tells the speed of the second one alone."""
+    whole = truth([1, 3, 0])
+    unknown = dataclasses.replace(whole, lead_mps=torch.tensor([torch.nan, 4.0, 4.0]))
+    found = head()(images([1, 3, 0], 0), plane(3, 0))
+    losses = affordance_losses(found, unknown, AffordanceLossWeights())
+    error_mps = (found.lead_mps[2] - 4.0).abs()
+    torch.testing.assert_close(losses["lead_mps"], AffordanceLossWeights().lead_mps * error_mps)
+    usual = affordance_losses(found, whole, AffordanceLossWeights())
+    torch.testing.assert_close(losses["lead_m"], usual["lead_m"])
+    losses["lead_mps"].backward()
+    metric = AffordanceMetric(EvaluationContext(0.5))
+    example = dataclasses.replace(one_example(0), truth=TaskTruth(affordances=unknown))
+    seen = dataclasses.replace(estimate([1, 3, 0], [[6.0, 1.0]], 0.5), lead_mps=torch.full((3,), 5.5))
+    metric.update(Prediction(affordances=seen), example)
+    assert metric.result()["lead_error_mps"] == pytest.approx(1.5)
+    assert metric.result()["leads_counted"] == 2
+
+
+def test_people_are_judged_from_the_front_bumper_of_the_recording_vehicle() -> None:
+    """A bumper at 4.09 m: someone at 24 m is 19.9 m away."""
+    metric = AffordanceMetric(EvaluationContext(0.5))
+    far = dataclasses.replace(truth([0]), crossing_xy=torch.tensor([[[24.0, 0.0], [0.0, 0.0]]]))
+    example = dataclasses.replace(one_example(0), truth=TaskTruth(affordances=far))
+    metric.update(Prediction(affordances=estimate([0], [[24.0, 0.0]], 0.5)), example)
+    assert metric.result()["crossing_counted"] == 1
+
+
 def test_heads_and_tokens_of_a_planner_read_affordances() -> None:
     config = small_heads(("affordances",)).heads
     torch.manual_seed(0)

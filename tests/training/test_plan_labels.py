@@ -170,6 +170,30 @@ def test_what_a_log_does_not_tell_is_masked() -> None:
         plan_labels(straight([1.0]), example, 0.25)
 
 
+def with_futures(example: Example, valid: list[bool]) -> Example:
+    """The same street, whose car is observed at some steps only."""
+    assert example.truth is not None
+    assert example.truth.futures is not None
+    there = torch.tensor(valid)[None, None]
+    futures = dataclasses.replace(
+        example.truth.futures, xy=example.truth.futures.xy * there[..., None], valid=there
+    )
+    return dataclasses.replace(example, truth=dataclasses.replace(example.truth, futures=futures))
+
+
+def test_collisions_after_the_end_of_a_log_are_unknown() -> None:
+    """An expert's plan is longer than the rest of the log, in which nobody hits the car 20 m ahead."""
+    ends = with_futures(street(car_x=20.0), [True] * 2 + [False] * 10)
+    found = plan_labels(straight([8.0]), ends, DT_S)
+    known = dict(zip(SUB_SCORES, found.known[0].tolist(), strict=True))
+    assert not known["no_collision"]
+    assert not known["time_to_collision"]
+    assert known["comfort"]
+    boxes = dataclasses.replace(ends.clip.boxes, valid=torch.zeros_like(ends.clip.boxes.valid))
+    empty = dataclasses.replace(ends, clip=dataclasses.replace(ends.clip, boxes=boxes))
+    assert bool(plan_labels(straight([8.0]), empty, DT_S).known[0, SUB_SCORES.index("no_collision")])
+
+
 def test_the_vocabulary_reaches_the_target_at_all_speeds() -> None:
     config = VocabularyConfig()
     target = torch.tensor([[18.0, 8.0, 1.0], [20.0, 0.0, 1.0], [0.0, 0.0, 0.0], [1.0, 0.0, 1.0]])

@@ -45,7 +45,7 @@ class Affordances(Record):
     lead_m: Float[Tensor, "*b"]
     """Gap to the nearest one."""
     lead_mps: Float[Tensor, "*b"]
-    """Its speed along the path."""
+    """Its speed along the path. NaN where its box has no velocity."""
     lead_known: Bool[Tensor, "*b"]
     crossing_xy: Float[Tensor, "*b K 2"]
     """Positions at now of the people who enter the path within `CROSSING_S` and `CROSSING_RANGE_M`."""

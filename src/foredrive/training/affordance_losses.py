@@ -49,13 +49,14 @@ def affordance_losses(
     """
     there = truth.light_known & (truth.light != LightState.NONE)
     lead = truth.lead_known & truth.lead
+    speed = lead & truth.lead_mps.isfinite()  # boxes of some logs have no velocity
     return {
         "light": weights.light * light_loss(found.light_logits, truth.light, truth.light_known),
         "lamps": weights.lamps * _lamp_loss(found, truth, rig),
         "light_m": weights.light_m * distance_loss(found.light_m, truth.light_m, there),
         "lead": weights.lead * presence_loss(found.lead_logit, truth.lead, truth.lead_known),
         "lead_m": weights.lead_m * distance_loss(found.lead_m, truth.lead_m, lead),
-        "lead_mps": weights.lead_mps * speed_loss(found.lead_mps, truth.lead_mps, lead),
+        "lead_mps": weights.lead_mps * speed_loss(found.lead_mps, truth.lead_mps, speed),
         "crossing": weights.crossing * _crossing_loss(found, truth),
     }
 

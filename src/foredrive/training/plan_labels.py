@@ -24,7 +24,6 @@ from foredrive.training.joint_tasks import boxes_now
 
 EGO_LENGTH_M, EGO_WIDTH_M, EGO_MIDDLE_M = 4.89, 1.84, 1.65
 """Size of the recording vehicle, and distance from its rear axle to its middle (CARLA's Lincoln MKZ)."""
-FRONT_M = EGO_MIDDLE_M + 0.5 * EGO_LENGTH_M
 NEAR_M = 60.0
 """Road users that are further away at now are left out."""
 STANDS_MPS = 0.05
@@ -78,7 +77,7 @@ def plan_labels(plans: Candidates, example: Example, dt_s: float) -> PlanLabels:
     if abs(truth.futures.dt_s - dt_s) > 1e-6 or truth.futures.xy.shape[2] < steps or steps > LATER_STEPS:
         raise InputError(f"plans of {steps} steps of {dt_s} s cannot be scored by this truth")
     boxes = boxes_now(clip)
-    annotated = clip.boxes_valid[:, clip.now]
+    followed = clip.boxes_valid[:, clip.now] & _followed(boxes, truth.futures, steps)
     traffic = _traffic(boxes, truth.futures, steps, dt_s)
     hit = _collides(plans, traffic, 0.0)
     road, seen = truth.affordances, truth.affordances.path_valid.sum(-1) > 1
@@ -97,11 +96,19 @@ def plan_labels(plans: Candidates, example: Example, dt_s: float) -> PlanLabels:
         "lane": beside_m.abs().gt(LANE_M).unfold(-1, min(LANE_STEPS, steps), 1).all(-1).any(-1).logical_not(),
         "comfort": _comfortable(plans, clip.ego_speed_mps[:, clip.now], dt_s),
     }
-    always = torch.ones_like(annotated)
-    known = [annotated, truth.raster.known, road.light_known, seen, annotated, seen, always]
+    always = torch.ones_like(followed)
+    known = [followed, truth.raster.known, road.light_known, seen, followed, seen, always]
     return PlanLabels(
         torch.stack([value.to(plans.xy) for value in values.values()], dim=-1), torch.stack(known, dim=-1)
     )
+
+
+def _followed(boxes: Boxes, futures: AgentFutures, steps: int) -> Bool[Tensor, "b"]:
+    """Return whether the log follows road users for as long as the plans last, or has none at now.
+
+    An expert's plan at the end of a log lasts longer than the log.
+    """
+    return futures.valid[:, :, steps - 1].any(-1) | ~boxes.valid.any(-1)
 
 
 def _traffic(boxes: Boxes, futures: AgentFutures, steps: int, dt_s: float) -> _Traffic:

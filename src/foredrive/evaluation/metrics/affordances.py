@@ -11,7 +11,7 @@ from foredrive.metrics.affordances import LEAD_M, LIGHT_M, crossing_counts, lead
 from foredrive.scene import Example
 from foredrive.scene.traffic_light import LightState
 
-FRONT_M = 3.9
+FRONT_M = 1.64855 + 0.5 * 4.89238
 """Distance from the rear axle to the front bumper of the recording vehicle, m."""
 NAN = float("nan")
 
@@ -55,7 +55,7 @@ class AffordanceMetric:
         counts["leads_named"] += int((true.lead_known & seen).sum())
         counts["leads_right"] += int((true.lead_known & seen & true.lead).sum())
         self._error_m.append(lead_error_m(estimate, true)[lead])
-        self._error_mps.append((estimate.lead_mps - true.lead_mps).abs()[lead])
+        self._error_mps.append((estimate.lead_mps - true.lead_mps).abs()[lead & true.lead_mps.isfinite()])
         for key, value in vars(crossing_counts(estimate, true, FRONT_M)).items():
             counts[f"crossing_{key}"] += value
 
