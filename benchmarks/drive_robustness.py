@@ -44,6 +44,9 @@ def scores(seed: int, name: str, **changes: object) -> Mapping[str, float]:
         ROUTES, seed=seed, rig=rig.raised(raised_m) if raised_m else rig, other_rig=raised_m != 0
     )
     suite = dataclasses.replace(DriveSuite(agent, source, sensors=False), **changes)  # type: ignore[arg-type]
+    for fault in suite.faults.cameras:
+        if fault.camera not in rig.cameras:
+            raise InputError(f"{name}: {AGENT} has no camera {fault.camera}; leave out this arm")
     driven = drive_suite(suite, WORK / f"{name}_seed{seed}", len(os.sched_getaffinity(0)))
     if driven.broken:
         job, why = next(iter(driven.broken.items()))
