@@ -7,16 +7,23 @@ import torch
 from foredrive.data.affordances import PathAhead, path_ahead
 from foredrive.geometry.polylines import arc_lengths
 from foredrive.scene.affordances import AffordanceEstimate
+from foredrive.scene.conditions import BackgroundTraffic
 from foredrive.scene.traffic_light import LightState
+from foredrive.simulation.drive import drive_route
 from foredrive.simulation.idm_agent import (
     DESIRED_MPS,
     STANDSTILL_M,
+    IdmAgent,
     Obstacle,
     _curve_speed,
     _told,
     _waypoints,
     drive_along,
 )
+from foredrive.simulation.scores import Ending
+from foredrive.simulation.town import TownScenario, TownSimulator
+from foredrive.towns.map.town_map import load_town_map
+from foredrive.towns.traffic.traffic import Traffic
 
 FRONT_M = 4.1
 
@@ -79,3 +86,23 @@ def test_what_a_model_tells_is_obeyed_where_it_is_probable() -> None:
     assert Obstacle(7.0, 3.0) in found
     assert Obstacle(13.0, 0.0) in found  # it stops two metres before
     assert [round(o.gap_m, 1) for o in found if o not in (Obstacle(7.0, 3.0), Obstacle(13.0, 0.0))] == [10.0]
+
+
+def test_it_waits_at_a_red_light_of_a_town_and_goes_on() -> None:
+    """40 m of a lane up to its light, which is red when the vehicle comes, and 12 m behind the line."""
+    lane, seed = 10, 3
+    graph = Traffic(load_town_map("Town02"), seed, 1, 0).lanes
+    onward = int(graph.successors[lane, 0])
+    before = graph.position(np.full(40, lane), graph.length_m[lane] - 40 + np.arange(40.0))
+    route = np.concatenate([before, graph.position(np.full(12, onward), np.arange(12.0))])
+    simulator = TownSimulator()
+    scenario = TownScenario(
+        "Town02", route, seed, lanes=(lane, onward), background_traffic=BackgroundTraffic(0, 0), limit_s=40.0
+    )
+    drive = drive_route(simulator, scenario, IdmAgent(simulator), route="r")
+    assert (drive.score.ending, drive.score.infractions) == (Ending.COMPLETED, ())
+    speed_mps = np.array([state.speed_mps for state in drive.states])
+    assert speed_mps.max() > 5.0
+    first_fast = int(np.flatnonzero(speed_mps > 5.0)[0])
+    assert speed_mps[first_fast:].min() < 0.1
+    assert speed_mps[-1] > 2.0
