@@ -118,6 +118,16 @@ def test_a_turning_vehicle_turns_the_points_too(made: Path, tmp_path: Path) -> N
     assert found[0].origin_ego[1, :2].tolist() == pytest.approx(turned.tolist(), abs=1e-3)
 
 
+def test_a_lost_sweep_has_an_empty_line_of_times(made: Path, tmp_path: Path) -> None:
+    """As in 2011_09_26_drive_0009: the sweeps behind keep their own times."""
+    folder = made / "2011_09_26" / DRIVE / "velodyne_points"
+    (folder / "data" / f"{1:010d}.bin").unlink()
+    lines = (folder / "timestamps.txt").read_text().split("\n")
+    (folder / "timestamps.txt").write_text("\n".join([lines[0], "", *lines[2:]]))
+    (path,) = convert(made, "kitti-raw", tmp_path / "out")
+    assert np.diff(Log(path).t_us).tolist() == [200_000]
+
+
 def test_a_missing_calibration_is_named(made: Path, tmp_path: Path) -> None:
     (made / "2011_09_26" / "calib_velo_to_cam.txt").unlink()
     with pytest.raises(InputError, match=f"{DRIVE}: cannot read the raw log") as refused:

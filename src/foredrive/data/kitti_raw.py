@@ -231,10 +231,12 @@ def _numbers(file: Path) -> dict[str, Float64[np.ndarray, "K"]]:
 
 
 def _times_us(file: Path) -> Int64[np.ndarray, "N"]:
-    """Return the times of a file with one in each line, with nanoseconds."""
+    """Return the times of a file with one in each line. The lines of lost frames are empty; they give 0."""
     found = []
-    for line in file.read_text().split("\n"):
-        if line.strip():
+    for line in file.read_text().rstrip().split("\n"):
+        if not line.strip():
+            found.append(0)
+        else:
             whole, _, part = line.strip().partition(".")
             seconds = datetime.fromisoformat(whole).replace(tzinfo=UTC).timestamp()
             found.append(round(seconds) * 1_000_000 + int(part.ljust(6, "0")[:6]))
