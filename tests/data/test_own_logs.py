@@ -145,12 +145,24 @@ BOX = Box("car", 1, (1.0, 2.0, 0.5), (4.0, 2.0, 1.5), 0.0)
         ({"boxes": [[dataclasses.replace(BOX, category="Spaceship")]] * 4}, "unknown category 'Spaceship'"),
         ({"boxes": [[dataclasses.replace(BOX, yaw_rad=np.nan)]] * 4}, "box 1 is not finite"),
         ({"boxes": [[BOX, BOX]] * 4}, "two boxes have the same track_id"),
+        ({"image_t_s": {"rear": TIMES_S}}, "times of 'rear', but there are no images"),
+        (
+            {"cameras": [CAMERA], "images": {"front": [IMAGE] * 4}, "image_t_s": {"front": TIMES_S * np.nan}},
+            "a time of front in image_t_s is not finite",
+        ),
         ({"split": "mine"}, "must be lower case and end in"),
     ],
 )
 def test_bad_input_is_named_and_leaves_no_log(given: dict[str, object], message: str, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=message):
         write(tmp_path, **given)
+    assert not list(tmp_path.rglob("*.arrow"))
+
+
+@pytest.mark.parametrize("name", ["", "..", "../drive", "a/b", "/tmp/drive"])
+def test_a_name_cannot_leave_the_folder_of_logs(name: str, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="the name of a log has letters"):
+        write_log(tmp_path / "data", name, TIMES_S, POSES)
     assert not list(tmp_path.rglob("*.arrow"))
 
 

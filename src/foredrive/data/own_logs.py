@@ -4,6 +4,7 @@ The frame of the ego vehicle is on the ground below the middle of the rear axle:
 Camera frames have x to the right, y down and z ahead. The world frame is any frame with z up.
 """
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -97,7 +98,7 @@ def write_log(
 
     Args:
         out: 123D data root; the log is out/logs/SPLIT/NAME.
-        name: of the log.
+        name: of the log: letters, digits, dots, dashes and underscores.
         t_s: [T] time of each frame, increasing.
         T_world_ego: [T, 4, 4] pose of the vehicle at these times.
         cameras: their calibration, at most 11.
@@ -114,12 +115,19 @@ def write_log(
         InputError: numbers of entries differ, times do not increase, an image cannot be read or has another
             size than its camera, an array has another shape, a value is not finite, a category is unknown.
     """
+    if not re.fullmatch(r"[\w-][\w.-]*", name):
+        raise InputError(f"the name of a log has letters, digits, dots, dashes and underscores; not {name!r}")
     drive = _Drive.of(name, np.asarray(t_s, np.float64), np.asarray(T_world_ego, np.float64))
     images, image_t_s = images or {}, image_t_s or {}
     given: dict[str, Sequence[Any] | np.ndarray | None] = {"sweeps": sweeps, "boxes": boxes, **image_t_s}
     for what, values in (given | {f"images of {camera}": rows for camera, rows in images.items()}).items():
         if values is not None and len(values) != len(drive.t_us):
             raise InputError(f"{name}: {len(values)} entries in {what}, but {len(drive.t_us)} frames")
+    for camera, times in image_t_s.items():
+        if camera not in images:
+            raise InputError(f"{name}: image_t_s has times of {camera!r}, but there are no images of it")
+        if not np.isfinite(np.asarray(times, np.float64)).all():
+            raise InputError(f"{name}: a time of {camera} in image_t_s is not finite")
     exposed = {camera: drive.exposures(np.asarray(times)) for camera, times in image_t_s.items()}
     place = (Path(out), split, name, list(cameras), None, None, None)
     with LogWriter(*place, vehicle=_metadata(vehicle), dataset=DATASET) as writer:
