@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from arrow_surgery import rewrite_column
 
 from foredrive.data import Box, CameraSpec, Points, find_logs, write_log
 from foredrive.data.log_check import LogCheck, check_log
@@ -121,3 +122,12 @@ def test_a_fault_is_found(changed: dict[str, Any], subject: str, text: str, tmp_
     findings = checked(tmp_path, **changed).findings
     told = [finding.text for finding in findings if finding.subject == subject]
     assert any(re.search(text, each) for each in told), findings
+
+
+def test_a_sweep_that_cannot_be_read_is_told_once_and_the_rest_is_checked(tmp_path: Path) -> None:
+    path = write_log(tmp_path, "drive", **(sound_drive() | {"boxes": FAST}))
+    file = path.folder / "lidar.lidar_top.arrow"
+    rewrite_column(file, "lidar.lidar_top.data", lambda values: [b"damaged"] * len(values))
+    findings = check_log(path).findings
+    assert [finding.subject for finding in findings if finding.level == "problem"].count("boxes") == 1
+    assert any(finding.subject == "lidar" for finding in findings)
