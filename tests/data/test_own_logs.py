@@ -133,6 +133,7 @@ BOX = Box("car", 1, (1.0, 2.0, 0.5), (4.0, 2.0, 1.5), 0.0)
         ({"t_s": TIMES_S[::-1]}, "times must increase"),
         ({"T_world_ego": np.full((4, 4, 4), np.nan)}, "not finite"),
         ({"T_world_ego": POSES * 2}, "a rotation that is none"),
+        ({"T_world_ego": POSES * np.array([1.0, 1, 1, 2])[:, None]}, "the last row of each"),
         ({"sweeps": [POINTS]}, "1 entries in sweeps, but 4 frames"),
         ({"cameras": [CAMERA], "images": {"front": [IMAGE]}}, "1 entries in images of front"),
         ({"images": {"front": [IMAGE] * 4}}, "'front', which was not declared"),

@@ -173,6 +173,8 @@ class _Drive:
         R = T_world_ego[:, :3, :3]
         if not np.allclose(R @ R.mT, np.eye(3), atol=1e-3) or (np.linalg.det(R) < 0).any():
             raise InputError(f"{name}: T_world_ego holds a rotation that is none")
+        if not np.allclose(T_world_ego[:, 3], [0, 0, 0, 1], atol=1e-6):
+            raise InputError(f"{name}: the last row of each T_world_ego must be 0, 0, 0, 1")
         velocity = _rates(T_world_ego[:, :3, 3], t_s)
         acceleration = _rates(velocity, t_s)
         return cls(
