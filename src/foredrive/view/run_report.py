@@ -15,6 +15,7 @@ from foredrive.view.example_panel import draw_example
 from foredrive.view.html import MetricTile, Provenance, write_page
 from foredrive.view.loss_curves import Losses, draw_loss_curves
 from foredrive.view.summary_tables import (
+    AGENT_TITLES,
     flow_table,
     full_table,
     image_table,
@@ -32,8 +33,8 @@ COMMAND_SOURCES = {
     "driven_future": "Commands from the driven future, which leaks part of the answer",
     "none": "Unknown commands",
 }
-REFERENCE = "constant_velocity"
-"""The baseline that stands beside the model in the tiles."""
+REFERENCES = ("ego_mlp", "constant_velocity")
+"""Baselines of planning: the first that was evaluated stands beside the model in the tiles."""
 MAX_NAMED_FAILURES = 5
 
 
@@ -147,8 +148,10 @@ def _tiles(summary: Summary) -> list[MetricTile]:
         ("uniad.l2_avg_m", "Planning L2, UniAD, average", "m"),
         ("uniad.collision_avg_pct", "Planning collisions, UniAD, average", "%"),
     ):
-        other = summary.get(f"planning.{REFERENCE}.{metric}")
-        note = "" if other is None else f"{words(REFERENCE)}: {number(other, 2)} {unit}"
+        others = {name: summary.get(f"planning.{name}.{metric}") for name in REFERENCES}
+        known = [f"{AGENT_TITLES.get(name, words(name))}: {number(value, 2)} {unit}"
+                 for name, value in others.items() if value is not None]  # fmt: skip
+        note = known[0] if known else ""
         add(title, summary.get(f"planning.{metric}"), 2, unit, note)
     add("Cars found, AP at 2 m within 30 m", summary.get("detection.car_ap_2m_30m"), 3)
     add("Semantic voxels, RayIoU", summary.get("occupancy.occ3d.rayiou_pct"), 1, "%")
