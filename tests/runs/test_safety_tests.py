@@ -12,8 +12,11 @@ from foredrive.cli.main import main
 from foredrive.errors import InputError
 from foredrive.evaluation.summary import read_summary
 from foredrive.runs.drive.in_ncap import SafetyTests, _folders, place_in, propose_scenarios
+from foredrive.runs.drive.in_rebuilt import RebuiltRoutes
+from foredrive.runs.drive.pseudo import pseudo_simulate
 from foredrive.runs.drive.suite import DriveSuite, drive_suite
 from foredrive.runs.rebuild.rebuilt_run import open_run_log
+from foredrive.simulation.faults import CameraFault, Faults
 from foredrive.simulation.ncap.outcome import Outcome
 from foredrive.simulation.ncap.rules import RULES
 from foredrive.simulation.ncap.running import set_up_run
@@ -149,3 +152,19 @@ def test_a_picture_shows_a_scenario(rebuilt: Path, scenarios: Path, tmp_path: Pa
     red = (np.abs(pixels - [255, 77, 79]).sum(axis=2) < 30).sum()
     assert pixels.shape[1] > 2 * 400
     assert red > 20  # the actor's way
+
+
+@pytest.mark.parametrize("agent", ["idm", "disturbed"])
+def test_an_agent_of_towns_cannot_be_pseudo_simulated_and_is_no_failed_start(
+    agent: str, rebuilt: Path, tmp_path: Path
+) -> None:
+    with pytest.raises(InputError, match="can drive only there"):
+        pseudo_simulate([str(rebuilt)], agent, tmp_path, every_s=1.0)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_camera_that_the_reconstruction_does_not_have_cannot_fail(rebuilt: Path, tmp_path: Path) -> None:
+    faults = Faults((CameraFault("black", "ahed"),))
+    suite = DriveSuite("stop", RebuiltRoutes(str(rebuilt)), sensors=False, faults=faults)
+    with pytest.raises(InputError, match="no camera ahed; there are ahead, left"):
+        drive_suite(suite, tmp_path)

@@ -161,6 +161,8 @@ def test_the_renderer_serves_images_sweeps_and_actors(rebuilt: Path) -> None:
                 ask(address, "/render_image", {**asked, **change})
         with pytest.raises(InputError, match=r"no lidar 'radar'; there are: .*vlp16"):
             ask(address, "/render_sweep", {**lidar, "lidar_name": "radar"})
+        with pytest.raises(InputError, match="twist has to be finite"):
+            ask(address, "/render_sweep", {**lidar, "twist": [float("nan"), 0, 0, 0, 0, 0]})
     assert (before.dtype, before.shape) == (torch.uint8, (24, 48, 3))
     direct = opened.scene.camera(opened.scene.graph, _view(opened, 1.0)).rgb_8bit.permute(1, 2, 0)
     assert (before.int() - direct.int()).abs().max() <= 1

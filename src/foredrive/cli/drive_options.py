@@ -83,11 +83,10 @@ class InputFaults:
         from foredrive.simulation.faults import Faults, read_camera_fault
 
         found = tuple(map(read_camera_fault, self.camera_fault))
-        known = {name.lower() for name in cameras}
-        for fault in found:
-            if known and fault.camera.lower() not in known:
-                raise InputError(f"--camera-fault: no camera {fault.camera}; there are {', '.join(cameras)}")
-        return Faults(found, self.speed_noise, self.position_noise)
+        faults = Faults(found, self.speed_noise, self.position_noise)
+        if cameras:
+            faults.check_cameras(tuple(cameras))
+        return faults
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 import dataclasses
 import zlib
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -45,6 +46,17 @@ class Faults:
         for name in ("speed_noise_mps", "position_noise_m"):
             if not 0 <= getattr(self, name) < np.inf:
                 raise InputError(f"{name} must be at least 0, got {getattr(self, name)}")
+
+    def check_cameras(self, names: Sequence[str]) -> None:
+        """Check that a vehicle has the cameras that fail.
+
+        Raises:
+            InputError: it has no such camera.
+        """
+        known = {name.lower() for name in names}
+        for fault in self.cameras:
+            if fault.camera.lower() not in known:
+                raise InputError(f"--camera-fault: no camera {fault.camera}; there are {', '.join(names)}")
 
 
 NO_FAULTS = Faults()

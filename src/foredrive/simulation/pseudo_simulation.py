@@ -8,7 +8,8 @@ which the extended comfort compares.
 Different from the devkit: agents of this package plan 3 s, so that a stage lasts 3 s and not 4; road users
 replay the log, where the devkit's follow IDM; the reference of progress is `ReplayExpert`, not PDM-Closed;
 the controller has neuro-ncap's settings of nuPlan's LQR; the vehicle is that of our drives; follow-up states
-lie on a fixed grid, where the devkit's come from other planners' drives; red lights are not known.
+lie on a fixed grid, where the devkit's come from other planners' drives. There the agent's route keeps the
+state's distance to the logged path, while scores look at the lanes. Red lights are not known.
 """
 
 import dataclasses

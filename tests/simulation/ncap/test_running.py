@@ -244,3 +244,18 @@ def test_the_hd_score_of_a_drive_tells_who_plans_through_others() -> None:
     assert beside.hd_score == pytest.approx(beside.completion)
     assert on.nc < 0.9
     assert on.hd_score < 0.7 * beside.hd_score
+
+
+def test_a_plan_that_stops_in_a_curve_keeps_its_heading() -> None:
+    """It turns by 0.4 rad/s and brakes by 3.2 m/s². To turn back within one step would be uncomfortable."""
+    here = place()
+    run = set_up_run(here, STANDING, 0, OURS, sensors=False, past_frames=0)
+    drive = drive_route(run.simulator, run.scenario, StraightAgent(SPEED_MPS), route="r", pilot=run.pilot)
+    ways, turns = np.array([2.0, 1.2, 0.4, 0.0, 0.0, 0.0]), np.array([0.15, 0.35, 0.55, 0.0, 0.0, 0.0])
+    points = np.cumsum(ways[:, None] * np.stack([np.cos(turns), np.sin(turns)], axis=1), axis=0)
+    street = shapely.Polygon([at(*corner)[:2] for corner in ((-20, -9), (150, -9), (150, 9), (-20, 9))])
+    curved = dataclasses.replace(drive, plans=((0, points),))
+    tracks, T = run.simulator.tracks, here.vehicle.T_world_scene
+    found = hd_score_of(curved, tracks, T, run.scenario.start_s, street)
+    assert found is not None
+    assert (found.comfort, found.dac) == (1.0, 1.0)

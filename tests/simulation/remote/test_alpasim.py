@@ -21,7 +21,7 @@ from test_planner_protocol import observation
 from foredrive.data.batches import stack_records
 from foredrive.errors import InputError
 from foredrive.scene import Clip, Command, Trajectory
-from foredrive.simulation.remote.alpasim_client import GrpcDriver, check_driver
+from foredrive.simulation.remote.alpasim_client import GrpcDriver, check_driver, points_of
 from foredrive.simulation.remote.alpasim_server import AlpasimDriver, route_of, serve_alpasim
 from foredrive.simulation.remote.json_http import Address
 from foredrive.simulation.remote.planner_server import PlannerNeeds
@@ -149,6 +149,13 @@ def test_plans_in_between_key_frames_are_interpolated() -> None:
         plan = GrpcDriver(Address("127.0.0.1", port, 10.0), lambda: 0.0).act(stack_records([observation()]))
     expected = torch.tensor([[0.5 * k * 2.0, 0.5 * k * 1.0] for k in range(1, 7)])
     torch.testing.assert_close(plan.xy[0, 0], expected, atol=1e-3, rtol=0)
+
+
+def test_a_plan_that_begins_late_is_refused() -> None:
+    """Its first pose, at 2 s, is not that at 0.5 s."""
+    late = TimedPoses([2_000_000, 4_000_000], [Pose.from_xyz_yaw(x, 0.0, 0.0, 0.0) for x in (16.0, 32.0)])
+    with pytest.raises(InputError, match="2 poses, which do not cover 3 s"):
+        points_of(late, np.eye(4), 0)
 
 
 def test_nobody_listens() -> None:

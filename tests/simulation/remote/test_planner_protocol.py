@@ -266,6 +266,7 @@ def message(**changes: object) -> dict[str, Any]:
         ({"command": 3}, "command must be one of"),
         ({"ego2world": [[1.0]]}, "ego2world has to be a 4 by 4 matrix"),
         ({"canbus": [0.0] * 5}, "canbus has 5 numbers"),
+        ({"canbus": [float("nan")] * 16}, "the speed nan, which is not finite"),
         ({"images": {}}, "cameras not sent: pcam_f0; sent: none"),
         ({"images": {"CAM_FRONT": "@@"}}, "not a tensor in base64"),
         ({"timestamp": "soon"}, "timestamp: Input should be a valid integer"),

@@ -77,6 +77,7 @@ class RebuiltRoutes:
     def set_up(self, job: DriveJob, suite: DriveSuite, out: Path) -> Iterator[DriveSetup]:
         """Set up a drive in the reconstructed scene."""
         opened, edits = opened_rebuilt(self.run), _edits_of(self.edits)
+        suite.faults.check_cameras(opened.vehicle.rig.names)
         past_frames = past_frames_of(suite.agent)
         _, start_s, threat = next(each for each in self._plan(past_frames) if each[0] == job)
         edited = edited_scene(opened.scene, edits)

@@ -5,6 +5,8 @@ import logging
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+import torch
+
 from foredrive.data.logs import Log
 from foredrive.data.road_maps import read_road_map
 from foredrive.errors import InputError
@@ -13,10 +15,12 @@ from foredrive.evaluation.summary import Summary, write_summary
 from foredrive.metrics.epdms.world import Roads
 from foredrive.runs.drive.agents import check_ready, inputs_of, is_remote
 from foredrive.runs.drive.in_ncap import place_in
-from foredrive.runs.drive.in_rebuilt import agent_in
+from foredrive.runs.drive.in_rebuilt import agent_in, check_lidar_of
 from foredrive.runs.folder import SUMMARY
 from foredrive.runs.rebuild.rebuilt_run import open_run_log
+from foredrive.simulation.logged_drive import LoggedDrive
 from foredrive.simulation.pseudo_simulation import PseudoScore, PseudoSimulation, figures_of
+from foredrive.simulation.rebuilt import RebuiltSimulator
 
 _log = logging.getLogger(__name__)
 
@@ -35,8 +39,8 @@ def pseudo_simulate(
         tick: called with the score of each start that did not fail.
 
     Raises:
-        InputError: there is no such agent, it remembers what it saw, or a log is missing, has no map, or is
-            too short for both stages.
+        InputError: there is no such agent, it remembers what it saw or cannot drive in a reconstruction, or a
+            log is missing, has no map, or is too short for both stages.
     """
     if is_remote(agent):
         raise InputError(f"{agent}: a planner in another process is reset for each drive and needs its past")
@@ -44,8 +48,13 @@ def pseudo_simulate(
     check_ready(agent)
     scores, failed = list[PseudoScore](), 0
     for run in runs:
+        place = place_in(run)
+        check_lidar_of(agent, None, place.vehicle, run)
+        drive = LoggedDrive(place.vehicle, torch.eye(4))
+        # an agent that cannot be made here is an error of the caller, and no failed start
+        agent_in(agent, RebuiltSimulator(place.renderer(place.graph), place.graph.tracks, drive, place.lanes))
         simulation = PseudoSimulation(
-            place_in(run),
+            place,
             roads_of(run),
             functools.partial(agent_in, agent),
             inputs.past_frames,

@@ -15,6 +15,9 @@ from foredrive.simulation.dynamics import EGO, STEP_S
 from foredrive.simulation.observation import FRAME_DT_S
 from foredrive.simulation.replayed import users_at
 
+STANDS_M = 0.05
+"""Largest distance between two points of a plan that stands, m."""
+
 
 def hd_score_of(
     drive: Drive,
@@ -46,12 +49,17 @@ def _in_traffic(
     T_world_scene: Float64[Tensor, "4 4"],
     start_s: float,
 ) -> PlanInTraffic:
-    """Return one plan with the vehicles at its times. Headings follow the points."""
+    """Return one plan with the vehicles at its times.
+
+    Headings follow the points. Where the plan stands, the vehicle keeps its heading.
+    """
     state = drive.states[index]
     path = np.vstack([np.zeros(2), points])
     steps = np.diff(path, axis=0)
-    turns = np.where(np.hypot(*steps.T) > 0.05, np.arctan2(steps[:, 1], steps[:, 0]), 0.0)
-    yaw = state.yaw_rad + np.append(0.0, turns)
+    moves = np.append(True, np.hypot(*steps.T) > STANDS_M)
+    turns = np.append(0.0, np.arctan2(steps[:, 1], steps[:, 0]))
+    last_moved = np.maximum.accumulate(np.where(moves, np.arange(len(path)), 0))
+    yaw = state.yaw_rad + turns[last_moved]
     cos, sin = math.cos(state.yaw_rad), math.sin(state.yaw_rad)
     axle = path @ np.array([[cos, sin], [-sin, cos]]) + [state.x_m, state.y_m]
     middle = axle + EGO.axle_to_centre_m * np.stack([np.cos(yaw), np.sin(yaw)], axis=1)

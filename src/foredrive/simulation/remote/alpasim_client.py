@@ -76,7 +76,7 @@ class GrpcDriver:
         except grpc.RpcError as error:
             raise _told(self._address, error) from error
         T_local_now = self._T_local_world @ clip.T_world_ego[clip.now].numpy()
-        return plan_of(_points(TimedPoses.from_proto(answer.trajectory), T_local_now, now_us)[None, None])
+        return plan_of(points_of(TimedPoses.from_proto(answer.trajectory), T_local_now, now_us)[None, None])
 
     def _begin(self, clip: Clip, until_s: float) -> None:
         """Begin a session: tell the cameras."""
@@ -182,14 +182,14 @@ def _route(clip: Clip) -> Float64[np.ndarray, "N 3"]:
     return np.column_stack([at_m[:, None] * direction, np.zeros(len(at_m))])
 
 
-def _points(plan: TimedPoses, T_local_now: Float64[np.ndarray, "4 4"], now_us: int) -> torch.Tensor:
+def points_of(plan: TimedPoses, T_local_now: Float64[np.ndarray, "4 4"], now_us: int) -> torch.Tensor:
     """Return the points of a plan at the next key frames in the ego frame, m.
 
     Raises:
-        InputError: the plan is not finite, or ends before 3 s.
+        InputError: the plan is not finite, begins after the first key frame, or ends before 3 s.
     """
     times = [now_us + round(FRAME_DT_S * 1e6) * step for step in range(1, HORIZON_STEPS + 1)]
-    if len(plan) < 2 or plan.timestamps_us[-1] < times[-1]:
+    if len(plan) < 2 or plan.timestamps_us[0] > times[0] or plan.timestamps_us[-1] < times[-1]:
         horizon_s = HORIZON_STEPS * FRAME_DT_S
         raise InputError(f"the driver answered {len(plan)} poses, which do not cover {horizon_s:g} s")
     poses = [plan.interpolate(at_us) for at_us in times]

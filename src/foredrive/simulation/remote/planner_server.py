@@ -1,6 +1,7 @@
 """An agent of ours as neuro-ncap's model server: `/alive`, `/reset`, `/infer`."""
 
 import dataclasses
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -96,6 +97,8 @@ def _key_frame(asked: PlannerInput, wanted: tuple[str, ...] | None) -> tuple[Key
     """Return the frame and the cameras of its images, in the order of those that are wanted."""
     if len(asked.canbus) <= SPEED:
         raise InputError(f"canbus has {len(asked.canbus)} numbers; 16 are needed")
+    if not math.isfinite(asked.canbus[SPEED]):
+        raise InputError(f"canbus has the speed {asked.canbus[SPEED]}, which is not finite")
     names = list(asked.images) if wanted is None else list(wanted)
     sent = {
         name: camera for name in names for camera in (name, nuscenes_name(name)) if camera in asked.images

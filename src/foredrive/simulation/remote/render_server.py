@@ -7,6 +7,7 @@ is not seen, since a request has no velocities.
 
 import dataclasses
 import io
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
@@ -213,6 +214,8 @@ class RenderService:
         if T_ego_lidar is None or asked.lidar_name not in self._lidar_names():
             there = ", ".join(self._lidar_names()) or "none, since the log had none"
             raise InputError(f"no lidar {asked.lidar_name!r}; there are: {there}")
+        if not all(map(math.isfinite, asked.twist)):
+            raise InputError(f"twist has to be finite, got {asked.twist}")
         lidar = self._lidar(asked.lidar_name, T_ego_lidar)
         T_lidar_ego = inverse_se3(T_ego_lidar.double())
         ego = self._ego(read_pose(asked.pose, "pose") @ T_lidar_ego, asked.timestamp, asked.twist)
