@@ -8,7 +8,8 @@ from small_drives import one_example
 
 from foredrive.errors import InputError
 from foredrive.scene import Clip, Trajectory
-from foredrive.simulation.faults import CameraFault, Faults, FaultyAgent, read_camera_fault
+from foredrive.simulation.faults import CameraFault, Faults, read_camera_fault
+from foredrive.simulation.faulty_agent import FaultyAgent
 
 
 class Keeper:

@@ -33,6 +33,8 @@ def test_after_a_step_no_trainable_parameter_is_without_a_gradient(
     example = make_example(past=clips.past_frames, future=clips.future_frames, spec=clips.voxels)
     torch.manual_seed(0)
     built = recipe.of_pretraining if stage == "pretrain" else recipe
+    if built.clips.tasks is not None:
+        example = with_truth(example, built.clips.tasks)
     objective = build_objective(built, getattr(recipe, stage), build_agent(built, fetch=False)).train()
     objective(example, torch.Generator().manual_seed(0))["loss"].backward()
     lacking = [key for key, p in objective.named_parameters() if p.requires_grad and p.grad is None]

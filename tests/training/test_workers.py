@@ -29,7 +29,8 @@ class Workers(Dataset):
 
 if __name__ == "__main__":
     schedule = Schedule(batch_size=1, lr=1e-3, steps=50, workers=2)
-    batches = iter(_loader(Workers(), list, schedule, 0, 50, SimpleNamespace(world_size=1, global_rank=0)))
+    alone = SimpleNamespace(world_size=1, global_rank=0)
+    batches = iter(_loader(Workers(), list, schedule, 0, 50, alone, None))
     Path("workers").write_text(f"{next(batches)[0]} {next(batches)[0]}")
     os.kill(os.getpid(), 9)
 """

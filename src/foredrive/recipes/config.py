@@ -61,12 +61,12 @@ class Recipe(Generic[M, S]):
 
     @property
     def of_pretraining(self) -> "Recipe[M, S]":
-        """Return the recipe with the world model of pre-training, without task heads."""
+        """Return the recipe with the world model of pre-training, without task heads and scored plans."""
         return replace(
             self,
             model=self.pretrained_model or self.model,
             clips=replace(self.clips, tasks=None),
-            planner=replace(self.planner, attends=()),
+            planner=replace(self.planner, attends=(), scorer=None),
             tasks=None,
         )
 

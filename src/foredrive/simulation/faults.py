@@ -1,21 +1,14 @@
 """Faults of an agent's inputs: cameras that fail, and noise on what it is told about itself."""
 
-import dataclasses
-import zlib
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-import numpy as np
-import torch
-from torch import Tensor
-
 from foredrive.errors import InputError
-from foredrive.scene import Agent, Clip, Trajectory
 
 FaultKind = Literal["lost", "black", "frozen"]
 KINDS: tuple[FaultKind, ...] = ("lost", "black", "frozen")
-TOLERANCE_S = 1e-6
 
 
 @dataclass(frozen=True)
@@ -44,7 +37,7 @@ class Faults:
 
     def __post_init__(self) -> None:
         for name in ("speed_noise_mps", "position_noise_m"):
-            if not 0 <= getattr(self, name) < np.inf:
+            if not 0 <= getattr(self, name) < math.inf:
                 raise InputError(f"{name} must be at least 0, got {getattr(self, name)}")
 
     def check_cameras(self, names: Sequence[str]) -> None:
@@ -79,71 +72,6 @@ def read_camera_fault(text: str) -> CameraFault:
         from_s = float(time) if time else 0.0
     except ValueError:
         from_s = -1.0
-    if not 0 <= from_s < np.inf:
+    if not 0 <= from_s < math.inf:
         raise InputError(f"--camera-fault {text}: {time!r} is no time of a drive, s")
     return CameraFault(kind, camera, from_s)
-
-
-class FaultyAgent:
-    """An `Agent` whose observations have faults. It counts the time of the drive by its own plans.
-
-    Args:
-        agent: gets the observations.
-        faults: the faults.
-        period_s: time between two plans.
-        name: name of the drive; seeds the noise.
-    """
-
-    def __init__(self, agent: Agent, faults: Faults, period_s: float, name: str) -> None:
-        self._agent, self._faults, self._period_s = agent, faults, period_s
-        self._rng = np.random.default_rng(zlib.crc32(name.encode()))
-        self._plans = 0
-        self._speeds: dict[float, float] = {}
-        self._kept: dict[str, Tensor] = {}
-
-    def act(self, observation: Clip) -> Trajectory:
-        """Return the agent's plan for the observation with its faults."""
-        now_s = self._plans * self._period_s
-        self._plans += 1
-        for fault in self._faults.cameras:
-            observation = self._failed(observation, fault, now_s)
-        return self._agent.act(self._noisy(observation, now_s))
-
-    def _failed(self, clip: Clip, fault: CameraFault, now_s: float) -> Clip:
-        """Return a clip in which a camera has failed in the key frames from the fault on."""
-        wanted = fault.camera.lower()
-        cameras = [k for k, name in enumerate(clip.rig.names) if name.lower() == wanted]
-        if not cameras:  # the agent does not read it
-            return clip
-        camera = cameras[0]
-        failed = clip.t_s[0] + now_s >= fault.from_s - TOLERANCE_S
-        frames = failed.nonzero()[:, 0]
-        images, valid = clip.images.clone(), clip.image_valid.clone()
-        if fault.kind == "frozen":
-            before = (~failed).nonzero()[:, 0]
-            if len(before):
-                self._kept[fault.camera] = images[:, before[-1], camera].clone()
-            kept = self._kept.setdefault(fault.camera, images[:, 0, camera].clone())
-            images[:, frames, camera] = kept[:, None]
-        else:
-            images[:, frames, camera] = 0
-            if fault.kind == "lost":
-                valid[:, frames, camera] = False
-        return dataclasses.replace(clip, images=images, image_valid=valid)
-
-    def _noisy(self, clip: Clip, now_s: float) -> Clip:
-        """Return a clip with noise on speed and target point. A key frame keeps its noise."""
-        faults = self._faults
-        if faults.speed_noise_mps > 0:
-            error = [self._speed_error(round(float(t_s) + now_s, 3)) for t_s in clip.t_s[0]]
-            speed = (clip.ego_speed_mps + torch.tensor(error)).clamp_min(0.0)
-            clip = dataclasses.replace(clip, ego_speed_mps=speed)
-        if faults.position_noise_m > 0:
-            moved = torch.from_numpy(self._rng.normal(0, faults.position_noise_m, 2)).float()
-            clip = dataclasses.replace(clip, target_xy=clip.target_xy + moved)
-        return clip
-
-    def _speed_error(self, t_s: float) -> float:
-        if t_s not in self._speeds:
-            self._speeds[t_s] = float(self._rng.normal(0, self._faults.speed_noise_mps))
-        return self._speeds[t_s]

@@ -13,6 +13,10 @@ from foredrive.errors import InputError
 from foredrive.simulation.remote.json_http import Address, JsonServer, Raw, ask, read_address
 
 
+def is_length(line: bytes) -> bool:
+    return line.lower().startswith(b"content-length:")
+
+
 @contextlib.contextmanager
 def raw_server(*chunks: bytes, gap_s: float = 0.0, answer_s: float = 1.0) -> Iterator[Address]:
     """A server that reads one request and sends bytes, some time apart."""
@@ -21,8 +25,9 @@ def raw_server(*chunks: bytes, gap_s: float = 0.0, answer_s: float = 1.0) -> Ite
         def respond() -> None:
             with contextlib.suppress(OSError):
                 connection, _ = listening.accept()
-                with connection:
-                    connection.recv(65536)
+                with connection, connection.makefile("rb") as request:
+                    length = [int(line[15:]) for line in iter(request.readline, b"\r\n") if is_length(line)]
+                    request.read(sum(length))  # what is not read would reset the connection
                     for chunk in chunks:
                         connection.sendall(chunk)
                         time.sleep(gap_s)

@@ -30,7 +30,8 @@ from foredrive.runs.folder import DRIVES, SUITE, SUMMARY, RunFolder
 from foredrive.scene import Agent, Simulator
 from foredrive.simulation.drive import Drive, Pilot, PlanningTiming, drive_route
 from foredrive.simulation.drive_record import DriveRecord, record_of
-from foredrive.simulation.faults import NO_FAULTS, Faults, FaultyAgent
+from foredrive.simulation.faults import NO_FAULTS, Faults
+from foredrive.simulation.faulty_agent import FaultyAgent
 from foredrive.simulation.ncap.outcome import SafetyResult
 from foredrive.training.interrupts import start_fork_server
 
