@@ -204,7 +204,7 @@ def test_affordances_and_scored_plans_are_trained_and_evaluated(
     assert {"task_light", "task_lamps", "score_no_collision", "score_imitation"} <= lines[0].keys()
     assert lines[0]["task_light"] == 0
     assert lines[0]["score_drivable"] == 0
-    assert lines[0]["score_no_collision"] > 0
+    assert max(line["score_no_collision"] for line in lines) > 0  # road users are followed in some clips
     summary = evaluate_run(run, [log], tmp_path / "evaluated", views=False).summary
     assert summary["failed"] == 0
     assert summary["affordances.lights_counted"] == 0
