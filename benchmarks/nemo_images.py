@@ -25,8 +25,7 @@ from foredrive.models.nemo import Nemo
 from foredrive.recipes import find_recipe
 from foredrive.recipes.config import rescheduled
 from foredrive.recipes.nemo import NemoRecipe
-from foredrive.runs.shipped import run_folder
-from foredrive.runs.train.run import load_agent, open_run, train_run
+from foredrive.runs.train.run import load_agent, train_run
 from foredrive.scene import Example, VoxelGrid
 from foredrive.training.rays import thinned_rays
 
@@ -84,14 +83,6 @@ def arm(name: str) -> Callable[[int], dict[str, float]]:
         return judge(load_agent(run), clips, WORK / "pictures" / f"{name}_seed{seed}.png")
 
     return measure
-
-
-def shipped(seed: int) -> dict[str, float]:
-    """Judge the frames of the `nemo_town` of the package, which was trained fifty times as long."""
-    logs = record_study(TOWNS, WORK / "towns", workers=1)
-    run = open_run(run_folder(Path("embedded:nemo_town"), WORK))
-    clips = ClipDataset(list(logs.test), run.recipe.clips, cache_dir=WORK / "cache")
-    return judge(load_agent(run), clips, WORK / "pictures" / "shipped.png")
 
 
 @torch.no_grad()
@@ -166,7 +157,7 @@ def _write_picture(path: Path, shown: list[Tensor], real: list[Tensor]) -> None:
 
 BENCHMARK = Benchmark(
     question="Do imagined frames blur, need they a smaller weight, does a perceptual loss sharpen them?",
-    arms={**{name: arm(name) for name in ARMS}, "shipped": shipped},
+    arms={name: arm(name) for name in ARMS},
     config={
         "recipes": {name: dataclasses.asdict(recipe) for name, recipe in ARMS.items()},
         "towns": dataclasses.asdict(TOWNS),

@@ -2,6 +2,7 @@
 
 import dataclasses
 import sys
+import tempfile
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from foredrive.data import find_logs
 from foredrive.runs import open_run
+from foredrive.runs.shipped import run_folder
 from foredrive.view.example_panel import front_camera
 from foredrive.view.image_drawing import Camera, resize
 from foredrive.view.log_frames import LogFrames
@@ -62,8 +64,9 @@ def sheet(rows: list[list[np.ndarray]]) -> Image.Image:
 
 def main(log: Path, run: Path, *seconds: float) -> None:
     """One row a time."""
-    frames = LogFrames(find_logs(log)[0], CELL_HW[1], open_run(run))
-    page = sheet([row(frames, t_s) for t_s in seconds])
+    with tempfile.TemporaryDirectory() as folder:  # for the run that comes with the package
+        frames = LogFrames(find_logs(log)[0], CELL_HW[1], open_run(run_folder(run, Path(folder))))
+        page = sheet([row(frames, t_s) for t_s in seconds])
     page.save(HERE / "nemo_volume.jpg", quality=88, optimize=True)
 
 
