@@ -71,11 +71,11 @@ def test_rigs_differ_by_place_angle_names_and_size() -> None:
     assert not same_rig(plan, plan.of_size((36, 64)))
 
 
-def test_the_narrow_camera_shows_a_lamp_at_40_m() -> None:
-    """A lamp of 0.3 m, 3.4 m above the camera, covers three pixels of an image 160 px wide."""
-    rig = camera_rig((90, 160), plan=DRIVING)
+def test_the_narrow_camera_shows_a_lamp_at_40_m_and_one_beside_the_near_line() -> None:
+    """A lamp of 0.3 m covers three pixels at 40 m. Lamps 14 m ahead over the next lane are in view."""
+    rig = camera_rig(DRIVING.image_hw, plan=DRIVING)
     tele = rig.names.index(TELE)
-    lamp_m = torch.tensor([[41.7, 0.15, 5.05], [41.7, -0.15, 5.05]])
+    lamp_m = torch.tensor([[41.7, 0.15, 5.05], [41.7, -0.15, 5.05], [15.7, 3.0, 4.8], [15.7, -3.0, 2.7]])
     in_camera = transform_points(inverse_se3(rig.T_ego_cam[tele]), lamp_m)
     uv, _, inside = project(in_camera, rig.K[tele], rig.dist[tele], rig.size_hw)
     assert inside.all()

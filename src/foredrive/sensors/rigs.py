@@ -86,8 +86,8 @@ SURROUND = RigPlan(
 """Six cameras in all directions, similar to those of nuScenes."""
 TELE = "FTCAM_TELE_F0"
 """123D's name for a front camera with a long focal length."""
-DRIVING = RigPlan(SURROUND.image_hw, {**SURROUND.cameras, TELE: Mount((1.70, 0.00, 1.65), 0.0, 22.0, 4.0)})
-"""`SURROUND` with a narrow front camera, tilted up. At 160 px of width, a lamp of 0.3 m is 3 px at 40 m."""
+DRIVING = RigPlan(SURROUND.image_hw, {**SURROUND.cameras, TELE: Mount((1.70, 0.00, 1.65), 0.0, 30.0, 6.0)})
+"""`SURROUND` with a narrow front camera, tilted up. In it, a lamp of 0.3 m is 3 px at 40 m."""
 RIGS: Mapping[str, RigPlan] = {"surround": SURROUND, "driving": DRIVING}
 
 
