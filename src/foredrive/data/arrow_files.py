@@ -23,7 +23,7 @@ _DAMAGED = (
     zlib.error,
     Image.DecompressionBombError,
 )
-_REFUSES_WRITING = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
+REFUSES_WRITING = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
 
 
 @contextlib.contextmanager
@@ -37,7 +37,7 @@ def reading(file: Path, what: str) -> Iterator[None]:
     except InputError:
         raise
     except OSError as error:
-        if error.errno in _REFUSES_WRITING:
+        if error.errno in REFUSES_WRITING:
             raise
         raise InputError(_said(file, what, error)) from error
     except _DAMAGED as error:

@@ -1,4 +1,4 @@
-"""Conversion of raw datasets to self-contained 123D logs."""
+"""Conversion of raw data sets to self-contained 123D logs."""
 
 import os
 from collections.abc import Callable, Iterator
@@ -7,28 +7,22 @@ from pathlib import Path
 from py123d.api.map.arrow.arrow_map_writer import ArrowMapWriter
 from py123d.api.scene.arrow.arrow_log_writer import ArrowLogWriter
 from py123d.api.scene.arrow.utils.log_writer_config import LogWriterConfig
-from py123d.parser.av2.av2_map_parser import Av2MapParser
-from py123d.parser.av2.av2_sensor_parser import Av2SensorLogParser
+from py123d.datatypes import LogMetadata
 from py123d.parser.base_dataset_parser import BaseLogParser, BaseMapParser
 
-from foredrive.data.arrow_files import reading
-from foredrive.data.av2_partial import Av2PartialParser
-from foredrive.data.kitti_object import KittiObjectParser
-from foredrive.data.kitti_raw import KittiRawParser
 from foredrive.data.log_paths import LogPath
-from foredrive.data.nuscenes_keyframe import NuScenesKeyframeParser
-from foredrive.data.pandaset import PandasetParser
+from foredrive.data.raw.datasets import DATASETS
+from foredrive.data.raw.guard import check_inside, check_names, reading_raw
+from foredrive.data.raw.raw_log import RawLog
 from foredrive.errors import InputError
 from foredrive.files import atomic_path
 
-LogParsers = Iterator[tuple[Path, BaseLogParser, BaseMapParser | None]]
-
 
 def convert(source: Path, dataset: str, out: Path) -> list[LogPath]:
-    """Convert a raw dataset into 123D logs that contain their images and sweeps.
+    """Convert a raw dataset into 123D logs that contain their images and sweeps, one after the other.
 
     Missing velocities are left out, not inferred, and no routes are derived. An existing log of the same name
-    is replaced.
+    is replaced. `runs.convert` converts many logs at once and keeps those that are there.
 
     Args:
         source: folder of one raw log, or a folder (of folders) of raw logs.
@@ -41,91 +35,112 @@ def convert(source: Path, dataset: str, out: Path) -> list[LogPath]:
     Raises:
         InputError: the dataset is unknown, or the source has no raw logs of it or cannot be read.
     """
+    return [convert_log(raw, Path(out)) for raw in find_raw_logs(Path(source), dataset)]
+
+
+def find_raw_logs(source: Path, dataset: str) -> Iterator[RawLog]:
+    """Yield the raw logs of a data set in a folder.
+
+    Raises:
+        InputError: the data set is unknown, there is no log of it, or an index of it cannot be read.
+    """
     if dataset not in DATASETS:
         raise InputError(f"unknown data set {dataset!r}; there are: {', '.join(DATASETS)}")
-    source = Path(source)
-    if not source.is_dir():
+    if not source.exists():
         raise InputError(f"{source}: no such folder")
-    logs = [_convert_one(*item, Path(out)) for item in DATASETS[dataset](source)]
-    if not logs:
-        raise InputError(f"{source}: no {dataset} log here")
-    return logs
+    kind, found = DATASETS[dataset], False
+    logs = iter(kind.find(source))
+    while True:
+        with reading_raw(source):
+            raw = next(logs, None)
+        if raw is None:
+            break
+        found = True
+        yield raw
+    if not found:
+        raise InputError(f"{source}: no {dataset} log here (looked for {kind.layout})")
 
 
-def _convert_one(folder: Path, log: BaseLogParser, map_: BaseMapParser | None, out: Path) -> LogPath:
+def log_path(metadata: LogMetadata, out: Path) -> LogPath:
+    """Return the path of a raw log in a data root, whether it has been converted or not.
+
+    Raises:
+        InputError: its name would lead out of the data root.
+    """
+    check_names(metadata)
+    folder = out / "logs" / metadata.split / metadata.log_name
+    return LogPath(folder.absolute(), out.absolute() / "maps")
+
+
+def convert_log(raw: RawLog, out: Path, tick: Callable[[], None] = lambda: None) -> LogPath:
+    """Convert one raw log, and its map unless that is shared and there.
+
+    Args:
+        raw: the log.
+        out: 123D data root.
+        tick: called after each frame.
+
+    Raises:
+        InputError: a file of it cannot be read, names a file outside of the data set, or it has no frames.
+    """
+    with reading_raw(raw.source):
+        metadata = raw.log.get_log_metadata()
+        path = log_path(metadata, out)
+        with atomic_path(path.folder) as temporary:
+            scratch = temporary.parent
+            if raw.map is not None:
+                _write_map(raw.map, scratch, out)
+            if not _write_frames(raw.log, metadata, raw.source, scratch, tick):
+                raise InputError(f"{raw.source}: the raw log has no frames")
+            os.replace(scratch / metadata.split / metadata.log_name, temporary)
+    return path
+
+
+def _write_frames(
+    log: BaseLogParser, metadata: LogMetadata, source: Path, scratch: Path, tick: Callable[[], None]
+) -> int:
     config = LogWriterConfig(
         camera_store_option="jpeg_binary",
         lidar_store_option="binary",
         lidar_codec="ipc_lz4",
         write_route=False,
     )
-    with reading(folder, "the raw log"):
-        metadata = log.get_log_metadata()
-        final = out / "logs" / metadata.split / metadata.log_name
-        with atomic_path(final) as temporary:
-            scratch = temporary.parent
-            if map_ is not None:
-                map_writer = ArrowMapWriter(True, maps_root=scratch, logs_root=scratch)
-                map_writer.reset(map_.get_map_metadata())
-                for item in map_.iter_map_objects():
-                    map_writer.write_map_object(item)
-                (scratch / metadata.split / metadata.log_name).mkdir(parents=True)
-                map_writer.close()
-            writer = ArrowLogWriter(config, scratch, scratch)
-            writer.reset(metadata)
-            for frame in log.iter_modalities_sync():
-                writer.write_sync(frame)
-            writer.close()
-            os.replace(scratch / metadata.split / metadata.log_name, temporary)
-    return LogPath(final.absolute(), out.absolute() / "maps")
+    writer = ArrowLogWriter(config, scratch, scratch)
+    writer.reset(metadata)
+    frames = 0
+    for frame in log.iter_modalities_sync():
+        for modality in frame.modalities:
+            check_inside(modality, source)
+        writer.write_sync(frame)
+        frames += 1
+        tick()
+    writer.close()
+    return frames
 
 
-def _folders_with(source: Path, file: str) -> list[Path]:
-    """Return `source`, or else the folders one or two levels below it that contain `file`."""
-    for depth in range(3):
-        found = sorted(source.glob("*/" * depth + file))
-        if found:
-            return [item.parents[file.count("/")] for item in found]
-    return []
+def _write_map(parser: BaseMapParser, scratch: Path, out: Path) -> None:
+    """Write the map of one log below `scratch`, or a shared map below `out` unless it is there."""
+    metadata = parser.get_map_metadata()
+    check_names(metadata)
+    if metadata.map_is_per_log:
+        _fill_map(parser, scratch, scratch)
+        (scratch / metadata.split / metadata.log_name).mkdir(parents=True, exist_ok=True)
+        return
+    name = Path(metadata.dataset) / f"{metadata.dataset}_{metadata.location}.arrow"
+    final = out / "maps" / name
+    if final.is_file():
+        return
+    with atomic_path(final) as temporary:
+        _fill_map(parser, temporary.parent, temporary.parent)
+        os.replace(temporary.parent / name, temporary)
 
 
-def _pandaset(source: Path) -> LogParsers:
-    for folder in _folders_with(source, "annotations/cuboids"):
-        yield folder, PandasetParser(folder, folder.name, "pandaset_train"), None
-
-
-def _av2(source: Path) -> LogParsers:
-    for folder in _folders_with(source, "city_SE3_egovehicle.feather"):
-        kind = folder.parent.name if folder.parent.name in ("train", "val", "test") else "val"
-        split = f"av2-sensor_{kind}"
-        whole = (folder / "sensors" / "cameras").is_dir()
-        parser = Av2SensorLogParser(folder, split, "sweep") if whole else Av2PartialParser(folder, split)
-        yield folder, parser, Av2MapParser(folder, split)
-
-
-def _nuscenes_keyframe(source: Path) -> LogParsers:
-    for folder in _folders_with(source, "v1.0-*/sample_data.json"):
-        yield folder, NuScenesKeyframeParser(folder, "nuscenes_val"), None
-
-
-def _kitti_object(source: Path) -> LogParsers:
-    for folder in _folders_with(source, "velodyne"):
-        split = "kitti_test" if folder.name == "testing" else "kitti_train"
-        for sweep in sorted(folder.glob("velodyne/*.bin")):
-            yield sweep, KittiObjectParser(folder, sweep.stem, split), None
-
-
-def _kitti_raw(source: Path) -> LogParsers:
-    for folder in _folders_with(source, "velodyne_points/data"):
-        yield folder, KittiRawParser(folder, "kitti-raw_train"), None
-
-
-DATASETS: dict[str, Callable[[Path], LogParsers]] = {
-    "pandaset": _pandaset,
-    "av2": _av2,
-    "nuscenes-keyframe": _nuscenes_keyframe,
-    "kitti-object": _kitti_object,
-    "kitti-raw": _kitti_raw,
-}
-"""Functions that find and parse the raw logs of each dataset. For full nuScenes and all other datasets, use
-py123d's own `py123d-conversion`."""
+def _fill_map(parser: BaseMapParser, maps_root: Path, logs_root: Path) -> None:
+    writer = ArrowMapWriter(True, maps_root=maps_root, logs_root=logs_root)
+    writer.reset(parser.get_map_metadata())
+    for item in parser.iter_map_objects():
+        writer.write_map_object(item)
+    metadata = parser.get_map_metadata()
+    if metadata.map_is_per_log:
+        (logs_root / metadata.split / metadata.log_name).mkdir(parents=True, exist_ok=True)
+    writer.close()

@@ -2,9 +2,10 @@
 
 import gzip
 import importlib
+import io
 import pickle
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -38,12 +39,15 @@ _TABLE = _PLAIN | {
 
 
 class _Unpickler(pickle.Unpickler):
-    def __init__(self, source: Any, allowed: set[tuple[str, str]]) -> None:
+    def __init__(
+        self, source: Any, allowed: set[tuple[str, str]], moved: Mapping[str, str] | None = None
+    ) -> None:
         super().__init__(source)
-        self._allowed = allowed
+        self._allowed, self._moved = allowed, moved or {}
 
     def find_class(self, module: str, name: str) -> Any:
         module = module.replace("numpy.core.", "numpy._core.")  # before numpy 2
+        module = self._moved.get(module, module)
         if (module, name) not in self._allowed:
             raise pickle.UnpicklingError(f"it asks for {module}.{name}, which plain data do not need")
         return getattr(importlib.import_module(module), name)
@@ -70,11 +74,58 @@ def load_table(file: Path) -> "pd.DataFrame":
     return table
 
 
-def _load(file: Path, opened: Callable[..., Any], allowed: set[tuple[str, str]]) -> Any:
+def load_records(file: Path, schema: str, moved: Mapping[str, str]) -> Any:
+    """Load a pickle of plain data and of the dataclasses of one module.
+
+    Args:
+        file: the pickle.
+        schema: name of the module; its dataclasses alone are allowed.
+        moved: for modules by which old files name the dataclasses, the module that has them.
+
+    Raises:
+        InputError: the file contains anything else, or it is damaged.
+    """
+    module = importlib.import_module(schema)
+    records = {
+        (schema, name) for name, value in vars(module).items() if hasattr(value, "__dataclass_fields__")
+    }
+    return _load(file, open, _PLAIN | records, moved)
+
+
+class PlainPickle:
+    """The functions of the module `pickle`, limited to plain data, to be put in its place in a library.
+
+    Args:
+        classes: further classes that are allowed, as (module, name).
+    """
+
+    UnpicklingError = pickle.UnpicklingError
+    HIGHEST_PROTOCOL = pickle.HIGHEST_PROTOCOL
+    dump = staticmethod(pickle.dump)
+    dumps = staticmethod(pickle.dumps)
+
+    def __init__(self, classes: Iterable[tuple[str, str]] = ()) -> None:
+        self._allowed = _PLAIN | set(classes)
+
+    def load(self, source: Any) -> Any:
+        """Load plain data from an open file. Raise `pickle.UnpicklingError` if it contains anything else."""
+        return _Unpickler(source, self._allowed).load()
+
+    def loads(self, data: bytes) -> Any:
+        """Load plain data from bytes. Raise `pickle.UnpicklingError` if they contain anything else."""
+        return self.load(io.BytesIO(data))
+
+
+def _load(
+    file: Path,
+    opened: Callable[..., Any],
+    allowed: set[tuple[str, str]],
+    moved: Mapping[str, str] | None = None,
+) -> Any:
     try:
         with opened(file, "rb") as source, warnings.catch_warnings():
             warnings.filterwarnings("ignore", message="dtype.*align")  # written by an older numpy
-            return _Unpickler(source, allowed).load()
+            return _Unpickler(source, allowed, moved).load()
     except Exception as error:  # a damaged pickle can raise any error
         raise InputError(f"{file}: cannot read it as a pickle of plain data: {_first_line(error)}") from error
 

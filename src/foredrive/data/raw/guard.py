@@ -1,0 +1,119 @@
+"""Reading of raw files by other people's parsers: errors of one line, and paths that stay in their folder."""
+
+import contextlib
+import os
+import re
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from py123d.datatypes import LogMetadata, MapMetadata
+from py123d.datatypes.modalities.base_modality import BaseModality
+from py123d.parser.base_dataset_parser import ParsedCamera, ParsedLidar, ParsedRadar
+
+from foredrive.data.arrow_files import REFUSES_WRITING
+from foredrive.errors import InputError
+
+_NAME = re.compile(r"[\w-][\w.+-]*")
+_READ_MODES = ("r", "rb", "rt", None)
+
+
+class _LastOpened:
+    """The file that Python opened last below a folder. Many parsers' errors do not name it."""
+
+    below: str | None = None
+    file: str | None = None
+    listens = False
+
+
+@contextlib.contextmanager
+def reading_raw(source: Path) -> Iterator[None]:
+    """Convert every error of a parser into a one-line `InputError` that names the log and the last read file.
+
+    Damaged files make foreign parsers raise errors of any class. Errors while writing to a full or read-only
+    disk and interruptions are raised unchanged.
+    """
+    with _noting_opened(source):
+        try:
+            yield
+        except InputError:
+            raise
+        except Exception as error:
+            if isinstance(error, OSError) and error.errno in REFUSES_WRITING:
+                raise
+            raise InputError(f"{source}: cannot read the raw log: {_reason(error)}{_place(error)}") from error
+
+
+@contextlib.contextmanager
+def _noting_opened(source: Path) -> Iterator[None]:
+    """Note which file below the folder was opened last; audit events of Python tell of each."""
+    if not _LastOpened.listens:
+        sys.addaudithook(_note)  # it stays, and does nothing outside of such a block
+        _LastOpened.listens = True
+    before = _LastOpened.below
+    _LastOpened.below, _LastOpened.file = os.path.abspath(source), None
+    try:
+        yield
+    finally:
+        _LastOpened.below = before
+
+
+def _note(event: str, details: tuple[Any, ...]) -> None:
+    if event == "open" and _LastOpened.below is not None and isinstance(details[0], str | os.PathLike):
+        path = os.path.abspath(details[0])
+        if details[1] in _READ_MODES and path.startswith(_LastOpened.below):
+            _LastOpened.file = path
+
+
+def _place(error: Exception) -> str:
+    """Return in which file the error arose, if the error does not say it."""
+    found = _LastOpened.file
+    if found is None or found == _LastOpened.below or Path(found).name in str(error):
+        return ""
+    return f" (in {os.path.relpath(found, _LastOpened.below)})"
+
+
+def _reason(error: Exception) -> str:
+    said = next(iter(str(error).strip().splitlines()), "")
+    if isinstance(error, KeyError):
+        return f"{said} is unknown or missing"
+    if isinstance(error, RecursionError):
+        return "it is nested too deeply"
+    if isinstance(error, MemoryError):
+        return "it asks for more memory than there is"
+    if isinstance(error, FileNotFoundError) and error.filename:
+        return f"{error.filename}: no such file"
+    if isinstance(error, ValueError | AssertionError | OSError) and said:
+        return said
+    return f"{type(error).__name__}: {said}" if said else type(error).__name__
+
+
+def check_names(metadata: LogMetadata | MapMetadata) -> None:
+    """Check that the names by which a log or a map is stored cannot lead out of its folder.
+
+    Raises:
+        InputError: a name has other characters than letters, digits, dots, dashes, plus and underscores.
+    """
+    for what in ("split", "log_name", "location", "dataset"):
+        name = getattr(metadata, what)
+        if name is not None and what != "location" and not _NAME.fullmatch(str(name)):
+            raise InputError(f"the name {name!r} ({what}) cannot be that of a folder")
+        if name is not None and what == "location" and re.search(r"[/\\\0]|^\.", str(name)):
+            raise InputError(f"the name {name!r} ({what}) cannot be that of a file")
+
+
+def check_inside(modality: BaseModality, source: Path) -> None:
+    """Check that a sensor's file lies in the data set. Symbolic links of the user may lead elsewhere.
+
+    Raises:
+        InputError: the data set names a file outside of it.
+    """
+    if not isinstance(modality, ParsedCamera | ParsedLidar | ParsedRadar):
+        return
+    root, relative = modality._dataset_root, modality._relative_path
+    if root is None or relative is None:
+        return
+    whole = os.path.abspath(os.path.join(root, relative))
+    if os.path.commonpath([whole, os.path.abspath(root)]) != os.path.abspath(root):
+        raise InputError(f"{source}: it names the file {str(relative)!r}, which is outside of the data set")

@@ -1,0 +1,101 @@
+"""Convert the logs of a data set, several at a time. Finished logs are kept; a bad one stops no other."""
+
+import contextlib
+import functools
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+
+from foredrive.data.arrow_files import check_whole
+from foredrive.data.convert import convert_log, find_raw_logs, log_path
+from foredrive.data.log_paths import LogPath
+from foredrive.data.raw.guard import reading_raw
+from foredrive.data.raw.raw_log import RawLog
+from foredrive.errors import InputError
+from foredrive.runs.fan_out import fan_out, reason
+
+
+@dataclass(frozen=True)
+class Conversion:
+    """What became of one raw log."""
+
+    name: str
+    """Its split and name."""
+    log: LogPath | None
+    """Its log, or None if it has none."""
+    failure: str | None = None
+    """The reason in one line if it has no log."""
+    kept: bool = False
+    """Whether its log was there before."""
+
+
+def convert_all(
+    source: Path,
+    dataset: str,
+    out: Path,
+    workers: int,
+    *,
+    overwrite: bool = False,
+    tick: Callable[[], None] = lambda: None,
+) -> Iterator[Conversion]:
+    """Yield each raw log when it has been converted, has failed, or was there before.
+
+    Args:
+        source: folder of one raw log, or of many.
+        dataset: one of `DATASETS`.
+        out: 123D data root.
+        workers: number of logs converted at a time; 1 converts in this process.
+        overwrite: whether logs that are there are replaced.
+        tick: called after each frame that is converted in this process.
+
+    Raises:
+        InputError: the data set is unknown, or there is no log of it.
+        OSError: the disk is full, so that no other log could be written.
+    """
+    todo, names = [], dict[int, str]()
+    for raw in find_raw_logs(source, dataset):
+        with reading_raw(raw.source):
+            path = log_path(raw.log.get_log_metadata(), out)
+        if not overwrite and _is_whole(path.folder):
+            yield Conversion(path.name, path, kept=True)
+        else:
+            names[id(raw)] = path.name
+            todo.append(raw)
+    for raw, result in _converted(todo, out, min(workers, len(todo)), tick):
+        name = names[id(raw)]
+        if isinstance(result, BaseException):
+            yield Conversion(name, None, reason(name, result))
+        else:
+            yield Conversion(name, result)
+
+
+def _converted(
+    todo: list[RawLog], out: Path, workers: int, tick: Callable[[], None]
+) -> Iterator[tuple[RawLog, LogPath | BaseException]]:
+    if workers > 1:
+        work = functools.partial(_convert_here, out=out)
+        with contextlib.closing(fan_out(todo, work, workers)) as results:
+            yield from results
+        return
+    for raw in todo:
+        try:
+            yield raw, convert_log(raw, out, tick)
+        except InputError as error:
+            yield raw, error
+
+
+def _convert_here(raw: RawLog, out: Path) -> LogPath:
+    torch.set_num_threads(1)
+    return convert_log(raw, out)
+
+
+def _is_whole(folder: Path) -> bool:
+    if not (folder / "sync.arrow").is_file():
+        return False
+    try:
+        check_whole(folder)
+    except InputError:
+        return False
+    return True
