@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 STAMP := .venv/.installed
 
-.PHONY: install demo test quick test-slow test-oracles golden lint format clean
+.PHONY: install demo docs test quick test-slow test-oracles golden lint format clean
 
 install: $(STAMP)
 
@@ -15,6 +15,17 @@ $(STAMP): pyproject.toml
 
 demo: install
 	$(BIN)/foredrive demo
+
+# The site, from the pages, the docstrings and benchmarks/results; a broken link or docstring is an error.
+DOCS_STAMP := .venv/.installed-docs
+
+$(DOCS_STAMP): $(STAMP)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e ".[docs]"
+	@touch $@
+
+docs: $(DOCS_STAMP)
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+	@echo "open build/site/index.html"
 
 lint: install
 	$(BIN)/ruff check .

@@ -13,7 +13,7 @@ import pytest
 from foredrive.cli import main as program
 
 ROOT = Path(__file__).parents[2]
-PAGES = (ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md")))
+PAGES = (ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md")))
 
 
 def blocks(page: Path, languages: str) -> list[str]:
@@ -22,7 +22,7 @@ def blocks(page: Path, languages: str) -> list[str]:
 
 def commands(page: Path) -> list[str]:
     text = "\n".join(blocks(page, "|bash"))
-    return re.findall(r"^foredrive (.+?)(?:\s+#.*)?$", text, flags=re.MULTILINE)
+    return re.findall(r"^foredrive (.+?)(?:\s+[#>].*)?$", text, flags=re.MULTILINE)
 
 
 COMMANDS = sorted({command for page in PAGES for command in commands(page) if "--help" not in command})
@@ -47,7 +47,7 @@ def test_a_command_is_understood(command: str, monkeypatch: pytest.MonkeyPatch) 
 
     monkeypatch.setattr(program, "VERBS", {name: only_called(name) for name in program.VERBS})
     assert program.main(shlex.split(command)) == 0
-    verb, then = shlex.split(command)[:2]
+    verb, then, *_ = (*shlex.split(command), "")
     assert called == [f"{verb} {then}" if f"{verb} {then}" in program.VERBS else verb]
 
 

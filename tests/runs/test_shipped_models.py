@@ -9,11 +9,13 @@ from pathlib import Path
 import pytest
 import torch
 
+from foredrive.cli.main import main
 from foredrive.data import LogPath
 from foredrive.errors import InputError
 from foredrive.evaluation.summary import read_summary
 from foredrive.runs import Run, evaluate_run, load_agent, open_run, shipped
 from foredrive.runs.drive.agents import inputs_of, rig_of
+from foredrive.runs.model_card import find_card, read_card, shipped_weights
 from foredrive.runs.ship import MAX_BYTES, ship
 from foredrive.runs.shipped import run_folder
 
@@ -78,6 +80,36 @@ def test_the_card_has_both_figures(package: Path) -> None:
     assert "Five seconds of a flat road." in card
     assert "| IoU above the ground, now |" in card
     assert "4 clips, 0 failed" in card
+
+
+def test_a_card_is_read_as_it_was_written(package: Path, evaluated: Run) -> None:
+    card = read_card(package / "tiny" / "card.md")
+    assert card.markdown() == (package / "tiny" / "card.md").read_text()
+    assert (card.name, card.recipe, card.clips, card.failed) == ("tiny", evaluated.recipe.name, 4, 0)
+    before = read_summary(evaluated.folder / "summary.json")["occupancy.above_ground.iou_now"]
+    assert card.figures["IoU above the ground, now"][0] == pytest.approx(before, abs=5e-4)
+    assert (card.data, card.limits) == ("Five seconds of a flat road.", "It has seen nothing else.")
+
+
+def test_another_file_is_no_card(tmp_path: Path) -> None:
+    (tmp_path / "card.md").write_text("# tiny\n\nA model.\n")
+    with pytest.raises(InputError, match=r"card.md: not a model card"):
+        read_card(tmp_path / "card.md")
+
+
+def test_all_weights_of_the_package_are_listed(capsys: pytest.CaptureFixture[str]) -> None:
+    *models, towers = shipped_weights()
+    assert [each.name for each in models] == [f"embedded:{name}" for name in shipped.shipped_models()]
+    assert all(each.card is not None and each.data and each.commit for each in models)
+    for each in (*models, towers):
+        assert 1e6 < each.size < 1.2e7
+    assert main(["models"]) == 0
+    printed = capsys.readouterr().out
+    assert all(each.name in printed for each in (*models, towers))
+    assert main(["models", models[0].name]) == 0
+    assert capsys.readouterr().out == find_card(models[0].name).read_text()
+    assert main(["models", "huge"]) == 2
+    assert "huge: no such model; there are" in capsys.readouterr().err
 
 
 def test_a_copy_is_kept_and_one_of_another_version_is_refused(package: Path, tmp_path: Path) -> None:

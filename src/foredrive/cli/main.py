@@ -22,6 +22,7 @@ from foredrive.cli.evaluate import evaluate
 from foredrive.cli.export import export
 from foredrive.cli.imagine import imagine
 from foredrive.cli.memory import keep_freed_memory
+from foredrive.cli.models import models
 from foredrive.cli.ncap import ncap
 from foredrive.cli.pseudo import pseudo
 from foredrive.cli.recipes import recipes
@@ -46,6 +47,7 @@ VERBS: dict[str, Callable[..., Any]] = {
     "convert": convert,
     "check": check,
     "recipes": recipes,
+    "models": models,
     "train": train,
     "evaluate": evaluate,
     "drive": drive,

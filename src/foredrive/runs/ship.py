@@ -15,6 +15,7 @@ from foredrive.files import atomic_path
 from foredrive.recipes.config import save_recipe
 from foredrive.runs.evaluate.run import evaluate_run
 from foredrive.runs.folder import CONFIG, LOGS, SUMMARY
+from foredrive.runs.model_card import ModelCard
 from foredrive.runs.shipped import CARD, MODELS
 from foredrive.runs.train.baselines import Baselines, baselines_file, run_baselines
 from foredrive.runs.train.rigs import RIGS
@@ -77,25 +78,17 @@ def ship(run: Run, name: str, test: Sequence[LogPath], data: str, limits: str, m
             evaluate_run(small, test, Path(folder), views=False)
             shipped = read_summary(Path(folder) / SUMMARY)
         card = _card(name, run.recipe.name, read_summary(run.folder / SUMMARY), shipped, data, limits)
-        (temporary / CARD).write_text(card)
+        (temporary / CARD).write_text(card.markdown())
     return models / name
 
 
 def _card(
     name: str, recipe: str, trained: Mapping[str, Any], shipped: Mapping[str, Any], data: str, limits: str
-) -> str:
-    """Return the model card as Markdown."""
-    rows = [
-        f"| {title} | {float(trained[key]):.3f} | {float(shipped[key]):.3f} |"
+) -> ModelCard:
+    figures = {
+        title: (float(trained[key]), float(shipped[key]))
         for title, key in FIGURES.items()
         if trained.get(key) is not None and shipped.get(key) is not None
-    ]
-    lines = [
-        f"# {name}",
-        f"Recipe `{recipe}`, evaluated at commit `{trained.get('commit')}`.",
-        f"**Data.** {data}",
-        f"**Figures** on {shipped['items']} clips, {shipped['failed']} failed:",
-        "\n".join(["| | as trained | as shipped, in 8 bits |", "|---|---|---|", *rows]),
-        f"**Limits.** {limits}",
-    ]
-    return "\n\n".join(lines) + "\n"
+    }
+    clips, failed, commit = shipped["items"], shipped["failed"], str(trained.get("commit"))
+    return ModelCard(name, recipe, commit, data, clips, failed, figures, limits)

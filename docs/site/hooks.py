@@ -1,0 +1,31 @@
+"""Hooks of MkDocs: the generated pages of the site, and links that leave docs/."""
+
+from pathlib import Path
+
+from api_pages import api_pages
+from benchmark_pages import benchmark_pages
+from mkdocs.config.defaults import MkDocsConfig
+from mkdocs.structure.files import File, Files
+from mkdocs.structure.pages import Page
+from repository_links import MOUNTED, linked_files, rewritten, source_page, source_uri
+from verb_help import verb_page
+
+ROOT = Path(__file__).parents[2]
+
+
+def on_files(files: Files, *, config: MkDocsConfig) -> Files:
+    """Add the generated pages: API, benchmarks, verbs, files of the repository that pages link to."""
+    pages = {uri: (ROOT / name).read_text() for name, uri in MOUNTED.items()}
+    pages |= api_pages(ROOT / "src" / "foredrive") | benchmark_pages(ROOT / "benchmarks" / "results")
+    pages["how-to/verbs.md"] = verb_page(ROOT)
+    written = [file.content_string for file in files.documentation_pages()]
+    for path in linked_files(ROOT, [*written, *pages.values()]):
+        pages[source_uri(path)] = source_page(ROOT, path)
+    for uri, text in pages.items():
+        files.append(File.generated(config, uri, content=text))
+    return files
+
+
+def on_page_markdown(markdown: str, *, page: Page, config: MkDocsConfig, files: Files) -> str:
+    """Lead links to files outside docs/ to their pages in the site."""
+    return rewritten(markdown, page.file.src_uri)

@@ -1,0 +1,35 @@
+"""`foredrive models`."""
+
+from typing import Annotated
+
+import tyro
+
+from foredrive.lazy import importing
+
+
+def models(
+    name: Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="MODEL")] = None,
+) -> None:
+    """List the trained models that come with the package, or print the card of one.
+
+    A model's name can stand wherever a run is asked for. The towers are those of `foredrive search`.
+
+    Args:
+        name: Print the card of this model, such as nemo_town, or of the towers.
+    """
+    with importing():
+        from rich.console import Console
+
+        from foredrive.runs.model_card import find_card, shipped_weights
+        from foredrive.view.model_tables import figures_table, models_table
+        from foredrive.view.table import print_table
+
+    if name is not None:
+        print(find_card(name).read_text(), end="")
+        return
+    console, weights = Console(), shipped_weights()
+    print_table(models_table(weights), console)
+    for each in weights:
+        console.print(f"{each.name}: {each.data}", markup=False, highlight=False)
+        if each.card is not None:
+            print_table(figures_table(each.card), console)
