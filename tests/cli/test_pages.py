@@ -22,7 +22,7 @@ def blocks(page: Path, languages: str) -> list[str]:
 
 def commands(page: Path) -> list[str]:
     text = "\n".join(blocks(page, "|bash"))
-    return re.findall(r"^foredrive (.+?)(?:\s+[#>].*)?$", text, flags=re.MULTILINE)
+    return re.findall(r"^foredrive (.+?)(?:\s+(?:#.*|> \S+\.\w+.*))?$", text, flags=re.MULTILINE)
 
 
 COMMANDS = sorted({command for page in PAGES for command in commands(page) if "--help" not in command})
