@@ -1,4 +1,4 @@
-"""The figures of README and docs/claims.md are those of the results that they were read from (docs/figures.yaml)."""
+"""The figures of README and docs/claims.md are those of the results that docs/figures.yaml names."""
 
 import json
 import re
@@ -15,7 +15,8 @@ RESULTS = ROOT / "benchmarks" / "results"
 SENTENCES: list[dict[str, Any]] = yaml.safe_load((ROOT / "docs" / "figures.yaml").read_text())
 CARD = re.compile(r"card:(\w+) \| (.+) (\S+)")
 FIGURE = re.compile(
-    r"(?P<file>\S+) (?P<arm>\S+) (?P<key>\S+)(?: \.(?P<of>std|seed\d+))?(?: \*(?P<times>\d+))?(?: (?P<format>\S+))?"
+    r"(?P<file>\S+) (?P<arm>\S+) (?P<key>\S+)"
+    r"(?: \.(?P<of>std|seed\d+))?(?: \*(?P<times>\d+))?(?: (?P<format>\S+))?"
 )
 
 
