@@ -25,3 +25,18 @@ def test_a_log_is_checked(tmp_path: Path, capsys: pytest.CaptureFixture[str]) ->
 def test_a_folder_without_logs_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["check", str(tmp_path)]) == 2
     assert "no 123D log here" in capsys.readouterr().err
+
+
+def test_a_damaged_log_stops_no_other(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_small_log(tmp_path, frames=4)
+    bad, whole = (write_small_log(tmp_path / name, frames=4) for name in ("a", "b"))
+    (bad.folder / "sync.arrow").write_bytes(b"ARROW1 but no more")
+    assert main(["check", str(bad.folder), str(whole.folder), "--json"]) == 2
+    said = capsys.readouterr()
+    first, second = json.loads(said.out)
+    assert first["findings"][0]["level"] == "problem"
+    assert "sync.arrow" in first["findings"][0]["text"]
+    assert second["frames"] == 4
+    assert "1 of 2 logs" in said.err
+    assert main(["check", str(bad.folder), str(whole.folder)]) == 2
+    assert "4 frames" in " ".join(capsys.readouterr().out.split())

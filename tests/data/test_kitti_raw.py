@@ -128,6 +128,15 @@ def test_a_lost_sweep_has_an_empty_line_of_times(made: Path, tmp_path: Path) -> 
     assert np.diff(Log(path).t_us).tolist() == [200_000]
 
 
+def test_a_drive_of_one_record_stands(made: Path, tmp_path: Path) -> None:
+    for frame in range(1, 4):
+        (made / "2011_09_26" / DRIVE / "oxts" / "data" / f"{frame:010d}.txt").unlink()
+    (path,) = convert(made, "kitti-raw", tmp_path / "out")
+    log = Log(path)
+    assert len(log) == 3
+    assert np.ptp(log.T_world_ego[:, :3, 3], axis=0).tolist() == [0.0, 0.0, 0.0]
+
+
 def test_a_missing_calibration_is_named(made: Path, tmp_path: Path) -> None:
     (made / "2011_09_26" / "calib_velo_to_cam.txt").unlink()
     with pytest.raises(InputError, match=f"{DRIVE}: cannot read the raw log") as refused:

@@ -152,6 +152,20 @@ BOX = Box("car", 1, (1.0, 2.0, 0.5), (4.0, 2.0, 1.5), 0.0)
             "a time of front in image_t_s is not finite",
         ),
         ({"split": "mine"}, "must be lower case and end in"),
+        (
+            {"cameras": [dataclasses.replace(CAMERA, K=CAMERA.K * np.nan)]},
+            "the calibration of front is not finite",
+        ),
+        ({"cameras": [dataclasses.replace(CAMERA, K=-CAMERA.K)]}, "focal lengths of front must be above 0"),
+        (
+            {"cameras": [dataclasses.replace(CAMERA, T_ego_cam=2 * CAMERA.T_ego_cam)]},
+            "T_ego_cam of front holds a rotation that is none",
+        ),
+        ({"t_s": TIMES_S + 1.7e18}, "times are in seconds; 1.7e"),
+        (
+            {"sweeps": [Points(np.ones((2, 3)), channel=np.array([0.5, 1.0]))] * 4},
+            "channels must be whole numbers",
+        ),
     ],
 )
 def test_bad_input_is_named_and_leaves_no_log(given: dict[str, object], message: str, tmp_path: Path) -> None:
@@ -160,8 +174,9 @@ def test_bad_input_is_named_and_leaves_no_log(given: dict[str, object], message:
     assert not list(tmp_path.rglob("*.arrow"))
 
 
-@pytest.mark.parametrize("name", ["", "..", "../drive", "a/b", "/tmp/drive"])
+@pytest.mark.parametrize("name", ["", "..", "../drive", "a/b", "{tmp}/drive"])
 def test_a_name_cannot_leave_the_folder_of_logs(name: str, tmp_path: Path) -> None:
+    name = name.format(tmp=tmp_path)
     with pytest.raises(InputError, match="the name of a log has letters"):
         write_log(tmp_path / "data", name, TIMES_S, POSES)
     assert not list(tmp_path.rglob("*.arrow"))

@@ -5,6 +5,8 @@ from typing import Annotated
 
 import tyro
 
+from foredrive.cli.failures import listed_failures
+from foredrive.errors import InputError
 from foredrive.lazy import importing
 
 
@@ -16,7 +18,8 @@ def check(
 
     Gaps in time, poses that jump, speeds that do not fit them, clocks that are off, black or frozen images,
     empty sweeps, an ego frame that does not stand on the ground, boxes without points, and calibrations by
-    which lidar points do not fit the images. The exit code is 0; problems are told.
+    which lidar points do not fit the images. Problems are told; the exit code is 0 unless a log cannot be
+    opened, which stops no other.
 
     Args:
         logs: Logs, folders of logs, or lists of clips.
@@ -29,14 +32,23 @@ def check(
         from rich.console import Console
 
         from foredrive.data import find_all_logs
+        from foredrive.data.log_check import Finding, LogCheck
         from foredrive.runs.check import check_with_calibration
         from foredrive.view.check_table import check_table
         from foredrive.view.table import print_table
 
-    found = []
+    found, unopened = [], {}
     for path in find_all_logs(logs):
-        found.append(check_with_calibration(path))
+        try:
+            found.append(check_with_calibration(path))
+        except InputError as error:
+            unopened[path.name] = str(error)
+            found.append(LogCheck(path.name, 0, 0.0, 0.0, [], [Finding("problem", "log", str(error))]))
         if not json:
             print_table(check_table(found[-1]), Console())
     if json:
         print(dumps([dataclasses.asdict(each) for each in found], indent=2))
+    if unopened and len(found) == 1:
+        raise InputError(next(iter(unopened.values())))
+    if unopened:
+        raise InputError(f"{len(unopened)} of {len(found)} logs: {listed_failures(unopened)}")

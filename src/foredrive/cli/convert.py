@@ -8,7 +8,7 @@ from typing import Annotated
 
 import tyro
 
-from foredrive.cli.arguments import check_number, check_out_folder
+from foredrive.cli.arguments import OptionalPath, check_number, check_out_folder
 from foredrive.cli.failures import listed_failures
 from foredrive.errors import InputError
 from foredrive.lazy import importing
@@ -17,9 +17,11 @@ from foredrive.lazy import importing
 def convert(
     dataset: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="DATASET")],
     source: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")],
-    out: Path,
+    out: OptionalPath = None,
     workers: int = 0,
     overwrite: bool = False,
+    topics: OptionalPath = None,
+    propose: bool = False,
 ) -> None:
     """Convert a raw data set into 123D logs.
 
@@ -28,17 +30,29 @@ def convert(
 
     Args:
         dataset: pandaset, av2, nuscenes, nuscenes-sweeps (10 Hz), nuplan, waymo, waymo-motion, kitti360,
-            kitti-raw, kitti-object, nuscenes-keyframe, griffin, truckdrive, physical-ai-av, ncore or
-            nureasoning. Some need more packages; the message says which.
-        source: Folder of one raw log, or of many.
+            kitti-raw, kitti-object, nuscenes-keyframe, griffin, truckdrive, physical-ai-av, ncore,
+            nureasoning, nerfstudio (folders with transforms.json) or rosbag (ROS 1, ROS 2 and MCAP). Some
+            need more packages; the message says which.
+        source: Folder of one raw log, or of many; for rosbag also a file.
         out: 123D data root to write to.
         workers: Number of logs converted at a time; 0: one for each core.
         overwrite: Convert logs again that are there.
+        topics: YAML that says which topics of a bag are cameras, lidar and poses; by default the bag's name
+            with .topics.yaml, beside it.
+        propose: Write this YAML from what the bag holds, and convert nothing.
     """
     check_number("--workers", workers, low=0)
     check_out_folder(out)
-    if not source.is_dir():
-        raise InputError(f"{source}: no such folder")
+    is_bag = dataset == "rosbag"
+    if not (source.exists() if is_bag else source.is_dir()):
+        raise InputError(f"{source}: no such {'bag' if is_bag else 'folder'}")
+    if (propose or topics) and not is_bag:
+        raise InputError("--propose and --topics are for rosbag")
+    if propose:
+        _propose(source, topics)
+        return
+    if out is None:
+        raise InputError("convert needs --out: the data root to write to")
 
     with importing():
         from foredrive.runs.convert import convert_all
@@ -46,7 +60,7 @@ def convert(
     failed, count = {}, 0
     with _progress(dataset) as tick:
         cores = workers or len(os.sched_getaffinity(0))
-        for done in convert_all(source, dataset, out, cores, overwrite=overwrite, tick=tick):
+        for done in convert_all(source, dataset, out, cores, overwrite=overwrite, topics=topics, tick=tick):
             count += 1
             if done.log is None:
                 failed[done.name] = done.failure or ""
@@ -57,6 +71,17 @@ def convert(
         raise InputError(next(iter(failed.values())))
     if failed:
         raise InputError(f"{len(failed)} of {count} logs failed: {listed_failures(failed)}")
+
+
+def _propose(bag: Path, topics: Path | None) -> None:
+    with importing():
+        from foredrive.data.raw.bag_topics import propose_topics, topics_file
+        from foredrive.data.raw.guard import reading_raw
+
+    file = topics or topics_file(bag)
+    with reading_raw(bag):
+        print(propose_topics(bag, file))
+    print(f"wrote {file}; check it, then: foredrive convert rosbag {bag} --out DATA")
 
 
 @contextmanager

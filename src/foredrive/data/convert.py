@@ -11,9 +11,10 @@ from py123d.datatypes import LogMetadata
 from py123d.parser.base_dataset_parser import BaseLogParser, BaseMapParser
 
 from foredrive.data.log_paths import LogPath
+from foredrive.data.raw.bag_log import find_bags
 from foredrive.data.raw.datasets import DATASETS
 from foredrive.data.raw.guard import check_inside, check_names, reading_raw
-from foredrive.data.raw.raw_log import RawLog
+from foredrive.data.raw.raw_log import OwnLog, RawLog
 from foredrive.errors import InputError
 from foredrive.files import atomic_path
 
@@ -38,8 +39,13 @@ def convert(source: Path, dataset: str, out: Path) -> list[LogPath]:
     return [convert_log(raw, Path(out)) for raw in find_raw_logs(Path(source), dataset)]
 
 
-def find_raw_logs(source: Path, dataset: str) -> Iterator[RawLog]:
+def find_raw_logs(source: Path, dataset: str, topics: Path | None = None) -> Iterator[RawLog]:
     """Yield the raw logs of a data set in a folder.
+
+    Args:
+        source: folder of one raw log, or of many; for bags also a file.
+        dataset: one of `DATASETS`.
+        topics: the YAML of a bag; None: that beside it.
 
     Raises:
         InputError: the data set is unknown, there is no log of it, or an index of it cannot be read.
@@ -49,7 +55,7 @@ def find_raw_logs(source: Path, dataset: str) -> Iterator[RawLog]:
     if not source.exists():
         raise InputError(f"{source}: no such folder")
     kind, found = DATASETS[dataset], False
-    logs = iter(kind.find(source))
+    logs = iter(kind.find(source) if topics is None else find_bags(source, topics))
     while True:
         with reading_raw(source):
             raw = next(logs, None)
@@ -86,6 +92,8 @@ def convert_log(raw: RawLog, out: Path, tick: Callable[[], None] = lambda: None)
     with reading_raw(raw.source):
         metadata = raw.log.get_log_metadata()
         path = log_path(metadata, out)
+        if isinstance(raw.log, OwnLog):
+            return raw.log.write(out, tick)
         with atomic_path(path.folder) as temporary:
             scratch = temporary.parent
             if raw.map is not None:

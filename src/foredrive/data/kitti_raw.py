@@ -155,8 +155,11 @@ class _Path:
         scale_m = np.cos(latitude[0]) * _EARTH_M
         north_m = scale_m * np.log(np.tan(0.25 * np.pi + 0.5 * latitude))
         position_m = np.stack([scale_m * longitude, north_m, rows[:, 2]], axis=-1)
-        turn = Rotation.from_euler("ZYX", rows[:, [5, 4, 3]])
         times_us = t_us[frames]
+        if len(rows) == 1:  # a vehicle that stands; a Slerp needs two
+            rows, times_us = np.repeat(rows, 2, axis=0), times_us + np.array([0, 1])
+            position_m = np.repeat(position_m, 2, axis=0)
+        turn = Rotation.from_euler("ZYX", rows[:, [5, 4, 3]])
         return cls(times_us, position_m - position_m[0], Slerp(times_us, turn))
 
     def at(self, t_us: Int64[np.ndarray, "M"]) -> Float64[np.ndarray, "M 4 4"]:

@@ -4,6 +4,7 @@ The frame of the ego vehicle is on the ground below the middle of the rear axle:
 Camera frames have x to the right, y down and z ahead. The world frame is any frame with z up.
 """
 
+import dataclasses
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -28,6 +29,8 @@ from foredrive.scene.boxes import unlabelled
 Num = Shaped[np.ndarray, "..."]
 RGB = UInt8[np.ndarray, "H W 3"]
 DATASET = "own"
+_MAX_S = 1e11
+"""Times beyond the year 5000 are in another unit."""
 
 
 @dataclass(frozen=True)
@@ -88,6 +91,7 @@ def write_log(
     lidar_position_m: tuple[float, float, float] = (0.0, 0.0, 1.8),
     boxes: Sequence[Sequence[Box] | None] | None = None,
     vehicle: Vehicle = Vehicle(),
+    path: tuple[Num, Num] | None = None,
     split: str = "own_train",
 ) -> LogPath:
     """Write sensor data as a 123D log. An existing log of the same name is replaced.
@@ -109,6 +113,8 @@ def write_log(
         lidar_position_m: of the lidar, in the ego frame.
         boxes: labels at each frame. None where a frame is not annotated, empty where nothing is there.
         vehicle: size of the recording vehicle.
+        path: times [P] and poses [P, 4, 4] of the vehicle at a higher rate. They tell where it was when
+            images and points between the frames were measured. Default: those of the frames.
         split: a name that ends in _train, _val or _test.
 
     Raises:
@@ -118,6 +124,10 @@ def write_log(
     if not re.fullmatch(r"[\w-][\w.-]*", name):
         raise InputError(f"the name of a log has letters, digits, dots, dashes and underscores; not {name!r}")
     drive = _Drive.of(name, np.asarray(t_s, np.float64), np.asarray(T_world_ego, np.float64))
+    if path is not None:
+        denser = _Drive.of(f"{name}, path", *(np.asarray(values, np.float64) for values in path))
+        drive = dataclasses.replace(drive, denser=denser)
+    _check_cameras(name, cameras)
     images, image_t_s = images or {}, image_t_s or {}
     given: dict[str, Sequence[Any] | np.ndarray | None] = {"sweeps": sweeps, "boxes": boxes, **image_t_s}
     for what, values in (given | {f"images of {camera}": rows for camera, rows in images.items()}).items():
@@ -159,6 +169,8 @@ class _Drive:
     T_world_ego: Float64[np.ndarray, "T 4 4"]
     velocity_ego_mps: Float64[np.ndarray, "T 3"]
     acceleration_ego_mps2: Float64[np.ndarray, "T 3"]
+    denser: "_Drive | None" = None
+    """Poses at a higher rate, for times between the frames."""
 
     @classmethod
     def of(cls, name: str, t_s: Num, T_world_ego: Num) -> "_Drive":
@@ -168,6 +180,8 @@ class _Drive:
             raise InputError(f"{name}: t_s must be [T] and T_world_ego [T, 4, 4]; they are {shapes}")
         if not (np.isfinite(t_s).all() and np.isfinite(T_world_ego).all()):
             raise InputError(f"{name}: a time or a pose is not finite")
+        if np.abs(t_s).max() > _MAX_S:
+            raise InputError(f"{name}: times are in seconds; {np.abs(t_s).max():g} s may be in ns, ms or µs")
         if (np.diff(t_s) < 1e-6).any():
             raise InputError(f"{name}: times must increase, by a microsecond at least")
         R = T_world_ego[:, :3, :3]
@@ -186,6 +200,8 @@ class _Drive:
 
     def poses_at(self, t_us: Float64[np.ndarray, "N"]) -> Float64[np.ndarray, "N 4 4"]:
         """Return poses between the frames, and by the last step's motion beyond them."""
+        if self.denser is not None:
+            return self.denser.poses_at(t_us)
         at, T = self.t_us, self.T_world_ego
         if len(at) == 1:
             return np.repeat(T, len(t_us), axis=0)
@@ -205,6 +221,23 @@ def _rates(values: Float64[np.ndarray, "T 3"], t_s: Float64[np.ndarray, "T"]) ->
         return np.zeros_like(values)
     rate = np.diff(values, axis=0) / np.diff(t_s)[:, None]
     return np.concatenate([rate[:1], rate])
+
+
+def _check_cameras(name: str, cameras: Sequence[CameraSpec]) -> None:
+    """Check calibrations before anything is written."""
+    for spec in cameras:
+        K, T, dist = (
+            np.asarray(values, np.float64)
+            for values in (spec.K, spec.T_ego_cam, 0.0 if spec.dist is None else spec.dist)
+        )
+        if K.shape != (3, 3) or T.shape != (4, 4):
+            raise InputError(f"{name}: K of {spec.name} must be [3, 3] and T_ego_cam [4, 4]")
+        if not all(np.isfinite(values).all() for values in (K, T, dist)) or not np.isfinite(spec.readout_s):
+            raise InputError(f"{name}: the calibration of {spec.name} is not finite")
+        if K[0, 0] <= 0 or K[1, 1] <= 0:
+            raise InputError(f"{name}: the focal lengths of {spec.name} must be above 0")
+        if not np.allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-3):
+            raise InputError(f"{name}: T_ego_cam of {spec.name} holds a rotation that is none")
 
 
 def _metadata(vehicle: Vehicle) -> EgoStateSE3Metadata:
@@ -252,6 +285,12 @@ def _sweep(
         raise InputError(f"{where}: a point is not finite")
     if (columns["intensity"] < 0).any() or (columns["intensity"] > 1).any():
         raise InputError(f"{where}: intensity must be between 0 and 1")
+    channel = columns["channel"]
+    if (
+        points.channel is not None
+        and ((channel != np.round(channel)) | (channel < 0) | (channel > 255)).any()
+    ):
+        raise InputError(f"{where}: channels must be whole numbers from 0 to 255")
     if not points.compensated and points.dt_s is not None:
         xyz = _compensated(xyz, columns["dt_s"], drive, frame)
     origin = torch.tensor(position_m).expand(count, 3)

@@ -38,6 +38,7 @@ def convert_all(
     workers: int,
     *,
     overwrite: bool = False,
+    topics: Path | None = None,
     tick: Callable[[], None] = lambda: None,
 ) -> Iterator[Conversion]:
     """Yield each raw log when it has been converted, has failed, or was there before.
@@ -48,6 +49,7 @@ def convert_all(
         out: 123D data root.
         workers: number of logs converted at a time; 1 converts in this process.
         overwrite: whether logs that are there are replaced.
+        topics: the YAML of a bag; None: that beside it.
         tick: called after each frame that is converted in this process.
 
     Raises:
@@ -55,7 +57,7 @@ def convert_all(
         OSError: the disk is full, so that no other log could be written.
     """
     todo, names = [], dict[int, str]()
-    for raw in find_raw_logs(source, dataset):
+    for raw in find_raw_logs(source, dataset, topics):
         with reading_raw(raw.source):
             path = log_path(raw.log.get_log_metadata(), out)
         if not overwrite and _is_whole(path.folder):

@@ -6,6 +6,7 @@ import socket
 import threading
 import time
 from collections.abc import Iterator
+from http.client import HTTPConnection
 
 import pytest
 
@@ -150,3 +151,23 @@ def test_a_taken_port_is_one_line() -> None:
     with pytest.raises(InputError, match="cannot be served"):
         JsonServer({}, port=server.address.port)
     server.close()
+
+
+@pytest.mark.parametrize(
+    ("headers", "status"),
+    [
+        ({}, 200),
+        ({"Host": "localhost:80"}, 200),
+        ({"Host": "attacker.example:80"}, 403),
+        ({"Origin": "http://attacker.example"}, 403),
+        ({"Origin": "null"}, 403),
+    ],
+)
+def test_pages_of_other_sites_are_refused(headers: dict[str, str], status: int) -> None:
+    with JsonServer({("GET", "/alive"): lambda _: True}).in_background() as address:
+        connection = HTTPConnection(address.host, address.port, timeout=5)
+        connection.request("GET", "/alive", headers=headers)
+        answer = connection.getresponse()
+        assert answer.status == status
+        answer.read()
+        connection.close()

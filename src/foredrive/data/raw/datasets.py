@@ -13,6 +13,8 @@ from foredrive.data.kitti_raw import KittiRawParser
 from foredrive.data.nuscenes_keyframe import NuScenesKeyframeParser
 from foredrive.data.pandaset import PandasetParser
 from foredrive.data.raw import py123d_datasets
+from foredrive.data.raw.bag_log import find_bags
+from foredrive.data.raw.nerfstudio import find_nerfstudio
 from foredrive.data.raw.raw_log import RawLog, folders_with
 
 
@@ -63,6 +65,8 @@ DATASETS: dict[str, RawDataset] = {
     "nuscenes-keyframe": RawDataset(_nuscenes_keyframe, "v1.0-*/sample_data.json"),
     "kitti-object": RawDataset(_kitti_object, "velodyne/*.bin"),
     "kitti-raw": RawDataset(_kitti_raw, "velodyne_points/data"),
+    "rosbag": RawDataset(find_bags, "BAG.topics.yaml beside a .bag, .db3, .mcap or the folder of a bag"),
+    "nerfstudio": RawDataset(find_nerfstudio, "transforms.json"),
     "nuscenes": RawDataset(py123d_datasets.nuscenes, "v1.0-trainval, v1.0-test or v1.0-mini with scene.json"),
     "nuscenes-sweeps": RawDataset(py123d_datasets.nuscenes_sweeps, "the same as for nuscenes"),
     "nuplan": RawDataset(py123d_datasets.nuplan, "nuplan-v1.1/splits/mini, trainval or test"),

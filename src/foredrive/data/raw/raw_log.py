@@ -1,9 +1,25 @@
 """A raw log that was found, and the search for its folder."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Protocol, runtime_checkable
 
+from py123d.datatypes import LogMetadata
 from py123d.parser.base_dataset_parser import BaseLogParser, BaseMapParser
+
+from foredrive.data.log_paths import LogPath
+
+
+@runtime_checkable
+class OwnLog(Protocol):
+    """A log that writes itself, by `write_log`."""
+
+    def get_log_metadata(self) -> LogMetadata:
+        """Return split and name of the log."""
+
+    def write(self, out: Path, tick: Callable[[], None]) -> LogPath:
+        """Write the log into a data root; call `tick` after each frame."""
 
 
 @dataclass(frozen=True)
@@ -12,7 +28,7 @@ class RawLog:
 
     source: Path
     """Folder or file that errors name."""
-    log: BaseLogParser
+    log: BaseLogParser | OwnLog
     map: BaseMapParser | None = None
     """Parser of the map, which may be shared by many logs."""
 

@@ -216,7 +216,25 @@ def _handler(
             finally:
                 open_requests.release()
 
+        def _foreign(self) -> str | None:
+            """Return why a request is not answered that a page of another site makes through a browser.
+
+            Such a page has its own name in Origin. A name that its owner points to this machine (DNS
+            rebinding) stands in Host.
+            """
+            host, origin = self.headers.get("Host", ""), self.headers.get("Origin")
+            is_local = tuple(self.server.server_address)[:1] == (LOOPBACK,)
+            if is_local and host and host.partition(":")[0] not in (LOOPBACK, "localhost"):
+                return f"this server is not at {host[:100]}"
+            if origin is not None and origin != f"http://{host}":
+                return f"{origin[:100]} may not ask this server"
+            return None
+
         def _answered(self) -> tuple[int, Raw]:
+            foreign = self._foreign()
+            if foreign is not None:
+                self.close_connection = True  # its body is not read
+                return 403, _detail(foreign)
             path = self.path.partition("?")[0]
             answer = answers.get((self.command, path))
             if answer is None:
