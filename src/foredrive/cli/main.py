@@ -20,6 +20,7 @@ from foredrive.cli.demo import demo
 from foredrive.cli.drive import drive
 from foredrive.cli.evaluate import evaluate
 from foredrive.cli.export import export
+from foredrive.cli.fetch import fetch_av2
 from foredrive.cli.imagine import imagine
 from foredrive.cli.memory import keep_freed_memory
 from foredrive.cli.models import models
@@ -44,6 +45,7 @@ from foredrive.interrupts import LastingInterrupt
 VERBS: dict[str, Callable[..., Any]] = {
     "demo": demo,
     "record": record,
+    "fetch av2": fetch_av2,
     "convert": convert,
     "check": check,
     "recipes": recipes,

@@ -223,7 +223,8 @@ def _handler(
             rebinding) stands in Host.
             """
             host, origin = self.headers.get("Host", ""), self.headers.get("Origin")
-            is_local = tuple(self.server.server_address)[:1] == (LOOPBACK,)
+            address = self.server.server_address
+            is_local = isinstance(address, tuple) and address[0] == LOOPBACK
             if is_local and host and host.partition(":")[0] not in (LOOPBACK, "localhost"):
                 return f"this server is not at {host[:100]}"
             if origin is not None and origin != f"http://{host}":

@@ -1,0 +1,79 @@
+"""`foredrive fetch av2`."""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from foredrive.cli.arguments import check_number, check_out_folder
+from foredrive.lazy import importing
+
+SHOWN = 20
+
+
+def fetch_av2(
+    log: Annotated[tuple[str, ...], tyro.conf.arg(metavar="ID [ID ...]")] = (),
+    out: Path = Path("av2"),
+    seconds: float | None = None,
+    images: bool = True,
+    at_a_time: int = 4,
+    dry_run: bool = False,
+    split: Literal["train", "val", "test"] = "val",
+    bucket: str = "https://argoverse.s3.amazonaws.com",
+) -> None:
+    """Fetch Argoverse 2 sensor logs from their public bucket, without credentials.
+
+    The size is said first. A download that was stopped goes on where it was; sizes and checksums are
+    checked. Argoverse 2 is published under CC BY-NC-SA 4.0. Without --log some names of logs are printed.
+
+    Args:
+        log: Names of logs.
+        out: Folder of the data set; a log goes to OUT/SPLIT/ID.
+        seconds: Fetch images and sweeps of the first seconds alone.
+        images: Fetch the images, which are most of a log.
+        at_a_time: Number of files that are downloaded at a time.
+        dry_run: Say the sizes and fetch nothing.
+        split: Split whose logs are printed without --log; a log is found in any.
+        bucket: Address of the bucket, or of a copy of it.
+    """
+    check_number("--seconds", seconds, above=0)
+    check_number("--at-a-time", at_a_time, low=1, high=32)
+    check_out_folder(out)
+    with importing():
+        from foredrive.data.raw.av2_fetch import fetch_log, find_log, log_ids
+
+    bucket = bucket.rstrip("/")
+    if not log:
+        found = log_ids(split, bucket)
+        print("\n".join(found[:SHOWN]))
+        print(f"{min(SHOWN, len(found))} of the {len(found)} logs of {split}; fetch some by --log ID")
+        return
+    wanted = [find_log(one, bucket, seconds=seconds, images=images) for one in log]
+    for one in wanted:
+        print(f"{one.log_id} ({one.split}): {len(one.files)} files, {_size(one.size)}", flush=True)
+    if dry_run:
+        return
+    with _progress(sum(one.size for one in wanted)) as tick:
+        folders = [fetch_log(one, out, at_a_time, tick, bucket) for one in wanted]
+    for folder in folders:
+        print(f"fetched {folder}")
+    print(f"next: foredrive convert av2 {folders[0]} --out data")
+
+
+def _size(size: int) -> str:
+    return f"{size / 1e9:.2f} GB" if size >= 1e9 else f"{size / 1e6:.1f} MB"
+
+
+@contextmanager
+def _progress(total: int) -> Iterator[Callable[[int], None]]:
+    """Show the bytes that came; yield the function that adds some."""
+    from rich.console import Console
+    from rich.progress import BarColumn, DownloadColumn, Progress, TimeRemainingColumn, TransferSpeedColumn
+
+    columns = (BarColumn(), DownloadColumn(), TransferSpeedColumn(), TimeRemainingColumn())
+    console = Console(stderr=True)
+    with Progress(*columns, console=console, disable=not console.is_terminal) as progress:
+        bar = progress.add_task("", total=total)
+        yield lambda size: progress.advance(bar, size)

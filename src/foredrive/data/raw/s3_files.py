@@ -1,0 +1,187 @@
+"""Files of a public S3 bucket over plain HTTPS, without credentials: listing, and downloads that resume.
+
+The listing is S3's ListObjectsV2. The ETag of an object is its MD5 unless it was uploaded in parts (AWS,
+"Amazon S3 API Reference", Object).
+"""
+
+import contextlib
+import hashlib
+import http.client
+import os
+import time
+import urllib.error
+import urllib.parse
+import urllib.request
+import xml.etree.ElementTree as ET
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from foredrive.errors import InputError
+
+MAX_LISTING_BYTES = 2**24
+"""Largest page of a listing: 1000 objects take 300 kB."""
+TRIES, TIMEOUT_S, CHUNK_BYTES = 4, 30.0, 2**20
+_MD5_DIGITS = 32
+_NETWORK = (urllib.error.URLError, http.client.HTTPException, TimeoutError, ConnectionError)
+
+
+@dataclass(frozen=True)
+class S3Object:
+    """One object of a bucket."""
+
+    key: str
+    size: int
+    etag: str
+
+    @property
+    def md5(self) -> str | None:
+        """Return the MD5 of its content, or None if the ETag is another sum."""
+        return self.etag if len(self.etag) == _MD5_DIGITS and "-" not in self.etag else None
+
+
+def list_objects(bucket: str, prefix: str) -> Iterator[S3Object]:
+    """Yield all objects whose keys begin with a prefix.
+
+    Args:
+        bucket: address of the bucket, such as https://argoverse.s3.amazonaws.com.
+        prefix: begin of the keys.
+
+    Raises:
+        InputError: the bucket cannot be reached, or does not answer with a listing.
+    """
+    for page in _pages(bucket, {"prefix": prefix}):
+        for entry in page.iterfind("{*}Contents"):
+            try:
+                size = int(_text(entry, "Size"))
+            except ValueError as error:
+                raise InputError(f"{bucket}: an object without a size in its listing") from error
+            yield S3Object(_text(entry, "Key"), size, _text(entry, "ETag").strip('"').lower())
+
+
+def list_folders(bucket: str, prefix: str) -> Iterator[str]:
+    """Yield the names of the "folders" right below a prefix that ends in a slash."""
+    for page in _pages(bucket, {"prefix": prefix, "delimiter": "/"}):
+        for entry in page.iterfind("{*}CommonPrefixes"):
+            yield _text(entry, "Prefix").removeprefix(prefix).rstrip("/")
+
+
+def _pages(bucket: str, query: dict[str, str]) -> Iterator[ET.Element]:
+    token: str | None = None
+    seen: set[str] = set()
+    while True:
+        asked = {"list-type": "2", **query} | ({"continuation-token": token} if token else {})
+        url = f"{bucket}/?{urllib.parse.urlencode(asked)}"
+        with _opened(url, {}) as answer:
+            content = answer.read(MAX_LISTING_BYTES + 1)
+        if len(content) > MAX_LISTING_BYTES:
+            raise InputError(f"{bucket}: its listing has more than {MAX_LISTING_BYTES} bytes")
+        try:
+            page = ET.fromstring(content)
+        except ET.ParseError as error:
+            raise InputError(f"{bucket}: it does not answer with a listing of S3: {error}") from error
+        yield page
+        token = _text(page, "NextContinuationToken")
+        if _text(page, "IsTruncated") != "true" or not token:
+            return
+        if token in seen:
+            raise InputError(f"{bucket}: its listing does not end")
+        seen.add(token)
+
+
+def _text(entry: ET.Element, name: str) -> str:
+    found = entry.find(f"{{*}}{name}")
+    return "" if found is None or found.text is None else found.text
+
+
+def download(
+    bucket: str, found: S3Object, file: Path, tick: Callable[[int], None], pause_s: float = 1.0
+) -> None:
+    """Download an object, from where an earlier download of it stopped, and check its size and MD5.
+
+    The file has its name only when it is complete; before, it ends in ".part". A file of the right size is
+    kept.
+
+    Args:
+        bucket: address of the bucket.
+        found: the object.
+        file: where it goes.
+        tick: called with the number of bytes that came, which may be negative when a download starts anew.
+        pause_s: time before the second try; it doubles with each.
+
+    Raises:
+        InputError: it cannot be had within `TRIES` tries, or its content is not what the listing says.
+    """
+    if file.is_file() and file.stat().st_size == found.size:
+        tick(found.size)
+        return
+    file.parent.mkdir(parents=True, exist_ok=True)
+    part = file.with_name(file.name + ".part")
+    tick(min(part.stat().st_size, found.size) if part.is_file() else 0)
+    for attempt in range(TRIES):
+        try:
+            _continue(f"{bucket}/{urllib.parse.quote(found.key)}", found, part, tick)
+            break
+        except InputError:
+            raise
+        except _NETWORK as error:
+            if attempt + 1 == TRIES:
+                raise InputError(
+                    f"{bucket}/{found.key}: {_told(error)} ({TRIES} tries); start again to go on"
+                ) from error
+            time.sleep(pause_s * 2**attempt)
+    os.replace(part, file)
+
+
+def _continue(url: str, found: S3Object, part: Path, tick: Callable[[int], None]) -> None:
+    """Download what is missing of `part`, and check it."""
+    have = part.stat().st_size if part.is_file() else 0
+    if have > found.size:
+        part.unlink()
+        have = 0
+    if have < found.size or not part.is_file():
+        headers = {"Range": f"bytes={have}-", "If-Range": f'"{found.etag}"'} if have else {}
+        with _opened(url, headers) as answer:
+            if have and answer.status != http.client.PARTIAL_CONTENT:  # it has changed, or knows no ranges
+                tick(-have)
+                have = 0
+            with part.open("ab" if have else "wb") as file:
+                while chunk := answer.read(CHUNK_BYTES):
+                    have += len(chunk)
+                    if have > found.size:
+                        raise InputError(f"{url}: it has more than the {found.size} bytes of the listing")
+                    file.write(chunk)
+                    tick(len(chunk))
+        if have < found.size:
+            raise ConnectionError(f"it ended after {have} of {found.size} bytes")
+    if found.md5 is not None and _md5(part) != found.md5:
+        part.unlink()
+        raise InputError(
+            f"{url}: its content is not what the listing says (MD5); start again to fetch it anew"
+        )
+
+
+@contextlib.contextmanager
+def _opened(url: str, headers: dict[str, str]) -> Iterator[Any]:
+    try:
+        with urllib.request.urlopen(
+            urllib.request.Request(url, headers=headers), timeout=TIMEOUT_S
+        ) as answer:
+            yield answer
+    except urllib.error.HTTPError as error:
+        if error.code >= 500:
+            raise ConnectionError(f"error {error.code}") from error
+        raise InputError(f"{url}: error {error.code} {error.reason}") from error
+    except ValueError as error:
+        raise InputError(f"{url}: not an address: {error}") from error
+
+
+def _md5(file: Path) -> str:
+    with file.open("rb") as opened:
+        return hashlib.file_digest(opened, lambda: hashlib.md5(usedforsecurity=False)).hexdigest()
+
+
+def _told(error: BaseException) -> str:
+    reason = getattr(error, "reason", None) or error
+    return " ".join(str(reason).split()) or type(error).__name__
