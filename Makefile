@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 STAMP := .venv/.installed
 
-.PHONY: install demo docs test quick test-slow test-oracles golden lint format clean
+.PHONY: install demo docs dist test quick test-slow test-oracles golden lint format clean
 
 install: $(STAMP)
 
@@ -26,6 +26,14 @@ $(DOCS_STAMP): $(STAMP)
 docs: $(DOCS_STAMP)
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 	@echo "open build/site/index.html"
+
+# Wheel and sdist; the wheel is installed into an empty environment and tried there, the quick demo included.
+dist: install
+	rm -rf dist
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check "build>=1.2"
+	$(BIN)/python -m build --outdir dist .
+	FOREDRIVE_WHEEL=$$(echo dist/*.whl) $(BIN)/python -m pytest -m slow tests/test_package.py
+	@du -h dist/*
 
 lint: install
 	$(BIN)/ruff check .
