@@ -46,7 +46,11 @@ def benchmark_page(content: Mapping[str, Any]) -> str:
         "seeds": _seeds(content),
     }
     rows = "\n".join(f"- {name}: {value}" for name, value in facts.items())
-    parts = [f"---\nhide: [toc]\n---\n\n# {content['name']}", content["question"], rows]
+    parts = [
+        f"---\nhide: [toc]\nsearch:\n  boost: 0.5\n---\n\n# {content['name']}",
+        content["question"],
+        rows,
+    ]
     parts += [figure_table(content["figures"], arms) for arms in _like_arms(content["figures"])]
     return "\n\n".join(parts) + "\n"
 
@@ -66,20 +70,20 @@ def cell(figures: Mapping[str, Mapping[str, float]], name: str) -> str:
         return ""
     entry = figures[name]
     text = number(entry["mean"])
-    if entry["n"] > 1:
-        text += f"{NBSP}±{NBSP}{number(entry['std'])}"
+    if entry["n"] > 1 and entry["std"]:
+        text += f"{NBSP}±{NBSP}{number(entry['std'], digits=2)}"
     if name + LOW in figures and name + HIGH in figures:
         text += f" [{number(figures[name + LOW]['mean'])},{NBSP}{number(figures[name + HIGH]['mean'])}]"
     return text
 
 
-def number(value: float | None) -> str:
-    """Return a number with four significant digits, whole numbers in full."""
+def number(value: float | None, digits: int = 4) -> str:
+    """Return a number with some significant digits, whole numbers in full."""
     if value is None:
         return "\N{EN DASH}"
     if value == int(value) and abs(value) < 1e9:
         return f"{int(value)}"
-    return re.sub(r"e([+-])0*", r"e\1", f"{value:.4g}")
+    return re.sub(r"e([+-])0*", r"e\1", f"{value:.{digits}g}")
 
 
 def _is_bound(name: str, names: Sequence[str]) -> bool:

@@ -1,6 +1,7 @@
 """Hooks of MkDocs: the generated pages of the site, and links that leave docs/."""
 
 from pathlib import Path
+from typing import TypeGuard
 
 from api_pages import api_pages
 from benchmark_pages import benchmark_pages
@@ -8,6 +9,7 @@ from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
 from repository_links import MOUNTED, linked_files, rewritten, source_page, source_uri
+from tutorials import tutorial_pages
 from verb_help import verb_page
 
 ROOT = Path(__file__).parents[2]
@@ -15,15 +17,21 @@ ROOT = Path(__file__).parents[2]
 
 def on_files(files: Files, *, config: MkDocsConfig) -> Files:
     """Add the generated pages: API, benchmarks, verbs, files of the repository that pages link to."""
-    pages = {uri: (ROOT / name).read_text() for name, uri in MOUNTED.items()}
+    pages: dict[str, str | bytes] = {uri: (ROOT / name).read_text() for name, uri in MOUNTED.items()}
     pages |= api_pages(ROOT / "src" / "foredrive") | benchmark_pages(ROOT / "benchmarks" / "results")
     pages["how-to/verbs.md"] = verb_page(ROOT)
+    pages |= tutorial_pages(ROOT / "docs" / "tutorials", ROOT)
     written = [file.content_string for file in files.documentation_pages()]
-    for path in linked_files(ROOT, [*written, *pages.values()]):
+    for path in linked_files(ROOT, [*written, *filter(is_text, pages.values())]):
         pages[source_uri(path)] = source_page(ROOT, path)
     for uri, text in pages.items():
         files.append(File.generated(config, uri, content=text))
     return files
+
+
+def is_text(content: str | bytes) -> TypeGuard[str]:
+    """Return whether the content of a page is text, not a picture."""
+    return isinstance(content, str)
 
 
 def on_page_markdown(markdown: str, *, page: Page, config: MkDocsConfig, files: Files) -> str:

@@ -35,7 +35,8 @@ def source_page(root: Path, path: str) -> str:
     text = (root / path).read_text()
     if path.endswith(".md"):
         return text
-    return f"# {path}\n\n`````{LEXERS.get(Path(path).suffix, 'text')}\n{text}`````\n"
+    head = f"---\nsearch:\n  exclude: true\n---\n\n# {path}"
+    return f"{head}\n\n`````{LEXERS.get(Path(path).suffix, 'text')}\n{text}`````\n"
 
 
 def linked_files(root: Path, pages: Iterable[str]) -> list[str]:
@@ -64,7 +65,7 @@ def rewritten(markdown: str, uri: str) -> str:
         elif path in FOLDERS:
             place = FOLDERS[path]
         elif path.startswith("docs/"):
-            place = path.removeprefix("docs/")
+            place = re.sub(r"(tutorials/\w+)\.py$", r"\1.md", path.removeprefix("docs/"))
         elif OUTSIDE.fullmatch(path):
             place = source_uri(path)
         else:

@@ -4,6 +4,7 @@ import json
 import os
 import subprocess
 import sys
+import textwrap
 from pathlib import Path
 
 LIST = "import json; from foredrive.cli.main import VERBS; print(json.dumps(list(VERBS)))"
@@ -12,13 +13,13 @@ ABOUT = """# All verbs
 What `foredrive VERB --help` prints, at the commit of this site. `foredrive --version` prints the version.
 Wrong input ends with one line on stderr and exit code 2, Ctrl-C with exit code 130.
 """
-COLUMNS = 100
+COLUMNS = 96
 
 
 def verb_page(root: Path) -> str:
     """Return the Markdown of the page."""
     verbs = json.loads(_python(root, "-c", LIST))
-    helps = {verb: _python(root, "-m", "foredrive", *verb.split(), "--help").strip() for verb in verbs}
+    helps = {verb: _wrapped(_python(root, "-m", "foredrive", *verb.split(), "--help")) for verb in verbs}
     return (
         "\n\n".join([ABOUT, *(f"## {verb}\n\n```text\n{text}\n```" for verb, text in helps.items())]) + "\n"
     )
@@ -29,3 +30,8 @@ def _python(root: Path, *args: str) -> str:
     return subprocess.run(
         [sys.executable, *args], env=environment, check=True, capture_output=True, text=True
     ).stdout
+
+
+def _wrapped(text: str) -> str:
+    """Return a text whose paragraphs are as wide as its boxes."""
+    return "\n".join(textwrap.fill(line, COLUMNS) for line in text.strip().splitlines())

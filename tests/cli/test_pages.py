@@ -13,6 +13,7 @@ import pytest
 from foredrive.cli import main as program
 
 ROOT = Path(__file__).parents[2]
+TUTORIALS = sorted((ROOT / "docs" / "tutorials").glob("*.py"))
 PAGES = (ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md")))
 
 
@@ -21,11 +22,14 @@ def blocks(page: Path, languages: str) -> list[str]:
 
 
 def commands(page: Path) -> list[str]:
-    text = "\n".join(blocks(page, "|bash"))
+    in_notebook = page.read_text().replace("# foredrive", "foredrive")
+    text = "\n".join(blocks(page, "|bash")) if page.suffix == ".md" else in_notebook
     return re.findall(r"^foredrive (.+?)(?:\s+(?:#.*|> \S+\.\w+.*))?$", text, flags=re.MULTILINE)
 
 
-COMMANDS = sorted({command for page in PAGES for command in commands(page) if "--help" not in command})
+COMMANDS = sorted(
+    {command for page in (*PAGES, *TUTORIALS) for command in commands(page) if "--help" not in command}
+)
 
 
 def test_there_are_commands() -> None:
@@ -51,9 +55,9 @@ def test_a_command_is_understood(command: str, monkeypatch: pytest.MonkeyPatch) 
     assert called == [f"{verb} {then}" if f"{verb} {then}" in program.VERBS else verb]
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+@pytest.mark.parametrize("page", [*PAGES, *TUTORIALS], ids=lambda page: page.stem)
 def test_names_in_examples_can_be_imported(page: Path) -> None:
-    for block in blocks(page, "python"):
+    for block in blocks(page, "python") if page.suffix == ".md" else [page.read_text()]:
         for node in ast.walk(ast.parse(block)):
             if isinstance(node, ast.ImportFrom):
                 module = importlib.import_module(node.module or "")
