@@ -20,6 +20,7 @@ from foredrive.cli.demo import demo
 from foredrive.cli.drive import drive
 from foredrive.cli.evaluate import evaluate
 from foredrive.cli.export import export
+from foredrive.cli.export_mcap import export_mcap
 from foredrive.cli.fetch import fetch_av2
 from foredrive.cli.imagine import imagine
 from foredrive.cli.memory import keep_freed_memory
@@ -69,6 +70,7 @@ VERBS: dict[str, Callable[..., Any]] = {
     "render": render,
     "imagine": imagine,
     "export": export,
+    "export mcap": export_mcap,
     "view": view,
     "bench": bench,
 }

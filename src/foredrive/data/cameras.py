@@ -134,6 +134,23 @@ def read_camera(
     )
 
 
+def encoded_image(log: Log, frame: int, metadata: PinholeCameraMetadata) -> bytes | None:
+    """Return the JPEG or PNG of a camera at one frame in full size, as it is stored where it is stored so.
+
+    Raises:
+        InputError: the image cannot be read.
+    """
+    with reading(log.file(metadata.modality_key), f"the image at frame {frame}"):
+        data = log.scene.get_modality_column_at_iteration(
+            log.iteration(frame), "data", ModalityType.CAMERA, metadata.camera_id
+        )
+        if data is None or isinstance(data, bytes):
+            return data
+        out = io.BytesIO()
+        _open_image(log, frame, metadata, data).convert("RGB").save(out, "JPEG", quality=95)
+        return out.getvalue()
+
+
 @functools.lru_cache(maxsize=1024)
 def _rows_exposed_s(log: Log, modality_key: str) -> tuple[float, float]:
     if log.metadata.dataset in _ROWS_EXPOSED_S:

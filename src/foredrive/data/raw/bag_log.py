@@ -188,7 +188,7 @@ def _first_pass(bag: Bag, topics: BagTopics) -> _Found:
 
 
 class _Stream(Sequence[Any]):
-    """The messages of a topic nearest to each frame, read in their order when they are asked for.
+    """The messages of a topic nearest to each frame, read when they are asked for, best in their order.
 
     Frames without a message within half of the frames' usual period have None.
     """
@@ -212,9 +212,12 @@ class _Stream(Sequence[Any]):
         period_us = float(np.median(np.diff(times_us))) if len(times_us) > 1 else 1e5
         self._there = np.abs(stamps[self._at] - times_us) <= 0.5 * period_us
         self.t_us = np.where(self._there, stamps[self._at], times_us)
-        self._messages = enumerate(message for _, message in bag.read([topic]))
+        self._bag, self._topic, self._decode, self._tick = bag, topic, decode, tick
+        self._rewind()
+
+    def _rewind(self) -> None:
+        self._messages = enumerate(message for _, message in self._bag.read([self._topic]))
         self._current: tuple[int, Any] = (-1, None)
-        self._topic, self._decode, self._tick = topic, decode, tick
 
     def __len__(self) -> int:
         return len(self._at)
@@ -228,6 +231,8 @@ class _Stream(Sequence[Any]):
         self._tick()
         if not self._there[frame]:
             return None
+        if self._current[0] > self._at[frame]:
+            self._rewind()
         while self._current[0] < self._at[frame]:
             self._current = next(self._messages)
         try:
