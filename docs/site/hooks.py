@@ -1,11 +1,13 @@
 """Hooks of MkDocs: the generated pages of the site, and links that leave docs/."""
 
+import re
 from pathlib import Path
 from typing import TypeGuard
 
 from api_pages import api_pages
 from benchmark_pages import benchmark_pages
 from mkdocs.config.defaults import MkDocsConfig
+from mkdocs.exceptions import PluginError
 from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
 from repository_links import MOUNTED, linked_files, rewritten, source_page, source_uri
@@ -13,6 +15,8 @@ from tutorials import tutorial_pages
 from verb_help import verb_page
 
 ROOT = Path(__file__).parents[2]
+LOADED = re.compile(r"<(?:script|img|iframe|link)\b[^>]*\b(?:src|href)=.?https?:[^ >]*")
+"""Matches what a page loads from the web."""
 
 
 def on_files(files: Files, *, config: MkDocsConfig) -> Files:
@@ -37,3 +41,10 @@ def is_text(content: str | bytes) -> TypeGuard[str]:
 def on_page_markdown(markdown: str, *, page: Page, config: MkDocsConfig, files: Files) -> str:
     """Lead links to files outside docs/ to their pages in the site."""
     return rewritten(markdown, page.file.src_uri)
+
+
+def on_post_page(output: str, *, page: Page, config: MkDocsConfig) -> str:
+    """Check that a page loads nothing from the web, so that it opens from disk."""
+    if found := LOADED.search(output):
+        raise PluginError(f"{page.file.src_uri} is not self-contained: {found[0]}")
+    return output

@@ -7,10 +7,13 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import jupytext
+import nbformat
 from nbclient import NotebookClient
 from nbconvert.exporters import MarkdownExporter
 
 MINUTES_AT_MOST = 5
+PLAIN_TEXT = "import os\n\nos.environ |= {'TERM': 'dumb'}\nos.environ.pop('FORCE_COLOR', None)"
+"""Run before each notebook: kernels ask programs for colours and for bars that move."""
 
 
 def tutorial_pages(folder: Path, root: Path) -> Mapping[str, str | bytes]:
@@ -35,19 +38,18 @@ def tutorial_pages(folder: Path, root: Path) -> Mapping[str, str | bytes]:
     return pages
 
 
-def _execute(notebook: jupytext.jupytext.NotebookNode, root: Path) -> None:
+def _execute(notebook: nbformat.NotebookNode, root: Path) -> None:
     """Run a notebook in a folder of its own, with the package of this checkout."""
     path = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", "")])
-    environment = os.environ | {
-        "PYTHONPATH": str(root / "src"),
-        "PATH": path,
-        "COLUMNS": "96",
-        "NO_COLOR": "1",
-    }
+    environment = os.environ | {"PYTHONPATH": str(root / "src"), "PATH": path, "COLUMNS": "96"}
+    notebook.cells.insert(0, nbformat.v4.new_code_cell(PLAIN_TEXT))
     with tempfile.TemporaryDirectory() as here:
         resources = {"metadata": {"path": here}}
-        client = NotebookClient(notebook, timeout=60 * MINUTES_AT_MOST, resources=resources)
+        client = NotebookClient(
+            notebook, timeout=60 * MINUTES_AT_MOST, resources=resources, coalesce_streams=True
+        )
         client.execute(env=environment)
+    notebook.cells.pop(0)
     for (
         cell
     ) in notebook.cells:  # an error has ended the build already; the rest of stderr is of no use to readers

@@ -18,16 +18,17 @@ LIDAR = np.array([1.0, 0.0, 1.8])  # position in the ego frame
 def range_along(origin, rays):
     """The distance to the ground (z = 0) or to the walls (y = 7 and y = -7) along each ray."""
     with np.errstate(divide="ignore", invalid="ignore"):
-        to = np.stack([-origin[2] / rays[:, 2], (7 - origin[1]) / rays[:, 1], (-7 - origin[1]) / rays[:, 1]])
+        ground, left = -origin[2] / rays[:, 2], (7 - origin[1]) / rays[:, 1]
+        to = np.stack([ground, left, (-7 - origin[1]) / rays[:, 1]])
     return np.where(to > 0, to, np.inf).min(axis=0)
 
 
 def photo(T_world_cam):
     """A picture of the street: stripes of 2 m on the walls, lane markings on the ground."""
     v, u = np.mgrid[0:136, 0:240] + 0.5
-    rays = np.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], np.ones_like(u)], -1).reshape(-1, 3)
-    rays = rays @ T_world_cam[:3, :3].T
-    hit = T_world_cam[:3, 3] + rays * np.minimum(range_along(T_world_cam[:3, 3], rays), 200)[:, None]
+    rays = np.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], np.ones_like(u)], axis=-1)
+    rays, eye = rays.reshape(-1, 3) @ T_world_cam[:3, :3].T, T_world_cam[:3, 3]
+    hit = eye + rays * np.minimum(range_along(eye, rays), 200)[:, None]
     wall, stripe = np.abs(hit[:, 1]) > 6.9, hit[:, 0] // 2 % 2 == 0
     paint = (np.abs(np.abs(hit[:, 1]) - 1.75) < 0.1) & stripe
     grey = np.where(wall, np.where(stripe, 170, 110), np.where(paint, 240, 70))
@@ -40,15 +41,13 @@ T_world_ego = np.tile(np.eye(4), (20, 1, 1))
 T_world_ego[:, 0, 3] = 8 * t_s  # 8 m/s along x
 images = [photo(T @ T_ego_cam) for T in T_world_ego]
 
-azimuth, elevation = np.meshgrid(np.radians(np.arange(-180, 180, 1.0)), np.radians(np.arange(-15, 3, 1.0)))
-rays = np.stack(
-    [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)], -1
-)
-rays = rays.reshape(-1, 3)
+azimuth = np.radians(np.arange(-180, 180, 1.0))
+elevation = np.radians(np.arange(-15, 3, 1.0))[:, None]
+level = np.cos(elevation)
+parts = (level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation) + 0 * azimuth)
+rays = np.stack(parts, axis=-1).reshape(-1, 3)
 distance = range_along(LIDAR, rays)
-points = (LIDAR + distance[:, None] * rays)[
-    distance < 60
-]  # the same in each frame: the street does not change
+points = (LIDAR + distance[:, None] * rays)[distance < 60]  # of each frame: the street does not change
 
 # %% [markdown]
 # ## The ten lines
@@ -57,13 +56,10 @@ points = (LIDAR + distance[:, None] * rays)[
 from foredrive.data import Box, CameraSpec, Points, write_log
 
 front = CameraSpec("front", K, T_ego_cam, size_hw=(136, 240))
-log = write_log(
-    "data", "my_street", t_s, T_world_ego,
-    cameras=[front],
-    images={"front": images},
-    sweeps=[Points(points) for _ in t_s],
-    boxes=[[Box("car", 1, (12 - 4 * t, 3.5, 0.8), (4.5, 1.8, 1.6), 0.0)] for t in t_s],
-)  # fmt: skip
+sweeps = [Points(points) for _ in t_s]
+boxes = [[Box("car", 1, (12 - 4 * t, 3.5, 0.8), (4.5, 1.8, 1.6), 0.0)] for t in t_s]
+sensed = {"images": {"front": images}, "sweeps": sweeps, "boxes": boxes}
+log = write_log("data", "my_street", t_s, T_world_ego, cameras=[front], **sensed)
 print(log.name)
 
 # %% [markdown]
@@ -83,10 +79,7 @@ print(log.name)
 turn = np.eye(4)
 turn[:2, :2] = [[np.cos(0.1), -np.sin(0.1)], [np.sin(0.1), np.cos(0.1)]]
 wrong = CameraSpec("front", K, turn @ T_ego_cam, size_hw=(136, 240))
-sweeps = [Points(points) for _ in t_s]
-turned = write_log(
-    "data", "turned", t_s, T_world_ego, cameras=[wrong], images={"front": images}, sweeps=sweeps
-)
+turned = write_log("data", "turned", t_s, T_world_ego, cameras=[wrong], **sensed)
 
 # %% language="bash"
 # foredrive check data/logs/own_train/turned
