@@ -57,7 +57,7 @@ def api_pages(package: Path) -> dict[str, str]:
 
 def _page(name: str, members: list[str] | None = None) -> str:
     options = f"\n    options:\n      members: [{', '.join(members)}]" if members else ""
-    return f"---\ntitle: {name}\nsearch:\n  boost: 0.5\n---\n\n::: {name}{options}\n"
+    return f"---\ntitle: {name}\nsearch:\n  boost: 0.1\n---\n\n::: {name}{options}\n"
 
 
 def _exported(init: Path) -> list[str]:

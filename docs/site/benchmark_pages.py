@@ -47,7 +47,7 @@ def benchmark_page(content: Mapping[str, Any]) -> str:
     }
     rows = "\n".join(f"- {name}: {value}" for name, value in facts.items())
     parts = [
-        f"---\nhide: [toc]\nsearch:\n  boost: 0.5\n---\n\n# {content['name']}",
+        f"---\nhide: [toc]\nsearch:\n  boost: 0.1\n---\n\n# {content['name']}",
         content["question"],
         rows,
     ]
