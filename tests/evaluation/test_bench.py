@@ -62,6 +62,21 @@ def test_an_interrupted_benchmark_goes_on_where_it_stopped(tmp_path: Path) -> No
     assert sum("measured before" in line for line in recorder.said) == 3
 
 
+def test_what_another_process_measures_meanwhile_is_kept_and_not_measured_again(tmp_path: Path) -> None:
+    recorder, other = Recorder(), Recorder()
+
+    def meanwhile(seed: int) -> Mapping[str, float]:
+        run_benchmark("speed", other.benchmark(), tmp_path, arms=["peer"], say=other.said.append)
+        return recorder.measure("ours", seed)
+
+    slow = recorder.benchmark()
+    slow = dataclasses.replace(slow, arms={**slow.arms, "ours": meanwhile})
+    path = run_benchmark("speed", slow, tmp_path, say=recorder.said.append)
+    assert recorder.measured == [("ours", seed) for seed in range(3)]
+    assert other.measured == [("peer", seed) for seed in range(3)]
+    assert len(json.loads(path.read_text())["runs"]) == 6
+
+
 def test_other_values_start_anew(tmp_path: Path) -> None:
     recorder = Recorder()
     run_benchmark("speed", recorder.benchmark(), tmp_path, say=recorder.said.append)

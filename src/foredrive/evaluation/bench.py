@@ -68,9 +68,11 @@ def run_benchmark(
     path = folder / f"{name}.json"
     origin = collect_provenance()
     same = _identity(benchmark, origin)
-    runs = _kept_runs(path, same, benchmark, origin, say)
+    if _kept_runs(path, same, benchmark, origin) is None:
+        say(f"{path.name}: measured on other code, configuration or machine; starting anew")
     chosen = [arm for arm in benchmark.arms if arms is None or arm in arms]
     for seed, arm in product(benchmark.seeds, chosen):  # what is interrupted has all arms beside each other
+        runs = _kept_runs(path, same, benchmark, origin) or []
         if any(run["arm"] == arm and run["seed"] == seed for run in runs):
             say(f"{name}: {arm}, seed {seed}: measured before")
             continue
@@ -79,6 +81,7 @@ def run_benchmark(
         figures = {key: float(value) for key, value in benchmark.arms[arm](seed).items()}
         wall_s = time.perf_counter() - started
         made_on = {key: origin[key] for key in MADE_ON}
+        runs = _kept_runs(path, same, benchmark, origin) or []  # other processes may have measured other arms
         runs.append({"arm": arm, "seed": seed, "figures": figures, "wall_s": wall_s, **made_on})
         write_json(path, _report(name, benchmark, origin, same, runs))
         say(f"{name}: {arm}, seed {seed}: " + ", ".join(f"{k} {v:.4g}" for k, v in figures.items()))
@@ -184,9 +187,9 @@ def _is_text(node: ast.stmt) -> bool:
 
 
 def _kept_runs(
-    path: Path, same: str, benchmark: Benchmark, origin: Mapping[str, Any], say: Callable[[str], None]
-) -> list[dict[str, Any]]:
-    """Return the earlier runs that still hold, each with the commit and machine that it was made on."""
+    path: Path, same: str, benchmark: Benchmark, origin: Mapping[str, Any]
+) -> list[dict[str, Any]] | None:
+    """Return the earlier runs, each with the commit and machine that it was made on; None if they do not hold."""
     if not path.is_file():
         return []
     try:
@@ -200,5 +203,4 @@ def _kept_runs(
     if identity == same:
         made_on = {key: earlier.get(key, origin[key]) for key in MADE_ON}  # files that have it once for all
         return [made_on | run for run in runs]
-    say(f"{path.name}: measured on other code, configuration or machine; starting anew")
-    return []
+    return None
