@@ -189,7 +189,7 @@ def _is_text(node: ast.stmt) -> bool:
 def _kept_runs(
     path: Path, same: str, benchmark: Benchmark, origin: Mapping[str, Any]
 ) -> list[dict[str, Any]] | None:
-    """Return the earlier runs, each with the commit and machine that it was made on; None if they do not hold."""
+    """Return the earlier runs, each with its commit and machine. None if they are of other code or values."""
     if not path.is_file():
         return []
     try:
