@@ -69,7 +69,7 @@ def read_clip_list(path: Path) -> list[ListedClip]:
         ]
     except InputError:
         raise
-    except (ValueError, LookupError, TypeError) as error:
+    except (OSError, ValueError, LookupError, TypeError, RecursionError) as error:
         raise InputError(f"{path}: not a list of clips ({FORMAT}): {error}") from error
     if not clips:
         raise InputError(f"{path}: the list has no clips")

@@ -13,7 +13,7 @@ from py123d.parser.base_dataset_parser import BaseLogParser, BaseMapParser
 from foredrive.data.log_paths import LogPath
 from foredrive.data.raw.bag_log import find_bags
 from foredrive.data.raw.datasets import DATASETS
-from foredrive.data.raw.guard import check_inside, check_names, reading_raw
+from foredrive.data.raw.guard import check_finite, check_inside, check_names, reading_raw
 from foredrive.data.raw.raw_log import OwnLog, RawLog
 from foredrive.errors import InputError
 from foredrive.files import atomic_path
@@ -119,6 +119,7 @@ def _write_frames(
     for frame in log.iter_modalities_sync():
         for modality in frame.modalities:
             check_inside(modality, source)
+            check_finite(modality, source)
         writer.write_sync(frame)
         frames += 1
         tick()

@@ -6,15 +6,19 @@ thus run any code in the files. This module replaces that function for all of py
 """
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, Literal
 
 from py123d.datatypes import BoxDetectionsSE3
 from py123d.parser.base_dataset_parser import ModalitiesSync
 from py123d.parser.pandaset import pandaset_parser, pandaset_sensor_io
 from py123d.parser.pandaset.pandaset_parser import PandasetLogParser
+from pydantic import FiniteFloat, TypeAdapter, ValidationError
 
 from foredrive.data.modalities import attributes_modality
 from foredrive.data.safe_pickle import load_table
+from foredrive.errors import InputError
 from foredrive.scene import Attribute
 from foredrive.scene.boxes import UNKNOWN
 
@@ -42,10 +46,27 @@ _ATTRIBUTE_OF_VALUE = {
 are asked in this order."""
 
 
+@dataclass(frozen=True)
+class _Pose:
+    position: dict[Literal["x", "y", "z"], FiniteFloat]
+    heading: dict[Literal["w", "x", "y", "z"], FiniteFloat]
+
+
+_SCHEMAS = {
+    "timestamps.json": TypeAdapter(list[FiniteFloat]),
+    "poses.json": TypeAdapter(list[_Pose]),
+    "intrinsics.json": TypeAdapter(dict[Literal["fx", "fy", "cx", "cy"], FiniteFloat]),
+}
+"""What the JSON files of a log hold."""
+
+
 class PandasetParser(PandasetLogParser):
     """py123d's parser, with an `Attribute` for each box."""
 
     def _iter_modalities_sync_from_path(self, source_log_path: Path) -> Iterator[ModalitiesSync]:
+        for file in sorted([*source_log_path.glob("meta/*.json"), *source_log_path.glob("camera/*/*.json")]):
+            if file.name in _SCHEMAS:
+                _check_json(file, _SCHEMAS[file.name])
         for frame, sync in enumerate(super()._iter_modalities_sync_from_path(source_log_path)):
             boxes = next((found for found in sync.modalities if isinstance(found, BoxDetectionsSE3)), None)
             cuboids = source_log_path / "annotations" / "cuboids" / f"{frame:02d}.pkl.gz"
@@ -54,6 +75,16 @@ class PandasetParser(PandasetLogParser):
                 row = [of_uuid[box.attributes.track_token] for box in boxes.box_detections]
                 sync.modalities.append(attributes_modality(row, sync.timestamp))
             yield sync
+
+
+def _check_json(file: Path, schema: Any) -> None:
+    """Check a file before py123d reads it. Its errors come later, without the file's name."""
+    try:
+        schema.validate_json(file.read_bytes())
+    except ValidationError as error:
+        first = error.errors(include_url=False, include_input=False)[0]
+        where = ".".join(str(part) for part in first["loc"])
+        raise InputError(f"{file}: {f'{where}: ' if where else ''}{first['msg']}") from error
 
 
 def _attributes(cuboids: Path) -> dict[str, int]:

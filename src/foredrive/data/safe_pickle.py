@@ -125,7 +125,9 @@ def _load(
     try:
         with opened(file, "rb") as source, warnings.catch_warnings():
             warnings.filterwarnings("ignore", message="dtype.*align")  # written by an older numpy
-            return _Unpickler(source, allowed, moved).load()
+            content = _Unpickler(source, allowed, moved).load()
+            source.read(1)  # a gzip's checksum is compared at its end
+            return content
     except Exception as error:  # a damaged pickle can raise any error
         raise InputError(f"{file}: cannot read it as a pickle of plain data: {_first_line(error)}") from error
 

@@ -30,7 +30,7 @@ def read_summary(path: Path) -> Figures:
     """Read what `write_summary` wrote."""
     try:
         summary = json.loads(path.read_text())
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise InputError(f"{path}: not a summary that can be read") from error
     if not isinstance(summary, dict):
         raise InputError(f"{path}: not a summary: expected a JSON object")

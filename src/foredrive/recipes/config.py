@@ -152,7 +152,7 @@ def read_values(path: Path) -> Any:
         return yaml.safe_load(path.read_text())
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
+    except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
         raise InputError(f"{path}: not a recipe: {str(error).splitlines()[0]}") from error
 
 

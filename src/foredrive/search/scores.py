@@ -28,6 +28,6 @@ def read_scores(path: Path) -> dict[str, dict[str, float]]:
             told = json.loads(line)
             log, _, t_us = told["frame"].rpartition("@")
             found[f"{log}@{int(t_us)}"] = {name: float(told[name]) for name in SCORES if name in told}
-        except (ValueError, LookupError, TypeError, AttributeError) as error:
+        except (ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
             raise InputError(f"{path}: line {number} does not score a frame: {error}") from error
     return found

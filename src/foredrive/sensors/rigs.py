@@ -104,8 +104,8 @@ def find_rig(name: str) -> RigPlan:
         written = yaml.safe_load(path.read_text())
     except OSError:
         raise InputError(f"no rig {name!r}: {', '.join(RIGS)}, or a YAML file") from None
-    except (UnicodeDecodeError, yaml.YAMLError) as error:
-        raise InputError(f"{path}: not YAML: {error}") from error
+    except (UnicodeDecodeError, yaml.YAMLError, RecursionError) as error:
+        raise InputError(f"{path}: not YAML: {str(error).splitlines()[0]}") from error
     try:
         return TypeAdapter(RigPlan).validate_python(written, extra="forbid")
     except ValidationError as error:

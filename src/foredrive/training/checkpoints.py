@@ -52,7 +52,7 @@ def load_checkpoint(path: Path, model: nn.Module, optimizer: Optimizer) -> int:
     try:
         progress = json.loads((path / PROGRESS).read_text())
         tensors = load_file(path / OPTIMIZER)
-    except (OSError, ValueError, SafetensorError) as error:
+    except (OSError, ValueError, RecursionError, SafetensorError) as error:
         raise InputError(f"{path}: checkpoint cannot be read: {error}") from error
     try:
         _restore_optimizer(optimizer, tensors, progress["optimizer"])

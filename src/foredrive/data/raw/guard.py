@@ -8,7 +8,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from py123d.datatypes import LogMetadata, MapMetadata
+import numpy as np
+from py123d.datatypes import BoxDetectionsSE3, Camera, EgoStateSE3, LogMetadata, MapMetadata
 from py123d.datatypes.modalities.base_modality import BaseModality
 from py123d.parser.base_dataset_parser import ParsedCamera, ParsedLidar, ParsedRadar
 
@@ -117,3 +118,23 @@ def check_inside(modality: BaseModality, source: Path) -> None:
     whole = os.path.abspath(os.path.join(root, relative))
     if os.path.commonpath([whole, os.path.abspath(root)]) != os.path.abspath(root):
         raise InputError(f"{source}: it names the file {str(relative)!r}, which is outside of the data set")
+
+
+def check_finite(modality: BaseModality, source: Path) -> None:
+    """Check that poses, calibrations and boxes are finite numbers. JSON and tables can hold others.
+
+    Raises:
+        InputError: one is not finite.
+    """
+    if isinstance(modality, EgoStateSE3):
+        values, what = [modality.imu_se3.array], "a pose of the vehicle"
+    elif isinstance(modality, BoxDetectionsSE3):
+        values, what = [box.bounding_box_se3.array for box in modality.box_detections], "a box"
+    elif isinstance(modality, ParsedCamera | Camera):
+        pose, lens = modality.camera_to_global_se3, getattr(modality.metadata, "intrinsics", None)
+        values = [part.array for part in (pose, lens) if part is not None]
+        what = f"the pose or the calibration of {modality.metadata.camera_name}"
+    else:
+        return
+    if not all(np.isfinite(part).all() for part in values):
+        raise InputError(f"{source}: {what} at {modality.timestamp.time_us} µs is not finite")

@@ -134,8 +134,11 @@ def _ego_places(folder: Path, wanted: Mapping[str, Row]) -> dict[str, np.ndarray
 def _table(folder: Path, name: str) -> dict[str, Row]:
     path = folder / f"{name}.json"
     try:
-        return {row["token"]: row for row in json.loads(path.read_text())}
+        rows = json.loads(path.read_text())
+        if not isinstance(rows, list):
+            raise TypeError("not a list of rows")
+        return {row["token"]: row for row in rows}
     except OSError as error:
         raise InputError(f"{path}: {error.strerror or error}") from error
-    except (ValueError, TypeError, KeyError) as error:
+    except (ValueError, TypeError, KeyError, RecursionError) as error:
         raise InputError(f"{path}: not a table of nuScenes") from error

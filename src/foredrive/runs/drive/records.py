@@ -59,7 +59,7 @@ def read_suite(folder: Path) -> dict[str, object]:
             suite["agent"] = suite.pop("driver")
         if not isinstance(suite["agent"], str) or not isinstance(suite["routes"], str):
             raise TypeError("agent and routes have to be texts")
-    except (OSError, ValueError, LookupError, TypeError, AttributeError) as error:
+    except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
         raise InputError(f"{folder / SUITE}: not the description of a suite ({error})") from error
     return suite
 

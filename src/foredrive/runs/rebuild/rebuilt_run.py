@@ -61,7 +61,7 @@ def open_run_log(folder: Path) -> tuple[RebuildRecipe[Any], LogPath]:
     try:
         named = json.loads((folder / LOG).read_text())
         path = LogPath(Path(named["folder"]), Path(named["maps_dir"]))
-    except (OSError, ValueError, LookupError, TypeError) as error:
+    except (OSError, ValueError, LookupError, TypeError, RecursionError) as error:
         raise InputError(f"{folder / LOG}: cannot be read as the path of a log: {error}") from error
     if not path.folder.is_dir():
         raise InputError(f"{folder}: its log no longer exists: {path.folder}")

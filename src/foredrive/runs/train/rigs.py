@@ -71,8 +71,15 @@ def read_rigs(folder: Path) -> TrainedRigs | None:
         return None
     try:
         return TypeAdapter(TrainedRigs).validate_python(yaml.safe_load(path.read_text()), extra="forbid")
-    except (OSError, UnicodeDecodeError, yaml.YAMLError, ValidationError, InputError) as error:
-        raise InputError(f"{path}: cannot be read as camera rigs: {error}") from error
+    except (
+        OSError,
+        UnicodeDecodeError,
+        yaml.YAMLError,
+        ValidationError,
+        RecursionError,
+        InputError,
+    ) as error:
+        raise InputError(f"{path}: cannot be read as camera rigs: {' '.join(str(error).split())}") from error
 
 
 def check_rig(rigs: TrainedRigs, rig: RigPlan, run: str) -> None:

@@ -67,7 +67,7 @@ class Run:
         """Return device, precision and processes of each stage, as flat dotted keys. Older runs have none."""
         found: dict[str, str | int] = {}
         for stage in STAGES:
-            with contextlib.suppress(OSError, ValueError, AttributeError):
+            with contextlib.suppress(OSError, ValueError, AttributeError, RecursionError):
                 entries = json.loads((self.folder / stage / CONDITIONS).read_text()).items()
                 found |= {f"training.{stage}.{name}": value for name, value in entries}
         return found
@@ -87,7 +87,7 @@ def open_run(folder: Path) -> Run:
         logs = tuple(_read_log(entry) for entry in written["logs"])
         start = written.get("start")
         return Run(folder, recipe, logs, Path(written["cache_dir"]), None if start is None else Path(start))
-    except (OSError, ValueError, LookupError, TypeError) as error:
+    except (OSError, ValueError, LookupError, TypeError, RecursionError) as error:
         raise InputError(f"{folder / LOGS}: cannot be read as paths of logs: {error}") from error
 
 

@@ -55,7 +55,7 @@ def _read(file: Path) -> list[SafetyScenario]:
         written = yaml.load(file.read_text(), Loader=yaml.BaseLoader)
     except OSError as error:
         raise InputError(f"{file}: cannot be read: {error.strerror or error}") from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
+    except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
         raise InputError(f"{file}: not YAML: {str(error).splitlines()[0]}") from error
     if not isinstance(written, Mapping):
         raise InputError(f"{file}: not a file of scenarios")
