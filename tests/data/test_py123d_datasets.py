@@ -2,6 +2,7 @@
 
 import importlib.util
 import io
+import json
 import pickle
 from pathlib import Path
 
@@ -10,6 +11,9 @@ import pytest
 import raw_kitti360
 import raw_nuscenes
 import raw_waymo
+from PIL import Image
+from plyfile import PlyData, PlyElement
+from py123d.parser.truckdrive.truckdrive_constants import LABEL_MAPPING, MAPPED_CATEGORIES
 from test_raw_pandaset import Intruder
 
 from foredrive.data.boxes import read_boxes
@@ -70,6 +74,85 @@ def test_a_pickle_in_a_library_stays_plain() -> None:
         assert repr(plain.loads(pickle.dumps(value))) == repr(value)
     with pytest.raises(pickle.UnpicklingError, match=r"posix\.system"):
         plain.load(io.BytesIO(pickle.dumps(Intruder("true"))))
+
+
+def write_griffin(folder: Path) -> None:
+    """The 27th scene, which is one of the published train split, with two frames 2 m apart."""
+    side = folder / "griffin_50scenes_25m" / "griffin-release" / "vehicle-side"
+    names = [f"none-{k}" for k in range(26)] + ["Town07-001"]
+    frames = ["000010", "000011"]
+    scenes = [{"name": name, "info": {"frames": frames if name == "Town07-001" else []}} for name in names]
+    for kind in ("calib", "pose", "label", "lidar/lidar_top", "camera/front"):
+        (side / kind).mkdir(parents=True)
+    (side / "scene_infos.json").write_text(json.dumps(scenes))
+    K, T = [[960, 0, 960], [0, 960, 540], [0, 0, 1]], np.eye(4)
+    T[:3] = [[0, 0, 1, 1.5], [-1, 0, 0, 0], [0, -1, 0, 1.6]]
+    for camera in ("front", "back", "left", "right"):
+        (side / "calib" / f"{camera}.json").write_text(json.dumps({"intrinsic": K, "extrinsic": T.tolist()}))
+    (side / "calib" / "lidar_top.json").write_text(json.dumps({"extrinsic": np.eye(4).tolist()}))
+    for k, frame in enumerate(frames):
+        pose = {"x": 2.0 * k, "y": 0.0, "z": 0.0, "roll": 0.0, "pitch": 0.0, "yaw": 0.0}
+        (side / "pose" / f"{frame}.json").write_text(json.dumps(pose))
+        (side / "label" / f"{frame}.txt").write_text(f"car {10 - 2 * k} 3 0.8 4.2 1.8 1.5 0 0 90 7 1.0\n")
+        points = np.array([(5.0, 1.0, 0.0, 0.5)], [(name, "f4") for name in "xyzI"])
+        PlyData([PlyElement.describe(points, "vertex")]).write(side / "lidar/lidar_top" / f"{frame}.ply")
+        Image.new("RGB", (1920, 1080)).save(side / "camera/front" / f"{frame}.png")
+
+
+def test_griffin(tmp_path: Path) -> None:
+    write_griffin(tmp_path / "raw")
+    there = tmp_path / "out" / "maps" / "griffin" / "griffin_Town07.arrow"
+    there.parent.mkdir(parents=True)
+    there.touch()  # the map of the town takes seconds, and is shared
+    (path,) = convert(tmp_path / "raw", "griffin", tmp_path / "out")
+    assert path.name == "griffin_50scenes_25m_train/scene-0026-Town07-001"
+    log = Log(path)
+    assert np.diff(log.t_us).tolist() == [100_000]
+    assert log.speed_mps[1] == pytest.approx(20.0)
+    boxes = read_boxes(log, 1)
+    assert boxes is not None
+    assert boxes.centre[0, :2].tolist() == pytest.approx([8.0, 3.0], abs=1e-5)
+    assert boxes.yaw[0].item() == pytest.approx(np.pi / 2, abs=1e-5)
+    assert there.stat().st_size == 0
+
+
+def write_truckdrive(folder: Path) -> None:
+    """A scene of two frames 3 m apart: one lidar, one box in the frame of the Velodyne."""
+    scene = folder / "scene_900_1"
+    frames = ("lidar_aeva_forward_center_wide", "velodyne")
+    turn = {"w": 1.0, "x": 0.0, "y": 0.0, "z": 0.0}
+    moved = {"translation": {"x": 4.0, "y": 0.0, "z": 2.0}, "rotation": turn}
+    tree = {
+        name: {"header": {"frame_id": "vehicle"}, "child_frame_id": name, "transform": moved}
+        for name in frames
+    }
+    points = scene / "lidar" / "aeva" / "joint_lidars" / "points"
+    boxes = scene / "annotations" / "bounding_boxes"
+    for made in (scene / "calibrations", scene / "poses", points, boxes):
+        made.mkdir(parents=True)
+    (scene / "calibrations" / "calib_tf_tree_full.json").write_text(json.dumps(tree))
+    rows = "".join(f"{k} {1000 + 0.1 * k} {3.0 * k} 0 0 0 0 0 1\n" for k in range(2))
+    (scene / "poses" / "gt_trajectory.txt").write_text("key t x y z qx qy qz qw\n" + rows)
+    for k in range(2):
+        np.array([[6.0, 1.0, 0.0, 40.0, *[0.0] * 7]]).tofile(points / f"{k}_{1000 + k}.bin")
+        box = {"class-id": CAR, "x": 20.0, "y": 1.0, "z": 0.0, "l": 4.0, "w": 2.0, "h": 1.5, "yaw": 0.0}
+        (boxes / f"{k}_{1000 + k}.json").write_text(json.dumps([box | {"Tracking_ID": 5}]))
+
+
+CAR = next(name for name, number in LABEL_MAPPING.items() if number == MAPPED_CATEGORIES["Passenger-Car"])
+
+
+def test_truckdrive_leaves_unknown_speeds_out(tmp_path: Path) -> None:
+    """py123d writes 0 m/s for the vehicle and the boxes; here the speed follows from the poses."""
+    write_truckdrive(tmp_path / "raw")
+    (path,) = convert(tmp_path / "raw", "truckdrive", tmp_path / "out")
+    assert path.name == "truckdrive_train/scene_900_1"
+    log = Log(path)
+    assert log.speed_mps[1] == pytest.approx(30.0)
+    boxes = read_boxes(log, 1)
+    assert boxes is not None
+    assert boxes.centre[0, 0].item() == pytest.approx(24.0, abs=1e-4)
+    assert boxes.velocity[0, 0].item() == pytest.approx(30.0, abs=0.1)
 
 
 @pytest.mark.skipif(not HAS_NUSCENES, reason="nuscenes-devkit is not installed")

@@ -161,11 +161,14 @@ def griffin(source: Path) -> Iterator[RawLog]:
 
 def truckdrive(source: Path) -> Iterator[RawLog]:
     """Find TruckDrive's scenes. Those of its test split have no poses and are left out."""
-    for root in dict.fromkeys(
-        folder.parent for folder in folders_with(source, "calibrations/calib_tf_tree_full.json")
-    ):
+    found = folders_with(source, "calibrations/calib_tf_tree_full.json")
+    for root in dict.fromkeys(folder.parent for folder in found):
+        constants = _module("truckdrive.truckdrive_constants")
+        if not hasattr(constants, "DEFAULT_VEHICLE_HEIGHT_M"):
+            constants.DEFAULT_VEHICLE_HEIGHT_M = 4.0  # py123d 0.7.0 has this line at the end of a comment
         module = _module("truckdrive.truckdrive_parser")
-        for raw in _of(module.TruckDriveDatasetParser(root), root):
+        scenes = [folder.name for folder in found if folder.parent == root]
+        for raw in _of(module.TruckDriveDatasetParser(root, scenes), root):
             yield RawLog(raw.source, _WithoutMotion(raw.log), raw.map)
 
 
