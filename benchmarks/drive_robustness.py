@@ -1,4 +1,4 @@
-"""How much a driver depends on its inputs: `foredrive bench drive-robustness`, hours on two cores.
+"""Measure how much a driver depends on its inputs: `foredrive bench drive-robustness`, hours on two cores.
 
 The agent is the driver of the package, or the one that FOREDRIVE_AGENT names. Each arm drives the same
 routes in the same traffic with one fault; seeds are repetitions. Drives are kept in

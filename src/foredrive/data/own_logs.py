@@ -130,14 +130,10 @@ def write_log(
     _check_cameras(name, cameras)
     images, image_t_s = images or {}, image_t_s or {}
     given: dict[str, Sequence[Any] | np.ndarray | None] = {"sweeps": sweeps, "boxes": boxes, **image_t_s}
-    for what, values in (given | {f"images of {camera}": rows for camera, rows in images.items()}).items():
-        if values is not None and len(values) != len(drive.t_us):
-            raise InputError(f"{name}: {len(values)} entries in {what}, but {len(drive.t_us)} frames")
-    for camera, times in image_t_s.items():
-        if camera not in images:
-            raise InputError(f"{name}: image_t_s has times of {camera!r}, but there are no images of it")
-        if not np.isfinite(np.asarray(times, np.float64)).all():
-            raise InputError(f"{name}: a time of {camera} in image_t_s is not finite")
+    _check_counts(
+        name, len(drive.t_us), given | {f"images of {camera}": rows for camera, rows in images.items()}
+    )
+    _check_image_times(name, images, image_t_s)
     exposed = {camera: drive.exposures(np.asarray(times)) for camera, times in image_t_s.items()}
     place = (Path(out), split, name, list(cameras), None, None, None)
     with LogWriter(*place, vehicle=_metadata(vehicle), dataset=DATASET) as writer:
@@ -159,6 +155,20 @@ def write_log(
             )
             writer.write(sensed)
     return LogPath(writer.folder.absolute(), Path(out).absolute() / "maps")
+
+
+def _check_counts(name: str, frames: int, given: Mapping[str, Sequence[Any] | np.ndarray | None]) -> None:
+    for what, values in given.items():
+        if values is not None and len(values) != frames:
+            raise InputError(f"{name}: {len(values)} entries in {what}, but {frames} frames")
+
+
+def _check_image_times(name: str, images: Mapping[str, Any], image_t_s: Mapping[str, Num]) -> None:
+    for camera, times in image_t_s.items():
+        if camera not in images:
+            raise InputError(f"{name}: image_t_s has times of {camera!r}, but there are no images of it")
+        if not np.isfinite(np.asarray(times, np.float64)).all():
+            raise InputError(f"{name}: a time of {camera} in image_t_s is not finite")
 
 
 @dataclass(frozen=True)

@@ -57,7 +57,7 @@ _SCHEMAS = {
     "poses.json": TypeAdapter(list[_Pose]),
     "intrinsics.json": TypeAdapter(dict[Literal["fx", "fy", "cx", "cy"], FiniteFloat]),
 }
-"""What the JSON files of a log hold."""
+"""Types of the JSON files of a log."""
 
 
 class PandasetParser(PandasetLogParser):

@@ -34,7 +34,7 @@ KINDS = {
     "foxglove.FrameTransforms": "tf",
     "foxglove.PoseInFrame": "pose",
 }
-"""What messages of a type hold. Other types are left out."""
+"""Kind of sensor data by message type. Other types are left out."""
 
 
 @dataclass(frozen=True)

@@ -50,7 +50,7 @@ def find_bags(source: Path, topics: Path | None = None) -> Iterator[RawLog]:
 
 @dataclass
 class _Found:
-    """What a first pass over a bag finds."""
+    """Times, transforms and calibrations that a first pass over a bag finds."""
 
     posed: list[Placed] = field(default_factory=list)
     """From the topic of poses, whose parents go before those of the transforms."""

@@ -1,4 +1,4 @@
-"""What single messages of ROS and Foxglove hold, as arrays: images, calibrations, points, poses."""
+"""Reading of single messages of ROS and Foxglove into arrays: images, calibrations, points, poses."""
 
 import io
 from collections.abc import Iterator

@@ -37,15 +37,15 @@ class LidarTopic(_Strict):
     intensity_max: float = 255.0
     """Stored intensity that is 1."""
     compensated: bool = False
-    """Whether the driver of the lidar has removed the vehicle's motion within a sweep."""
+    """True if the driver of the lidar has removed the vehicle's motion within a sweep."""
     frame: str | None = None
 
 
 class BagTopics(_Strict):
-    """What of a bag becomes a log."""
+    """The topics of a bag that become a log."""
 
     name: str
-    """Of the log."""
+    """Name of the log."""
     world_frame: str
     ego_frame: str
     """x ahead, y to the left, z up (REP 103)."""

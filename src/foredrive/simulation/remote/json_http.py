@@ -11,8 +11,10 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from email.message import Message
 from http.client import HTTPConnection, HTTPException
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from io import BufferedIOBase
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
@@ -216,23 +218,8 @@ def _handler(
             finally:
                 open_requests.release()
 
-        def _foreign(self) -> str | None:
-            """Return why a request is not answered that a page of another site makes through a browser.
-
-            Such a page has its own name in Origin. A name that its owner points to this machine (DNS
-            rebinding) stands in Host.
-            """
-            host, origin = self.headers.get("Host", ""), self.headers.get("Origin")
-            address = self.server.server_address
-            is_local = isinstance(address, tuple) and address[0] == LOOPBACK
-            if is_local and host and host.partition(":")[0] not in (LOOPBACK, "localhost"):
-                return f"this server is not at {host[:100]}"
-            if origin is not None and origin != f"http://{host}":
-                return f"{origin[:100]} may not ask this server"
-            return None
-
         def _answered(self) -> tuple[int, Raw]:
-            foreign = self._foreign()
+            foreign = _foreign(self.headers, self.server.server_address)
             if foreign is not None:
                 self.close_connection = True  # its body is not read
                 return 403, _detail(foreign)
@@ -242,7 +229,7 @@ def _handler(
                 known = ", ".join(" ".join(each) for each in answers)
                 return 404, _detail(f"no {self.command} {path}; there are: {known}")
             try:
-                body = self._body() if self.command == "POST" else None
+                body = _body(self.headers, self.rfile, max_bytes) if self.command == "POST" else None
                 with one_at_a_time:
                     value = answer(body)
             except InputError as error:
@@ -251,19 +238,6 @@ def _handler(
                 _log.exception("%s failed", path)
                 return 500, _detail("internal error")
             return 200, value if isinstance(value, Raw) else _json(value)
-
-        def _body(self) -> Any:
-            length = self.headers.get("Content-Length", "")
-            if not length.isascii() or not length.isdecimal():
-                raise InputError("a request needs a Content-Length")
-            if len(length) > 12 or int(length) > max_bytes:
-                raise InputError(f"a request may have {max_bytes:,} bytes, not {length[:20]}")
-            if self.headers.get_content_type() != "application/json":  # a page in a browser cannot send it
-                raise InputError("a request has to be application/json")
-            try:
-                return json.loads(self.rfile.read(int(length)))
-            except (ValueError, RecursionError, OSError) as error:
-                raise InputError(f"the request is not JSON: {_one_line(error)}") from error
 
         def _send(self, status: int, answer: Raw) -> None:
             with contextlib.suppress(OSError):  # the client has gone
@@ -274,6 +248,40 @@ def _handler(
                 self.wfile.write(answer.content)
 
     return Handler
+
+
+def _foreign(headers: Message, address: object) -> str | None:
+    """Return why a request is not answered that a page of another site makes through a browser.
+
+    Such a page has its own name in Origin. A name that its owner points to this machine (DNS rebinding)
+    stands in Host.
+    """
+    host, origin = headers.get("Host", ""), headers.get("Origin")
+    is_local = isinstance(address, tuple) and address[0] == LOOPBACK
+    if is_local and host and host.partition(":")[0] not in (LOOPBACK, "localhost"):
+        return f"this server is not at {host[:100]}"
+    if origin is not None and origin != f"http://{host}":
+        return f"{origin[:100]} may not ask this server"
+    return None
+
+
+def _body(headers: Message, content: BufferedIOBase, max_bytes: int) -> Any:
+    """Read the JSON of a request.
+
+    Raises:
+        InputError: it has no length or too large a one, is of another type, or not JSON.
+    """
+    length = headers.get("Content-Length", "")
+    if not length.isascii() or not length.isdecimal():
+        raise InputError("a request needs a Content-Length")
+    if len(length) > 12 or int(length) > max_bytes:
+        raise InputError(f"a request may have {max_bytes:,} bytes, not {length[:20]}")
+    if headers.get_content_type() != "application/json":  # a page in a browser cannot send it
+        raise InputError("a request has to be application/json")
+    try:
+        return json.loads(content.read(int(length)))
+    except (ValueError, RecursionError, OSError) as error:
+        raise InputError(f"the request is not JSON: {_one_line(error)}") from error
 
 
 def _json(value: object) -> Raw:
