@@ -1,27 +1,31 @@
 """Closed-loop driving on Town05: `foredrive bench drive-nemo`, days on two cores; `--arms` measures some.
 
 Demonstrations with the rig of `nemo_drive_tele` are driven in the training towns in all weathers: first by
-the disturbed expert, then in rounds of DAgger by the student of the round before. Every arm learns from
-them and drives the same routes in the same traffic, three repetitions by day. All is kept in
-runs/drive_nemo/COMMIT. An interrupted benchmark continues with the next drive, and `foredrive compare`
-reads the folders of drives.
+the disturbed expert, then in rounds of DAgger by the student of the round before. NeMo starts from the
+pre-training that `nemo-ablation` shares; its rig, surround cameras, is another. Every arm learns from the
+demonstrations and drives the same routes in the same traffic by day; ARM@long drives the long routes.
+Seeds are those of fine-tuning.
+
+All is kept in runs/drive_nemo, where an interrupted benchmark continues with the next drive, and
+`foredrive compare` reads the folders of drives.
 """
 
 import dataclasses
 import os
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from benchmarks.common.study import HEADLINE, JUDGED_EVERY_S, seeded, work_folder
+from benchmarks.common.fine_tuning import CONFIG as PRETRAINING
+from benchmarks.common.fine_tuning import pretraining
+from benchmarks.common.study import HEADLINE, JUDGED_EVERY_S, seeded
 from foredrive.data import LogPath, find_all_logs
 from foredrive.errors import InputError
-from foredrive.evaluation.bench import Benchmark
+from foredrive.evaluation.bench import Benchmark, study_identity
 from foredrive.evaluation.summary import read_summary
 from foredrive.metrics.bootstrap import bootstrap_mean
-from foredrive.recipes import Recipe, find_recipe
+from foredrive.recipes import find_recipe
 from foredrive.runs.drive.agents import IDM, IDM_BY_SIGHT
 from foredrive.runs.drive.compare import values_of
 from foredrive.runs.drive.in_towns import TownRoutes
@@ -33,7 +37,6 @@ from foredrive.sensors.rigs import DRIVING
 from foredrive.simulation.drive_record import DriveRecord
 from foredrive.towns.campaign import Campaign, plan_drives
 
-WORK = work_folder(Path("runs/drive_nemo"))
 FULL = "nemo_drive_tele"
 RECIPES = {
     "pretrained": FULL,
@@ -42,14 +45,31 @@ RECIPES = {
     "scorer_present": f"{FULL}_scorer_present",
     "driveworld": "driveworld_drive_tele",
 }
-"""Arms that are pre-trained on the demonstrations. The first four are 2 x 2: scorer, futures."""
-ROUNDS = 2
+"""Pre-trained arms, DriveWorld on the demonstrations. The first four are 2 x 2: scorer, futures."""
+ROUNDS = 1
 """Rounds of DAgger after the demonstrations of the disturbed expert."""
-DEMONSTRATIONS = ("training-short", "training-long")
+DEMONSTRATIONS = "training-short"
 JUDGED = {"short": "town05-short", "long": "town05-long"}
-REPETITIONS = 3
+REPETITIONS = 1
 OPEN_LOOP = Campaign(("Town05",), seeds=tuple(range(1, 7)), seconds=60.0, rate_hz=2.0)
 CORES = len(os.sched_getaffinity(0))
+CONFIG = {
+    "recipes": {name: dataclasses.asdict(find_recipe(recipe)) for name, recipe in RECIPES.items()},
+    "pretraining": PRETRAINING,
+    "demonstrations": DEMONSTRATIONS,
+    "rounds": ROUNDS,
+    "routes": JUDGED,
+    "repetitions": REPETITIONS,
+}
+DECIDED_BY = (
+    "foredrive.simulation",
+    "foredrive.towns",
+    "foredrive.models",
+    "foredrive.losses",
+    "foredrive.training",
+    "foredrive.data",
+)
+WORK = Path("runs/drive_nemo") / study_identity(CONFIG, DECIDED_BY)
 
 
 def _driven(suite: DriveSuite, out: Path) -> SuiteResult:
@@ -68,31 +88,31 @@ def demonstrations(rounds: int) -> tuple[LogPath, ...]:
     folders = []
     for number in range(rounds + 1):
         student = "disturbed" if number == 0 else f"student:{_student(number - 1).folder.absolute()}"
-        for name in DEMONSTRATIONS if number == 0 else DEMONSTRATIONS[:1]:
-            folder = WORK / "demonstrations" / f"round{number}_{name}"
-            source = TownRoutes(name, seed=number, conditions="any", rig=DRIVING)
-            _driven(DriveSuite(student, source), folder)
-            folders.append(folder)
+        folder = WORK / "demonstrations" / f"round{number}"
+        source = TownRoutes(DEMONSTRATIONS, seed=number, conditions="any", rig=DRIVING)
+        _driven(DriveSuite(student, source), folder)
+        folders.append(folder)
     return find_all_logs(folders)
 
 
 def _student(rounds: int) -> Run:
-    return trained(seeded(find_recipe(FULL), 0), f"dagger_{rounds}_seed0", rounds)
+    return trained(FULL, f"dagger_{rounds}", 0, rounds)
 
 
-def trained(recipe: Recipe[Any, Any], name: str, rounds: int = ROUNDS) -> Run:
+def trained(recipe: str, name: str, seed: int, rounds: int = ROUNDS, pretrained: bool = True) -> Run:
     """Return a run on the demonstrations of some rounds, and train what is missing."""
-    return train_run(recipe, demonstrations(rounds), WORK / "runs" / name, WORK / "cache")
+    chosen = seeded(find_recipe(recipe), seed)
+    start = pretraining() if pretrained and recipe.startswith("nemo") else None
+    chosen = chosen if pretrained else dataclasses.replace(chosen, pretrain=None)
+    folder = WORK / "runs" / f"{name}_seed{seed}"
+    return train_run(chosen, demonstrations(rounds), folder, WORK / "cache", start)
 
 
-def scores(agent: str, name: str) -> dict[str, float]:
-    """Return the figures of an agent on each set of routes, with 95 % intervals over routes."""
-    figures = {}
-    for short, routes in JUDGED.items():
-        source = TownRoutes(routes, repetitions=REPETITIONS, rig=DRIVING)
-        drives = _driven(DriveSuite(agent, source, sensors=False), WORK / "drives" / f"{name}_{short}").drives
-        figures |= {f"{key}_{short}": value for key, value in _figures(list(drives.values())).items()}
-    return figures
+def scores(agent: str, name: str, routes: str) -> dict[str, float]:
+    """Return the figures of an agent on a set of routes, with 95 % intervals over routes."""
+    source = TownRoutes(JUDGED[routes], repetitions=REPETITIONS, rig=DRIVING)
+    drives = _driven(DriveSuite(agent, source, sensors=False), WORK / "drives" / f"{name}_{routes}").drives
+    return {f"{key}_{routes}": value for key, value in _figures(list(drives.values())).items()}
 
 
 def _figures(drives: Sequence[DriveRecord]) -> dict[str, float]:
@@ -120,16 +140,16 @@ def _figures(drives: Sequence[DriveRecord]) -> dict[str, float]:
     }
 
 
-def learned(
-    name: str, recipe: str, rounds: int = ROUNDS, pretrained: bool = True
-) -> Callable[[int], Mapping[str, float]]:
+Arm = Callable[[int, str], Mapping[str, float]]
+"""An arm, of a seed and a set of routes."""
+
+
+def learned(name: str, recipe: str, rounds: int = ROUNDS, pretrained: bool = True) -> Arm:
     """Return an arm of a recipe that learns from the demonstrations."""
 
-    def measure(seed: int) -> Mapping[str, float]:
-        chosen = seeded(find_recipe(recipe), seed)
-        chosen = chosen if pretrained else dataclasses.replace(chosen, pretrain=None)
-        run = trained(chosen, f"{name}_seed{seed}", rounds)
-        return {**_open_loop(run), **scores(str(run.folder.absolute()), f"{name}_seed{seed}")}
+    def measure(seed: int, routes: str) -> Mapping[str, float]:
+        run = trained(recipe, name, seed, rounds, pretrained)
+        return {**_open_loop(run), **scores(str(run.folder.absolute()), f"{name}_seed{seed}", routes)}
 
     return measure
 
@@ -151,48 +171,43 @@ def _open_loop(run: Run) -> dict[str, float]:
     return {name: float(value) for name, key in keys.items() if (value := summary.get(key)) is not None}
 
 
-def blind_mlp(seed: int) -> Mapping[str, float]:
+def blind_mlp(seed: int, routes: str) -> Mapping[str, float]:
     """Score the MLP that is told the same and sees nothing, fitted to the same demonstrations."""
-    run = trained(seeded(find_recipe(FULL), seed), f"pretrained_seed{seed}")
-    return scores(f"ego-mlp:{run.folder.absolute()}", f"blind_mlp_seed{seed}")
+    run = trained(FULL, "pretrained", seed)
+    return scores(f"ego-mlp:{run.folder.absolute()}", f"blind_mlp_seed{seed}", routes)
 
 
-def idm_by_sight(seed: int) -> Mapping[str, float]:
+def idm_by_sight(seed: int, routes: str) -> Mapping[str, float]:
     """Score the rule-based agent with what a run tells of lights, lead vehicle and people."""
-    run = trained(seeded(find_recipe(FULL), seed), f"pretrained_seed{seed}")
-    return scores(f"{IDM_BY_SIGHT}{run.folder.absolute()}", f"idm_by_sight_seed{seed}")
+    run = trained(FULL, "pretrained", seed)
+    return scores(f"{IDM_BY_SIGHT}{run.folder.absolute()}", f"idm_by_sight_seed{seed}", routes)
 
 
-def without_training(agent: str, name: str) -> Callable[[int], Mapping[str, float]]:
+def without_training(agent: str, name: str) -> Arm:
     """Return an arm of an agent that learns nothing: all seeds are the same drives."""
-    return lambda seed: scores(agent, name)
+    return lambda seed, routes: scores(agent, name, routes)
+
+
+ARMS: Mapping[str, Arm] = {
+    "expert": without_training("expert", "expert"),
+    "constant_velocity": without_training("constant-velocity", "constant_velocity"),
+    "idm": without_training(IDM, "idm"),
+    **{f"dagger_{rounds}": learned(f"dagger_{rounds}", FULL, rounds) for rounds in range(ROUNDS)},
+    **{name: learned(name, recipe) for name, recipe in RECIPES.items()},
+    "scratch": learned("scratch", FULL, pretrained=False),
+    "blind_mlp": blind_mlp,
+    "idm_by_sight": idm_by_sight,
+}
+
+
+def _of_routes(arm: Arm, routes: str) -> Callable[[int], Mapping[str, float]]:
+    return lambda seed: arm(seed, routes)
 
 
 BENCHMARK = Benchmark(
     question="How well does NeMo drive Town05's routes by sight, and what does each part bring?",
-    arms={
-        "expert": without_training("expert", "expert"),
-        "constant_velocity": without_training("constant-velocity", "constant_velocity"),
-        "idm": without_training(IDM, "idm"),
-        **{f"dagger_{k}": learned(f"dagger_{k}", FULL, k) for k in range(ROUNDS)},
-        **{name: learned(name, recipe) for name, recipe in RECIPES.items()},
-        "scratch": learned("scratch", FULL, pretrained=False),
-        "blind_mlp": blind_mlp,
-        "idm_by_sight": idm_by_sight,
-    },
-    config={
-        "recipes": {name: dataclasses.asdict(find_recipe(recipe)) for name, recipe in RECIPES.items()},
-        "demonstrations": DEMONSTRATIONS,
-        "rounds": ROUNDS,
-        "routes": JUDGED,
-        "repetitions": REPETITIONS,
-    },
-    decided_by=(
-        "foredrive.simulation",
-        "foredrive.towns",
-        "foredrive.models",
-        "foredrive.losses",
-        "foredrive.training",
-        "foredrive.data",
-    ),
+    arms={name: _of_routes(arm, "short") for name, arm in ARMS.items()}
+    | {f"{name}@long": _of_routes(arm, "long") for name, arm in ARMS.items()},
+    config=CONFIG,
+    decided_by=DECIDED_BY,
 )

@@ -54,14 +54,14 @@ def fine_tuned(name: str, seed: int, *, pretrained: bool = True, share: float = 
         pretrained: whether the recipe's pre-training comes first, if it has one.
         share: part of the training drives. Pre-training has them all.
     """
-    logs = StudyLogs(*learning.logs_of(learning.BUDGETS[BUDGET].drives))
+    logs = _logs()
     few = dataclasses.replace(logs, train=share_of(logs.train, share))
     recipe = _of_the_study(find_recipe(name), seed)
     start = None
     if recipe.pretrain is None or not pretrained:
         recipe = dataclasses.replace(recipe, pretrain=None)
     else:
-        start = _pretraining(name, logs)
+        start = pretraining(name)
     arm = f"{name}{'' if pretrained else '_from_scratch'}_{100 * share:.0f}pct_seed{seed}"
     return run_arm(recipe, few, ROOT / IDENTITY / arm, learning.ROOT / "cache", start)
 
@@ -81,12 +81,16 @@ def _pretraining_recipe(recipe: Recipe[Any, Any]) -> Recipe[Any, Any]:
     return seeded(learning.pretraining_alone(recipe, steps), PRETRAINING_SEED)
 
 
-def _pretraining(name: str, logs: StudyLogs) -> Path:
-    """Return the run folder with the pre-training of a row, which may be there already."""
+def pretraining(name: str = PRETRAINED) -> Path:
+    """Return the run folder with the pre-training of a recipe of `nemo_town`, which may be there already."""
     recipe, usual = find_recipe(name), find_recipe(PRETRAINED)
     if (recipe.pretrain, recipe.model, recipe.clips) == (usual.pretrain, usual.model, usual.clips):
         name, recipe = PRETRAINED, usual
     folder = ROOT / f"{name}_pretraining"
     if not (folder / "pretrain" / WEIGHTS).is_file():
-        train_run(_pretraining_recipe(recipe), logs.train, folder, learning.ROOT / "cache")
+        train_run(_pretraining_recipe(recipe), _logs().train, folder, learning.ROOT / "cache")
     return folder
+
+
+def _logs() -> StudyLogs:
+    return StudyLogs(*learning.logs_of(learning.BUDGETS[BUDGET].drives))
