@@ -32,7 +32,7 @@ from foredrive.recipes.task_heads import HEADED, INSTANCES, TaskHeadsRecipe, tow
 from foredrive.runs.evaluate.predict import AgentPredictor
 from foredrive.runs.shipped import run_folder
 from foredrive.runs.train.run import Run, load_agent, open_run, train_run
-from foredrive.runs.train.tasks import probe_run, train_heads
+from foredrive.runs.train.tasks import TrainedHeads, probe_run, train_heads
 
 ROOT = Path("runs/task_probes")
 DRIVES = 28
@@ -111,16 +111,22 @@ def trained(name: str, *, pretrained: bool = True) -> Callable[[int], Run]:
     return begin
 
 
+def probe(name: str, world_of: Callable[[int], Run], seed: int) -> tuple[Run, TrainedHeads]:
+    """Return heads that are trained on a frozen world model, and their run; train what is missing."""
+    train_logs, _ = logs_of(DRIVES)
+    world = world_of(seed)
+    folder = ROOT / IDENTITY / f"{name}_seed{seed}"
+    run = probe_run(world.recipe, train_logs, folder, ROOT / "cache", world.folder)
+    return run, train_heads(run, heads_recipe(seed))
+
+
 def probed(name: str, world_of: Callable[[int], Run]) -> Callable[[int], dict[str, float]]:
     """Return an arm that trains heads on a frozen world model and judges them in the test town."""
 
     def measure(seed: int) -> dict[str, float]:
         torch.set_num_threads(1)
-        train_logs, test_logs = logs_of(DRIVES)
-        world = world_of(seed)
-        folder = ROOT / IDENTITY / f"{name}_seed{seed}"
-        run = probe_run(world.recipe, train_logs, folder, ROOT / "cache", world.folder)
-        found = train_heads(run, heads_recipe(seed))
+        _, test_logs = logs_of(DRIVES)
+        run, found = probe(name, world_of, seed)
         clips = run.recipe.clips
         read = dataclasses.replace(
             clips.judged, future_images=False, now_stride_s=JUDGED_EVERY_S, tasks=found.recipe.truth
