@@ -1,0 +1,78 @@
+"""Does a planner gain by attending to what task heads find? `foredrive bench planner-attention`, an hour.
+
+World model and heads are those of `task-probes` (the shipped `nemo_town`, heads of seed 0), and stay as they
+are. Arms train the planner alone, for as long as `nemo-ablation` fine-tunes: from the volume alone, with the
+agents that the heads find, and with agents and map elements, as VAD and UniAD do. Seeds are the planner's.
+"""
+
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from benchmarks import learning, task_probes
+from benchmarks.common.fine_tuning import PATH_STRIDE_S, STEPS, WARMUP_STEPS
+from benchmarks.common.study import StudyLogs, run_arm
+from foredrive.evaluation.bench import Benchmark, study_identity
+from foredrive.models.tasks.scene_tokens import Attended
+from foredrive.recipes import Recipe, find_recipe
+from foredrive.recipes.config import rescheduled
+from foredrive.training import PathFit
+
+ATTENDED: dict[str, tuple[Attended, ...]] = {
+    "volume": (),
+    "agents": ("agents",),
+    "agents_and_map": ("agents", "map"),
+}
+DRIVES = 56
+"""Training drives: eight of each town."""
+CONFIG = {
+    "probes": task_probes.CONFIG,
+    "attended": ATTENDED,
+    "drives": DRIVES,
+    "steps": STEPS,
+    "path_stride_s": PATH_STRIDE_S,
+}
+DECIDED_BY = (
+    *task_probes.DECIDED_BY,
+    "foredrive.metrics.planning",
+    "foredrive.metrics.protocols",
+    "foredrive.models.planner",
+    "foredrive.runs.train.kept_parts",
+    "foredrive.training.path_fit",
+    "foredrive.training.planner_objective",
+)
+WORK = Path("runs/planner_attention") / study_identity(CONFIG, DECIDED_BY)
+
+
+def recipe_of(attends: tuple[Attended, ...], seed: int) -> Recipe[Any, Any]:
+    """Return `nemo_town` with a planner that attends to outputs of the heads, and nothing else to train."""
+    recipe = find_recipe(task_probes.NEMO)
+    return dataclasses.replace(
+        recipe,
+        pretrain=None,
+        transfer="frozen",
+        planner=dataclasses.replace(recipe.planner, attends=attends),
+        path=PathFit(stride_s=PATH_STRIDE_S),
+        finetune=rescheduled(recipe.finetune, steps=STEPS, warmup_steps=WARMUP_STEPS, seed=seed),
+    )
+
+
+def attending(name: str) -> Callable[[int], dict[str, float]]:
+    """Return an arm."""
+
+    def measure(seed: int) -> dict[str, float]:
+        probe, _ = task_probes.probe(task_probes.NEMO, task_probes.shipped, 0)
+        logs = StudyLogs(*learning.logs_of(DRIVES))
+        folder = WORK / f"{name}_seed{seed}"
+        return run_arm(recipe_of(ATTENDED[name], seed), logs, folder, learning.ROOT / "cache", probe.folder)
+
+    return measure
+
+
+BENCHMARK = Benchmark(
+    question="Does a planner gain by attending to the agents and map elements that task heads find?",
+    arms={name: attending(name) for name in ATTENDED},
+    config=CONFIG,
+    decided_by=DECIDED_BY,
+)
