@@ -1,6 +1,7 @@
 """Safety tests after NeuroNCAP in rebuilt towns and in PandaSet 002: `foredrive bench ncap`, hours.
 
-Three drives of 20 s are recorded with six cameras and a lidar, and rebuilt. In each rebuild, four scenarios
+Three drives of 20 s are recorded with six cameras and a lidar, and rebuilt in runs/safety_rebuilds, for
+`ncap-transfer` too. In each rebuild, four scenarios
 of each kind are driven ten times by each agent, under our rules, and by some under those of the paper and of
 its released code. `suite_minutes` counts the drives of one suite alone. Intervals (`score_low`, `score_high`)
 hold 95 % over the runs of a town; the figures of an arm are means over its towns. PandaSet 002 lasts 5.5 s,
@@ -14,7 +15,7 @@ import functools
 import os
 from pathlib import Path
 
-from benchmarks.common.safety_suites import SuiteSize, driven_suite, rebuilt_town, safety_drive
+from benchmarks.common.safety_suites import DRIVES, REBUILDING, SuiteSize, driven_suite, rebuilt_town
 from benchmarks.common.study import pandaset_log
 from foredrive.errors import InputError
 from foredrive.evaluation.bench import Benchmark, study_identity
@@ -22,8 +23,7 @@ from foredrive.recipes.rebuilding import gaussians_tiny
 from foredrive.runs.drive.in_ncap import propose_scenarios
 from foredrive.runs.rebuild.reconstruct import reconstruct
 
-DRIVES = tuple(safety_drive(town, seed) for town, seed in (("Town10HD", 3), ("Town03", 4), ("Town05", 5)))
-SIZE = SuiteSize(gaussians_tiny())
+SIZE = SuiteSize()
 WORKERS = len(os.sched_getaffinity(0))
 NEMO = "embedded:nemo_town"
 AGENTS = {
@@ -42,7 +42,7 @@ AGENTS = {
 }
 """Agent and rules of each arm."""
 CONFIG = {
-    "drives": [dataclasses.asdict(drive) for drive in DRIVES],
+    "rebuilding": REBUILDING,
     "size": dataclasses.asdict(SIZE),
     "agents": {arm: list(of) for arm, of in AGENTS.items()},
 }
@@ -64,13 +64,13 @@ def in_town(arm: str, town: str, _: int) -> dict[str, float]:
     """Return the figures of a suite in a rebuilt town."""
     drive = next(drive for drive in DRIVES if drive.town == town)
     agent, rules = AGENTS[arm]
-    return driven_suite(agent, rules, rebuilt_town(drive, SIZE, WORK), SIZE, WORK / arm / town, WORKERS)
+    return driven_suite(agent, rules, rebuilt_town(drive), SIZE, WORK, arm, WORKERS)
 
 
 def in_pandaset(_: int) -> dict[str, float]:
     """Return the number of scenarios that are feasible in PandaSet 002."""
     folder, file = WORK / "rebuilt" / "pandaset_002", WORK / "rebuilt" / "pandaset_002.yaml"
-    reconstruct(SIZE.recipe, pandaset_log(Path("runs/ncap/pandaset")), folder, WORK / "cache")
+    reconstruct(gaussians_tiny(), pandaset_log(Path("runs/ncap/pandaset")), folder, WORK / "cache")
     file.unlink(missing_ok=True)
     try:
         return {"scenarios": float(len(propose_scenarios((str(folder),), file, "ours", SIZE.runs).passed))}

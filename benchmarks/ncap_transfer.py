@@ -15,18 +15,22 @@ from pathlib import Path
 
 from benchmarks.common.rebuilt_towns import TownDrive
 from benchmarks.common.safety_pairs import Pair, PairedTests, agreement
-from benchmarks.common.safety_suites import SuiteSize, chosen_scenarios, rebuilt_town, safety_drive
+from benchmarks.common.safety_suites import (
+    DRIVES,
+    REBUILDING,
+    SuiteSize,
+    chosen_scenarios,
+    rebuilt_town,
+)
 from foredrive.evaluation.bench import Benchmark, study_identity
-from foredrive.recipes.rebuilding import gaussians_tiny
 from foredrive.simulation.ncap.scenario_file import load_scenarios
 from foredrive.simulation.threats import Threat
 
-DRIVES = tuple(safety_drive(town, seed) for town, seed in (("Town10HD", 3), ("Town03", 4), ("Town05", 5)))
-SIZE = SuiteSize(gaussians_tiny(), starts=4, runs=3)
+SIZE = SuiteSize(runs=3)
 """3 towns x 3 kinds x 4 starts x 3 runs: 108 pairs of each agent, if all kinds are feasible four times."""
 AGENTS = {"nemo_cameras": "embedded:nemo_town", "corridor_lidar": "lidar-corridor"}
 CONFIG = {
-    "drives": [dataclasses.asdict(drive) for drive in DRIVES],
+    "rebuilding": REBUILDING,
     "size": dataclasses.asdict(SIZE),
     "agents": AGENTS,
 }
@@ -49,14 +53,14 @@ WORK = Path("runs/ncap_transfer") / study_identity(CONFIG, DECIDED_BY)
 @functools.lru_cache(maxsize=1)
 def tests_in(drive: TownDrive) -> PairedTests:
     """Return the paired tests of one town; the next town replaces it."""
-    return PairedTests(drive, rebuilt_town(drive, SIZE, WORK))
+    return PairedTests(drive, rebuilt_town(drive))
 
 
 def pairs_of(agent: str) -> list[Pair]:
     """Return the pairs of an agent in all towns; drive those that are missing."""
     pairs = []
     for drive in DRIVES:
-        for scenario in load_scenarios(chosen_scenarios(rebuilt_town(drive, SIZE, WORK), SIZE)):
+        for scenario in load_scenarios(chosen_scenarios(rebuilt_town(drive), SIZE, WORK)):
             for number in range(SIZE.runs):
                 file = WORK / agent / drive.town / f"{scenario.label}_rep{number}.json"
                 pairs.append(tests_in(drive).pair(AGENTS[agent], scenario, number, file))

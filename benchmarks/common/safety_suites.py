@@ -4,13 +4,13 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from benchmarks.common.rebuilt_towns import TownDrive
 from foredrive.errors import InputError
-from foredrive.recipes.rebuilding import RebuildRecipe
+from foredrive.evaluation.bench import study_identity
+from foredrive.recipes.rebuilding import gaussians_tiny
 from foredrive.runs.drive.in_ncap import SafetyTests, propose_scenarios
 from foredrive.runs.drive.records import tested_runs
 from foredrive.runs.drive.suite import DriveSuite, drive_suite
@@ -29,7 +29,6 @@ CAMERAS = ("PCAM_F0", "PCAM_L0", "PCAM_R0", "PCAM_L1", "PCAM_R1", "PCAM_B0")
 class SuiteSize:
     """Sizes of a benchmark of safety tests in one rebuilt town."""
 
-    recipe: RebuildRecipe[Any]
     starts: int = 4
     """Largest number of scenarios of each kind."""
     runs: int = 10
@@ -44,24 +43,37 @@ def safety_drive(town: str, seed: int, seconds: float = 20.0) -> TownDrive:
     )
 
 
-def rebuilt_town(drive: TownDrive, size: SuiteSize, work: Path) -> Path:
+DRIVES = tuple(safety_drive(town, seed) for town, seed in (("Town10HD", 3), ("Town03", 4), ("Town05", 5)))
+"""The drives that benchmarks of safety tests rebuild."""
+REBUILDING = {
+    "drives": [dataclasses.asdict(drive) for drive in DRIVES],
+    "recipe": dataclasses.asdict(gaussians_tiny()),
+}
+WORK = Path("runs/safety_rebuilds") / study_identity(
+    REBUILDING,
+    ("foredrive.rendering", "foredrive.training.gaussian_training", "foredrive.training.rebuilding"),
+)
+
+
+def rebuilt_town(drive: TownDrive) -> Path:
     """Return the folder of the rebuild of a drive; record and rebuild what is missing."""
-    folder = work / "rebuilt" / drive.town
-    recipe = dataclasses.replace(size.recipe, cameras=drive.cameras, image_hw=drive.image_hw)
-    reconstruct(recipe, drive.recorded(work / "towns"), folder, work / "cache")
+    folder = WORK / "rebuilt" / drive.town
+    recipe = dataclasses.replace(gaussians_tiny(), cameras=drive.cameras, image_hw=drive.image_hw)
+    reconstruct(recipe, drive.recorded(WORK / "towns"), folder, WORK / "cache")
     return folder
 
 
-def chosen_scenarios(rebuilt: Path, size: SuiteSize) -> Path:
+def chosen_scenarios(rebuilt: Path, size: SuiteSize, work: Path) -> Path:
     """Return the file of scenarios of a rebuild: of each kind some proposals, spread over the log.
 
     Raises:
         InputError: no scenario is feasible.
     """
-    file = rebuilt.with_name(f"{rebuilt.name}_scenarios.yaml")
+    file = work / "scenarios" / f"{rebuilt.name}.yaml"
     if not file.is_file():
         proposed = file.with_name(f"{rebuilt.name}_proposed.yaml")
         if not proposed.is_file():
+            file.parent.mkdir(parents=True, exist_ok=True)
             propose_scenarios((str(rebuilt),), proposed, "ours", size.runs)
         found = load_scenarios(proposed)
         kept = [each for kind in Threat for each in spread([s for s in found if s.kind is kind], size.starts)]
@@ -77,15 +89,20 @@ def spread(scenarios: Sequence[SafetyScenario], count: int) -> list[SafetyScenar
 
 
 def driven_suite(
-    agent: str, rules: str, rebuilt: Path, size: SuiteSize, out: Path, workers: int
+    agent: str, rules: str, rebuilt: Path, size: SuiteSize, work: Path, arm: str, workers: int
 ) -> dict[str, float]:
-    """Drive the suite of a rebuild that is missing; return its figures.
+    """Drive what is missing of the suite of a rebuild; return its figures.
+
+    Args:
+        work: folder of the study.
+        arm: name of its folder of drives.
 
     Raises:
         InputError: no scenario is feasible, or a drive broke off.
     """
-    source = SafetyTests((str(rebuilt),), str(chosen_scenarios(rebuilt, size)), rules, size.runs, workers > 1)
-    driven = drive_suite(DriveSuite(agent, source), out, workers)
+    scenarios = chosen_scenarios(rebuilt, size, work)
+    source = SafetyTests((str(rebuilt),), str(scenarios), rules, size.runs, workers > 1)
+    driven = drive_suite(DriveSuite(agent, source), work / arm / rebuilt.name, workers)
     if driven.broken:
         job, why = next(iter(driven.broken.items()))
         raise InputError(f"{len(driven.broken)} drives broke off, {job.name}: {why}")
