@@ -101,12 +101,3 @@ def test_a_killed_process_leaves_the_folder_free(holder: subprocess.Popen[str], 
         pass
     with held(tmp_path / "run"), pytest.raises(InputError, match="another process"), held(tmp_path / "run"):
         pass
-
-
-def test_processes_that_train_together_share_the_lock_of_the_first(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    with held(tmp_path):
-        monkeypatch.setenv("LOCAL_RANK", "1")
-        with held(tmp_path):
-            pass

@@ -31,7 +31,7 @@ from foredrive.runs.rebuild.reconstruct import reconstruct
 from foredrive.training.gaussian_rates import LearningRates
 from foredrive.training.gaussian_training import GaussianSchedule
 from foredrive.training.learning_rates import Rate
-from foredrive.training.loop import read_metrics
+from foredrive.training.metrics_log import read_metrics
 
 GOLDEN = Path(__file__).with_name("golden_rebuild.json")
 RTOL, ATOL = 2e-3, 2e-4

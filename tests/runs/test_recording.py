@@ -1,7 +1,9 @@
 """Many drives at once: the same bytes as one after another, none twice, none lost for another's failure."""
 
+import functools
 import hashlib
 import os
+import signal
 from pathlib import Path
 
 import pytest
@@ -106,9 +108,27 @@ def die_of_the_first(plan: DrivePlan) -> None:
         os._exit(1)
 
 
-def test_a_process_that_dies_takes_its_own_drive_along() -> None:
-    results = dict(fan_out(PLANS, die_of_the_first, 1))
-    assert [isinstance(result, BaseException) for result in results.values()] == [True, False, False]
+@pytest.mark.parametrize("workers", [1, 3])
+def test_a_process_that_dies_takes_its_own_drive_along(workers: int) -> None:
+    results = dict(fan_out(PLANS, die_of_the_first, workers))
+    assert {plan: isinstance(result, BaseException) for plan, result in results.items()} == {
+        PLANS[0]: True,
+        PLANS[1]: False,
+        PLANS[2]: False,
+    }
+
+
+def die_once(number: int, folder: Path) -> int:
+    if number == 2 and not (folder / "died").exists():
+        (folder / "died").touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    return number * number
+
+
+def test_nothing_is_lost_with_a_killed_process(tmp_path: Path) -> None:
+    results = fan_out(range(5), functools.partial(die_once, folder=tmp_path), 2)
+    assert dict(results) == {0: 0, 1: 1, 2: 4, 3: 9, 4: 16}
+    assert (tmp_path / "died").exists()
 
 
 @pytest.mark.skipif(

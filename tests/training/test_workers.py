@@ -12,11 +12,11 @@ PATIENCE_S = 300.0
 KILLED = """
 import os
 from pathlib import Path
-from types import SimpleNamespace
 
 from torch.utils.data import Dataset
 
-from foredrive.training.loop import Schedule, _loader
+from foredrive.training.loop import _loader
+from foredrive.training.parts import Part
 
 
 class Workers(Dataset):
@@ -28,9 +28,8 @@ class Workers(Dataset):
 
 
 if __name__ == "__main__":
-    schedule = Schedule(batch_size=1, lr=1e-3, steps=50, workers=2)
-    alone = SimpleNamespace(world_size=1, global_rank=0)
-    batches = iter(_loader(Workers(), list, schedule, 0, 50, alone, None))
+    steps = [[Part(0, 1.0, [number])] for number in range(50)]
+    batches = iter(_loader(Workers(), list, steps, 2))
     Path("workers").write_text(f"{next(batches)[0]} {next(batches)[0]}")
     os.kill(os.getpid(), 9)
 """

@@ -1,6 +1,7 @@
 """Argument types that several verbs share, and checks without expensive imports."""
 
 import math
+import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -82,6 +83,11 @@ def chosen_rig(rig: str, image_hw: tuple[int, int] | None) -> "RigPlan":
         if name not in CAMERA_NAMES:
             raise InputError(f"{rig}: 123D has no camera {name!r}; it has {', '.join(CAMERA_NAMES)}")
     return plan
+
+
+def rank() -> int | None:
+    """Return this process' number among those that torchrun started; None if it did not start this one."""
+    return int(os.environ["RANK"]) if "TORCHELASTIC_RUN_ID" in os.environ else None
 
 
 def check_out_folder(folder: Path | None) -> None:

@@ -12,6 +12,7 @@ from typing import Any
 import tyro
 
 import foredrive
+from foredrive.cli.arguments import rank
 from foredrive.cli.bench import bench
 from foredrive.cli.check import check
 from foredrive.cli.compare import compare
@@ -80,6 +81,8 @@ DESCRIPTION = (
 )
 # OpenMP threads spin while they wait, which would take the cores from kernels and data workers.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+if rank() is not None:  # DDP warns in each process where it looked for unused parameters and found none
+    os.environ.setdefault("TORCH_CPP_LOG_LEVEL", "ERROR")
 
 EXIT_INPUT, EXIT_INTERRUPTED, EXIT_PIPE = 2, 130, 141
 DISK_ERRORS = {
@@ -163,7 +166,8 @@ def _end_interrupted() -> int:
 
 
 def _give_up(reason: str) -> int:
-    print(f"foredrive: {' '.join(reason.split())}", file=sys.stderr)
+    own = "foredrive" if rank() is None else f"foredrive (rank {rank()})"
+    print(f"{own}: {' '.join(reason.split())}", file=sys.stderr)
     return EXIT_INPUT
 
 

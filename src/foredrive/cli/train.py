@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from foredrive.cli.arguments import OptionalPath, Settings, SomePaths, check_out_folder, check_run
+from foredrive.cli.arguments import OptionalPath, Settings, SomePaths, check_out_folder, check_run, rank
 from foredrive.data.log_paths import find_all_logs
 from foredrive.errors import InputError
 from foredrive.lazy import importing
@@ -20,6 +20,7 @@ def train(
     start: OptionalPath = None,
     tasks: str = "",
     probe: bool = False,
+    strategy: Literal["ddp", "fsdp"] = "ddp",
     set: Settings = (),
 ) -> None:
     """Train a recipe on logs, or continue an interrupted run.
@@ -42,6 +43,9 @@ def train(
             imagined key frames.
         probe: Train the heads of --tasks on the frozen world model instead. Its volumes are computed once and
             kept.
+        strategy: How the processes that torchrun started, or the GPUs of this machine, share the training:
+            "ddp", each holds the whole model; "fsdp", each holds a shard of its weights, gradients and
+            optimizer state.
         set: Entries of the recipe to replace, such as finetune.schedule.lr=1e-3; `foredrive recipes RECIPE`
             prints all entries. With --tasks, tasks.weights.raster=2 and others for the heads; with
             --probe, tasks.schedule.steps=100 too (tasks/config.yaml in the run's folder has all).
@@ -51,6 +55,8 @@ def train(
         start = check_run(start)
     if probe and not tasks:
         raise InputError("--probe trains the heads of --tasks: name the tasks too")
+    if probe and rank() is not None:
+        raise InputError("--probe trains in one process: start it without torchrun")
     found = find_all_logs(logs)
 
     with importing():
@@ -70,9 +76,10 @@ def train(
     if probe and start is not None:
         run = probe_run(chosen, found, out, cache, start)
     else:
-        run = train_run(chosen, found, out, cache, start)
+        run = train_run(chosen, found, out, cache, start, strategy)
     if heads is not None and probe:
         train_heads(run, heads)
         print(f"trained heads of {tasks}: {out / TASKS}")
-    print(f"trained {run.recipe.name}: {run.weights}")
-    print(f"next: foredrive evaluate {out} --logs ...")
+    if not rank():
+        print(f"trained {run.recipe.name}: {run.weights}")
+        print(f"next: foredrive evaluate {out} --logs ...")

@@ -1,5 +1,8 @@
 """Run many jobs at once, in processes or on Ray; a job that fails does not stop the others.
 
+A job whose process dies is tried once more. In a pool of processes all jobs under way are lost with one
+process. Each of them is then tried alone, so that a job that kills its process takes no other along.
+
 An interruption reaches every worker. Each worker removes its unfinished files before the interruption is
 raised.
 
@@ -30,6 +33,8 @@ from foredrive.training.interrupts import start_fork_server
 LAST_WORDS_S = 60.0
 """Maximum time for Ray's tasks to remove their unfinished files, s."""
 
+_DEATHS_ON_RAY = ("WorkerCrashedError", "OutOfMemoryError", "NodeDiedError", "LocalRayletDiedError")
+"""Names of ray.exceptions that stand for the death of a task's process; Ray is slow to import."""
 _log = logging.getLogger(__name__)
 J = TypeVar("J")
 R = TypeVar("R")
@@ -47,16 +52,24 @@ def fan_out(
         workers: jobs at a time. On Ray it is the size of a cluster that is started here; a cluster that
             RAY_ADDRESS names is used as it is.
     """
-    waiting, running = deque(jobs), dict[Future[R], J]()
+    waiting, lost, running = deque(jobs), deque[J](), dict[Future[R], J]()
     if not jobs:
         return
     with (_on_ray if on_ray else _on_processes)(work, workers) as (submit, width):
-        while waiting or running:
-            while waiting and len(running) < width:
+        while waiting or lost or running:
+            alone = bool(lost) and not running
+            if alone:
+                job = lost.popleft()
+                running[submit(job)] = job
+            while waiting and not lost and not alone and len(running) < width:
                 job = waiting.popleft()
                 running[submit(job)] = job
             for future in wait(running, return_when=FIRST_COMPLETED).done:
-                yield running.pop(future), future.exception() or future.result()
+                job, error = running.pop(future), future.exception()
+                if isinstance(error, BrokenProcessPool) and not alone:
+                    lost.append(job)
+                else:
+                    yield job, error or future.result()
 
 
 def reason(name: str, error: BaseException) -> str:
@@ -70,8 +83,8 @@ def reason(name: str, error: BaseException) -> str:
         raise error
     if isinstance(error, InputError):
         return str(error)
-    if isinstance(error, BrokenProcessPool):
-        return "its process died, maybe for want of memory"
+    if isinstance(error, BrokenProcessPool) or type(error).__name__ in _DEATHS_ON_RAY:
+        return "its process died twice, maybe for want of memory"
     _log.warning("%s failed", name, exc_info=error)
     return f"{type(error).__name__}: {(str(error).splitlines() or [''])[-1]}"
 
@@ -143,7 +156,7 @@ def _on_ray(work: Callable[[J], R], workers: int) -> Iterator[tuple[Callable[[J]
     if started_here:
         cpus = None if "RAY_ADDRESS" in os.environ else workers
         ray.init(num_cpus=cpus, include_dashboard=False, log_to_driver=False, logging_level=logging.ERROR)
-    task: Any = ray.remote(num_cpus=1, max_retries=0)(_quietly)
+    task: Any = ray.remote(num_cpus=1, max_retries=1)(_quietly)  # only when its process dies
     refs = {}
 
     def submit(job: J) -> Future[R]:

@@ -3,7 +3,6 @@
 import contextlib
 import json
 import logging
-import os
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -32,8 +31,6 @@ LOCK = ".lock"
 """Lock file. The operating system holds the lock as long as its process lives, so that a killed process
 leaves the folder free.
 """
-_RANKS = ("RANK", "LOCAL_RANK", "SLURM_PROCID")
-"""Variables that number processes that train together; the first process holds the lock for all."""
 _log = logging.getLogger(__name__)
 
 
@@ -98,9 +95,6 @@ def held(folder: Path) -> Iterator[None]:
     Raises:
         InputError: another process writes to it.
     """
-    if any(os.environ.get(rank, "0") != "0" for rank in _RANKS):
-        yield
-        return
     make_folder(folder)
     lock = FileLock(folder / LOCK)
     try:

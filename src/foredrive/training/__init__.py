@@ -14,7 +14,8 @@ if TYPE_CHECKING:
     )
     from foredrive.training.ego_mlp_fit import EgoMLPFit, StatusDemonstrations, fit_ego_mlp, read_status
     from foredrive.training.fabric import make_fabric
-    from foredrive.training.loop import CONDITIONS, Schedule, read_metrics, train
+    from foredrive.training.loop import CONDITIONS, Schedule, train
+    from foredrive.training.metrics_log import read_metrics
     from foredrive.training.objective import NemoObjective, NemoStage, NemoWeights
     from foredrive.training.path_fit import PathDemonstrations, PathFit, fit_path
     from foredrive.training.rays import ImageRays, thinned_rays
@@ -53,7 +54,8 @@ __getattr__ = on_demand(
         "driveworld_objective": ("DriveWorldObjective", "DriveWorldStage", "DriveWorldWeights"),
         "ego_mlp_fit": ("EgoMLPFit", "StatusDemonstrations", "fit_ego_mlp", "read_status"),
         "fabric": ("make_fabric",),
-        "loop": ("CONDITIONS", "Schedule", "read_metrics", "train"),
+        "loop": ("CONDITIONS", "Schedule", "train"),
+        "metrics_log": ("read_metrics",),
         "objective": ("NemoObjective", "NemoStage", "NemoWeights"),
         "path_fit": ("PathDemonstrations", "PathFit", "fit_path"),
         "rays": ("ImageRays", "thinned_rays"),

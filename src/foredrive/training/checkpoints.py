@@ -12,22 +12,30 @@ from torch.optim import Optimizer
 
 from foredrive.errors import InputError
 from foredrive.files import atomic_path
+from foredrive.training.parts import placed_like, whole
 from foredrive.training.small_weights import full_precision
 
 MODEL, OPTIMIZER, PROGRESS = "model.safetensors", "optimizer.safetensors", "progress.json"
 
 
-def save_checkpoint(folder: Path, model: nn.Module, optimizer: Optimizer, step: int) -> Path:
+def save_checkpoint(
+    folder: Path, model: nn.Module, optimizer: Optimizer, step: int, *, writes: bool = True
+) -> Path:
     """Write `folder/step_N` and then remove older checkpoints.
 
     Exact resuming needs only the model's weights, the optimizer's tensors and the step number. Data order and
     random numbers follow from the seed and the step.
+
+    Where processes hold shards, all of them have to call this, and one writes. The checkpoint is the same as
+    that of one process.
     """
     final = folder / f"step_{step:07d}"
+    weights, (tensors, scalars) = whole_weights(model), _flatten_optimizer(optimizer)
+    if not writes:
+        return final
     with atomic_path(final) as temporary:
         temporary.mkdir()
-        save_weights(model, temporary / MODEL)
-        tensors, scalars = _flatten_optimizer(optimizer)
+        save_file(weights, temporary / MODEL)
         save_file(tensors, temporary / OPTIMIZER)
         (temporary / PROGRESS).write_text(json.dumps({"step": step, "optimizer": scalars}))
     for old in folder.glob("step_*"):
@@ -63,9 +71,14 @@ def load_checkpoint(path: Path, model: nn.Module, optimizer: Optimizer) -> int:
     return int(progress["step"])
 
 
+def whole_weights(model: nn.Module) -> dict[str, Tensor]:
+    """Return all parameters and buffers of a model by name; shards of several processes are put together."""
+    return {name: whole(tensor.detach()).contiguous() for name, tensor in model.state_dict().items()}
+
+
 def save_weights(model: nn.Module, path: Path) -> None:
     """Write all parameters and buffers of a model as safetensors."""
-    save_file({name: tensor.detach().contiguous() for name, tensor in model.state_dict().items()}, path)
+    save_file(whole_weights(model), path)
 
 
 def load_weights(model: nn.Module, path: Path, part: str = "") -> None:
@@ -89,13 +102,13 @@ def load_weights(model: nn.Module, path: Path, part: str = "") -> None:
     ]
     if wrong:
         raise InputError(f"{path}: weights of another architecture: {wrong[0]} ({len(wrong)} entries differ)")
-    model.load_state_dict(state)
+    model.load_state_dict({name: placed_like(value, own[name]) for name, value in state.items()})
 
 
 def _flatten_optimizer(optimizer: Optimizer) -> tuple[dict[str, Tensor], dict[str, Any]]:
     state = optimizer.state_dict()
     tensors = {
-        f"{index}.{name}": value.contiguous()
+        f"{index}.{name}": whole(value).contiguous()
         for index, entry in state["state"].items()
         for name, value in entry.items()
     }
@@ -114,8 +127,11 @@ def _restore_optimizer(optimizer: Optimizer, tensors: dict[str, Tensor], scalars
     ]
     if sizes[0] != sizes[1]:
         raise ValueError(f"whose optimizer has groups of {sizes[1]} parameters, not of {sizes[0]}")
+    parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
     state: dict[int, dict[str, Tensor]] = {}
     for key, value in tensors.items():
         index, name = key.split(".", 1)
-        state.setdefault(int(index), {})[name] = value
+        own = parameters[int(index)]
+        placed = placed_like(value, own) if value.shape == own.shape else value  # the count of steps is not
+        state.setdefault(int(index), {})[name] = placed
     optimizer.load_state_dict({"state": state, "param_groups": scalars["param_groups"]})

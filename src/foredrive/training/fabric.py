@@ -1,12 +1,27 @@
-"""Fabric for training, with mixed precision that does not change the inputs."""
+"""Fabric for training: devices, processes, and mixed precision that does not change the inputs."""
 
-from typing import Any, Literal
+import warnings
+from datetime import timedelta
+from typing import TYPE_CHECKING, Any, Literal
 
 import torch
 from lightning_fabric import Fabric
 from lightning_fabric.plugins import MixedPrecision
+from lightning_fabric.strategies import DDPStrategy, ModelParallelStrategy
+from torch import nn
 
+from foredrive.errors import InputError
 from foredrive.ops.precision import computes_bfloat16
+from foredrive.training.processes import processes_of_launcher
+
+if TYPE_CHECKING:
+    from torch.distributed.device_mesh import DeviceMesh
+
+Sharing = Literal["ddp", "fsdp"]
+"""How processes share a training. DDP: each holds all weights and the optimizer's state. FSDP: each holds a
+shard of both, and has all weights only during a step."""
+PATIENCE = timedelta(hours=2)
+"""Time that the other processes wait for what the first does alone, such as the fit of path features."""
 
 
 class _Autocast(MixedPrecision):
@@ -19,15 +34,55 @@ class _Autocast(MixedPrecision):
         return data
 
 
-def make_fabric(precision: Literal["32-true", "bf16-mixed"]) -> Fabric:
-    """Return a Fabric on all available GPUs or the CPU.
+def make_fabric(precision: Literal["32-true", "bf16-mixed"], sharing: Sharing | None = None) -> Fabric:
+    """Return a Fabric on a GPU, or on the CPU if there is none.
 
-    "bf16-mixed" uses bfloat16 autocast, unless that would be slower.
+    Args:
+        precision: "bf16-mixed" uses bfloat16 autocast, unless that would be slower.
+        sharing: use the processes that torchrun started, or all GPUs of this machine. None: one device.
+
+    Raises:
+        InputError: torchrun started more processes than this machine has GPUs.
     """
     device = "cuda" if torch.cuda.is_available() else "cpu"
+    gpus = torch.cuda.device_count()
+    machines, per_machine = (processes_of_launcher() or (1, max(1, gpus))) if sharing else (1, 1)
+    if 0 < gpus < per_machine:
+        raise InputError(
+            f"{per_machine} processes, but this machine has {gpus} GPUs: --nproc-per-node {gpus}"
+        )
     mixed = precision == "bf16-mixed" and computes_bfloat16(device)
     return Fabric(
         accelerator=device,
-        devices="auto" if device == "cuda" else 1,
+        devices=per_machine,
+        num_nodes=machines,
+        strategy=_strategy(sharing, machines * per_machine) if sharing else "auto",
         plugins=[_Autocast("bf16-mixed", device)] if mixed else [],
     )
+
+
+def _strategy(sharing: Sharing, processes: int) -> DDPStrategy | ModelParallelStrategy | str:
+    if processes == 1:
+        return "auto"
+    if sharing == "fsdp":
+        return ModelParallelStrategy(
+            _shard, data_parallel_size=processes, tensor_parallel_size=1, timeout=PATIENCE
+        )
+    warnings.filterwarnings("ignore", message="Grad strides do not match bucket view strides")
+    warnings.filterwarnings("ignore", message="`broadcast_buffers` is deprecated")
+    # Heads have no loss in batches without their truth, so some parameters may be unused in a step.
+    return DDPStrategy(find_unused_parameters=True, broadcast_buffers=False, timeout=PATIENCE)
+
+
+def _shard(module: nn.Module, mesh: "DeviceMesh") -> nn.Module:
+    """Shard all parameters of a module over the processes (FSDP2), after making them those of the first.
+
+    The module is one group: its parts are called by other methods than `forward`, before which FSDP would not
+    gather their weights.
+    """
+    from torch.distributed.fsdp import fully_shard
+
+    for tensor in (*module.parameters(), *module.buffers()):
+        torch.distributed.broadcast(tensor.data, src=0)
+    fully_shard(module, mesh=mesh["data_parallel"])  # changes the module itself
+    return module

@@ -4,7 +4,6 @@ import contextlib
 import itertools
 import json
 import math
-import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,15 +16,19 @@ from torch import Tensor, nn
 from torch.utils.data import DataLoader, Dataset
 
 from foredrive.errors import InputError
-from foredrive.files import atomic_path, naming
+from foredrive.files import atomic_path
 from foredrive.training.checkpoints import latest_checkpoint, load_checkpoint, save_checkpoint
 from foredrive.training.interrupts import end_with_parent, hold_interrupts, start_fork_server
+from foredrive.training.metrics_log import MetricsLog
 from foredrive.training.one_cycle import OneCycle
 from foredrive.training.parameter_groups import parameter_groups
+from foredrive.training.parts import Part, StepBuffers, mean_losses, parts_of_step
+from foredrive.training.processes import gathered, naming_lost_processes
 from foredrive.training.ranges import check_at_least
 
 if TYPE_CHECKING:  # slow to import, and not needed to read schedules and metrics
     from lightning_fabric import Fabric
+    from lightning_fabric.wrappers import _FabricModule
 
 CHECKPOINTS = "checkpoints"
 
@@ -43,7 +46,7 @@ class Batch(Protocol):
 B = TypeVar("B", bound=Batch)
 
 CONDITIONS = "conditions.json"
-"""File of a stage: device, precision and number of processes."""
+"""File of a stage: device, precision, number of processes and parts of a step."""
 
 
 @dataclass(frozen=True)
@@ -52,12 +55,12 @@ class Schedule:
 
     With `one_cycle`, learning rate and momentum follow this policy instead.
 
-    The length is given in steps, or in epochs over the data when `steps` is None. Steps, here and in
-    `warmup_steps`, are those of one process: N processes consume N batches at a time and so take 1/N as many.
+    The length is given in steps, or in epochs over the data when `steps` is None. A step is the same on any
+    number of processes: they share its items.
     """
 
     batch_size: int
-    """Items of one process in one step."""
+    """Items of one step, of all processes together."""
     lr: float
     steps: int | None = None
     epochs: int | None = None
@@ -70,29 +73,50 @@ class Schedule:
     workers: int = 0
     seed: int = 0
     one_cycle: OneCycle | None = None
+    accumulate: int = 1
+    """Parts of a step, one after the other or in several processes; their gradients are accumulated. More
+    processes make more parts. The same number of parts gives the same losses, on any number of processes."""
 
     def __post_init__(self) -> None:
         """Check the numbers' ranges. No steps are allowed: then nothing is trained."""
         check_at_least(self, batch_size=1, lr=0, steps=0, epochs=0, weight_decay=0, warmup_steps=0)
         check_at_least(self, final_lr_fraction=0, clip_grad_norm=0, checkpoint_every=1, workers=0)
+        check_at_least(self, accumulate=1)
 
-    def total_steps(self, items: int, processes: int = 1) -> int:
-        """Return the number of steps over a data set of `items` that several processes share."""
+    def parts(self, processes: int, begun_with: int = 1) -> int:
+        """Return the number of parts of a step.
+
+        Args:
+            processes: number of processes. Each computes at least one part.
+            begun_with: parts with which the training began.
+
+        Raises:
+            InputError: a step has fewer items.
+        """
+        count = max(self.accumulate, processes, begun_with)
+        if count > self.batch_size:
+            raise InputError(
+                f"{count} processes or parts share the {self.batch_size} items of a step: "
+                f"set batch_size in the recipe's schedules to {count} or more"
+            )
+        return count
+
+    def total_steps(self, items: int) -> int:
+        """Return the number of steps over a data set of `items`."""
         if (self.steps is None) == (self.epochs is None):
             raise InputError("a schedule has either steps or epochs")
         if self.steps is not None:
-            return math.ceil(self.steps / processes)
+            return self.steps
         assert self.epochs is not None
-        return self.epochs * math.ceil(items / (self.batch_size * processes))
+        return self.epochs * math.ceil(items / self.batch_size)
 
-    def lr_at(self, step: int, total: int, processes: int = 1) -> float:
+    def lr_at(self, step: int, total: int) -> float:
         """Return the learning rate of step `step` (from 0) of `total`."""
         if self.one_cycle is not None:
             return self.lr * self.one_cycle.at(step, total)[0]
-        warmup = math.ceil(self.warmup_steps / processes)
-        if step < warmup:
-            return self.lr * (step + 1) / warmup
-        progress = (step - warmup) / max(total - warmup, 1)
+        if step < self.warmup_steps:
+            return self.lr * (step + 1) / self.warmup_steps
+        progress = (step - self.warmup_steps) / max(total - self.warmup_steps, 1)
         floor = self.final_lr_fraction
         return self.lr * (floor + (1 - floor) * 0.5 * (1 + math.cos(math.pi * progress)))
 
@@ -132,33 +156,55 @@ def train(
 
     With `weights`, items are drawn in proportion to them.
 
+    Several processes share the parts of each step, and the first one writes. All end after the same step.
+
     Raises:
-        InputError: the data set is empty, or a loss is not finite (the message names the batch).
+        InputError: the data set is empty, a loss is not finite (the message names the batch), there are more
+            processes than items of a step, or another process has ended.
     """
     items = len(dataset)  # type: ignore[arg-type]
     if items == 0:
         raise InputError("there is nothing to train on: the data set is empty")
-    total = schedule.total_steps(items, fabric.world_size)
-    groups = parameter_groups(objective, schedule.weight_decay)
-    optimizer = torch.optim.AdamW(groups, lr=schedule.lr, fused=True)
-    model, fabric_optimizer = fabric.setup(objective, optimizer)
-    found = latest_checkpoint(folder / CHECKPOINTS)
-    done = load_checkpoint(found, objective, optimizer) if found is not None else 0
-    if done >= total:
-        return
-    if fabric.is_global_zero:
-        write_conditions(folder, fabric)
-    loader: Any = fabric.setup_dataloaders(
-        _loader(dataset, collate, schedule, done, total, fabric, weights), use_distributed_sampler=False
-    )
-    model.train()
-    with step_counter(
-        folder, objective, optimizer, done, total, schedule.checkpoint_every, writes=fabric.is_global_zero
-    ) as end_step:
-        for step, example in enumerate(loader, start=done):
-            losses = _one_step(model, fabric_optimizer, example, step, total, schedule, fabric)
-            if end_step(losses, f"loss {losses['loss'].item():.3f}"):
-                break
+    total = schedule.total_steps(items)
+    parts = schedule.parts(fabric.world_size, _parts_before(folder))
+    with naming_lost_processes(fabric):
+        model = fabric.setup_module(objective)
+        groups = parameter_groups(objective, schedule.weight_decay)
+        optimizer = torch.optim.AdamW(groups, lr=schedule.lr, fused=True)
+        found = fabric.broadcast(latest_checkpoint(folder / CHECKPOINTS))
+        done = load_checkpoint(found, objective, optimizer) if found is not None else 0
+        if done >= total:
+            return
+        if fabric.is_global_zero:
+            write_conditions(folder, fabric, parts)
+        batches = itertools.islice(
+            batch_order(items, schedule.batch_size, schedule.seed, weights), done, total
+        )
+        mine = [parts_of_step(batch, parts)[fabric.global_rank :: fabric.world_size] for batch in batches]
+        loader: Any = fabric.setup_dataloaders(
+            _loader(dataset, collate, mine, schedule.workers), use_distributed_sampler=False
+        )
+        model.train()
+        steps = _Steps(
+            model, fabric.setup_optimizers(optimizer), StepBuffers(objective), schedule, total, fabric
+        )
+        examples = iter(loader)
+        with step_counter(
+            folder,
+            objective,
+            optimizer,
+            done,
+            total,
+            schedule.checkpoint_every,
+            writes=fabric.is_global_zero,
+            agreed=lambda stop: any(gathered(stop, fabric)),
+        ) as end_step:
+            for step, own in enumerate(mine, start=done):
+                losses = steps.take(step, own, examples)
+                if end_step(losses, f"loss {losses['loss'].item():.3f}"):
+                    break
+        if step + 1 < total:  # another process was interrupted
+            raise KeyboardInterrupt
 
 
 @contextlib.contextmanager
@@ -171,6 +217,7 @@ def step_counter(
     checkpoint_every: int,
     *,
     writes: bool = True,
+    agreed: Callable[[bool], bool] = bool,
 ) -> Iterator[Callable[[dict[str, Tensor], str], bool]]:
     """Count, log, show and save the steps of a training. Ctrl-C takes effect at the end of a step.
 
@@ -181,6 +228,7 @@ def step_counter(
         total: number of steps at the end.
         checkpoint_every: steps between checkpoints. The last step has one too.
         writes: whether this process writes files and shows progress.
+        agreed: returns whether any process has to stop, from whether this one has to.
 
     Yields:
         a function to call after each step with its losses and a note to show. It returns whether to stop.
@@ -200,74 +248,98 @@ def step_counter(
             if log is not None:
                 log.add(step, losses)
             progress.update(task, completed=step, note=note)
-            last = step == total or interrupted()
-            if writes and (last or step % checkpoint_every == 0):
-                save_checkpoint(folder / CHECKPOINTS, model, optimizer, step)
+            last = agreed(interrupted()) or step == total
+            if last or step % checkpoint_every == 0:
+                save_checkpoint(folder / CHECKPOINTS, model, optimizer, step, writes=writes)
             return last
 
         yield end_step
 
 
 def _loader(
-    dataset: Dataset[B],
-    collate: Callable[[list[B]], B],
-    schedule: Schedule,
-    done: int,
-    total: int,
-    fabric: "Fabric",
-    weights: Float[Tensor, "N"] | None,
+    dataset: Dataset[B], collate: Callable[[list[B]], B], steps: Sequence[Sequence[Part]], workers: int
 ) -> DataLoader[B]:
-    """Return batches from step `done` on. Each rank takes its share of every global batch."""
-    items = len(dataset)  # type: ignore[arg-type]
-    batches = itertools.islice(
-        batch_order(items, schedule.batch_size * fabric.world_size, schedule.seed, weights), done, total
-    )
-    if schedule.workers:
+    """Return the parts of steps, one after the other."""
+    if workers:
         start_fork_server(preload=type(dataset).__module__)
-    mine = [_rank_part(batch, fabric.global_rank, fabric.world_size) for batch in batches]
     return DataLoader(
         dataset,
-        batch_sampler=mine,
+        batch_sampler=[part.items for parts in steps for part in parts],
         collate_fn=collate,
-        num_workers=schedule.workers,
+        num_workers=workers,
         worker_init_fn=end_with_parent,
         # Forked workers crash if numba's threads have run in the parent.
-        multiprocessing_context="forkserver" if schedule.workers else None,
+        multiprocessing_context="forkserver" if workers else None,
     )
 
 
-def _rank_part(batch: Sequence[int], rank: int, world_size: int) -> list[int]:
-    """Return a rank's part of a batch. Every rank gets at least one item, also of a short last batch."""
-    padded = list(itertools.islice(itertools.cycle(batch), max(len(batch), world_size)))
-    return padded[rank::world_size]
+@dataclass(frozen=True)
+class _Steps:
+    """What a step needs besides its data."""
+
+    model: "_FabricModule"
+    optimizer: Any
+    buffers: StepBuffers
+    schedule: Schedule
+    total: int
+    fabric: "Fabric"
+
+    def take(self, step: int, parts: Sequence[Part], examples: Iterator[Batch]) -> dict[str, Tensor]:
+        """Take a step from this process' parts; return the losses of all processes, by name."""
+        self._set_rates(step)
+        self.optimizer.zero_grad(set_to_none=True)
+        in_parts = parts[0].weight < 1
+        if in_parts:
+            self.buffers.begin()
+        found, complaint = [], None
+        for part in parts:
+            last = part is parts[-1]
+            example = next(examples)
+            with self.fabric.no_backward_sync(self.model, enabled=not last):
+                losses = self._backward(step, part, example)
+            if in_parts:
+                self.buffers.end_part(part.weight, last=last)
+            found.append((part.weight, {name: value.item() for name, value in losses.items()}))
+            complaint = complaint or _not_finite(losses, step, f"the batch {', '.join(example.key)}")
+        if in_parts:
+            self.buffers.end(processes=self.fabric.world_size)
+        everywhere = gathered((found, complaint), self.fabric)
+        for _, told in everywhere:
+            if told is not None:
+                raise InputError(told)
+        self.fabric.clip_gradients(
+            self.model, self.optimizer, max_norm=self.schedule.clip_grad_norm, error_if_nonfinite=False
+        )
+        self.optimizer.step()
+        means = mean_losses(itertools.chain.from_iterable(losses for losses, _ in everywhere))
+        return {name: torch.tensor(value, dtype=torch.float64) for name, value in means.items()}
+
+    def _set_rates(self, step: int) -> None:
+        one_cycle = self.schedule.one_cycle
+        for group in self.optimizer.param_groups:
+            group["lr"] = self.schedule.lr_at(step, self.total)
+            if one_cycle is not None:
+                group["betas"] = (one_cycle.at(step, self.total)[1], group["betas"][1])
+
+    def _backward(self, step: int, part: Part, example: Batch) -> dict[str, Tensor]:
+        """Return the losses of a part; add its share to the gradients."""
+        seed = (self.schedule.seed * 1_000_003 + step) * 1009 + part.number
+        torch.manual_seed(seed)  # dropout
+        losses: dict[str, Tensor] = self.model(example, torch.Generator().manual_seed(seed))
+        # The gradients of processes are averaged.
+        self.fabric.backward(losses["loss"] * (part.weight * self.fabric.world_size))
+        return {name: value.detach() for name, value in losses.items()}
 
 
-def _one_step(
-    model: nn.Module,
-    optimizer: Any,
-    example: Batch,
-    step: int,
-    total: int,
-    schedule: Schedule,
-    fabric: "Fabric",
-) -> dict[str, Tensor]:
-    for group in optimizer.param_groups:
-        group["lr"] = schedule.lr_at(step, total, fabric.world_size)
-        if schedule.one_cycle is not None:
-            group["betas"] = (schedule.one_cycle.at(step, total)[1], group["betas"][1])
-    seed = (schedule.seed * 1_000_003 + step) * 1009 + fabric.global_rank
-    torch.manual_seed(seed)  # dropout
-    losses: dict[str, Tensor] = model(example, torch.Generator().manual_seed(seed))
-    check_finite(losses, step, f"the batch {', '.join(example.key)}")
-    optimizer.zero_grad(set_to_none=True)
-    fabric.backward(losses["loss"])
-    fabric.clip_gradients(model, optimizer, max_norm=schedule.clip_grad_norm, error_if_nonfinite=False)
-    optimizer.step()
-    return {name: value.detach() for name, value in losses.items()}
+def _parts_before(folder: Path) -> int:
+    """Return the number of parts with which a training began; 1 if it has not begun."""
+    with contextlib.suppress(OSError, ValueError, LookupError, TypeError):
+        return int(json.loads((folder / CONDITIONS).read_text())["parts"])
+    return 1
 
 
-def write_conditions(folder: Path, fabric: "Fabric") -> None:
-    """Write device, precision and number of processes of a training to `folder/conditions.json`.
+def write_conditions(folder: Path, fabric: "Fabric", parts: int) -> None:
+    """Write device, precision, number of processes and parts of a step to `folder/conditions.json`.
 
     The precision is the one that was used: bfloat16 is not where it would be slower.
     """
@@ -278,6 +350,7 @@ def write_conditions(folder: Path, fabric: "Fabric") -> None:
         "device": device,
         "precision": str(dtype).removeprefix("torch."),
         "processes": fabric.world_size,
+        "parts": parts,
     }
     with atomic_path(folder / CONDITIONS) as temporary:
         temporary.write_text(json.dumps(conditions) + "\n")
@@ -289,40 +362,14 @@ def check_finite(losses: dict[str, Tensor], step: int, source: str) -> None:
     Raises:
         InputError: a loss is not finite. The message names `source`, the data of the step.
     """
-    if not bool(torch.stack([value.detach() for value in losses.values()]).isfinite().all()):
-        values = ", ".join(f"{name} = {value.item():g}" for name, value in losses.items())
-        raise InputError(f"step {step + 1}: loss is not finite ({values}) on {source}")
+    complaint = _not_finite(losses, step, source)
+    if complaint is not None:
+        raise InputError(complaint)
 
 
-class MetricsLog:
-    """The file metrics.jsonl, one line per step. Lines after the resumed step are dropped.
-
-    `step_s` is the time since the step before, `cpu_s` this process's CPU time, without its data workers.
-    """
-
-    def __init__(self, path: Path, done: int) -> None:
-        kept = [line for line in read_metrics(path) if line["step"] <= done]
-        with atomic_path(path) as temporary:
-            temporary.write_text("".join(json.dumps(line) + "\n" for line in kept))
-        self.path = path
-        self._wall_s, self._cpu_s = time.perf_counter(), time.process_time()
-
-    def add(self, step: int, losses: dict[str, Tensor]) -> None:
-        """Write the losses of one finished step."""
-        wall_s, cpu_s = time.perf_counter(), time.process_time()
-        took = {"step_s": round(wall_s - self._wall_s, 4), "cpu_s": round(cpu_s - self._cpu_s, 4)}
-        line = {"step": step, **{name: value.item() for name, value in losses.items()}}
-        with naming(self.path), self.path.open("a") as file:
-            file.write(json.dumps({**line, **took}) + "\n")
-        self._wall_s, self._cpu_s = wall_s, cpu_s
-
-
-def read_metrics(path: Path) -> list[dict[str, float | int]]:
-    """Return the lines of a metrics file. A last line cut off by a crash is left out."""
-    lines = []
-    for text in path.read_text().splitlines() if path.exists() else []:
-        try:
-            lines.append(json.loads(text))
-        except json.JSONDecodeError:
-            break
-    return lines
+def _not_finite(losses: dict[str, Tensor], step: int, source: str) -> str | None:
+    """Return what is wrong with the losses of a step; None if they are finite."""
+    if bool(torch.stack([value.detach() for value in losses.values()]).isfinite().all()):
+        return None
+    values = ", ".join(f"{name} = {value.item():g}" for name, value in losses.items())
+    return f"step {step + 1}: loss is not finite ({values}) on {source}"

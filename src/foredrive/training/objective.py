@@ -63,8 +63,9 @@ class NemoStage:
     imagine: bool = True
     """Imagine the future key frames and supervise them. If False, only the present is trained."""
     imagined_items: int | None = None
-    """Number of items of each batch that are imagined, with their pasts and futures. The other items train
-    the present alone, at a fraction of the cost. None: all items, as in the paper."""
+    """Number of items of each batch, or of each part of a step, that are imagined, with their pasts and
+    futures. The other items train the present alone, at a fraction of the cost. None: all items, as in the
+    paper."""
     imagine_every: int = 1
     """Imagine in one step of so many, from the first step on. The steps between train the present alone."""
     past_gradient: bool = True

@@ -35,7 +35,7 @@ from foredrive.runs.rebuild.calibration_check import calibration_findings
 from foredrive.scene import Clip
 from foredrive.sensors.lidar_estimation import estimate_lidar
 from foredrive.training.checkpoints import load_weights, save_weights
-from foredrive.training.loop import read_metrics
+from foredrive.training.metrics_log import read_metrics
 from foredrive.training.rebuilding import SensorViews, rebuild
 
 VEHICLE = "vehicle.json"

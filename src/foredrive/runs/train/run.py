@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 from jaxtyping import Float
+from safetensors.torch import save_file
 
 from foredrive.data import ClipDataset, LogPath, collate
 from foredrive.data.batches import stack_records
@@ -29,9 +30,13 @@ from foredrive.runs.train.task_priors import PRIORS, TASKS, check_truth, save_pr
 from foredrive.scene.task_truth import TaskTruth
 from foredrive.training import CONDITIONS, PathFit, fit_path, load_weights, save_weights, train
 from foredrive.training.balancing import balanced_weights, manoeuvres
+from foredrive.training.checkpoints import whole_weights
+from foredrive.training.processes import entered_by_first, naming_lost_processes
 
 if TYPE_CHECKING:
     from lightning_fabric import Fabric
+
+    from foredrive.training.fabric import Sharing
 
 STAGES = ("pretrain", "finetune")
 PATH = "path"
@@ -97,6 +102,7 @@ def train_run(
     folder: Path,
     cache_dir: Path | None = None,
     start: Path | None = None,
+    sharing: "Sharing" = "ddp",
 ) -> Run:
     """Pre-train, fine-tune, then fit the path features of the planner, if the recipe says so.
 
@@ -111,11 +117,12 @@ def train_run(
             this run skips that stage. It allows pre-training on many logs and fine-tuning on few, or with
             another planner. If the recipe's `transfer` is "frozen", its last world model and its heads are
             used instead.
+        sharing: how the processes that torchrun started share the training, if there are several.
 
     Raises:
         InputError: `folder` holds a run of another recipe, other logs or another start; another process
             trains it; a log cannot be read; no log has the truth of a task; `start` has not finished
-            pre-training, or its world model has other sizes.
+            pre-training, or its world model has other sizes; another process of this training has ended.
     """
     from foredrive.training import make_fabric  # the import takes seconds; opening a run does without
 
@@ -134,9 +141,10 @@ def train_run(
     pretrained = None if start is None or kept is not None else _pretrained(start)
     if recipe.planner.attends or recipe.tasks is not None:
         build_agent(recipe, fetch=False)  # heads that do not fit the rest must not create a run
-    with claim.claimed():  # only now: logs that cannot be read must not create a run
-        fabric = make_fabric(recipe.precision)
-        fabric.launch()
+    fabric = make_fabric(recipe.precision, sharing)
+    fabric.launch()
+    # Only now: logs that cannot be read must not create a run.
+    with naming_lost_processes(fabric), entered_by_first(claim.claimed(), fabric):
         if fabric.is_global_zero and not (folder / RIGS).is_file():
             rigs = trained_rigs(run.logs, dataset.camera_names)
             if rigs is not None:
@@ -189,8 +197,8 @@ def _train_stages(run: Run, dataset: ClipDataset, start: "Path | Run | None", fa
     _train_stage(run, "finetune", agent, dataset, fabric)
     if recipe.tasks is not None and fabric.is_global_zero and not (folder / TASKS / PRIORS).is_file():
         save_priors(fit_task_priors(_truths(dataset)), folder / TASKS / PRIORS)
-    if recipe.path is not None:
-        _fit_path(run, recipe.path, agent, fabric)
+    if recipe.path is not None and agent.planner.path is not None:
+        _fit_path(run, recipe.path, fabric)
 
 
 def fresh_agent(recipe: Recipe) -> PlanningAgent[Any]:
@@ -211,13 +219,13 @@ def load_pretrained(agent: PlanningAgent[Any], recipe: Recipe, weights: Path) ->
         load_weights(agent.get_submodule(name), weights, name)
 
 
-def _fit_path(run: Run, fit: PathFit, agent: PlanningAgent[Any], fabric: "Fabric") -> None:
-    """Fit the planner's path features on the final volume."""
-    path, weights = agent.planner.path, run.folder / PATH / WEIGHTS
-    if path is None or weights.is_file():
-        return
-    if fabric.is_global_zero:
-        agent.to(fabric.device)
+def _fit_path(run: Run, fit: PathFit, fabric: "Fabric") -> None:
+    """Fit the planner's path features on the final volume, in the first process."""
+    weights = run.folder / PATH / WEIGHTS
+    if fabric.is_global_zero and not weights.is_file():
+        agent = load_agent(run).to(fabric.device)
+        path = agent.planner.path
+        assert path is not None
         demonstrations = sample_paths(agent, run.logs, run.recipe.clips, run.cache_dir, fit.stride_s)
         fit_path(path, demonstrations, fit, run.recipe.finetune.schedule.seed)
         with atomic_path(weights) as temporary:
@@ -261,11 +269,11 @@ def _train_stage(
             if drawn is not None and items is not dataset:
                 raise InputError("balance draws single clips: it does not go with heads that carry agents on")
             train(objective, items, join, schedule, run.folder / name, fabric, drawn)
+        trained = whole_weights(agent)
         if fabric.is_global_zero:
             with atomic_path(weights) as temporary:
-                save_weights(agent, temporary)
+                save_file(trained, temporary)
         fabric.barrier()
-    load_weights(agent, weights)
 
 
 def _balanced(dataset: ClipDataset, power: float) -> Float[torch.Tensor, "N"]:

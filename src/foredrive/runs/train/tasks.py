@@ -96,16 +96,12 @@ def train_heads(run: Run, heads: TaskHeadsRecipe) -> TrainedHeads:
         class_weight = semantic_weights(example.truth for example in dataset.examples)
         voxels = run.recipe.clips.voxels
         objective = ProbeObjective(fresh, voxels, heads.weights, class_weight, heads.mirror)
-        fabric = make_fabric("32-true")
-        fabric.launch()
         keys = [key for example in dataset.examples for key in example.key]
         items, join, schedule = in_sequences(dataset, keys, collate_kept, heads.heads, heads.schedule)
-        train(objective, items, join, schedule, folder, fabric)
-        if fabric.is_global_zero:
-            save_priors(fit_task_priors(example.truth for example in dataset.examples), folder / PRIORS)
-            with atomic_path(folder / WEIGHTS) as temporary:
-                save_weights(fresh, temporary)
-        fabric.barrier()
+        train(objective, items, join, schedule, folder, make_fabric("32-true"))
+        save_priors(fit_task_priors(example.truth for example in dataset.examples), folder / PRIORS)
+        with atomic_path(folder / WEIGHTS) as temporary:
+            save_weights(fresh, temporary)
     found = load_heads(run)
     assert found is not None
     return found
