@@ -10,8 +10,9 @@ from pathlib import Path
 
 from benchmarks.common.detection import DetectionSample, DetectionSplit, compare_losses, detection_samples
 from foredrive.evaluation.bench import Benchmark
-from foredrive.runs.demo import camera_rig, roof_lidar
 from foredrive.scene import VoxelSpec
+from foredrive.sensors.rigs import camera_rig
+from foredrive.sensors.vehicle import roof_lidar
 from foredrive.towns.recorder import LabelOptions, record
 from foredrive.towns.sensing.capture import SensorSuite
 

@@ -15,7 +15,7 @@ MOUNTED = {
 LINK = re.compile(r"(?<=\]\()([^)\s#]+)")
 """Matches the target of a link, without its anchor."""
 WEB = re.compile(r"[a-z]+:")
-OUTSIDE = re.compile(r"(?:\.\./)*((?:src|tests|benchmarks)/[^)\s#]+|NOTICE|LICENSE)")
+OUTSIDE = re.compile(r"(?:\.\./)*((?:src|tests|benchmarks|examples)/[^)\s#]+|NOTICE|LICENSE)")
 """Matches a link to code, results or a licence, from a page of any depth."""
 RESULTS = "benchmarks/results/"
 FOLDERS = {"benchmarks/results": "benchmarks/index.md", "src/foredrive": "api/index.md"}

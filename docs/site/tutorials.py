@@ -1,5 +1,6 @@
 """The tutorials: notebooks in docs/tutorials (py:percent), executed when the site is built."""
 
+import base64
 import os
 import sys
 import tempfile
@@ -12,6 +13,7 @@ from nbclient import NotebookClient
 from nbconvert.exporters import MarkdownExporter
 
 MINUTES_AT_MOST = 5
+WEBP = "image/webp"
 PLAIN_TEXT = "import os\n\nos.environ |= {'TERM': 'dumb'}\nos.environ.pop('FORCE_COLOR', None)"
 """Run before each notebook: kernels ask programs for colours and for bars that move."""
 
@@ -30,12 +32,26 @@ def tutorial_pages(folder: Path, root: Path) -> Mapping[str, str | bytes]:
         notebook = jupytext.read(file)
         if os.environ.get("TUTORIALS") != "no":
             _execute(notebook, root)
+        films = _films_in_files(notebook, file.stem)
         text, resources = MarkdownExporter().from_notebook_node(
             notebook, {"output_files_dir": f"{file.stem}_files"}
         )
         pages[f"tutorials/{file.stem}.md"] = text
         pages |= {f"tutorials/{name}": picture for name, picture in resources["outputs"].items()}
+        pages |= {f"tutorials/{name}": film for name, film in films.items()}
     return pages
+
+
+def _films_in_files(notebook: nbformat.NotebookNode, stem: str) -> dict[str, bytes]:
+    """Replace outputs of animated WebP, which the exporter leaves out, by pictures; return their files."""
+    films = {}
+    for cell in notebook.cells:
+        for output in cell.get("outputs", []):
+            if (encoded := output.get("data", {}).pop(WEBP, None)) is not None:
+                name = f"{stem}_files/film_{len(films)}.webp"
+                films[name] = base64.b64decode(encoded)
+                output["data"]["text/html"] = f'<img src="{name}" alt="film">'
+    return films
 
 
 def _execute(notebook: nbformat.NotebookNode, root: Path) -> None:

@@ -25,6 +25,7 @@ def test_a_file_holds_what_viewers_look_for(tmp_path: Path) -> None:
     lines = header.decode("ascii").splitlines()
     comments = [line for line in lines if line.startswith("comment ")]
     assert "antialiased" in comments[0]
+    assert lines[2] == "element vertex 2"  # SIBR's viewer takes the number from there
     assert [line for line in lines if line not in comments] == [
         *("ply", "format binary_little_endian 1.0", "element vertex 2"),
         *(f"property float {name}" for name in NAMES),

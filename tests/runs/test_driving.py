@@ -107,6 +107,14 @@ def test_a_route_whose_id_cannot_name_a_file_is_refused(name: str, routes: Path,
     assert [path.name for path in tmp_path.rglob("*")] == ["deep", "routes.xml"]
 
 
+def test_only_some_routes_of_a_set_are_driven(suite: DriveSuite) -> None:
+    assert [job.route for job in changed(suite, only=("b",), repetitions=2).jobs()] == ["b", "b"]
+    assert changed(suite, only=("b",)).noted()["only"] == ["b"]
+    assert "only" not in suite.noted()  # folders of suites from before there was the field are continued
+    with pytest.raises(InputError, match="has no route c; it has a, b"):
+        changed(suite, only=("c",)).jobs()
+
+
 def test_every_drive_is_kept_scored_and_logged(driven: SuiteResult, out: Path) -> None:
     assert list(driven.drives) == [job_of("a", 0), job_of("b", 0)]
     assert (driven.skipped, driven.broken) == (0, {})

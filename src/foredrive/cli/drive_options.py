@@ -98,6 +98,7 @@ class InTowns:
             scenarios.
         routes: town05-short, town05-short-10, town05-long, longest6, or a CARLA route file; for DAgger
             demonstrations in the other towns training-short and training-long.
+        only: Ids of the routes to drive; by default all of the set.
         repetitions: Number of drives of each route, each with other traffic.
         seed: Seed of the town, the traffic and all noise in the first repetition; each repetition adds one.
         conditions: clear, morning, overcast, dusk, night, rain, night_rain, fog or night_fog; any: drawn for
@@ -116,6 +117,7 @@ class InTowns:
     """
 
     routes: Annotated[str, tyro.conf.arg(metavar="SET|FILE.xml")] = "town05-short"
+    only: Annotated[tuple[str, ...], tyro.conf.arg(metavar="ROUTE [ROUTE ...]")] = ()
     carla: Annotated[str | None, tyro.conf.arg(metavar="HOST:PORT")] = None
     repetitions: int = 1
     seed: int = 0
@@ -157,6 +159,7 @@ class InTowns:
             "other_rig": self.other_rig,
             "vehicles": self.vehicles,
             "people": self.people,
+            "only": self.only,
         }
         if self.carla is not None:
             from foredrive.runs.drive.in_carla import CarlaRoutes

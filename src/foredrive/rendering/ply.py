@@ -44,4 +44,6 @@ def write_ply(gaussians: Gaussians, path: Path) -> None:
     table = torch.cat(columns, dim=-1).numpy()
     rows = unstructured_to_structured(table, np.dtype([(name, "<f4") for name in _COLUMNS]))
     with atomic_path(path) as temporary:
-        PlyData([PlyElement.describe(rows, "vertex")], byte_order="<", comments=_COMMENTS).write(temporary)
+        # The first published viewer reads the number of splats from the third line, so comments come later.
+        vertices = PlyElement.describe(rows, "vertex", comments=_COMMENTS)
+        PlyData([vertices], byte_order="<").write(temporary)

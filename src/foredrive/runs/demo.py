@@ -1,92 +1,261 @@
-"""The demo without its pictures: record towns, train, evaluate on the held-out town."""
+"""The demo without its pictures: once round the loop, each step in its own part of one folder.
+
+The folder is a 123D data root. What an earlier call has finished is not done again.
+"""
 
 import dataclasses
-from collections.abc import Callable
+import os
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from foredrive.data import LogPath
+from foredrive.data.clip_list import write_clip_list
+from foredrive.errors import InputError
+from foredrive.evaluation.summary import Summary, read_summary
 from foredrive.recipes.config import Recipe, rescheduled
 from foredrive.recipes.nemo import nemo_tiny
-from foredrive.runs.evaluate.run import evaluate_run
-from foredrive.runs.train.run import Run, train_run
-from foredrive.sensors.rigs import camera_rig
-from foredrive.sensors.vehicle import roof_lidar
-from foredrive.towns.recorder import LabelOptions, record, split_of
-from foredrive.towns.sensing.capture import SensorSuite
+from foredrive.recipes.rebuilding import RebuildRecipe, gaussians_tiny, rescheduled_recipe
+from foredrive.runs.drive.agents import CORRIDOR, EXPERT, REPLAY
+from foredrive.runs.drive.in_rebuilt import RebuiltRoutes
+from foredrive.runs.drive.in_towns import TownRoutes
+from foredrive.runs.drive.recording import log_of, record_drives
+from foredrive.runs.drive.suite import DriveSuite, drive_suite
+from foredrive.runs.evaluate.run import ExamplePrediction, evaluate_run, predict_examples
+from foredrive.runs.folder import SUMMARY
+from foredrive.runs.rebuild.reconstruct import Reconstruction
+from foredrive.runs.rebuild.reconstruct import reconstruct as rebuild_log
+from foredrive.runs.search.indexing import index_logs
+from foredrive.runs.search.searching import ask, listed_clips
+from foredrive.runs.search.towers import EMBEDDED
+from foredrive.runs.shipped import run_folder
+from foredrive.runs.train.run import Run, open_run, train_run
+from foredrive.scene.conditions import BackgroundTraffic
+from foredrive.search.find import Hit
+from foredrive.search.index import FrameIndex
+from foredrive.search.query import Query
+from foredrive.sensors.rigs import SURROUND
+from foredrive.simulation.drive_record import DriveRecord
+from foredrive.simulation.threats import Threat
+from foredrive.towns.campaign import DrivePlan
 
-RATE_HZ = 2.0
-"""Recording rate: one key frame every 0.5 s."""
+SHIPPED = "embedded:nemo_town"
+"""The model that sees and drives."""
+ROUTES = "town05-short"
+MODEL = "model"
+"""Key of the shipped model's drive, beside that of the expert."""
+MET_BY = (REPLAY, CORRIDOR)
+"""Agents that meet the car in the way: one that drives on as recorded, one that looks at the lidar."""
+TEXTS = ("a pedestrian close by", "a street at night")
+HITS = 3
+STRIDE_S = 0.5
+BEFORE_S, AFTER_S = 2.0, 4.0
+"""The part of a log around a hit that goes into the list of clips, s."""
 
 
 @dataclass(frozen=True)
 class DemoSize:
-    """The amount of recorded data and of training."""
+    """The amount of recorded data and of computing."""
 
+    train: tuple[DrivePlan, ...]
+    test: DrivePlan
+    """The drive through the town that no model was trained on."""
+    rebuilt: DrivePlan
+    """The drive that is rebuilt."""
     recipe: Recipe
-    train_drives: tuple[tuple[str, int], ...]
-    """Town and seed of each drive."""
-    test_drives: tuple[tuple[str, int], ...]
-    train_s: float
-    test_s: float
+    rebuilding: RebuildRecipe
+    route: str
+    """Id of the route of `ROUTES` that is driven."""
+    examples: int
+    """Number of moments that models are asked about for the pictures."""
+
+
+@dataclass(frozen=True)
+class Demo:
+    """A demo and its folder."""
+
+    size: DemoSize
+    out: Path
+
+    @property
+    def plans(self) -> tuple[DrivePlan, ...]:
+        """Return all drives to record, each once."""
+        return tuple(dict.fromkeys((*self.size.train, self.size.test, self.size.rebuilt)))
+
+
+@dataclass(frozen=True)
+class Judged:
+    """A model on the held-out drive."""
+
+    run: Run
+    logs: list[LogPath]
+    summary: Summary
+    examples: list[ExamplePrediction]
+
+
+@dataclass(frozen=True)
+class Driven:
+    """One drive, in the folder of its suite."""
+
+    folder: Path
+    name: str
+    record: DriveRecord
+
+
+@dataclass(frozen=True)
+class Rebuilt:
+    """A rebuilt drive, and what became of each agent that met a car in it."""
+
+    scene: Reconstruction
+    met: dict[str, Driven]
+
+
+@dataclass(frozen=True)
+class Found:
+    """The best hits of a query."""
+
+    query: Query
+    hits: list[Hit]
 
 
 def full_demo() -> DemoSize:
-    """Return the full size, minutes on two cores: two training towns, Town05 held out."""
+    """Return the full size: minutes on two cores."""
     return DemoSize(
+        train=tuple(
+            plan_drive(*drive, seconds=60.0)
+            for drive in (("Town01", 1), ("Town03", 1), ("Town10HD", 1, "night"))
+        ),
+        test=plan_drive("Town05", 1, seconds=30.0),
+        rebuilt=plan_drive("Town05", 7, seconds=8.0, rate_hz=10.0),
         recipe=nemo_tiny(),
-        train_drives=(("Town01", 1), ("Town03", 1), ("Town01", 2), ("Town03", 2)),
-        test_drives=(("Town05", 1), ("Town05", 2)),
-        train_s=60.0,
-        test_s=30.0,
+        rebuilding=dataclasses.replace(
+            rescheduled_recipe(gaussians_tiny(), steps=300), image_hw=SURROUND.image_hw
+        ),
+        route="28",
+        examples=4,
     )
 
 
 def quick_demo() -> DemoSize:
-    """Return a size with the same steps that takes about a minute. The model learns nothing useful."""
-    recipe, few = nemo_tiny(), {"batch_size": 2, "warmup_steps": 2}
+    """Return a size with the same steps that takes about a minute. Its model learns nothing useful."""
+    tiny, few = nemo_tiny(), {"batch_size": 2, "warmup_steps": 2}
+    test = plan_drive("Town05", 7, seconds=6.0, rate_hz=4.0)
     return DemoSize(
+        train=(plan_drive("Town02", 1, "night", seconds=6.0),),
+        test=test,
+        rebuilt=test,
         recipe=dataclasses.replace(
-            recipe,
+            tiny,
             name="nemo_tiny (quick)",
-            pretrain=None if recipe.pretrain is None else rescheduled(recipe.pretrain, steps=12, **few),
-            finetune=rescheduled(recipe.finetune, steps=6, **few),
+            pretrain=None if tiny.pretrain is None else rescheduled(tiny.pretrain, steps=12, **few),
+            finetune=rescheduled(tiny.finetune, steps=6, **few),
         ),
-        train_drives=(("Town01", 1), ("Town02", 1)),
-        test_drives=(("Town05", 1),),
-        train_s=6.0,
-        test_s=6.0,
+        rebuilding=dataclasses.replace(rescheduled_recipe(gaussians_tiny(), steps=20), image_hw=(72, 128)),
+        route="4",
+        examples=1,
     )
 
 
-def run_demo(size: DemoSize, out: Path, say: Callable[[str], None]) -> tuple[Run, list[LogPath]]:
-    """Record, pre-train, fine-tune and evaluate; continue where an earlier call stopped.
+def plan_drive(
+    town: str, seed: int, conditions: str | None = None, *, seconds: float, rate_hz: float = 2.0
+) -> DrivePlan:
+    """Return a drive to record, with the usual traffic."""
+    traffic = BackgroundTraffic()
+    return DrivePlan(town, seed, conditions, traffic.vehicles, traffic.pedestrians, seconds, rate_hz)
 
-    Returns:
-        the run, whose folder is `out/run`, and the held-out logs.
+
+def record_logs(demo: Demo) -> list[LogPath]:
+    """Record the drives of the demo."""
+    cores = len(os.sched_getaffinity(0))
+    recorded = record_drives(demo.plans, demo.out, SURROUND, workers=min(2, cores))
+    if recorded.failed:
+        raise InputError("; ".join(f"{plan.log_name}: {why}" for plan, why in recorded.failed.items()))
+    return list(recorded.logs.values())
+
+
+def judge_shipped(demo: Demo) -> Judged:
+    """Evaluate the shipped model on the held-out drive."""
+    return _judged(open_run(_shipped(demo)), demo, demo.out / "seen")
+
+
+def train_tiny(demo: Demo) -> Judged:
+    """Train a model from scratch on the training drives, and evaluate it on the held-out one."""
+    run = train_run(demo.size.recipe, _logs(demo, demo.size.train), demo.out / "learned")
+    return _judged(run, demo, run.folder)
+
+
+def drive_route(demo: Demo) -> dict[str, Driven]:
+    """Drive a route of the held-out town: the shipped model, and the expert without sensors."""
+    source = TownRoutes(ROUTES, only=(demo.size.route,))
+    return {
+        MODEL: _driven(DriveSuite(str(_shipped(demo).absolute()), source), demo.out / "driven"),
+        EXPERT: _driven(DriveSuite(EXPERT, source, sensors=False), demo.out / "driven_expert"),
+    }
+
+
+def rebuild_drive(demo: Demo) -> Rebuilt:
+    """Rebuild a drive, and put a car in the way of some agents that drive in it."""
+    (log,) = _logs(demo, [demo.size.rebuilt])
+    folder = demo.out / "rebuilt"
+    scene = rebuild_log(demo.size.rebuilding, log, folder)
+    source = RebuiltRoutes(str(folder.absolute()), threats=(Threat.STATIONARY,))
+    return Rebuilt(scene, {agent: _driven(DriveSuite(agent, source), folder / agent) for agent in MET_BY})
+
+
+def search_logs(demo: Demo) -> list[Found]:
+    """Index all recorded drives, and search them by text and by the best hit of the first text.
+
+    The hits of the texts are written as a list of clips, which `foredrive train` takes as logs.
     """
-    say("1/4 recording the training towns and Town05, which is held out")
-    train_logs = [_drive(town, seed, size.train_s, out) for town, seed in size.train_drives]
-    test_logs = [_drive(town, seed, size.test_s, out) for town, seed in size.test_drives]
-    say("2/4 training NeMo: self-supervised pre-training, then planning")
-    run = train_run(size.recipe, train_logs, out / "run")
-    say("3/4 evaluating on Town05")
-    evaluate_run(run, test_logs, run.folder)
-    return run, test_logs
+    index = FrameIndex(str(_indexed(demo)))
+    found = [_found(index, Query(text=text, modality="joint", top=HITS)) for text in TEXTS]
+    hits = [hit for each in found for hit in each.hits]
+    if hits:
+        best = hits[0].row
+        found.append(_found(index, Query(like=f"{best.log}@{best.t_s:.2f}s/{best.view}", top=HITS)))
+        write_clip_list(demo.out / "clips.json", listed_clips(hits, BEFORE_S, AFTER_S))
+    return found
 
 
-def _drive(town: str, seed: int, seconds: float, out: Path) -> LogPath:
-    folder = out / "towns"
-    there = folder / "logs" / split_of(town) / f"{town}_seed{seed}"
-    if there.is_dir():  # a log is either complete or absent
-        return LogPath(there, folder / "maps")
-    sensors = SensorSuite(camera_rig(nemo_tiny().clips.image_hw), roof_lidar())
-    return record(
-        town,
-        seconds,
-        seed,
-        folder,
-        rate_hz=RATE_HZ,
-        sensors=sensors,
-        labels=LabelOptions(occupancy=None, visibility=False, captions=False),
-    )
+def _indexed(demo: Demo) -> Path:
+    folder = demo.out / "search"
+    done = index_logs(_logs(demo, demo.plans), str(folder), EMBEDDED, STRIDE_S, workers=1)
+    if done.failed:
+        raise InputError("; ".join(f"{log}: {why}" for log, why in done.failed.items()))
+    return folder
+
+
+def _found(index: FrameIndex, query: Query) -> Found:
+    return Found(query, ask(index, query).hits)
+
+
+def _shipped(demo: Demo) -> Path:
+    return run_folder(Path(SHIPPED), demo.out)
+
+
+def _logs(demo: Demo, plans: Sequence[DrivePlan]) -> list[LogPath]:
+    """Return recorded logs.
+
+    Raises:
+        InputError: one is missing.
+    """
+    logs = [log_of(plan, demo.out) for plan in plans]
+    for log in logs:
+        if not log.folder.is_dir():
+            raise InputError(f"{log.folder}: was not recorded")
+    return logs
+
+
+def _judged(run: Run, demo: Demo, out: Path) -> Judged:
+    logs = _logs(demo, [demo.size.test])
+    if not (out / SUMMARY).is_file():
+        evaluate_run(run, logs, out)
+    return Judged(run, logs, read_summary(out / SUMMARY), predict_examples(run, logs, demo.size.examples))
+
+
+def _driven(suite: DriveSuite, out: Path) -> Driven:
+    result = drive_suite(suite, out)
+    if result.broken:
+        raise InputError("; ".join(result.broken.values()))
+    ((job, record),) = result.drives.items()
+    return Driven(out, job.name, record)

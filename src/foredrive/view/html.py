@@ -97,6 +97,14 @@ def picture(
     return Picture(f"data:image/{kind};base64,{data}", caption, image.shape[1], image.shape[0])
 
 
+def stored_film(path: Path, caption: str) -> Picture:
+    """Encode an animated WebP from a file, which browsers show as a picture, for a page."""
+    with Image.open(path) as film:
+        width, height = film.size
+    data = base64.b64encode(path.read_bytes()).decode()
+    return Picture(f"data:image/webp;base64,{data}", caption, width, height)
+
+
 def inline_svg(figure: Figure) -> Markup:
     """Draw a figure as SVG with the page's width, font and text colour; matplotlib escapes its texts."""
     with rc_context({"svg.fonttype": "none", "svg.hashsalt": "foredrive"}):

@@ -39,6 +39,8 @@ class RouteSource:
     """Whether a run may drive with a rig that it was not trained with."""
     vehicles: int = BackgroundTraffic.vehicles
     people: int = BackgroundTraffic.pedestrians
+    only: tuple[str, ...] = ()
+    """Ids of the routes to drive; empty: all."""
 
     def __post_init__(self) -> None:
         if self.repetitions < 1:
@@ -48,9 +50,11 @@ class RouteSource:
             raise InputError(f"unknown conditions {self.conditions}; the conditions are {there_are}")
 
     def noted(self) -> Mapping[str, object]:
-        """Return the fields. Those of the cameras are left out for the usual rig."""
+        """Return the fields. Those of the cameras are left out for the usual rig, `only` if it is empty."""
         fields = dataclasses.asdict(self)
         rig = fields.pop("rig")
+        if not self.only:
+            del fields["only"]
         if not self.other_rig:
             del fields["other_rig"]
         other = {} if self.rig.cameras == SURROUND.cameras else {"cameras": rig["cameras"]}
@@ -61,8 +65,11 @@ class RouteSource:
         inputs_of(agent)
         if not self.other_rig:
             check_rig_of(agent, self.rig)
-        routes = load_route_set(self.routes)
-        return [job_of(route.id, n) for n in range(self.repetitions) for route in routes]
+        ids = [route.id for route in load_route_set(self.routes)]
+        for name in self.only:
+            if name not in ids:
+                raise InputError(f"{self.routes} has no route {name}; it has {', '.join(ids)}")
+        return [job_of(name, n) for n in range(self.repetitions) for name in self.only or ids]
 
     def route_of(self, job: DriveJob) -> DriveRoute:
         """Return the route of a drive, snapped to the lanes."""

@@ -1,0 +1,96 @@
+"""The report of the demo: one self-contained page whose table of contents is the loop."""
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from markupsafe import Markup
+
+from foredrive.runs.demo import Demo
+from foredrive.runs.fan_out import reason
+from foredrive.view.html import MetricTile, Picture, Provenance, write_page
+from foredrive.view.table import Table
+
+
+@dataclass(frozen=True)
+class Block:
+    """A part of a section; what it lacks is left out."""
+
+    title: str = ""
+    text: str = ""
+    tiles: Sequence[MetricTile] = ()
+    drawings: Sequence[Markup] = ()
+    """Inline SVG; two stand side by side, the first one narrow."""
+    figures: Sequence[Picture] = ()
+    columns: Literal["one", "two", "three"] = "one"
+    """Number of figures side by side on a wide screen."""
+    table: Table | None = None
+
+
+@dataclass(frozen=True)
+class Section:
+    """What came out of one step."""
+
+    result: str
+    """The outcome in one line, for the loop."""
+    cover: Picture | None
+    """A small picture, for the loop."""
+    blocks: Sequence[Block]
+
+
+@dataclass(frozen=True)
+class Step:
+    """A step of the demo: what it is about, and the function that does it and shows what came out."""
+
+    title: str
+    doing: str
+    """What it does, in one line, for the terminal."""
+    about: str
+    """What a reader should know of it."""
+    commands: Sequence[str]
+    """Commands that do the same with other data."""
+    work: Callable[[Demo], Section]
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """A step that was done, or failed."""
+
+    step: Step
+    seconds: float
+    section: Section | None
+    failure: str = ""
+    """Why it failed, in one line."""
+
+
+def do_steps(steps: Sequence[Step], demo: Demo, say: Callable[[str], None]) -> list[Outcome]:
+    """Do all steps; one that fails does not stop the others.
+
+    Raises:
+        OSError: the disk is full or cannot be written.
+    """
+    outcomes = []
+    for number, step in enumerate(steps, 1):
+        say(f"{number}/{len(steps)} {step.doing}")
+        began, section, failure = time.perf_counter(), None, ""
+        try:
+            section = step.work(demo)
+        except Exception as error:
+            failure = reason(step.title, error)
+            say(f"{step.title} failed: {failure}")
+        outcomes.append(Outcome(step, time.perf_counter() - began, section, failure))
+    return outcomes
+
+
+def write_demo_report(path: Path, outcomes: Sequence[Outcome], provenance: Provenance) -> None:
+    """Write the page."""
+    write_page(
+        path,
+        "demo_report.html.j2",
+        title="Once round the loop",
+        provenance=provenance,
+        outcomes=outcomes,
+        minutes=sum(outcome.seconds for outcome in outcomes) / 60,
+    )
