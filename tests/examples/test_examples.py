@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 import torch
 import yaml
-from conftest import EXAMPLES, AgentInput, Camera, Cameras, EgoStatus, SensorConfig, TrajectorySampling
+from navsim_records import AgentInput, Camera, Cameras, EgoStatus, SensorConfig, TrajectorySampling
 
 from foredrive.runs import Run, load_agent
 from foredrive.scene import Command, Trajectory
 
+EXAMPLES = Path(__file__).parents[2] / "examples"
 Loader = Callable[[str], ModuleType]
 LOOKS_DEG = {"f0": 0, "l0": 55, "r0": -55, "l1": 110, "r1": -110, "b0": 180, "l2": 140, "r2": -140}
 STEP_M, TURN_RAD = 2.0, 0.1
