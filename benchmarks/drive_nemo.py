@@ -1,10 +1,10 @@
 """Closed-loop driving on Town05: `foredrive bench drive-nemo`, days on two cores; `--arms` measures some.
 
 Demonstrations with the rig of `nemo_drive_tele` are driven in the training towns in all weathers: first by
-the disturbed expert, then in rounds of DAgger by the student of the round before. NeMo starts from the
-pre-training that `nemo-ablation` shares; its rig, surround cameras, is another. Every arm learns from the
-demonstrations and drives the same routes in the same traffic by day; ARM@long drives the long routes.
-Seeds are those of fine-tuning.
+the disturbed expert, then in rounds of DAgger by the student of the round before. NeMo starts from the world
+model that comes with the package, which was trained with surround cameras. Arms ending in a number learn from
+the rounds up to it; the others learn from all. All drive the same routes in the same traffic by day; ARM@long
+drives the long routes. Seeds are those of fine-tuning.
 
 All is kept in runs/drive_nemo, where an interrupted benchmark continues with the next drive, and
 `foredrive compare` reads the folders of drives.
@@ -17,8 +17,6 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.common.fine_tuning import CONFIG as PRETRAINING
-from benchmarks.common.fine_tuning import pretraining
 from benchmarks.common.study import HEADLINE, JUDGED_EVERY_S, seeded
 from foredrive.data import LogPath, find_all_logs
 from foredrive.errors import InputError
@@ -32,6 +30,7 @@ from foredrive.runs.drive.in_towns import TownRoutes
 from foredrive.runs.drive.recording import record_drives
 from foredrive.runs.drive.suite import DriveSuite, SuiteResult, drive_suite
 from foredrive.runs.evaluate.run import SUMMARY, evaluate_run
+from foredrive.runs.shipped import run_folder
 from foredrive.runs.train.run import Run, train_run
 from foredrive.sensors.rigs import DRIVING
 from foredrive.simulation.drive_record import DriveRecord
@@ -39,13 +38,13 @@ from foredrive.towns.campaign import Campaign, plan_drives
 
 FULL = "nemo_drive_tele"
 RECIPES = {
-    "pretrained": FULL,
     "present": f"{FULL}_present",
     "scorer": f"{FULL}_scorer",
     "scorer_present": f"{FULL}_scorer_present",
     "driveworld": "driveworld_drive_tele",
 }
-"""Pre-trained arms, DriveWorld on the demonstrations. The first four are 2 x 2: scorer, futures."""
+"""With the last round's arm of `FULL`, the first three are 2 x 2: scorer, futures."""
+PRETRAINED = Path("embedded:nemo_town")
 ROUNDS = 1
 """Rounds of DAgger after the demonstrations of the disturbed expert."""
 DEMONSTRATIONS = "training-short"
@@ -54,8 +53,8 @@ REPETITIONS = 1
 OPEN_LOOP = Campaign(("Town05",), seeds=tuple(range(1, 7)), seconds=60.0, rate_hz=2.0)
 CORES = len(os.sched_getaffinity(0))
 CONFIG = {
-    "recipes": {name: dataclasses.asdict(find_recipe(recipe)) for name, recipe in RECIPES.items()},
-    "pretraining": PRETRAINING,
+    "recipes": {name: dataclasses.asdict(find_recipe(name)) for name in (FULL, *RECIPES.values())},
+    "pretraining": str(PRETRAINED),
     "demonstrations": DEMONSTRATIONS,
     "rounds": ROUNDS,
     "routes": JUDGED,
@@ -102,7 +101,7 @@ def _student(rounds: int) -> Run:
 def trained(recipe: str, name: str, seed: int, rounds: int = ROUNDS, pretrained: bool = True) -> Run:
     """Return a run on the demonstrations of some rounds, and train what is missing."""
     chosen = seeded(find_recipe(recipe), seed)
-    start = pretraining() if pretrained and recipe.startswith("nemo") else None
+    start = run_folder(PRETRAINED) if pretrained and recipe.startswith("nemo") else None
     chosen = chosen if pretrained else dataclasses.replace(chosen, pretrain=None)
     folder = WORK / "runs" / f"{name}_seed{seed}"
     return train_run(chosen, demonstrations(rounds), folder, WORK / "cache", start)
@@ -171,16 +170,24 @@ def _open_loop(run: Run) -> dict[str, float]:
     return {name: float(value) for name, key in keys.items() if (value := summary.get(key)) is not None}
 
 
-def blind_mlp(seed: int, routes: str) -> Mapping[str, float]:
-    """Score the MLP that is told the same and sees nothing, fitted to the same demonstrations."""
-    run = trained(FULL, "pretrained", seed)
-    return scores(f"ego-mlp:{run.folder.absolute()}", f"blind_mlp_seed{seed}", routes)
+def blind_mlp(rounds: int) -> Arm:
+    """Return an arm of the MLP that is told the same as NeMo after a round, and sees nothing."""
+
+    def measure(seed: int, routes: str) -> Mapping[str, float]:
+        run = trained(FULL, f"dagger_{rounds}", seed, rounds)
+        return scores(f"ego-mlp:{run.folder.absolute()}", f"blind_mlp_{rounds}_seed{seed}", routes)
+
+    return measure
 
 
-def idm_by_sight(seed: int, routes: str) -> Mapping[str, float]:
-    """Score the rule-based agent with what a run tells of lights, lead vehicle and people."""
-    run = trained(FULL, "pretrained", seed)
-    return scores(f"{IDM_BY_SIGHT}{run.folder.absolute()}", f"idm_by_sight_seed{seed}", routes)
+def idm_by_sight(rounds: int) -> Arm:
+    """Return an arm of the rule-based agent with what NeMo tells of lights, lead vehicle and people."""
+
+    def measure(seed: int, routes: str) -> Mapping[str, float]:
+        run = trained(FULL, f"dagger_{rounds}", seed, rounds)
+        return scores(f"{IDM_BY_SIGHT}{run.folder.absolute()}", f"idm_by_sight_{rounds}_seed{seed}", routes)
+
+    return measure
 
 
 def without_training(agent: str, name: str) -> Arm:
@@ -192,11 +199,17 @@ ARMS: Mapping[str, Arm] = {
     "expert": without_training("expert", "expert"),
     "constant_velocity": without_training("constant-velocity", "constant_velocity"),
     "idm": without_training(IDM, "idm"),
-    **{f"dagger_{rounds}": learned(f"dagger_{rounds}", FULL, rounds) for rounds in range(ROUNDS)},
+    **{
+        f"{name}_{rounds}": arm
+        for rounds in range(ROUNDS + 1)
+        for name, arm in (
+            ("dagger", learned(f"dagger_{rounds}", FULL, rounds)),
+            ("blind_mlp", blind_mlp(rounds)),
+            ("idm_by_sight", idm_by_sight(rounds)),
+        )
+    },
     **{name: learned(name, recipe) for name, recipe in RECIPES.items()},
     "scratch": learned("scratch", FULL, pretrained=False),
-    "blind_mlp": blind_mlp,
-    "idm_by_sight": idm_by_sight,
 }
 
 

@@ -90,8 +90,8 @@ def test_an_interrupted_run_goes_on_to_the_same_bits(
     """Stopped at its first checkpoint, after three of six steps."""
     save = loop.save_checkpoint
 
-    def save_and_stop(*args):  # type: ignore[no-untyped-def]
-        save(*args)
+    def save_and_stop(*args, **kwargs):  # type: ignore[no-untyped-def]
+        save(*args, **kwargs)
         if args[-1] == 3:
             raise KeyboardInterrupt
 

@@ -118,8 +118,8 @@ def test_an_interrupted_run_comes_to_the_same(
 
     save = loop.save_checkpoint
 
-    def save_and_stop(*args):  # type: ignore[no-untyped-def]
-        save(*args)
+    def save_and_stop(*args, **kwargs):  # type: ignore[no-untyped-def]
+        save(*args, **kwargs)
         if args[-1] == 20:
             raise KeyboardInterrupt
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 import os
+import shutil
 import signal
 from collections.abc import Callable
 from pathlib import Path
@@ -115,6 +116,22 @@ def test_fine_tuning_may_start_from_another_runs_pretraining(trained: Run, tmp_p
     with pytest.raises(InputError, match="no pre-trained weights"):
         train_run(trained.recipe, trained.logs, tmp_path / "other", start=run.folder)
     assert not (tmp_path / "other").exists()
+
+
+def test_fine_tuning_may_start_from_the_last_weights_if_only_those_were_kept(
+    trained: Run, tmp_path: Path
+) -> None:
+    """As in the models that come with the package."""
+    kept = shutil.copytree(trained.folder, tmp_path / "kept", ignore=shutil.ignore_patterns("pretrain"))
+    slow = dataclasses.replace(trained.recipe.finetune.schedule, steps=1, warmup_steps=0, lr=1e-9)
+    recipe = dataclasses.replace(
+        trained.recipe, finetune=dataclasses.replace(trained.recipe.finetune, schedule=slow)
+    )
+    run = train_run(recipe, trained.logs, tmp_path / "more", start=kept)
+    mine, theirs = load_file(run.weights), load_file(trained.weights)
+    of_world = [name for name in theirs if name.startswith("world_model.") and name.endswith("weight")]
+    assert of_world
+    assert all(torch.allclose(mine[name], theirs[name], atol=1e-6) for name in of_world)
 
 
 def test_a_recipe_without_pretraining_starts_from_scratch(trained: Run, tmp_path: Path) -> None:

@@ -115,7 +115,8 @@ def train_run(
         cache_dir: folder for labels and shrunk images; by default in `folder`.
         start: a run folder. The part of its pre-trained world model that the recipe transfers is used, and
             this run skips that stage. It allows pre-training on many logs and fine-tuning on few, or with
-            another planner. If the recipe's `transfer` is "frozen", its last world model and its heads are
+            another planner. A model that comes with the package has its last weights only; these are then
+            used. If the recipe's `transfer` is "frozen", its last world model and its heads are
             used instead.
         sharing: how the processes that torchrun started share the training, if there are several.
 
@@ -234,10 +235,14 @@ def _fit_path(run: Run, fit: PathFit, fabric: "Fabric") -> None:
 
 
 def _pretrained(start: Path) -> Path:
+    """Return the pre-trained weights of a run, or its last ones if only those were kept."""
     weights = start / "pretrain" / WEIGHTS
-    if not weights.is_file():
+    if weights.is_file():
+        return weights
+    run = open_run(start)
+    if run.recipe.pretrain is None or run.start is not None:
         raise InputError(f"{start}: no pre-trained weights (no pretrain/{WEIGHTS})")
-    return weights
+    return run.weights
 
 
 def _kept(recipe: Recipe, start: Path | None) -> Run:
