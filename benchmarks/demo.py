@@ -1,0 +1,68 @@
+"""Run the demo as a new user does, in a folder of its own, and keep its figures: `foredrive bench demo`.
+
+README's tables of the demo are these figures. The folder, runs/demo_benchmark/COMMIT, keeps the report.
+"""
+
+import resource
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Mapping
+from pathlib import Path
+
+from benchmarks.common.study import PLANNERS, work_folder
+from foredrive.evaluation.bench import Benchmark
+from foredrive.evaluation.summary import read_summary
+from foredrive.metrics.protocols import PROTOCOLS
+from foredrive.training import read_metrics
+
+WORK = work_folder(Path("runs/demo_benchmark"))
+STAGES = ("pretrain", "finetune")
+
+
+def demo(seed: int, *options: str) -> Mapping[str, float]:
+    """Return computing time, memory and results of a demo from an empty folder."""
+    out = WORK / ("quick" if options else "full")
+    shutil.rmtree(out, ignore_errors=True)
+    before, began = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
+    command = [sys.executable, "-m", "foredrive", "demo", "--out", str(out), *options]
+    subprocess.run(command, check=True)
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    cpu_s = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    figures = {
+        "wall_min": (time.perf_counter() - began) / 60,
+        "cpu_min": cpu_s / 60,
+        "largest_process_gib": after.ru_maxrss / 2**20,
+    }
+    return figures | results(out)
+
+
+def results(out: Path) -> Mapping[str, float]:
+    """Return the figures of a finished demo."""
+    figures: dict[str, float] = {}
+    for part in ("seen", "learned"):
+        summary = read_summary(out / part / "summary.json")
+        keys = ["items", "failed", *(key for key in summary if key.startswith("vehicles.car_recall_20m"))]
+        keys += [key for key in summary if "iou_" in key and "threshold" not in key]
+        for planner in ("", *(f"{name}." for name in PLANNERS)):
+            for protocol in PROTOCOLS:
+                keys += [f"planning.{planner}{protocol}.{end}" for end in ("l2_avg_m", "collision_avg_pct")]
+        figures |= {f"{part}.{key}": summary[key] for key in keys if summary[key] is not None}
+    for stage in STAGES:
+        steps = read_metrics(out / "learned" / stage / "metrics.jsonl")
+        figures[f"learned.{stage}.steps"] = len(steps)
+        figures[f"learned.{stage}.min"] = sum(float(step["step_s"]) for step in steps) / 60
+    for part in ("driven", "driven_expert"):
+        summary = read_summary(out / part / "summary.json")
+        figures |= {f"{part}.{key}": summary[key] for key in ("driving_score_1_0", "completion")}
+    rebuilt = read_summary(out / "rebuilt" / "summary.json")
+    figures |= {f"rebuilt.{key}": rebuilt[key] for key in ("psnr_db", "nearest.psnr_db", "minutes")}
+    return figures
+
+
+BENCHMARK = Benchmark(
+    question="What does the demo take, and what comes out of it?",
+    arms={"full": demo, "quick": lambda seed: demo(seed, "--quick")},
+    seeds=(0,),
+)
