@@ -15,6 +15,7 @@ from pathlib import Path
 
 from torch.utils.data import DataLoader
 
+from benchmarks.common.process_tree import tree_use
 from foredrive.data import ClipDataset, collate, find_logs
 from foredrive.evaluation.bench import Benchmark
 from foredrive.recipes import find_recipe
@@ -54,7 +55,7 @@ def _measure(dataset: ClipDataset) -> dict[str, float]:
     started = time.perf_counter()
     for batch in _batches(dataset):
         loaded += len(batch.key)
-        memory_mib.append((loaded, _memory_mib()))
+        memory_mib.append((loaded, tree_use(os.getpid()).memory_mib))
         if loaded >= CLIPS:
             break
     took_s = time.perf_counter() - started
@@ -80,36 +81,6 @@ def _batches(dataset: ClipDataset) -> Iterator[Example]:
     )
     for _ in itertools.count():
         yield from loader
-
-
-def _memory_mib() -> float:
-    """Return the memory of this process and all its descendants, MiB."""
-    parents = {}
-    for status in Path("/proc").glob("[0-9]*/stat"):
-        try:
-            fields = status.read_text().rpartition(")")[2].split()
-        except OSError:  # the process has ended
-            continue
-        parents[int(status.parent.name)] = int(fields[1])
-    family = {os.getpid()}
-    while more := {pid for pid, parent in parents.items() if parent in family} - family:
-        family |= more
-    return sum(_resident_mib(pid) for pid in family)
-
-
-def _resident_mib(pid: int) -> float:
-    """Return a process's memory without pages of files, swapped out or not, MiB; shared pages count in parts.
-
-    The parts make the sum over processes equal to the machine's use. Workers share the modules of the process
-    that they are forked from. A worker that writes to such a page gets its own copy. That is growth, although
-    the memory of each single process (RssAnon) does not change.
-    """
-    try:
-        lines = Path(f"/proc/{pid}/smaps_rollup").read_text().splitlines()
-    except OSError:
-        return 0.0
-    held = {line.split(":")[0]: int(line.split()[1]) for line in lines[1:]}
-    return (held["Pss_Anon"] + held["Pss_Shmem"] + held["SwapPss"]) / 1024
 
 
 BENCHMARK = Benchmark(

@@ -65,6 +65,16 @@ def test_the_page_is_served_until_it_is_closed(log: LogPath) -> None:
     pytest.fail("it still listens after 10 s")
 
 
+def test_a_frame_that_is_asked_for_too_late_is_not_drawn(log: LogPath) -> None:
+    viewer = Viewer(LogFrames(log, 96), "localhost", 0)
+    viewer.close()
+    while viewer.server._websock_server._server_thread.is_alive():
+        time.sleep(0.01)
+    viewer._drawn = -1
+    viewer._draw()  # as the slider's events that still wait do; the page's event loop is closed
+    assert viewer._drawn == -1
+
+
 def test_stepping_shows_what_was_sensed_then(viewer: Viewer) -> None:
     for index in (3, 20):
         viewer.show(index)

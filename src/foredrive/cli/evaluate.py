@@ -54,11 +54,7 @@ def evaluate(
 
     with importing():
         from foredrive.runs import evaluate_run, open_run, predict_examples
-
-    trained = open_run(run)
-    chosen = named or trained.logs
-    folder = out or run
-    result = evaluate_run(trained, chosen, folder, batch_size, results_files=write_results is not None)
+        from foredrive.runs.folder import held_for_results
 
     from rich.console import Console
 
@@ -66,12 +62,17 @@ def evaluate(
     from foredrive.view.run_report import report_on_run, write_run_report
     from foredrive.view.summary_tables import print_summary
 
-    summary = read_summary(folder / "summary.json")
-    print_summary(summary, Console(), trained.recipe.name)
-    predictions = predict_examples(trained, chosen, examples)
-    report = report_on_run(trained, chosen, summary, predictions, result.failures)
-    write_run_report(folder / "report.html", report)
-    print(f"wrote {folder / 'summary.json'} and {folder / 'report.html'}")
+    trained = open_run(run)
+    chosen = named or trained.logs
+    folder = out or run
+    with held_for_results(folder):
+        result = evaluate_run(trained, chosen, folder, batch_size, results_files=write_results is not None)
+        summary = read_summary(folder / "summary.json")
+        print_summary(summary, Console(), trained.recipe.name)
+        predictions = predict_examples(trained, chosen, examples)
+        report = report_on_run(trained, chosen, summary, predictions, result.failures)
+        write_run_report(folder / "report.html", report)
+        print(f"wrote {folder / 'summary.json'} and {folder / 'report.html'}")
     if write_results is not None:
         print(
             f"wrote {folder / 'results'}; next: foredrive score {folder / 'results'}/… --truth LOGS --task …"
@@ -85,10 +86,11 @@ def _evaluate_gap(run: Path, rebuilt: Path, out: Path) -> None:
 
         from foredrive.runs import open_run
         from foredrive.runs.evaluate.real_to_sim_gap import GAP, measure_gap
+        from foredrive.runs.folder import held_for_results
         from foredrive.view.gap_table import gap_table
         from foredrive.view.table import print_table
 
-    with Progress() as progress:
+    with held_for_results(out), Progress() as progress:
         bar = progress.add_task("real and rendered")
         figures = measure_gap(
             open_run(run), rebuilt, out, lambda done, of: progress.update(bar, completed=done, total=of)

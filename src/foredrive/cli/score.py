@@ -66,13 +66,17 @@ def score(
     from rich.console import Console
 
     from foredrive.evaluation.detections.score import ScoreConfig
+    from foredrive.runs.folder import held_for_results
     from foredrive.runs.score.run import FRAMES, SUMMARY, score_detections
     from foredrive.view.score_report import REPORT, score_table, write_score_report
     from foredrive.view.table import print_table
 
     config = ScoreConfig(background_rate=background_rate, k=k)
-    scored, figures = score_detections(results, truth, out, against=against, family=family, config=config)
-    write_score_report(out / REPORT, f"{results.name} and the truth, {truth.name}", scored, figures, worst)
+    with held_for_results(out):
+        scored, figures = score_detections(results, truth, out, against=against, family=family, config=config)
+        write_score_report(
+            out / REPORT, f"{results.name} and the truth, {truth.name}", scored, figures, worst
+        )
     print_table(score_table(figures), Console())
     print(f"wrote {out / SUMMARY}, {out / REPORT} and {out / FRAMES}")
 
@@ -80,13 +84,15 @@ def score(
 def _score_task(task: Task, results: Path, truth: Path, out: Path, poses: Path | None) -> None:
     from rich.console import Console
 
+    from foredrive.runs.folder import held_for_results
     from foredrive.runs.score.run import SUMMARY
     from foredrive.runs.score.tasks import score_task
     from foredrive.view.score_report import REPORT
     from foredrive.view.table import print_table
     from foredrive.view.task_report import task_tables, write_task_report
 
-    figures = score_task(task, results, truth, out, poses)
-    write_task_report(out / REPORT, f"{results.name} and the truth, {truth.name}", figures)
+    with held_for_results(out):
+        figures = score_task(task, results, truth, out, poses)
+        write_task_report(out / REPORT, f"{results.name} and the truth, {truth.name}", figures)
     print_table(task_tables(figures)[0], Console())
     print(f"wrote {out / SUMMARY} and {out / REPORT}")

@@ -80,7 +80,7 @@ def view(
 
     with closing(Viewer(frames, host, port)) as viewer:
         viewer.show(index)
-        print(f"{frames.name} is at {viewer.url} until you press Ctrl-C")
+        print(f"{frames.name} is at {viewer.url} until you press Ctrl-C", flush=True)
         viewer.play()
 
 
@@ -104,5 +104,5 @@ def _serve_rebuilt(folder: Path, edits: Path | None, t_s: float | None, host: st
     with closing(RebuiltViewer(run, known, edits or folder / EDITS, host, port)) as viewer:
         if t_s is not None:
             viewer.show(t_s)
-        print(f"{folder.name} is at {viewer.url} until you press Ctrl-C")
+        print(f"{folder.name} is at {viewer.url} until you press Ctrl-C", flush=True)
         viewer.play()

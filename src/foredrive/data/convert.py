@@ -94,7 +94,7 @@ def convert_log(raw: RawLog, out: Path, tick: Callable[[], None] = lambda: None)
         path = log_path(metadata, out)
         if isinstance(raw.log, OwnLog):
             return raw.log.write(out, tick)
-        with atomic_path(path.folder) as temporary:
+        with atomic_path(path.folder, alone=True) as temporary:
             scratch = temporary.parent
             if raw.map is not None:
                 _write_map(raw.map, scratch, out)

@@ -180,7 +180,7 @@ class LogWriter:
         self._previous: Frame | None = None
 
     def __enter__(self) -> "LogWriter":
-        self._final = self._stack.enter_context(atomic_path(self.folder))
+        self._final = self._stack.enter_context(atomic_path(self.folder, alone=True))
         config = LogWriterConfig(
             camera_store_option="jpeg_binary",
             lidar_store_option="binary",

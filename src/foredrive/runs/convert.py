@@ -14,6 +14,7 @@ from foredrive.data.log_paths import LogPath
 from foredrive.data.raw.guard import reading_raw
 from foredrive.data.raw.raw_log import RawLog
 from foredrive.errors import InputError
+from foredrive.files import remove_abandoned
 from foredrive.runs.fan_out import fan_out, reason
 
 
@@ -60,6 +61,7 @@ def convert_all(
     for raw in find_raw_logs(source, dataset, topics):
         with reading_raw(raw.source):
             path = log_path(raw.log.get_log_metadata(), out)
+        remove_abandoned(path.folder.parent)  # also if all logs are there
         if not overwrite and _is_whole(path.folder):
             yield Conversion(path.name, path, kept=True)
         else:

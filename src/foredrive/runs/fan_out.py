@@ -28,7 +28,7 @@ import rich
 
 from foredrive.errors import InputError
 from foredrive.interrupts import LastingInterrupt
-from foredrive.training.interrupts import start_fork_server
+from foredrive.training.interrupts import end_with_parent, start_fork_server
 
 LAST_WORDS_S = 60.0
 """Maximum time for Ray's tasks to remove their unfinished files, s."""
@@ -125,7 +125,8 @@ class _Worker:
 def _start_worker(stop: Connection) -> None:
     """Set up a worker: stop when the parent closes its end of the pipe, not by Ctrl-C.
 
-    The worker removes its unfinished files when it stops.
+    The worker removes its unfinished files when it stops. The pool ends the workers, unless the parent was
+    killed: then a worker ends by itself.
     """
     rich.get_console().quiet = True  # the parent shows the progress
 
@@ -135,6 +136,7 @@ def _start_worker(stop: Connection) -> None:
 
     signal.signal(signal.SIGINT, _Worker.interrupt)
     threading.Thread(target=watch, daemon=True).start()
+    end_with_parent(0)
 
 
 def _unless_stopped(work: Callable[[J], R], job: J) -> R:

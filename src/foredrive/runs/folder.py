@@ -11,7 +11,7 @@ from filelock import FileLock, Timeout
 
 from foredrive.errors import InputError
 from foredrive.evaluation.provenance import COMMIT
-from foredrive.files import atomic_path, make_folder
+from foredrive.files import atomic_path, make_folder, remove_abandoned
 
 CONFIG, LOGS, LOG, WEIGHTS, SUMMARY = (
     "config.yaml",
@@ -31,6 +31,8 @@ LOCK = ".lock"
 """Lock file. The operating system holds the lock as long as its process lives, so that a killed process
 leaves the folder free.
 """
+RESULTS_LOCK = ".results.lock"
+"""Lock file of results that are written in one go. A run may be evaluated while it is being trained."""
 _log = logging.getLogger(__name__)
 
 
@@ -68,9 +70,10 @@ class RunFolder:
             InputError: it holds something else, or another process writes to it.
         """
         with held(self.path):
-            if not (begun := self.check()) or self.grows:
+            begun = self.check()
+            self._mark(begun)  # before the request: a folder with a request has begun
+            if not begun or self.grows:
                 self.write()
-            self._mark(begun)
             yield
 
     def _mark(self, begun: bool) -> None:
@@ -92,6 +95,8 @@ class RunFolder:
 def held(folder: Path) -> Iterator[None]:
     """Keep other processes from writing to a folder; create it if it does not exist.
 
+    What a killed process left half-written in it is removed.
+
     Raises:
         InputError: another process writes to it.
     """
@@ -102,6 +107,34 @@ def held(folder: Path) -> Iterator[None]:
     except Timeout:
         raise InputError(f"{folder}: another process is writing to it; wait for it or end it") from None
     try:
+        remove_abandoned(folder, below=True)
         yield
     finally:
         lock.release()
+
+
+@contextlib.contextmanager
+def held_for_results(folder: Path) -> Iterator[None]:
+    """Keep other processes from writing results to a folder. Nothing but the results stays in it.
+
+    Raises:
+        InputError: another process writes results to it.
+    """
+    was_there = folder.is_dir()
+    make_folder(folder)
+    lock = FileLock(folder / RESULTS_LOCK)
+    try:
+        lock.acquire(blocking=False)
+    except Timeout:
+        raise InputError(
+            f"{folder}: another process is writing results to it; wait for it or end it"
+        ) from None
+    try:
+        remove_abandoned(folder)
+        yield
+    finally:
+        (folder / RESULTS_LOCK).unlink(missing_ok=True)
+        lock.release()
+        if not was_there:
+            with contextlib.suppress(OSError):  # it holds results
+                folder.rmdir()

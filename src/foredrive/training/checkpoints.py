@@ -38,10 +38,15 @@ def save_checkpoint(
         save_file(weights, temporary / MODEL)
         save_file(tensors, temporary / OPTIMIZER)
         (temporary / PROGRESS).write_text(json.dumps({"step": step, "optimizer": scalars}))
-    for old in folder.glob("step_*"):
-        if old != final:
-            shutil.rmtree(old)
+    remove_older(final)
     return final
+
+
+def remove_older(checkpoint: Path) -> None:
+    """Remove the other checkpoints beside one. It is done again on resuming, in case it was killed."""
+    for old in checkpoint.parent.glob("step_*"):
+        if old != checkpoint:
+            shutil.rmtree(old)
 
 
 def latest_checkpoint(folder: Path) -> Path | None:

@@ -17,7 +17,7 @@ from torch.utils.data import DataLoader, Dataset
 
 from foredrive.errors import InputError
 from foredrive.files import atomic_path
-from foredrive.training.checkpoints import latest_checkpoint, load_checkpoint, save_checkpoint
+from foredrive.training.checkpoints import latest_checkpoint, load_checkpoint, remove_older, save_checkpoint
 from foredrive.training.interrupts import end_with_parent, hold_interrupts, start_fork_server
 from foredrive.training.metrics_log import MetricsLog
 from foredrive.training.one_cycle import OneCycle
@@ -172,7 +172,9 @@ def train(
         groups = parameter_groups(objective, schedule.weight_decay)
         optimizer = torch.optim.AdamW(groups, lr=schedule.lr, fused=True)
         found = fabric.broadcast(latest_checkpoint(folder / CHECKPOINTS))
-        done = load_checkpoint(found, objective, optimizer) if found is not None else 0
+        done = 0 if found is None else load_checkpoint(found, objective, optimizer)
+        if found is not None and fabric.is_global_zero:
+            remove_older(found)
         if done >= total:
             return
         if fabric.is_global_zero:

@@ -18,7 +18,7 @@ from torch.optim import Adam, Optimizer
 from foredrive.errors import InputError
 from foredrive.rendering.rebuilt import RebuiltScene
 from foredrive.rendering.views import CameraView, SweepView
-from foredrive.training.checkpoints import latest_checkpoint, load_checkpoint
+from foredrive.training.checkpoints import latest_checkpoint, load_checkpoint, remove_older
 from foredrive.training.learning_rates import Rate
 from foredrive.training.loop import CHECKPOINTS, check_finite, step_counter
 
@@ -109,6 +109,7 @@ def rebuild(training: SceneTraining, folder: Path) -> None:
     optimizer = make_optimizer(training)
     if found is not None:
         done = load_checkpoint(found, scene, optimizer)
+        remove_older(found)
     if done >= steps:
         return
     rates, shown_db = {group.name: group.rate for group in training.parameter_groups()}, math.nan

@@ -29,7 +29,7 @@ class Viewer(Page):
 
     def __init__(self, frames: LogFrames, host: str, port: int) -> None:
         self.frames = frames
-        self._drawing, self._drawn = threading.Lock(), -1
+        self._drawing, self._drawn, self._closed = threading.Lock(), -1, False
         super().__init__(frames.name, host, port)
         show_ego(self.server.scene)
         self._add_controls()
@@ -47,6 +47,12 @@ class Viewer(Page):
             time.sleep(PLAY_PERIOD_S)
             if self._play.value:
                 self.show((self._frame.value + 1) % len(self.frames))
+
+    def close(self) -> None:
+        """Stop serving. Frames that browsers have asked for are not drawn any more."""
+        with self._drawing:
+            self._closed = True
+        super().close()
 
     def _add_controls(self) -> None:
         gui, count = self.server.gui, len(self.frames)
@@ -69,7 +75,7 @@ class Viewer(Page):
         """Draw the newest requested frame; frames requested in between are dropped."""
         with self._drawing:
             index = min(self._frame.value, len(self.frames) - 1)
-            if index == self._drawn:
+            if index == self._drawn or self._closed:
                 return
             clip = self.frames.clip(index)
             with self.server.atomic():

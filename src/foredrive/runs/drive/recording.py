@@ -16,6 +16,7 @@ from foredrive.data.cameras import rig_of_log
 from foredrive.data.log_paths import LogPath
 from foredrive.data.logs import Log
 from foredrive.errors import InputError
+from foredrive.files import remove_abandoned
 from foredrive.runs.fan_out import fan_out, reason
 from foredrive.scene.conditions import BackgroundTraffic, find_conditions
 from foredrive.sensors.rigs import RigPlan, camera_rig, same_rig
@@ -61,6 +62,8 @@ def record_drives(
         OSError: the disk is full, so that no other drive could be recorded.
     """
     logs, failed = {}, {}
+    for folder in {log_of(plan, out).folder.parent for plan in plans}:
+        remove_abandoned(folder)  # also if all logs are there
     for plan in plans:
         if is_recorded(plan, out, rig):
             logs[plan] = log_of(plan, out)
