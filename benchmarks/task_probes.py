@@ -35,8 +35,10 @@ from foredrive.runs.train.run import Run, load_agent, open_run, train_run
 from foredrive.runs.train.tasks import TrainedHeads, probe_run, train_heads
 
 ROOT = Path("runs/task_probes")
-DRIVES = 28
-"""Training drives: four of each town."""
+DRIVES = 14
+"""Training drives: two of each town."""
+STEPS = 600
+"""Steps of the heads, of eight clips each."""
 JUDGED_EVERY_S = 0.5
 """Time between judged key frames, s: that of the key frames, because tracks are judged too."""
 TASKS = (*HEADED, INSTANCES)
@@ -74,7 +76,7 @@ DECIDED_BY = (
 def heads_recipe(seed: int = 0) -> TaskHeadsRecipe:
     """Return the heads of every arm."""
     recipe = town_heads(TASKS)
-    return dataclasses.replace(recipe, schedule=dataclasses.replace(recipe.schedule, seed=seed))
+    return dataclasses.replace(recipe, schedule=dataclasses.replace(recipe.schedule, steps=STEPS, seed=seed))
 
 
 def world_model_alone(recipe: Recipe[Any, Any]) -> Recipe[Any, Any]:

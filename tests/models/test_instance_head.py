@@ -13,7 +13,8 @@ from foredrive.evaluation.metrics.instances import InstanceMetric, drawn_boxes
 from foredrive.evaluation.predictor import Prediction
 from foredrive.geometry.se3 import matrix_from_yaw
 from foredrive.models.detection import BoxSet
-from foredrive.models.tasks.agents import AGENT_CLASSES, AgentSet
+from foredrive.models.tasks.agents import AGENT_CLASSES, AgentHeadConfig, AgentSet, CarriedConfig
+from foredrive.models.tasks.heads import TaskHeads, TaskHeadsConfig, TaskVolume
 from foredrive.models.tasks.instances import (
     MARGIN_M,
     InstanceHead,
@@ -29,6 +30,7 @@ from foredrive.scene.map_elements import InstanceRaster, PlaneSpec
 from foredrive.scene.task_truth import TaskTruth
 from foredrive.training.detection_losses import MatchingLossConfig
 from foredrive.training.instance_losses import instance_loss
+from foredrive.training.task_losses import TaskWeights, task_losses
 
 SPEC = VoxelSpec((-8.0, -12.0, -1.0), 1.0, (2, 24, 32))
 GRID = PlaneSpec((-50.0, -50.0), 0.5, (200, 200))
@@ -91,6 +93,34 @@ def test_pixels_of_imagined_beliefs_are_read_where_the_ego_vehicle_will_be() -> 
     torch.testing.assert_close(found.pixels[0, 1, :, y, x], later[:2], atol=1e-4, rtol=0)
     assert not found.pixels[0, 2].any()  # the world model imagines one key frame alone
     assert (found.sharpness > 1).all()
+
+
+def test_sequences_are_read_and_judged_at_their_last_frames() -> None:
+    sizes = TaskHeadsConfig(
+        16,
+        agents=AgentHeadConfig(queries=8, motion=None, carried=CarriedConfig(agents=3, frames=2)),
+        elements=None,
+        raster=None,
+        voxels=None,
+        instances=InstanceHeadConfig(width=4),
+    )
+    torch.manual_seed(0)
+    heads = TaskHeads(sizes, SPEC, channels=2, instance_grid=GRID)
+    now, later = torch.randn(4, 2, *SPEC.shape_zyx), torch.randn(4, STEPS, 2, *SPEC.shape_zyx)
+    eye = torch.eye(4).expand(4, 4, 4)
+    volumes = {"detection": TaskVolume(now, later=later, T_now_later=torch.eye(4).expand(4, STEPS, 4, 4))}
+    sequences = heads(volumes, heads.config.steps(eye.double()))
+    single = heads(volumes)
+    torch.testing.assert_close(sequences.instances.pixels, single.instances.pixels[[1, 3]])
+
+    found = agents([(2.0, 2.0, 0.3, 4.0)])
+    truth = TaskTruth(instances=truth_of(found)[[0] * 4])
+    boxes = boxes_of(found)[[0] * 4]
+    for annotated, trains in (([True, False, True, False], False), ([False, True, False, False], True)):
+        loss = task_losses(
+            sequences, boxes, torch.tensor(annotated), truth, SPEC, None, TaskWeights(), frames=2
+        )
+        assert bool(loss["instances"] > 0) is trains
 
 
 def test_cells_belong_to_the_most_probable_vehicle() -> None:

@@ -80,12 +80,13 @@ def task_losses(
     if output.voxels is not None and truth.semantics is not None:
         losses["voxels"] = weights.voxels * _voxel_loss(output.voxels, truth.semantics, class_weight)
     if output.instances is not None and output.agents is not None and truth.instances is not None:
+        last = slice(frames - 1, None, frames)  # the heads leave out the other frames of a sequence
         losses["instances"] = weights.instances * instance_loss(
             output.instances,
-            output.agents[-1],
-            boxes,
-            boxes_valid,
-            truth.instances,
+            output.agents[-1][last],
+            boxes[last],
+            boxes_valid[last],
+            truth.instances[last],
             spec,
             weights.agents.boxes,
         )

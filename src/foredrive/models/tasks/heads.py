@@ -19,7 +19,7 @@ from foredrive.models.tasks.carried import (
 )
 from foredrive.models.tasks.instances import InstanceHead, InstanceHeadConfig, InstanceSet
 from foredrive.models.tasks.maps import MapHead, MapHeadConfig, MapSet, RasterHead, RasterHeadConfig
-from foredrive.models.tasks.plane import PlanePyramid, Planes
+from foredrive.models.tasks.plane import Plane, PlanePyramid, Planes
 from foredrive.models.tasks.proposals import CentreMap
 from foredrive.models.tasks.voxels import VoxelHead, VoxelHeadConfig
 from foredrive.scene import Belief, Task, VoxelSpec, WorldModel
@@ -151,7 +151,7 @@ class HeadOutput:
     lineage: Lineage | None = None
     """Origin of each agent in the frame before. Only heads that carry agents have it."""
     instances: InstanceSet | None = None
-    """Occupancy of single vehicles, now and later."""
+    """Occupancy of single vehicles, now and later; of sequences, that of the last frame of each."""
     affordances: AffordanceSet | None = None
 
 
@@ -231,17 +231,19 @@ class TaskHeads(nn.Module):
             voxels = self.voxels(volumes["occupancy"].now, planes_of("occupancy"))
         instances = None
         if self.instances is not None and agents is not None and volumes["detection"].later is not None:
+            last = _last_frames(steps)
             instances = self._imagined(
-                self.instances, agents[-1], volumes["detection"], planes_of("detection")
+                self.instances,
+                agents[-1][last],
+                volumes["detection"][last],
+                planes_of("detection").fine[last],
             )
         affordances = None
         if self.affordances is not None:
             affordances = self.affordances(volumes["planning"].images, planes_of("planning").fine)
         return HeadOutput(agents, centres, elements, raster, voxels, lineage, instances, affordances)
 
-    def _imagined(
-        self, head: InstanceHead, agents: AgentSet, volume: TaskVolume, planes: Planes
-    ) -> InstanceSet:
+    def _imagined(self, head: InstanceHead, agents: AgentSet, volume: TaskVolume, now: Plane) -> InstanceSet:
         """Return the instances on the planes of the imagined volumes; each has the one before as its past."""
         assert agents.query is not None
         assert volume.later is not None, "instances need imagined volumes"
@@ -252,7 +254,7 @@ class TaskHeads(nn.Module):
             T_before_now = torch.linalg.inv(T_now_before.to(T_now)) @ T_now
             later.append(self.planes(imagined, before, T_before_now).fine)
             before, T_now_before = imagined, T_now
-        return head(agents.query, planes.fine, later, volume.T_now_later)
+        return head(agents.query, now, later, volume.T_now_later)
 
     def _follow(
         self,
@@ -268,3 +270,13 @@ class TaskHeads(nn.Module):
             return follow(head, config, planes, motion, steps)
         centres, agents = head(planes, motion, None if carried is None else carried.agents)
         return centres, agents, None if config is None else lineage_of(agents[-1], carried, config.decay)
+
+
+def _last_frames(steps: FrameSteps | None) -> slice:
+    """Return the items that are the last frame of a sequence; all items if they are single frames.
+
+    The imagined volumes of one frame cost four times its planes, and those of the next frame show the same
+    vehicles.
+    """
+    frames = 1 if steps is None else steps.T_now_before.shape[1]
+    return slice(frames - 1, None, frames)
