@@ -20,6 +20,7 @@ from foredrive.recipes.config import load_recipe
 from foredrive.recipes.task_heads import base_heads, heads_for, with_joint_heads
 from foredrive.runs import Run, evaluate_run, load_agent, open_run, train_run
 from foredrive.runs.build import build_agent
+from foredrive.runs.drive.seeing_agents import SeeingAgent, following
 from foredrive.runs.export import export_run
 from foredrive.runs.open_clips import open_clips
 from foredrive.runs.train.tasks import load_heads, probe_run, train_heads
@@ -116,6 +117,29 @@ def test_a_planner_attends_to_frozen_heads_of_a_probe(trained: Run, log: LogPath
     summary = evaluate_run(run, [log], tmp_path / "evaluated", views=False).summary
     assert summary["failed"] == 0
     assert {"detection.nuscenes.map", "occupancy.uniad.vpq_near_pct"} <= summary.keys()
+
+
+def test_an_agent_drives_with_the_agents_that_it_carries_on_as_in_training(
+    trained: Run, log: LogPath
+) -> None:
+    """Frame by frame its plans are those of a training sequence, and those of single frames after a gap."""
+    recipe = with_small_heads(trained.recipe, ("detection", "tracking"), attends=("agents",))
+    torch.manual_seed(0)
+    agent = build_agent(recipe, fetch=False).eval()
+    clips = dataclasses.replace(recipe.clips, now_stride_s=recipe.clips.frame_dt_s)
+    data = open_clips([log], clips, trained.cache_dir)
+    first, second = (collate([data[number]]).clip.observed() for number in (0, 1))
+    both = collate([data[0], data[1]]).clip.observed()
+    with torch.no_grad():
+        beliefs = agent.rollout(both, agent.planner.imagined_frames)
+        sequence = agent.plan(both, beliefs, agent.perceive(beliefs[0], sequences=both))
+    time_s = [10.0, 10.5, 20.0]
+    driving = following(SeeingAgent(agent, recipe.clips.image_hw, "cpu"), lambda: time_s.pop(0))
+    plans = [driving.act(first), driving.act(second), driving.act(second)]
+    for number in (0, 1):
+        torch.testing.assert_close(plans[number].xy[0], sequence.xy[number], atol=1e-4, rtol=1e-4)
+    assert (plans[1].xy - plans[2].xy).abs().max() > 1e-4
+    torch.testing.assert_close(plans[2].xy, agent.act(second).xy)
 
 
 def test_the_graph_of_an_agent_that_attends_is_the_agent(trained: Run, log: LogPath) -> None:

@@ -11,6 +11,7 @@ from foredrive.geometry.precision import full_precision
 from foredrive.models.ego_mlp import ego_motion, route_target
 from foredrive.models.plan_scorer import ScoredPlans
 from foredrive.models.planner import VolumePlanner
+from foredrive.models.tasks.carried import CarriedAgents
 from foredrive.models.tasks.heads import HeadOutput, TaskHeads, volumes_of
 from foredrive.scene import Belief, Clip, Decoded, Trajectory, WorldModel
 
@@ -58,22 +59,34 @@ class PlanningAgent(nn.Module, Generic[W]):
     def perceive(self, now: Belief, sequences: Clip | None = None) -> HeadOutput | None:
         """Return the output of the agent's task heads for a belief about now; None without heads.
 
+        Args:
+            now: belief about now.
+            sequences: the clips, if they are the sequences in which heads that carry agents on are trained.
+        """
+        return None if self.heads is None else self.perceived(now, sequences)
+
+    def perceived(
+        self, now: Belief, sequences: Clip | None = None, carried: CarriedAgents | None = None
+    ) -> HeadOutput:
+        """Return the output of the task heads of an agent that has some.
+
         Heads compute in 32 bits, because positions in 16 are off by tenths of a cell. No planner reads
         instances, so nothing is imagined for them.
 
         Args:
             now: belief about now.
-            sequences: the clips, if they are the sequences in which heads that carry agents on are trained.
+            sequences: as for `perceive`.
+            carried: agents of the frame before, for heads that carry agents on.
         """
-        if self.heads is None:
-            return None
+        assert self.heads is not None
         steps = None
         if sequences is not None:
             steps = self.heads.config.steps(sequences.T_world_ego[:, sequences.now])
         read = volumes_of(self.world_model, now, self.heads.config.tasks)
         with full_precision(now.volume):
             cast = {id(volume): volume.map_tensors(Tensor.float) for volume in read.values()}
-            found: HeadOutput = self.heads({task: cast[id(volume)] for task, volume in read.items()}, steps)
+            volumes = {task: cast[id(volume)] for task, volume in read.items()}
+            found: HeadOutput = self.heads(volumes, steps, carried)
         return found
 
     def tokens(self, now: Belief, found: HeadOutput | None = None) -> Float[Tensor, "b N C"] | None:

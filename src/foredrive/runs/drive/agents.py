@@ -5,19 +5,18 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import torch
 
-from foredrive.data.resizing import shrink_images
 from foredrive.errors import InputError
-from foredrive.models.agent import PlanningAgent
 from foredrive.models.ego_mlp import EgoMLP
+from foredrive.runs.drive.seeing_agents import SeeingAgent, following
 from foredrive.runs.shipped import run_folder
 from foredrive.runs.train.baselines import run_baselines
 from foredrive.runs.train.rigs import TrainedRigs, check_rig, read_rigs
 from foredrive.runs.train.run import load_agent, open_run
-from foredrive.scene import Agent, Clip, Trajectory
+from foredrive.scene import Agent, Clip
 from foredrive.scene.affordances import AffordanceEstimate
 from foredrive.sensors.rigs import SURROUND, RigPlan
 from foredrive.simulation.demonstrations import AlternatingStudent, DisturbedExpert
@@ -82,19 +81,6 @@ def check_seeing(agent: str, sees: Sees | None) -> None:
         raise InputError(f"{agent} needs its {needed}, which --sees {sees} hides")
     if (not inputs.cameras and sees == "camera") or not (inputs.cameras or inputs.lidar):
         raise InputError(f"{agent} does not look at what --sees {sees} shows")
-
-
-@dataclass(frozen=True, eq=False)
-class _ResizingAgent:
-    """An agent that was trained on smaller images than the vehicle records."""
-
-    agent: PlanningAgent[Any]
-    image_hw: tuple[int, int]
-    device: str
-
-    def act(self, observation: Clip) -> Trajectory:
-        """Shrink the images and return the agent's plan."""
-        return self.agent.act(shrink_images(observation, self.image_hw).to(self.device))
 
 
 def inputs_of(agent: str) -> AgentInputs:
@@ -194,8 +180,9 @@ def make_agent(
     if agent.startswith(IDM_BY_SIGHT):
         return IdmAgent(_town(town), _affordances(folder))
     if agent.startswith((STUDENT, OLD_STUDENT)):
-        return AlternatingStudent(_seeing(folder), _expert(town), clock, seed)
-    return RestartingAgent(_fitted(folder) if agent.startswith(EGO_MLP) else _seeing(folder), clock)
+        return AlternatingStudent(following(_seeing(folder), clock), _expert(town), clock, seed)
+    student = _fitted(folder) if agent.startswith(EGO_MLP) else following(_seeing(folder), clock)
+    return RestartingAgent(student, clock)
 
 
 def is_remote(agent: str) -> bool:
@@ -249,12 +236,12 @@ def _affordances(folder: Path) -> Callable[[Clip], AffordanceEstimate]:
     heads = None if run.recipe.tasks is None else run.recipe.tasks.heads
     if heads is None or heads.affordances is None:
         raise InputError(f"{folder}: {IDM_BY_SIGHT}RUN needs a run with affordances, such as nemo_drive_tele")
-    resizing = _seeing(folder)
+    seeing = _seeing(folder)
 
     @torch.no_grad()
     def perceive(observation: Clip) -> AffordanceEstimate:
-        clip = shrink_images(observation, resizing.image_hw).to(resizing.device)
-        found = resizing.agent.perceive(resizing.agent.rollout(clip, 0)[0])
+        clip = seeing.seen(observation)
+        found = seeing.agent.perceive(seeing.agent.rollout(clip, 0)[0])
         assert found is not None
         assert found.affordances is not None
         estimate: AffordanceEstimate = found.affordances.estimate().to("cpu")
@@ -279,9 +266,9 @@ def _run_folder(agent: str) -> Path:
 
 
 @lru_cache(maxsize=1)  # a worker drives many routes with the same agent
-def _seeing(folder: Path) -> _ResizingAgent:
+def _seeing(folder: Path) -> SeeingAgent:
     run, device = open_run(folder), "cuda" if torch.cuda.is_available() else "cpu"
-    return _ResizingAgent(load_agent(run).to(device), run.recipe.clips.image_hw, device)
+    return SeeingAgent(load_agent(run).to(device), run.recipe.clips.image_hw, device)
 
 
 @lru_cache(maxsize=1)

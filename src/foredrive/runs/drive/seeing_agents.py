@@ -1,0 +1,76 @@
+"""Agents of runs as they drive: images in the size of training, other vehicles followed over time."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+
+from foredrive.data.resizing import shrink_images
+from foredrive.evaluation.frame_keys import MAX_GAP_S
+from foredrive.models.agent import PlanningAgent
+from foredrive.models.tasks.following import AgentFollower
+from foredrive.scene import Agent, Clip, Trajectory
+
+
+@dataclass(frozen=True, eq=False)
+class SeeingAgent:
+    """The agent of a run. Its images may be smaller than the vehicle records them."""
+
+    agent: PlanningAgent[Any]
+    image_hw: tuple[int, int]
+    device: str
+
+    def seen(self, observation: Clip) -> Clip:
+        """Return the observation as the agent reads it."""
+        clip: Clip = shrink_images(observation, self.image_hw).to(self.device)
+        return clip
+
+    def act(self, observation: Clip) -> Trajectory:
+        """Return the plan."""
+        return self.agent.act(self.seen(observation))
+
+
+class FollowingAgent:
+    """A `SeeingAgent` in one drive whose planner attends to agents that are carried from frame to frame.
+
+    It is trained with the agents of the frames before, and so it drives with them. They are forgotten after
+    a gap in the observations.
+
+    Args:
+        seeing: the agent of the run.
+        follower: the state of the drive.
+        clock: returns the time of the drive, s.
+    """
+
+    def __init__(self, seeing: SeeingAgent, follower: AgentFollower, clock: Callable[[], float]) -> None:
+        self._seeing, self._follower, self._clock = seeing, follower, clock
+        self._before_s: float | None = None
+
+    @torch.no_grad()
+    def act(self, observation: Clip) -> Trajectory:
+        """Return the plan."""
+        agent, clip, now_s = self._seeing.agent, self._seeing.seen(observation), self._clock()
+        dt_s = None if self._before_s is None else now_s - self._before_s
+        if dt_s is not None and not 0 < dt_s <= MAX_GAP_S:
+            dt_s = None
+        beliefs = agent.rollout(clip, agent.planner.imagined_frames)
+        found, _ = self._follower.step(
+            lambda carried: agent.perceived(beliefs[0], carried=carried), clip.T_world_ego[0, clip.now], dt_s
+        )
+        self._before_s = now_s
+        return agent.plan(clip, beliefs, found)
+
+
+def following(seeing: SeeingAgent, clock: Callable[[], float]) -> Agent:
+    """Return the agent for one drive; one with a state if its planner attends to agents that are carried.
+
+    Args:
+        seeing: the agent of the run.
+        clock: returns the time of the drive, s.
+    """
+    agent = seeing.agent
+    heads = None if agent.heads is None else agent.heads.config.agents
+    if agent.planner.scene is None or heads is None or heads.carried is None:
+        return seeing
+    return FollowingAgent(seeing, AgentFollower(heads.carried), clock)
