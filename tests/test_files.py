@@ -88,6 +88,13 @@ def test_one_process_writes_a_log_and_the_other_says_so(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["log"]
 
 
+def test_what_is_being_written_may_be_written_whole_or_not_at_all_too(tmp_path: Path) -> None:
+    with atomic_path(tmp_path / "a", alone=True) as outer, atomic_path(outer) as inner:
+        inner.write_text("whole")
+    assert (tmp_path / "a").read_text() == "whole"
+    assert len(list(tmp_path.iterdir())) == 1
+
+
 def test_abandoned_scratch_is_found_in_all_folders_below(tmp_path: Path) -> None:
     deep = tmp_path / "run" / "cache" / f".b.labels.{files._HOST}-{DEAD}-abc.part"
     deep.mkdir(parents=True)

@@ -1,4 +1,4 @@
-"""A process and all its descendants: their memory, open files and threads, and who is left of a session."""
+"""A process and all its descendants: their memory, open files and threads; the processes of a session."""
 
 import os
 from pathlib import Path
@@ -40,6 +40,14 @@ def in_session(session: int) -> set[int]:
     return {
         pid for pid, fields in _all_processes().items() if int(fields[3]) == session and fields[0] not in "ZX"
     }
+
+
+def cpu_s(session: int) -> float:
+    """Return the CPU time of a session's processes, s, and of those of their children that have ended."""
+    spent = (
+        sum(map(int, fields[11:15])) for fields in _all_processes().values() if int(fields[3]) == session
+    )
+    return sum(spent) / os.sysconf("SC_CLK_TCK")
 
 
 def resident_mib(pid: int) -> float:

@@ -111,7 +111,10 @@ def _folders_below(folder: Path) -> Iterator[Path]:
 
 def _new_scratch(final: Path, alone: bool) -> tuple[Path, int | None]:
     """Make a scratch folder; return it and its lock, which tells others that its process lives."""
-    among = _lock(final.parent, wait=True)  # nobody takes it for abandoned before it has its lock
+    nested = _SCRATCH.fullmatch(final.parent.name)  # the lock of a scratch folder is this process' own
+    among = (
+        None if nested else _lock(final.parent, wait=True)
+    )  # nobody takes it for abandoned before its lock
     try:
         _remove_abandoned(final.parent, again=alone)
         for _, name in _scratch_folders(final.parent) if alone else ():

@@ -13,14 +13,22 @@ from pathlib import Path
 
 import pytest
 from miniature import miniature
-from program_server import ProgramServer
 
+from benchmarks.common.program_server import ProgramServer
 from foredrive.data import LogPath
 from foredrive.evaluation.summary import read_summary
 from foredrive.runs import Run, train_run
 from foredrive.training import read_metrics
 
+TESTS = Path(__file__).parents[1]
 PATIENCE_S = 300.0
+PRELUDE = """
+import foredrive.runs.drive.recording, foredrive.runs.evaluate.run, foredrive.runs.train.run
+import foredrive.view.overview, foredrive.view.run_report, foredrive.view.summary_tables
+from miniature import miniature
+from foredrive.recipes import RECIPES
+RECIPES["miniature"] = miniature()
+"""
 Sign = Callable[[], bool]
 
 
@@ -48,7 +56,7 @@ class Programs:
 
 @pytest.fixture(scope="module")
 def programs(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Programs]:
-    server = ProgramServer(tmp_path_factory.mktemp("programs"))
+    server = ProgramServer(tmp_path_factory.mktemp("programs"), PRELUDE, [TESTS, TESTS / "data"])
     yield Programs(server)
     server.close()
 

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+import viser
 from miniature import miniature, write_log
 from test_task_pictures import agents
 
@@ -63,6 +64,34 @@ def test_the_page_is_served_until_it_is_closed(log: LogPath) -> None:
             return
         time.sleep(0.1)
     pytest.fail("it still listens after 10 s")
+
+
+@pytest.mark.parametrize(
+    ("host", "origin", "status"),
+    [
+        (None, None, None),
+        (None, "own", None),
+        (None, "http://elsewhere.example", 403),
+        (None, "null", 403),
+        ("rebound.example:80", "http://rebound.example:80", 403),
+    ],
+)
+def test_pages_of_other_sites_are_refused(
+    viewer: Viewer, host: str | None, origin: str | None, status: int | None
+) -> None:
+    """Browsers let any page open a WebSocket to this machine."""
+    port = viewer.server.get_port()
+    asked = f"viser-v{viser.__version__}"
+    sent = {"Origin": f"http://localhost:{port}" if origin == "own" else origin} if origin else {}
+    with socket.create_connection(("localhost", port)) as connection:
+        lines = [
+            "GET / HTTP/1.1", f"Host: {host or f'localhost:{port}'}", "Connection: Upgrade",
+            "Upgrade: websocket", "Sec-WebSocket-Version: 13", f"Sec-WebSocket-Protocol: {asked}",
+            "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==", *(f"{k}: {v}" for k, v in sent.items()),
+        ]  # fmt: skip
+        connection.sendall(("\r\n".join(lines) + "\r\n\r\n").encode())
+        answer = connection.recv(1000).split(b"\r\n")[0].decode()
+    assert answer.split(" ")[1] == str(status or 101)
 
 
 def test_a_frame_that_is_asked_for_too_late_is_not_drawn(log: LogPath) -> None:

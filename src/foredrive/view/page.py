@@ -4,12 +4,18 @@ import contextlib
 import errno
 import io
 import socket
+from collections.abc import Callable, Iterator
+from typing import Any
 
 import viser
+import websockets.asyncio.server
+from websockets import Headers, Request, Response
+from websockets.asyncio.server import ServerConnection
 
 from foredrive.errors import InputError
 
 PORTS, PORTS_TRIED = 65536, 100
+LOOPBACK = ("localhost", "127.0.0.1", "[::1]")
 AMBIENT_LIGHT = 0.7
 START_EYE_M, START_TARGET_M = (-20.0, 8.0, 15.0), (6.0, 0.0, 0.0)
 
@@ -33,10 +39,49 @@ def free_port(host: str, port: int) -> int:
     raise InputError(f"cannot serve a page at {host}: ports {port} to {candidates[-1]} are taken")
 
 
+@contextlib.contextmanager
+def _refusing_other_sites() -> Iterator[None]:
+    """Make the servers that viser starts in the block refuse what pages of other sites ask them.
+
+    viser has no option for it. Browsers let any page open a WebSocket to this machine, through which it would
+    see the log and move the controls.
+    """
+    serve = websockets.asyncio.server.serve
+
+    def checking(
+        handler: Any, host: str, port: int, *, process_request: Callable[..., Response | None], **options: Any
+    ) -> Any:
+        def checked(connection: ServerConnection, request: Request) -> Response | None:
+            why = _refusal(request.headers, is_local=host in LOOPBACK)
+            return process_request(connection, request) if why is None else connection.respond(403, why)
+
+        return serve(handler, host, port, process_request=checked, **options)
+
+    websockets.asyncio.server.serve = checking  # type: ignore[assignment, misc]
+    try:
+        yield
+    finally:
+        websockets.asyncio.server.serve = serve  # type: ignore[misc]
+
+
+def _refusal(headers: Headers, *, is_local: bool) -> str | None:
+    """Return why a request is refused, or None.
+
+    A page of another site has its own name in Origin. A name that its owner points to this machine (DNS
+    rebinding) stands in Host.
+    """
+    host, origin = headers.get("Host", ""), headers.get("Origin")
+    if is_local and host.rpartition(":")[0] not in LOOPBACK:
+        return f"this page is not at {host}\n"
+    if origin is not None and origin.partition("://")[2] != host:
+        return f"{origin} may not use this page\n"
+    return None
+
+
 def _open_server(label: str, host: str, port: int) -> viser.ViserServer:
     """Serve an empty dark page, seen from behind and above the ego vehicle; it has its own threads."""
     port = free_port(host, port)  # viser would wait for a host that does not exist
-    with contextlib.redirect_stdout(io.StringIO()):  # viser prints a greeting
+    with contextlib.redirect_stdout(io.StringIO()), _refusing_other_sites():  # viser prints a greeting
         server = viser.ViserServer(host=host, port=port, label=label, verbose=False)
     server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
     server.scene.configure_environment_map(hdri=None)  # lights without a download

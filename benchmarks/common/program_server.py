@@ -9,20 +9,16 @@ import select
 import signal
 import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
-TESTS = Path(__file__).parents[1]
 START_S = 120.0
 """Time for importing."""
 SERVER = """
 import json, os, sys, warnings
-import foredrive.runs.drive.recording, foredrive.runs.evaluate.run, foredrive.runs.train.run
-import foredrive.view.overview, foredrive.view.run_report, foredrive.view.summary_tables
-from miniature import miniature
+{prelude}
 from foredrive.cli.main import main
-from foredrive.recipes import RECIPES
 
-RECIPES["miniature"] = miniature()
 for line in sys.stdin:
     asked = json.loads(line)
     with warnings.catch_warnings():
@@ -44,30 +40,41 @@ class ProgramServer:
 
     Args:
         scratch: folder for what the programs print.
+        prelude: Python that imports what the programs need, and adds recipes.
+        paths: folders from which it imports besides.
+        start_s: time for importing, s.
+        temporary: folder for the programs' temporary files; None: the system's.
     """
 
-    def __init__(self, scratch: Path) -> None:
-        path = os.pathsep.join([str(TESTS), str(TESTS / "data"), os.environ.get("PYTHONPATH", "")])
-        self._err = scratch / "stderr"
+    def __init__(
+        self,
+        scratch: Path,
+        prelude: str,
+        paths: Sequence[Path] = (),
+        *,
+        start_s: float = START_S,
+        temporary: Path | None = None,
+    ) -> None:
+        path = os.pathsep.join([*map(str, paths), os.environ.get("PYTHONPATH", "")])
+        self._err, self._start_s = scratch / "stderr", start_s
         self._group: int | None = None
         self._process = subprocess.Popen(
-            [sys.executable, "-W", "error", "-c", SERVER],
+            [sys.executable, "-W", "error", "-c", SERVER.format(prelude=prelude)],
             bufsize=0,  # so that `select` sees every line that is not read yet
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
-            env=os.environ | {"PYTHONPATH": path},
+            env=os.environ | {"PYTHONPATH": path} | ({"TMPDIR": str(temporary)} if temporary else {}),
             start_new_session=True,
-            cwd=TESTS,
         )
 
     def start(self, *args: str | Path) -> int:
-        """Start the program, which knows the recipe "miniature" too, and return its process and group."""
+        """Start the program, and return its process, which is also its group and its session."""
         self._end_the_last()
         files = [os.devnull, os.devnull, str(self._err)]
         asked = json.dumps({"args": [str(arg) for arg in args], "files": files})
         assert self._process.stdin is not None
         self._process.stdin.write(asked.encode() + b"\n")
-        self._group = self._read(START_S)
+        self._group = self._read(self._start_s)
         return self._group
 
     def is_running(self) -> bool:
@@ -82,13 +89,13 @@ class ProgramServer:
     def close(self) -> None:
         """End the server."""
         self._end_the_last()
-        self._process.communicate(timeout=START_S)
+        self._process.communicate(timeout=self._start_s)
 
     def _end_the_last(self) -> None:
         """End a program that a failed test has left."""
         if self._group is not None:
             os.killpg(self._group, signal.SIGKILL)
-            self.finish(START_S)
+            self.finish(self._start_s)
 
     def _read(self, patience_s: float) -> int:
         assert self._process.stdout is not None
