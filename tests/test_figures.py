@@ -13,6 +13,7 @@ from foredrive.runs.model_card import find_card, read_card
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "benchmarks" / "results"
 SENTENCES: list[dict[str, Any]] = yaml.safe_load((ROOT / "docs" / "figures.yaml").read_text())
+PICTURES = sorted(path for kind in ("png", "jpg", "webp") for path in (ROOT / "docs").rglob(f"*.{kind}"))
 CARD = re.compile(r"card:(\w+) \| (.+) (\S+)")
 FIGURE = re.compile(
     r"(?P<file>\S+) (?P<arm>\S+) (?P<key>\S+)"
@@ -47,6 +48,13 @@ def figure(source: str) -> float | str:
 def test_a_sentence_says_what_was_measured(sentence: dict[str, Any]) -> None:
     said = plain(sentence["says"].format(*map(figure, sentence["figures"])))
     assert said in plain((ROOT / sentence["page"]).read_text()), f"{sentence['page']} does not say: {said}"
+
+
+@pytest.mark.parametrize("picture", PICTURES, ids=lambda path: path.name)
+def test_a_picture_is_made_by_committed_code(picture: Path) -> None:
+    scripts = "".join(path.read_text() for path in (ROOT / "docs").glob("draw_*.py"))
+    by_verb = "".join(path.read_text() for path in (ROOT / "docs").glob("*.md"))
+    assert picture.name in scripts or re.search(rf"--(out|save) {picture.stem}\.", by_verb)
 
 
 @pytest.mark.parametrize("page", ["README.md", "docs/claims.md"])

@@ -194,6 +194,6 @@ def test_the_report_says_where_its_figures_come_from(
 ) -> None:
     assert foredrive("evaluate", trained.folder, "--out", tmp_path, "--examples", "1") == (0, "")
     report, summary = (tmp_path / "report.html").read_text(), read_summary(tmp_path / "summary.json")
-    assert f"{summary['machine.cores']} cores of" in report
+    assert f"of {summary['machine.cpu']}" in report
     assert str(summary["commit"]) in report
     assert "None" not in report.partition("<img")[0]

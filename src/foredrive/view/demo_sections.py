@@ -160,7 +160,7 @@ def show_rebuilding(demo: Demo) -> Section:
     psnr, nearest = (number(summary.get(key), 1) for key in ("psnr_db", "nearest.psnr_db"))
     tiles = [
         MetricTile("Held-out images, PSNR", psnr, "dB", f"the nearest recorded image: {nearest} dB"),
-        MetricTile("Gaussians", number(summary.get("gaussians"))),
+        MetricTile("Gaussians", f"{summary['gaussians']:,}"),
         MetricTile("Training", number(summary.get("minutes"), 1), "min"),
     ]
     films = [stored_film(_film_path(one), f"{agent}: {MET_BY[agent]}") for agent, one in rebuilt.met.items()]
@@ -180,7 +180,7 @@ def show_search(demo: Demo) -> Section:
     found = search_logs(demo)
     hits = [hit for each in found for hit in each.hits]
     return Section(
-        f"{len(hits)} hits of “{TEXTS[0]}” and {len(found) - 1} other queries",
+        f"{len(hits)} hits for “{TEXTS[0]}” and {len(found) - 1} other queries",
         _cover(hit_picture(hits[0])[:, :WIDTH_PX]) if hits else None,
         [
             Block(

@@ -59,8 +59,9 @@ class Provenance:
     @classmethod
     def of(cls, summary: Summary, date: str = "") -> "Provenance":
         """Return the provenance that a summary states."""
+        cores = summary.get("machine.cores")
         machine = [
-            f"{summary.get('machine.cores')} cores of {summary.get('machine.cpu')}",
+            f"{cores} {'core' if cores == 1 else 'cores'} of {summary.get('machine.cpu')}",
             f"{summary.get('machine.ram_gib')} GiB",
             summary.get("machine.gpu"),
             f"Python {summary.get('version.python')}",

@@ -16,7 +16,7 @@ INK = "#e8ecf2"
 FAINT = "#8b95a5"
 GRID = "#2b3442"
 
-EXPERT = "#3ddc84"
+EXPERT = "#2ee6a8"
 """The driven path."""
 PLAN = "#ff4d4f"
 """The model's plan."""
@@ -76,9 +76,9 @@ VOXEL_COLOURS: dict[str, str] = {
 }
 """By name of the class in Occ3D and OpenOcc. Road users have the colours of their boxes."""
 
-TRUE_POSITIVE = "#3ddc84"
-FALSE_POSITIVE = "#ff8c42"
-FALSE_NEGATIVE = "#4d9de0"
+TRUE_POSITIVE = "#2ee6a8"
+FALSE_POSITIVE = "#f07a3a"
+FALSE_NEGATIVE = "#4d7de0"
 KNOWN_FREE = "#2a323e"
 
 RANGE_MAP = matplotlib.colormaps["plasma"].reversed()

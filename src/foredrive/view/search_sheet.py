@@ -5,7 +5,7 @@ from pathlib import Path
 
 from foredrive.errors import InputError
 from foredrive.search.find import Hit
-from foredrive.search.query import Query
+from foredrive.search.query import Modality, Query
 from foredrive.view import palette
 from foredrive.view.hit_picture import (
     GAP_PX,
@@ -25,6 +25,7 @@ MARGIN_PX, HEAD_PX, TEXT_PX = 16, 54, 62
 CELL_PX = WIDTH_PX + GAP_PX + HEIGHT_PX
 LINE_PX = 17
 MAX_ON_PICTURE = 60
+SENSORS: dict[Modality, str] = {"image": "images", "lidar": "lidar", "joint": "images and lidar"}
 
 
 def write_search_sheet(path: Path, query: Query, hits: Sequence[Hit]) -> None:
@@ -62,7 +63,9 @@ def query_line(query: Query) -> str:
     asked = [f"“{text}”" for text in (query.text, query.image_text, query.lidar_text) if text]
     asked += [f"like {query.like}"] if query.like else []
     if asked:
-        asked.append(f"by {query.modality}" + (f" ({query.rule})" if query.modality == "joint" else ""))
+        asked.append(
+            f"by {SENSORS[query.modality]}" + ("" if query.rule == "features" else f" ({query.rule})")
+        )
     asked += [f"where {query.where}"] if query.where else []
     asked += [f"tagged {query.tag}"] if query.tag else []
     asked += [f"ranked by {query.by}"] if query.by else []
