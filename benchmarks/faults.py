@@ -90,7 +90,7 @@ def train(recipe: str) -> Command:
     found = find_recipe(recipe)
     clips = dataclasses.replace(
         found.clips,
-        now_stride_s=0.2,
+        now_stride_s=0.25,
         image_hw=(32, 64),
         voxels=VoxelSpec(lower_m=(-16.0, -16.0, -1.0), voxel_m=2.0, shape_zyx=(2, 16, 16)),
     )
@@ -209,10 +209,10 @@ def _recording(seconds: float) -> tuple[str, ...]:
 
 
 def _town() -> LogPath:
-    """Return a recording of four seconds, which is made only once."""
+    """Return a recording of six seconds, which is made only once."""
     folder = ROOT / "town"
     if not (folder / "logs").is_dir():
-        _server().start("record", *_recording(4.0), "--out", str(folder))
+        _server().start("record", *_recording(6.0), "--out", str(folder))
         code, said = _server().finish(START_S)
         if code != 0:
             raise RuntimeError(f"recording ended with {code}: {said[-3000:]}")
