@@ -1,6 +1,8 @@
 """A torch dataset of clips from 123D logs, with voxel labels."""
 
 import dataclasses
+import functools
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,12 +10,12 @@ from typing import Literal
 
 import numpy as np
 import torch
-from jaxtyping import Float64
+from jaxtyping import Float64, Int64
 from torch.utils.data import Dataset
 
 from foredrive.data.assemble import assemble_clip
 from foredrive.data.cameras import find_camera, pinhole_cameras, told_cameras
-from foredrive.data.commands import command_at, target_at
+from foredrive.data.commands import command_at, count_command_sources, target_at
 from foredrive.data.frame_store import FrameStore
 from foredrive.data.label_store import LabelStore
 from foredrive.data.labels import VoxelLabels
@@ -88,8 +90,6 @@ class ClipDataset(Dataset[Example]):
             log has a requested camera.
     """
 
-    command_source: dict[str, int]
-    """Number of clips by source of their command: "route" (provided), "driven_future" or "none"."""
     camera_names: tuple[str, ...]
 
     def __init__(self, logs: Sequence[LogPath], config: ClipConfig, cache_dir: Path | None) -> None:
@@ -104,28 +104,46 @@ class ClipDataset(Dataset[Example]):
             cache_dir, config.voxels, "accumulated" if config.occupancy_source == "accumulated" else "lidar"
         )
         self._truth = None if config.tasks is None else TaskTruthStore(cache_dir, config.tasks, config.voxels)
-        self._clips: list[tuple[int, list[int]]] = []
-        self.command_source = {"route": 0, "driven_future": 0, "none": 0}
-        for number, log in enumerate(self._logs):
-            if config.occupancy_source == "recorded":
+        if config.occupancy_source == "recorded":
+            for log in self._logs:
                 check_recorded_occupancy(log)
-            for frames in _clip_frames(log, config):
-                self._clips.append((number, frames))
-                self.command_source[self._command(log, frames[config.past_frames])[1]] += 1
-        if not self._clips:
+        frames = [_clip_frames(log, config) for log in self._logs]
+        self._clip_frames = np.concatenate(frames)
+        self._clip_logs = np.repeat(np.arange(len(self._logs)), [len(of_log) for of_log in frames])
+        if not len(self):
             raise InputError(f"{logs[0].folder}: none of the selected parts is long enough for a clip")
 
     def __len__(self) -> int:
-        return len(self._clips)
+        return len(self._clip_logs)
+
+    @functools.cached_property
+    def command_source(self) -> dict[str, int]:
+        """Number of clips by source of their command: "route" (provided), "driven_future" or "none".
+
+        Raises:
+            InputError: a route cannot be read.
+        """
+        counts = Counter({"route": 0, "driven_future": 0, "none": 0})
+        nows = self._clip_frames[:, self.config.past_frames]
+        for number, log in enumerate(self._logs):
+            of_log = nows[self._clip_logs == number]
+            counts.update(
+                count_command_sources(log, of_log, self.config.horizon_steps, self.config.horizon_dt_s)
+            )
+        return dict(counts)
+
+    def _clip(self, index: int) -> tuple[int, list[int]]:
+        """Return the number of the log of a clip, and the clip's frames."""
+        return int(self._clip_logs[index]), self._clip_frames[index].tolist()
 
     def now_us(self, index: int) -> int:
         """Return the now of a clip in the time of its log, µs."""
-        number, frames = self._clips[index]
+        number, frames = self._clip(index)
         return int(self._logs[number].t_us[frames[self.config.past_frames]])
 
     def log_path(self, index: int) -> LogPath:
         """Return the log of a clip."""
-        return self._logs[self._clips[index][0]].path
+        return self._logs[self._clip_logs[index]].path
 
     def key(self, index: int) -> str:
         """Return the name of the log and the time of the now of a clip, for messages."""
@@ -137,7 +155,7 @@ class ClipDataset(Dataset[Example]):
         Raises:
             InputError: data cannot be read.
         """
-        number, frames = self._clips[index]
+        number, frames = self._clip(index)
         log = self._logs[number]
         labels = [self._voxel_labels(log, frame) for frame in frames]
         occupied = torch.stack([label.occupied for label in labels])
@@ -163,7 +181,7 @@ class ClipDataset(Dataset[Example]):
         Raises:
             InputError: the future cannot be read.
         """
-        number, frames = self._clips[index]
+        number, frames = self._clip(index)
         log, now = self._logs[number], frames[self.config.past_frames]
         return float(np.nan_to_num(log.speed_mps[now])), self._future(log, now)
 
@@ -175,7 +193,7 @@ class ClipDataset(Dataset[Example]):
         """
         if self._truth is None:
             return None
-        number, frames = self._clips[index]
+        number, frames = self._clip(index)
         cameras = [find_camera(self._cameras[number], name) for name in self.camera_names]
         return self._truth.read(self._logs[number], frames[self.config.past_frames], cameras)
 
@@ -193,10 +211,6 @@ class ClipDataset(Dataset[Example]):
                 raise InputError(f"no log has a camera {name!r}; there are: {there}")
         return self.config.cameras
 
-    def _command(self, log: Log, now: int) -> tuple[int | None, str]:
-        future = log.driven_future(now, self.config.horizon_steps, self.config.horizon_dt_s)
-        return command_at(log, now, future)
-
     def _future(self, log: Log, now: int) -> Trajectory:
         steps, dt_s = self.config.horizon_steps, self.config.horizon_dt_s
         plan = read_expert_plan(log, now) if self.config.future_source == "expert" else None
@@ -210,7 +224,7 @@ class ClipDataset(Dataset[Example]):
         Raises:
             InputError: data cannot be read.
         """
-        number, frames = self._clips[index]
+        number, frames = self._clip(index)
         log, config = self._logs[number], self.config
         now = frames[config.past_frames]
         cameras = [find_camera(self._cameras[number], name) for name in self.camera_names]
@@ -224,13 +238,15 @@ class ClipDataset(Dataset[Example]):
             seen,
             [read_sweep(log, frame) if config.lidar else None for frame in frames],
             self._future(log, now),
-            command=self._command(log, now)[0],
+            command=command_at(log, now, log.driven_future(now, config.horizon_steps, config.horizon_dt_s))[
+                0
+            ],
             target_xy=target_at(log, now),
             map_patch=read_map_patch(log, now) if config.map else None,
         )
 
 
-def _clip_frames(log: Log, config: ClipConfig) -> list[list[int]]:
+def _clip_frames(log: Log, config: ClipConfig) -> Int64[np.ndarray, "N T"]:
     """Return the frames of each clip: those nearest to the key times, at most half the log's period away."""
     offset_us = np.arange(-config.past_frames, config.future_frames + 1) * config.frame_dt_s * 1e6
     slack_us = 0.5e6 * log.period_s
@@ -253,7 +269,7 @@ def _clip_frames(log: Log, config: ClipConfig) -> list[list[int]]:
             f"do not fit into its {len(log)} frames of {(log.t_us[-1] - log.t_us[0]) * 1e-6:.1f} s"
             + ("" if config.part_s is None else f", or not into the part {config.part_s}")
         )
-    clips: list[list[int]] = frames[whole].tolist()
+    clips: np.ndarray = frames[whole]
     return clips
 
 

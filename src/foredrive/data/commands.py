@@ -1,7 +1,8 @@
 """The driving command at a frame, from the log's route or from the driven future."""
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float64, Int64
+from py123d.api.scene.arrow.modalities.sync_utils import get_modality_table
 from py123d.datatypes import ModalityType, RouteMetadata
 
 from foredrive.data.arrow_files import reading
@@ -33,6 +34,22 @@ def command_at(log: Log, frame: int, future: Trajectory) -> tuple[Command | None
     if not valid.any():
         return None, "none"
     return command_of(float(future.xy[0, np.flatnonzero(valid)[-1], 1])), "driven_future"
+
+
+def count_command_sources(log: Log, nows: Int64[np.ndarray, "N"], steps: int, dt_s: float) -> dict[str, int]:
+    """Return how many frames have each source of `command_at`, without their commands.
+
+    Args:
+        steps: steps of the driven future, `dt_s` apart.
+
+    Raises:
+        InputError: the route cannot be read.
+    """
+    routed = np.isin(nows, _frames_with_route(log))
+    future_us = log.t_us[nows[~routed], None] + np.arange(1, steps + 1) * dt_s * 1e6
+    driven = int(log.knows_pose_at(future_us).any(axis=-1).sum())
+    route = int(routed.sum())
+    return {"route": route, "driven_future": driven, "none": len(nows) - route - driven}
 
 
 def command_of(lateral_m: float) -> Command:
@@ -91,14 +108,32 @@ def route_at(
     Raises:
         InputError: the route cannot be read.
     """
-    metadata = log.scene.get_modality_metadata(ModalityType.ROUTE_POSITION)
-    if not isinstance(metadata, RouteMetadata) or metadata.source != "provided":
+    metadata = _provided_route(log)
+    if metadata is None:
         return None
     with reading(log.file(metadata.modality_key), f"the route at frame {frame}"):
         progress_m = log.scene.get_route_progress_at_iteration(log.iteration(frame))
         if progress_m is None:
             return None
         return metadata.polyline_arc_m, metadata.polyline_xyz, float(progress_m)
+
+
+def _provided_route(log: Log) -> RouteMetadata | None:
+    metadata = log.scene.get_modality_metadata(ModalityType.ROUTE_POSITION)
+    provided = isinstance(metadata, RouteMetadata) and metadata.source == "provided"
+    return metadata if provided else None
+
+
+def _frames_with_route(log: Log) -> Int64[np.ndarray, "K"]:
+    """Return the frames at which `route_at` has a route."""
+    metadata = _provided_route(log)
+    if metadata is None:
+        return np.zeros(0, dtype=np.int64)
+    key = metadata.modality_key
+    with reading(log.file(key), "the progress along the route"):
+        frames, rows = log.rows(key)
+        progress = get_modality_table(log.path.folder, key)[f"{key}.progress_m"]
+        return frames[progress.is_valid().to_numpy(zero_copy_only=False)[rows]]
 
 
 def route_offset_m(

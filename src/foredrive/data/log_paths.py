@@ -1,5 +1,6 @@
 """Locations of 123D logs. This module has no heavy imports, so that a wrong path is reported at once."""
 
+import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,6 +9,8 @@ from foredrive.data.clip_list import read_clip_list
 from foredrive.errors import InputError
 
 _SEARCH_DEPTH = 3
+_URL = re.compile(r"[a-z][a-z0-9+.-]+:/{1,2}[^/]")
+"""The beginning of a URL, such as s3://bucket/logs. pathlib leaves one of its two slashes."""
 
 
 @dataclass(frozen=True)
@@ -33,19 +36,28 @@ def find_logs(path: Path) -> list[LogPath]:
     """Find all 123D logs at `path`.
 
     The path is a data root (with logs/SPLIT/NAME), the folder of a split or of one log, or a clip list
-    (`clip_list`). A clip list gives its logs with the listed parts.
+    (`clip_list`). A clip list gives its logs with the listed parts. Folders may be in object storage, as
+    s3://BUCKET/PATH: their logs are fetched when they are opened (`log_mirror`).
 
     Raises:
-        InputError: there is no log.
+        InputError: there is no log, or object storage cannot be read.
     """
+    if _URL.match(str(path)):
+        from foredrive.data.log_mirror import mirrored_logs  # pyarrow is slow to import
+
+        folders = mirrored_logs(path, _SEARCH_DEPTH)
+        return _found(folders, str(path))
     path = Path(path).absolute()
     if path.is_file():
         return _listed_logs(path)
     if not path.is_dir():
         raise InputError(f"{path}: no such folder")
-    folders = sorted(_log_folders(path, _SEARCH_DEPTH))
+    return _found(sorted(_log_folders(path, _SEARCH_DEPTH)), str(path))
+
+
+def _found(folders: list[Path], where: str) -> list[LogPath]:
     if not folders:
-        raise InputError(f"{path}: no 123D log here (a log is a folder with a sync.arrow)")
+        raise InputError(f"{where}: no 123D log here (a log is a folder with a sync.arrow)")
     return [LogPath(folder, folder.parents[2] / "maps") for folder in folders]
 
 
@@ -71,9 +83,15 @@ def _listed_logs(path: Path) -> list[LogPath]:
     for clip in read_clip_list(path):
         parts.setdefault((clip.folder, clip.maps_dir), []).append((clip.start_s, clip.end_s))
     for folder, _ in parts:
-        if not (folder / "sync.arrow").is_file():
+        if not (folder / "sync.arrow").is_file() and not _is_mirrored(folder):
             raise InputError(f"{path}: the log {folder} does not exist")
     return [LogPath(folder, maps_dir, _united(spans)) for (folder, maps_dir), spans in parts.items()]
+
+
+def _is_mirrored(folder: Path) -> bool:
+    from foredrive.data.log_mirror import is_mirrored  # pyarrow is slow to import
+
+    return is_mirrored(folder)
 
 
 def _united(spans: list[tuple[float, float]]) -> tuple[tuple[float, float], ...]:

@@ -2,17 +2,19 @@
 
 import functools
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Float64, Int64
-from py123d.api.scene.arrow.arrow_scene_api import ArrowSceneAPI
-from py123d.api.scene.arrow.modalities.sync_utils import get_modality_table, get_sync_table
+from py123d.api.scene.arrow.modalities.sync_utils import get_sync_table
 from py123d.datatypes import EgoStateSE3Metadata, ModalityType
 
-from foredrive.data.arrow_files import check_whole, column_array, fixed_lists, pose_matrices, reading
+from foredrive.data.arrow_files import arrow_table, column_array, fixed_lists, pose_matrices, reading
 from foredrive.data.ego_path import interpolated_poses
+from foredrive.data.log_mirror import hold
 from foredrive.data.log_paths import LogPath
+from foredrive.data.log_scene import LogScene
 from foredrive.errors import InputError
 from foredrive.scene import Trajectory
 
@@ -23,6 +25,8 @@ _MAX_GAP_S = 1.0
 
 class Log:
     """One opened log, picklable. Frames are the rows of its sync table that have an ego pose.
+
+    A log in object storage is fetched first, and kept here while it is open.
 
     The ego frame is that of Foredrive: on the ground below the rear axle. The bottom face of 123D's vehicle
     box is on the ground, so the ground is half the box height below the box centre.
@@ -42,11 +46,10 @@ class Log:
 
     def __init__(self, path: LogPath) -> None:
         self.path = path
-        check_whole(path.folder)
-        self.scene = ArrowSceneAPI(path.folder, maps_root=path.maps_dir)
-        with reading(path.folder, "its metadata"):
-            self.metadata = self.scene.get_log_metadata()
-            vehicle = self.scene.get_modality_metadata(ModalityType.EGO_STATE_SE3)
+        self._held = (hold(path.folder), hold(path.maps_dir))
+        self.scene = LogScene(path.folder, path.maps_dir)
+        self.metadata = self.scene.get_log_metadata()
+        vehicle = self.scene.get_modality_metadata(ModalityType.EGO_STATE_SE3)
         if not isinstance(vehicle, EgoStateSE3Metadata):
             raise InputError(f"{path.folder}: a log without ego poses (no {_EGO}.arrow)")
         self.vehicle = vehicle
@@ -58,6 +61,9 @@ class Log:
         self._drive_t_us, self._drive_T = ego_t_us[distinct], T_world_ego[distinct]
         self.period_s = float(np.median(np.diff(self.t_us))) * 1e-6 if len(self.t_us) > 1 else 0.0
         self.speed_mps = _speed(speed_mps[ego_rows], self.t_us, self.T_world_ego)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return self.__dict__ | {"_held": ()}  # the process that opened a log keeps it for its workers
 
     def __len__(self) -> int:
         return len(self.t_us)
@@ -133,18 +139,24 @@ class Log:
         A pose is valid if the log has close poses before and after it. The vehicle stands still before and
         after the log.
         """
+        valid = self.knows_pose_at(t_us)
+        if len(self._drive_t_us) < 2 or len(t_us) == 0:
+            return np.repeat(self._drive_T[:1], len(t_us), axis=0), valid
+        return interpolated_poses(self._drive_t_us, self._drive_T, t_us), valid
+
+    def knows_pose_at(self, t_us: Float64[np.ndarray, "*n"]) -> Bool[np.ndarray, "*n"]:
+        """Return whether the log has close poses before and after each time."""
         at = self._drive_t_us
-        if len(at) < 2 or len(t_us) == 0:
-            return np.repeat(self._drive_T[:1], len(t_us), axis=0), np.zeros(len(t_us), dtype=bool)
+        if len(at) < 2:
+            return np.zeros(t_us.shape, dtype=bool)
         after = np.searchsorted(at, t_us).clip(1, len(at) - 1)
-        valid = (t_us >= at[0]) & (t_us <= at[-1]) & (at[after] - at[after - 1] <= _MAX_GAP_S * 1e6)
-        return interpolated_poses(at, self._drive_T, t_us), valid
+        return (t_us >= at[0]) & (t_us <= at[-1]) & (at[after] - at[after - 1] <= _MAX_GAP_S * 1e6)
 
     def _read_ego(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return times [E] (µs), poses [E 4 4] and logged speeds [E] (NaN if missing) of all ego states."""
         file = self.file(_EGO)
         with reading(file, "the ego states"):
-            table = get_modality_table(self.path.folder, _EGO)
+            table = arrow_table(file)
             t_us = table[f"{_EGO}.timestamp_us"].to_numpy()
             pose = fixed_lists(column_array(table, f"{_EGO}.imu_se3"), 7)
             velocity = fixed_lists(column_array(table, f"{_EGO}.dynamic_state_se3"), 9)[:, :2]
@@ -162,7 +174,7 @@ class Log:
         """Return the sync rows that have an ego pose, and the rows of those poses."""
         file = self.path.folder / "sync.arrow"
         with reading(file, "the frames"):
-            table = get_sync_table(self.path.folder)
+            table = arrow_table(file)
             ego_rows = table[_EGO].to_numpy(zero_copy_only=False).astype(np.float64)
             t_us = table["sync.timestamp_us"].to_numpy()
         if (np.diff(t_us) <= 0).any():

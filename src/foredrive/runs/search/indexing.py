@@ -190,7 +190,8 @@ def _plan(logs: Sequence[LogPath], index: FrameIndex, failed: dict[str, str]) ->
             failed[path.name] = f"{path.folder} has the name of {folder_of[path.name]}"
             continue
         try:
-            frames, digest = moments(Log(path), index.settings.stride_s), log_digest(path)
+            log = Log(path)
+            frames, digest = moments(log, index.settings.stride_s), log_digest(path)
         except InputError as error:
             failed[path.name] = str(error)
             continue
