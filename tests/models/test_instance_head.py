@@ -140,6 +140,18 @@ def test_cells_belong_to_the_most_probable_vehicle() -> None:
     assert not instance_raster(untrained(3), agents([(0.0, 0.0, 0.0, 0.0)] * 3, score=0.2), GRID).any()
 
 
+def test_two_queries_on_one_vehicle_do_not_share_its_cells() -> None:
+    """The less certain one is 0.5 m ahead; all that is left to it are cells beyond the other's box."""
+    found = agents([(0.0, 0.0, 0.0, 0.0), (0.5, 0.0, 0.0, 0.0)])
+    logits = found.boxes.logits.clone()
+    logits[0, 1, CAR], logits[0, 1, -1] = math.log(0.4), math.log(0.6)
+    found = dataclasses.replace(found, boxes=dataclasses.replace(found.boxes, logits=logits))
+    cells = instance_raster(untrained(2), found, GRID)[0, 0]
+    alone = instance_raster(untrained(1), agents([(0.0, 0.0, 0.0, 0.0)]), GRID)[0, 0]
+    assert int((cells == 1).sum()) >= 0.8 * int((alone == 1).sum())
+    assert int((cells == 2).sum()) < 0.3 * int((cells == 1).sum())
+
+
 def boxes_of(found: AgentSet) -> Boxes:
     mean, heading = found.boxes.mean, found.boxes.heading
     count = mean.shape[1]

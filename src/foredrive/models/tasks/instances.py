@@ -148,10 +148,11 @@ def instance_logits(
 
 
 def instance_raster(instances: InstanceSet, agents: AgentSet, spec: PlaneSpec) -> Int[Tensor, "b S Y X"]:
-    """Return the most probable vehicle of each cell of a grid, its query's number + 1; 0 for none.
+    """Return the vehicle of each cell of a grid, its query's number + 1; 0 for none.
 
     Vehicles are agents of UniAD's seven classes with a score of at least `MIN_SCORE`, and cells have a
-    probability of at least `MIN_PROBABILITY`.
+    probability of at least `MIN_PROBABILITY`. Of several vehicles, a cell belongs to that of the highest
+    product of probability and score, as in UniAD: so two queries on one vehicle do not share its cells.
     """
     count = instances.embedding.shape[-2]
     points = cell_middles(spec.lower_m, spec.cell_m, spec.shape_yx).to(instances.embedding)
@@ -161,6 +162,8 @@ def instance_raster(instances: InstanceSet, agents: AgentSet, spec: PlaneSpec) -
         score, label = agents.boxes.logits[item].softmax(dim=-1)[..., :-1].max(dim=-1)
         rows = ((score >= MIN_SCORE) & is_vehicle[label]).nonzero()[:, 0]
         if len(rows):
-            best, which = instance_logits(instances[item], agents[item], rows, points).sigmoid().max(dim=0)
-            found[item] = torch.where(best >= MIN_PROBABILITY, rows[which] + 1, 0)
+            probability = instance_logits(instances[item], agents[item], rows, points).sigmoid()
+            inside = probability >= MIN_PROBABILITY
+            which = (probability * inside * score[rows, None, None]).argmax(dim=0)
+            found[item] = torch.where(inside.any(dim=0), rows[which] + 1, 0)
     return found.unflatten(-1, spec.shape_yx)
