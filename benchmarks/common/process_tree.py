@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 
 class TreeUse(NamedTuple):
-    """What a process and all its descendants hold."""
+    """The memory, descriptors, threads and processes of a process and all its descendants."""
 
     memory_mib: float
     """See `resident_mib`."""

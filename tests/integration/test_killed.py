@@ -58,7 +58,7 @@ def test_train(server: ProgramServer, log: LogPath, tmp_path: Path) -> None:
 
 
 def test_a_difference_is_found(trained: Run, tmp_path: Path) -> None:
-    """What the comparison leaves out are times alone."""
+    """Nothing but times is left out of the comparison."""
     run = Path(shutil.copytree(trained.folder, tmp_path / "run"))
     found, metrics = contents(run), run / "pretrain/metrics.jsonl"
     for field, same in (("cpu_s", True), ("loss", False)):
