@@ -74,14 +74,20 @@ def test_kept_volumes_are_shared_and_those_of_the_world_model(
     train_heads(run, recipe)
     files = sorted((tmp_path / "cache" / "volumes").rglob("*.safetensors"))
     times = [file.stat().st_mtime_ns for file in files]
-    files[0].write_bytes(b"damaged")
     other = probe_run(trained.recipe, [log], tmp_path / "two", tmp_path / "cache", trained.folder)
     train_heads(other, recipe)
-    after = [file.stat().st_mtime_ns for file in files]
-    assert after[1:] == times[1:]
-    assert load_file(files[0])["volume"].shape == (1, 8, 2, 16, 16)
+    assert [file.stat().st_mtime_ns for file in files] == times
     one, two = (load_file(each.folder / TASKS / WEIGHTS) for each in (run, other))
     assert all(torch.equal(value, two[name]) for name, value in one.items())
+
+    volume = load_file(files[0])["volume"].clone()  # the file is mapped
+    assert volume.shape == (1, 8, 2, 16, 16)
+    files[0].write_bytes(b"damaged")
+    third = probe_run(trained.recipe, [log], tmp_path / "three", tmp_path / "cache", trained.folder)
+    train_heads(third, recipe)
+    assert [file.stat().st_mtime_ns for file in files[1:]] == times[1:]
+    # Made in another batch, so on some processors with another rounding of 16 bits.
+    torch.testing.assert_close(load_file(files[0])["volume"], volume, atol=2e-3, rtol=2e-3)
 
 
 def test_a_probe_keeps_the_recipe_of_its_world_model(trained: Run, log: LogPath, tmp_path: Path) -> None:
