@@ -111,10 +111,9 @@ def _folders_below(folder: Path) -> Iterator[Path]:
 
 def _new_scratch(final: Path, alone: bool) -> tuple[Path, int | None]:
     """Make a scratch folder; return it and its lock, which tells others that its process lives."""
-    nested = _SCRATCH.fullmatch(final.parent.name)  # the lock of a scratch folder is this process' own
-    among = (
-        None if nested else _lock(final.parent, wait=True)
-    )  # nobody takes it for abandoned before its lock
+    among = None
+    if not _SCRATCH.fullmatch(final.parent.name):  # the lock of a scratch folder is this process' own
+        among = _lock(final.parent, wait=True)  # nobody takes the new folder for abandoned before its lock
     try:
         _remove_abandoned(final.parent, again=alone)
         for _, name in _scratch_folders(final.parent) if alone else ():

@@ -227,6 +227,8 @@ class ClipDataset(Dataset[Example]):
         number, frames = self._clip(index)
         log, config = self._logs[number], self.config
         now = frames[config.past_frames]
+        driven = log.driven_future(now, config.horizon_steps, config.horizon_dt_s)
+        command, _ = command_at(log, now, driven)
         cameras = [find_camera(self._cameras[number], name) for name in self.camera_names]
         seen = [
             self._frames.read(log, frame, cameras, config.future_images or frame <= now) for frame in frames
@@ -238,9 +240,7 @@ class ClipDataset(Dataset[Example]):
             seen,
             [read_sweep(log, frame) if config.lidar else None for frame in frames],
             self._future(log, now),
-            command=command_at(log, now, log.driven_future(now, config.horizon_steps, config.horizon_dt_s))[
-                0
-            ],
+            command=command,
             target_xy=target_at(log, now),
             map_patch=read_map_patch(log, now) if config.map else None,
         )
