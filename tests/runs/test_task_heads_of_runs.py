@@ -80,13 +80,14 @@ def test_kept_volumes_are_shared_and_those_of_the_world_model(
     one, two = (load_file(each.folder / TASKS / WEIGHTS) for each in (run, other))
     assert all(torch.equal(value, two[name]) for name, value in one.items())
 
-    kept = files[0].read_bytes()
-    assert load_file(files[0])["volume"].shape == (1, 8, 2, 16, 16)
+    volume = load_file(files[0])["volume"].clone()  # the file is mapped
+    assert volume.shape == (1, 8, 2, 16, 16)
     files[0].write_bytes(b"damaged")
     third = probe_run(trained.recipe, [log], tmp_path / "three", tmp_path / "cache", trained.folder)
     train_heads(third, recipe)
     assert [file.stat().st_mtime_ns for file in files[1:]] == times[1:]
-    assert files[0].read_bytes() == kept
+    # Made in another batch, so some values are rounded to the next number of 16 bits.
+    torch.testing.assert_close(load_file(files[0])["volume"], volume, atol=2e-3, rtol=2e-3)
 
 
 def test_a_probe_keeps_the_recipe_of_its_world_model(trained: Run, log: LogPath, tmp_path: Path) -> None:
