@@ -1,12 +1,12 @@
 """Many drives at once: the same bytes as one after another, none twice, none lost for another's failure."""
 
 import functools
-import hashlib
 import os
 import signal
 from pathlib import Path
 
 import pytest
+from file_digests import digests
 
 from foredrive.cli.arguments import chosen_rig
 from foredrive.data.cameras import rig_of_log
@@ -23,14 +23,6 @@ PLANS = [
     for seed, conditions in ((1, None), (2, None), (2, "clear"))
 ]
 LOST = DrivePlan("Town99", 1, None, 6, 4, 1.0, 2.0)
-
-
-def digests(folder: Path) -> dict[str, str]:
-    return {
-        str(file.relative_to(folder)): hashlib.sha256(file.read_bytes()).hexdigest()
-        for file in sorted(folder.rglob("*"))
-        if file.is_file()
-    }
 
 
 @pytest.fixture(scope="module")
@@ -129,14 +121,3 @@ def test_nothing_is_lost_with_a_killed_process(tmp_path: Path) -> None:
     results = fan_out(range(5), functools.partial(die_once, folder=tmp_path), 2)
     assert dict(results) == {0: 0, 1: 1, 2: 4, 3: 9, 4: 16}
     assert (tmp_path / "died").exists()
-
-
-@pytest.mark.skipif(
-    "FOREDRIVE_TEST_RAY" not in os.environ, reason="Ray takes long to start on a busy machine"
-)
-@pytest.mark.filterwarnings("ignore::ResourceWarning")  # Ray leaves its own processes to the system
-def test_on_ray(tmp_path: Path, recorded: RecordingResult, root: Path) -> None:
-    on_ray = record_drives([LOST, PLANS[0]], tmp_path, RIG, workers=1, on_ray=True)
-    assert list(on_ray.logs) == [PLANS[0]]
-    assert "unknown town 'Town99'" in on_ray.failed[LOST]
-    assert digests(tmp_path).items() <= digests(root).items()

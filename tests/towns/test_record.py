@@ -1,6 +1,5 @@
 """A recording is a 123D log that others can open, the same for the same seed, whole or not there."""
 
-import hashlib
 import shutil
 from pathlib import Path
 
@@ -8,6 +7,7 @@ import numpy as np
 import pytest
 import shapely
 import torch
+from file_digests import digests
 from py123d.api.scene.arrow.arrow_scene_api import ArrowSceneAPI
 from py123d.datatypes import MapLayer, ModalityType, RouteMetadata
 from py123d.geometry import Point2D
@@ -26,14 +26,6 @@ from foredrive.towns.map.town_map import TownMap
 from foredrive.towns.recorder import record, split_of
 from foredrive.towns.traffic.expert import ExpertDrive
 from foredrive.towns.traffic.traffic import Traffic
-
-
-def digests(folder: Path) -> dict[str, str]:
-    return {
-        str(file.relative_to(folder)): hashlib.sha256(file.read_bytes()).hexdigest()
-        for file in sorted(folder.rglob("*"))
-        if file.is_file()
-    }
 
 
 def test_the_same_seed_gives_the_same_bytes(recording: LogPath, tmp_path: Path) -> None:
