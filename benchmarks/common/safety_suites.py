@@ -14,6 +14,7 @@ from foredrive.recipes.rebuilding import gaussians_tiny
 from foredrive.runs.drive.in_ncap import SafetyTests, propose_scenarios
 from foredrive.runs.drive.records import tested_runs
 from foredrive.runs.drive.suite import DriveSuite, drive_suite
+from foredrive.runs.folder import SUMMARY
 from foredrive.runs.rebuild.reconstruct import reconstruct
 from foredrive.scene.conditions import BackgroundTraffic
 from foredrive.simulation.drive_record import DriveRecord
@@ -58,6 +59,8 @@ WORK = Path("runs/safety_rebuilds") / study_identity(
 def rebuilt_town(drive: TownDrive) -> Path:
     """Return the folder of the rebuild of a drive; record and rebuild what is missing."""
     folder = WORK / "rebuilt" / drive.town
+    if (folder / SUMMARY).is_file():
+        return folder  # the first step of `reconstruct` takes a minute, even if nothing is left to do
     recipe = dataclasses.replace(gaussians_tiny(), cameras=drive.cameras, image_hw=drive.image_hw)
     reconstruct(recipe, drive.recorded(WORK / "towns"), folder, WORK / "cache")
     return folder
