@@ -8,8 +8,8 @@ from torch.utils.data import DataLoader
 from foredrive.data import LogPath, collate
 from foredrive.evaluation.run import evaluate
 from foredrive.recipes.config import Recipe
+from foredrive.runs.evaluate.inputs import FUTURES
 from foredrive.runs.evaluate.predict import AgentPredictor
-from foredrive.runs.evaluate.run import FUTURES
 from foredrive.runs.open_clips import open_clips
 from foredrive.runs.train.baselines import fit_baselines
 from foredrive.runs.train.run import Run, load_agent

@@ -130,3 +130,14 @@ def test_logs_too_short_for_the_horizon_are_named(trained: Run, tmp_path: Path) 
     with pytest.raises(InputError, match="too short for one clip"):
         evaluate_run(trained, [short], tmp_path / "out")
     assert not (tmp_path / "out").exists()
+
+
+def test_figures_do_not_depend_on_the_number_of_processes(
+    trained: Run, log: LogPath, result: EvaluationResult, tmp_path: Path
+) -> None:
+    shared = evaluate_run(trained, [log], tmp_path, batch_size=1, workers=2)
+    single = evaluate_run(trained, [log], tmp_path, batch_size=1)
+    for key, value in single.summary.items():
+        if isinstance(value, float) and key not in ("wall_s", "peak_rss_gib"):
+            assert shared.summary[key] == pytest.approx(value, rel=1e-6, nan_ok=True), key
+    assert shared.failures == single.failures == ()

@@ -305,3 +305,25 @@ def test_a_log_of_one_frame_is_said_not_to_be_evaluated(
     assert main([*line, "--recipe", str(tmp_path / "recipe.yaml")]) == 0
     assert "no frame was held out, so the scene is not evaluated" in capsys.readouterr().out
     assert "psnr_db" not in json.loads((tmp_path / "run" / "summary.json").read_text())
+
+
+def test_several_logs_have_a_run_each_and_a_bad_one_stops_no_other(
+    log: LogPath, run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    split = tmp_path / "data" / "logs" / "flat_train"
+    for name in ("bad", "first", "second"):
+        shutil.copytree(log.folder, split / name)
+    for file in (split / "bad").glob("camera.*.arrow"):
+        file.write_bytes(file.read_bytes()[:100])
+    save_recipe(recipe(3), tmp_path / "recipe.yaml")
+    line = ["reconstruct", str(tmp_path / "data"), "--out", str(tmp_path / "runs"), "--workers", "2"]
+    assert main([*line, "--recipe", str(tmp_path / "recipe.yaml")]) == 2
+    told = capsys.readouterr()
+    assert "1 of 3 logs failed: flat_train/bad (" in told.err
+    assert told.out.count("rebuilt flat_train/") == 2
+    alone = tmp_path / "alone"
+    reconstruct(recipe(3), LogPath(split / "first", tmp_path / "data" / "maps"), alone)
+    for name in ("first", "second"):
+        folder = tmp_path / "runs" / "flat_train" / name
+        assert (folder / "held_out.png").is_file()
+        assert (folder / "model.safetensors").read_bytes() == (alone / "model.safetensors").read_bytes()

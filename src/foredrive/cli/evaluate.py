@@ -25,6 +25,8 @@ def evaluate(
     batch_size: int = 4,
     write_results: Literal["nuscenes"] | None = None,
     rebuilt: Annotated[OptionalPath, tyro.conf.arg(name="in", metavar="REBUILT")] = None,
+    workers: int = 1,
+    ray: bool = False,
 ) -> None:
     """Evaluate a trained run and its baselines; write summary.json and report.html.
 
@@ -42,8 +44,12 @@ def evaluate(
             the formats of nuScenes' code bases, which `foredrive score` reads: detection.json, tracking.json,
             motion.json, map.json and the folder occupancy (docs/tasks.md).
         rebuilt: Folder of a reconstruction whose log still exists; writes gap.json.
+        workers: Number of processes that predict; 1 predicts in this process, on all cores. On Ray it is the
+            size of a cluster that is started here.
+        ray: Predict on Ray: on the cluster at RAY_ADDRESS, or on a cluster that is started here.
     """
     run = check_run(run)
+    check_number("--workers", workers, low=1)
     check_number("--examples", examples, low=0)
     check_out_folder(out)
     if rebuilt is not None:
@@ -66,7 +72,15 @@ def evaluate(
     chosen = named or trained.logs
     folder = out or run
     with held_for_results(folder):
-        result = evaluate_run(trained, chosen, folder, batch_size, results_files=write_results is not None)
+        result = evaluate_run(
+            trained,
+            chosen,
+            folder,
+            batch_size,
+            results_files=write_results is not None,
+            workers=workers,
+            on_ray=ray,
+        )
         summary = read_summary(folder / "summary.json")
         print_summary(summary, Console(), trained.recipe.name)
         predictions = predict_examples(trained, chosen, examples)

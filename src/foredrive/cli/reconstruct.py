@@ -1,19 +1,39 @@
 """`foredrive reconstruct`."""
 
+import contextlib
 import dataclasses
+import functools
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from foredrive.cli.arguments import ImageSize, OptionalPath, Settings, check_image_size, check_out_folder
-from foredrive.data.log_paths import find_one_log
+from foredrive.cli.arguments import (
+    ImageSize,
+    OptionalPath,
+    Settings,
+    check_image_size,
+    check_number,
+    check_out_folder,
+)
+from foredrive.cli.failures import listed_failures
+from foredrive.data.log_paths import LogPath, find_logs
 from foredrive.errors import InputError
 from foredrive.lazy import importing
 
+if TYPE_CHECKING:
+    from foredrive.evaluation.perceptual import PerceptualWeights
+    from foredrive.recipes.rebuilding import RebuildRecipe
+
+FIGURES = (
+    *("minutes", "psnr_db", "nearest.psnr_db", "ssim", "lpips", "fid"),
+    *("depth_median_sq_m2", "intensity_rmse", "drop_accuracy", "chamfer_m2"),
+)
+
 
 def reconstruct(
-    log: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="LOG")],
+    logs: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="LOGS")],
     out: Path,
     method: Literal["gaussians", "field"] | None = None,
     recipe: str | None = None,
@@ -23,16 +43,19 @@ def reconstruct(
     lpips_weights: OptionalPath = None,
     fid_weights: OptionalPath = None,
     set: Settings = (),
+    workers: int = 1,
+    ray: bool = False,
 ) -> None:
-    """Reconstruct a log as a scene that renders cameras and lidars, or continue an interrupted run.
+    """Reconstruct logs as scenes that render cameras and lidars, or continue interrupted runs.
 
-    Every second frame is held out, and the scene is evaluated on the held-out frames. The run's folder holds
+    Every second frame is held out, and the scene is evaluated on the held-out frames. A run's folder holds
     the scene, its metrics (summary.json), pictures of held-out frames (held_out.png) and the static part as a
     PLY file for viewers of 3-D Gaussians (static.ply).
 
     Args:
-        log: Folder of a 123D log, or of a split or data root with exactly one log in it.
-        out: Folder of the run. If it holds this run already, the run continues from the last checkpoint.
+        logs: Folder of a 123D log, of a split or of a data root.
+        out: Folder of the run; of several logs, each has its run in SPLIT/NAME there. If it holds a run
+            already, the run continues from the last checkpoint, and a finished run is kept.
         method: Representation of the scene; by default the recipe's.
         recipe: Name of the recipe: gaussians_tiny (minutes on two cores), field_tiny (half an hour on two
             cores), gaussians_base, gaussians_published or field_base (a GPU), or a YAML file; by default
@@ -41,20 +64,20 @@ def reconstruct(
             recipe's.
         image_size: Images are shrunk to this size (height, width), px; by default the recipe's, 270 480 or
             1080 1920.
-        cache: Folder for shrunk images; by default "cache" in the run's folder.
+        cache: Folder for shrunk images; by default "cache" in OUT.
         lpips_weights: Evaluate LPIPS too, with this file of torchvision's AlexNet (.pth or .safetensors).
         fid_weights: Evaluate FID too, with this file of the Inception of 2015 that pytorch-fid publishes.
         set: Entries of the recipe to replace, such as representation.schedule.steps=2000; `foredrive recipes
             RECIPE` prints all entries.
     """
     check_image_size(image_size)
+    check_number("--workers", workers, low=1)
     check_out_folder(out)
-    found = find_one_log(log)
+    found = find_logs(logs)
 
     with importing():
-        from foredrive.evaluation.perceptual import PerceptualMetrics, PerceptualWeights
+        from foredrive.evaluation.perceptual import PerceptualWeights
         from foredrive.recipes.rebuilding import find_rebuild_recipe
-        from foredrive.runs.rebuild.reconstruct import reconstruct as rebuild_log
 
     chosen = find_rebuild_recipe(recipe or f"{method or 'gaussians'}_tiny", set)
     kind = chosen.representation.kind
@@ -64,21 +87,70 @@ def reconstruct(
         chosen = dataclasses.replace(chosen, cameras=cameras)
     if image_size is not None:
         chosen = dataclasses.replace(chosen, image_hw=image_size)
-    perceptual = None
-    if lpips_weights is not None or fid_weights is not None:
-        perceptual = PerceptualMetrics(PerceptualWeights(lpips_weights, fid_weights))
-    run = rebuild_log(chosen, found, out, cache, perceptual)
+    work = functools.partial(
+        rebuild_log,
+        recipe=chosen,
+        cache=(cache or out / "cache").absolute(),
+        weights=PerceptualWeights(lpips_weights, fid_weights),
+    )
+    if len(found) == 1 and not ray:
+        print(work((found[0], out)), flush=True)
+    else:
+        _rebuild_logs(found, out.absolute(), work, workers, ray)
+
+
+def rebuild_log(
+    job: tuple[LogPath, Path],
+    recipe: "RebuildRecipe[Any]",
+    cache: Path,
+    weights: "PerceptualWeights",
+    threads: int | None = None,
+) -> str:
+    """Reconstruct one log in a folder, draw its held-out frames, and return its figures as lines."""
+    import torch
+
+    from foredrive.evaluation.perceptual import PerceptualMetrics, PerceptualWeights
+    from foredrive.runs.rebuild.reconstruct import reconstruct
+
+    if threads is not None:
+        torch.set_num_threads(threads)
+    log, out = job
+    perceptual = None if weights == PerceptualWeights() else PerceptualMetrics(weights)
+    run = reconstruct(recipe, log, out, cache, perceptual)
+    lines = [f"rebuilt {log.name} by {recipe.representation.kind}: {out}"]
     if run.held_out.cameras:
         from foredrive.view.rebuilt_sheet import write_rebuilt_sheet
 
-        title = f"{found.name}, frames that were held out"
+        title = f"{log.name}, frames that were held out"
         write_rebuilt_sheet(out / "held_out.png", run.scene, run.held_out.cameras, title)
-    if not run.held_out.cameras and not run.held_out.sweeps:
-        print(f"{found.name} is too short: no frame was held out, so the scene is not evaluated")
-    print(f"rebuilt {found.name} by {kind}: {out}")
-    for name in (
-        *(*run.scene.sizes, "minutes", "psnr_db", "nearest.psnr_db", "ssim", "lpips", "fid"),
-        *("depth_median_sq_m2", "intensity_rmse", "drop_accuracy", "chamfer_m2"),
-    ):
-        if run.summary.get(name) is not None:
-            print(f"  {name}: {run.summary[name]:.4g}")
+    elif not run.held_out.sweeps:
+        lines.insert(0, f"{log.name} is too short: no frame was held out, so the scene is not evaluated")
+    known = {
+        name: value for name in (*run.scene.sizes, *FIGURES) if (value := run.summary.get(name)) is not None
+    }
+    return "\n".join([*lines, *(f"  {name}: {value:.4g}" for name, value in known.items())])
+
+
+def _rebuild_logs(
+    found: Sequence[LogPath], out: Path, work: Callable[..., str], workers: int, on_ray: bool
+) -> None:
+    """Reconstruct several logs, some at a time.
+
+    Raises:
+        InputError: some logs failed.
+    """
+    import torch
+
+    from foredrive.runs.fan_out import fan_out, reason
+
+    jobs = [(log, out / log.name) for log in found]
+    work = functools.partial(work, threads=max(1, torch.get_num_threads() // workers))
+    failed = {}
+    with contextlib.closing(fan_out(jobs, work, workers, on_ray=on_ray)) as results:
+        for (log, _), result in results:
+            if isinstance(result, BaseException):
+                failed[log.name] = reason(log.name, result)
+            else:
+                print(result, flush=True)
+    if failed:
+        raise InputError(f"{len(failed)} of {len(jobs)} logs failed: {listed_failures(failed)}")

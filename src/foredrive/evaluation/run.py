@@ -2,12 +2,12 @@
 
 import dataclasses
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import get_args
 
 import torch
-from jaxtyping import Bool
+from jaxtyping import Bool, Int
 from torch import Tensor
 
 from foredrive.errors import InputError
@@ -49,6 +49,28 @@ class EvaluationResult:
     """Of the model under evaluation; those of baselines are in `summary` as counts."""
 
 
+@dataclass(frozen=True)
+class PredictedBatch:
+    """A batch of examples and a model's predictions for it."""
+
+    truth: Example | None
+    """None if the batch could not be loaded."""
+    parts: tuple[tuple[Int[Tensor, "_n"], Prediction], ...]
+    """Predictions with the indices of their items, in order. Items that failed are in none."""
+    failures: tuple[Failure, ...]
+
+    @property
+    def items(self) -> int:
+        """Return the number of items, failed ones included."""
+        return len(self.failures) if self.truth is None else len(self.truth.key)
+
+    def to(self, device: torch.device | str) -> "PredictedBatch":
+        """Return the batch on a device."""
+        truth = None if self.truth is None else self.truth.to(device)
+        parts = tuple((chosen.to(device), found.to(device)) for chosen, found in self.parts)
+        return PredictedBatch(truth, parts, self.failures)
+
+
 def evaluate(
     predictor: Predictor,
     loader: Iterable[Example],
@@ -63,12 +85,79 @@ def evaluate(
     on_items: Callable[[int], None] = lambda items: None,
     on_prediction: OnPrediction = lambda prediction, truth: None,
 ) -> EvaluationResult:
-    """Judge a model and its baselines on every item of a loader.
+    """Judge a model and its baselines on every item of a loader; see `judge` for the other arguments.
 
     Args:
         predictor: sees `clip.observed()` only, and is asked for the parts that the metrics need. A metric
             gives no figures where the model leaves one of its parts None.
         loader: batches.
+
+    Raises:
+        InputError: if there are no items, or all of them failed.
+    """
+    return judge(
+        predict_batches(predictor, loader, parts_needed(metrics), device),
+        frame_dt_s=frame_dt_s,
+        metrics=metrics,
+        baselines=baselines,
+        prior=prior,
+        task_priors=task_priors,
+        command_source=command_source,
+        device=device,
+        on_items=on_items,
+        on_prediction=on_prediction,
+    )
+
+
+def parts_needed(metrics: Sequence[MetricFactory] = METRICS) -> frozenset[Part]:
+    """Return the parts of a prediction that some metrics need."""
+    context = EvaluationContext(1.0)
+    return frozenset().union(*(start(context).needs for start in metrics))
+
+
+@torch.inference_mode()
+def predict_batches(
+    predictor: Predictor,
+    loader: Iterable[Example],
+    asked: frozenset[Part],
+    device: torch.device | str = "cpu",
+) -> Generator[PredictedBatch, None, None]:
+    """Yield the batches of a loader with their predictions.
+
+    An item for which the predictor raises an error, or predicts a value that is not finite, counts as failed;
+    its batch is then tried again item by item. Where the loader raises an InputError and can go on after it,
+    a batch (of its `batch_size`; without one, an item) counts as failed.
+    """
+    batches = iter(loader)
+    batch_size = getattr(loader, "batch_size", None) or 1
+    while True:
+        try:
+            example = next(batches).to(device)
+        except StopIteration:
+            return
+        except InputError as error:  # the loader has moved on and can give the next batch
+            yield PredictedBatch(None, (), (Failure("not loaded", _line(error)),) * batch_size)
+            continue
+        yield _predicted(predictor, example, asked)
+
+
+def judge(
+    batches: Iterable[PredictedBatch],
+    *,
+    frame_dt_s: float,
+    metrics: Sequence[MetricFactory] = METRICS,
+    baselines: Mapping[str, Agent] | None = None,
+    prior: OccupancyPrior | None = None,
+    task_priors: TaskPriors | None = None,
+    command_source: Mapping[str, int] | None = None,
+    device: torch.device | str = "cpu",
+    on_items: Callable[[int], None] = lambda items: None,
+    on_prediction: OnPrediction = lambda prediction, truth: None,
+) -> EvaluationResult:
+    """Judge predictions of a model, and baselines on the same items.
+
+    Args:
+        batches: of `predict_batches`, in the order of the data set.
         frame_dt_s: time between key frames; names the figures of future frames.
         metrics: started once for the model and once for each baseline.
         baselines: planners by name, judged by the metrics of plans on every item that they manage. Their keys
@@ -80,39 +169,38 @@ def evaluate(
         on_prediction: called with the model's predictions and their truth, batch by batch. Failed items are
             left out.
 
-    An item for which the predictor raises an error, or predicts a value that is not finite, counts as failed;
-    its batch is then tried again item by item. Where the loader raises an InputError and can go on after it,
-    a batch (of its `batch_size`; without one, an item) counts as failed.
-
     Raises:
         InputError: if there are no items, or all of them failed.
     """
     started = time.perf_counter()
     context = EvaluationContext(frame_dt_s, prior, task_priors)
-    model = _EvaluatedMethod(predictor, metrics, context)
+    model = _JudgedMethod(metrics, context)
     planners = {
-        name: _EvaluatedMethod(PlannerPredictor(planner), metrics, context, only=frozenset({"plan"}))
+        name: (PlannerPredictor(planner), _JudgedMethod(metrics, context, only=frozenset({"plan"})))
         for name, planner in (baselines or {}).items()
     }
     with torch.inference_mode():
-        for loaded in _load(loader, model.failures, on_items):
-            example = loaded.to(device)
-            model.add(example, on_prediction)
-            for planner in planners.values():
-                planner.add(example)
-            on_items(len(example.key))
+        for batch in batches:
+            model.add(batch, on_prediction)
+            if batch.truth is not None:
+                for predictor, method in planners.values():
+                    method.add(_predicted(predictor, batch.truth.to(device), frozenset({"plan"})))
+            on_items(batch.items)
     failed = len(model.failures)
     if model.items == 0:
         first = f"all {failed} items failed, {model.failures[0].reason}" if failed else "no items"
         raise InputError(f"there is nothing to evaluate: {first}")
-    summary = _figures(model, planners) | _command_figures(command_source or {})
+    summary = model.figures()
+    for name, (_, method) in planners.items():
+        summary |= method.figures(f"{name}.") | {f"planning.{name}.failed": len(method.failures)}
+    summary |= _command_figures(command_source or {})
     summary |= {"items": model.items + failed, "failed": failed}
     summary |= {"peak_rss_gib": peak_rss_gib(), "wall_s": time.perf_counter() - started}
     return EvaluationResult(summary, tuple(model.failures))
 
 
-class _EvaluatedMethod:
-    """A model or baseline, its metrics and its failures.
+class _JudgedMethod:
+    """The metrics and the failures of a model or baseline.
 
     Args:
         only: parts that it predicts, if that is known; metrics of others are not started.
@@ -120,25 +208,26 @@ class _EvaluatedMethod:
 
     def __init__(
         self,
-        predictor: Predictor,
         metrics: Sequence[MetricFactory],
         context: EvaluationContext,
         only: frozenset[Part] | None = None,
     ) -> None:
-        self._predictor = predictor
         started = [start(context) for start in metrics]
         self._metrics = [metric for metric in started if only is None or metric.needs <= only]
-        self._asked: frozenset[Part] = frozenset().union(*(metric.needs for metric in self._metrics))
         self._has_figures = [only is not None for _ in self._metrics]
         """Metrics that give figures: those that were updated, and all of them where `only` is given."""
         self.failures: list[Failure] = []
         self.items = 0
         """Number of clips that were predicted."""
 
-    def add(self, example: Example, on_prediction: OnPrediction = lambda prediction, truth: None) -> None:
-        """Predict and judge one batch."""
-        for chosen, prediction in self._attempt(example):
-            truth = _select(example, chosen)
+    def add(
+        self, batch: PredictedBatch, on_prediction: OnPrediction = lambda prediction, truth: None
+    ) -> None:
+        """Judge one batch."""
+        self.failures.extend(batch.failures)
+        for chosen, prediction in batch.parts:
+            assert batch.truth is not None
+            truth = _select(batch.truth, chosen)
             self.items += len(chosen)
             for number, metric in enumerate(self._metrics):
                 if all(getattr(prediction, part) is not None for part in metric.needs):
@@ -155,56 +244,32 @@ class _EvaluatedMethod:
             for key, value in metric.result().items()
         }
 
-    def _attempt(self, example: Example) -> Iterator[tuple[Tensor, Prediction]]:
-        """Yield predictions with the indices of their items, in order; note the failures."""
-        batches = [torch.arange(len(example.key))]
-        while batches:
-            chosen = batches.pop(0)
-            try:
-                part = _select(example, chosen)
-                observed = part.clip.observed()
-                if isinstance(self._predictor, DriveFollowing):
-                    self._predictor.follow(part.key)
-                prediction = self._predictor.predict(observed, self._asked)
-            except Exception as error:  # whatever a model does wrong, the others are still to be judged
-                if len(chosen) > 1:
-                    batches.extend(chosen[:, None])
-                else:
-                    self.failures.append(Failure(example.key[int(chosen)], _line(error)))
-                continue
-            good = _is_complete(prediction).cpu()
-            bad = chosen[~good].tolist()
-            self.failures.extend(Failure(example.key[i], "not finite or incomplete") for i in bad)
-            if good.all():
-                yield chosen, prediction
-            elif good.any():
-                yield chosen[good], prediction[good]
 
-
-def _figures(model: _EvaluatedMethod, planners: Mapping[str, _EvaluatedMethod]) -> Figures:
-    """Return the figures of the model and of its baselines."""
-    summary = model.figures()
-    for name, method in planners.items():
-        summary |= method.figures(f"{name}.") | {f"planning.{name}.failed": len(method.failures)}
-    return summary
-
-
-def _load(
-    loader: Iterable[Example], failures: list[Failure], on_items: Callable[[int], None]
-) -> Iterator[Example]:
-    """Yield the batches that can be loaded; note those that cannot."""
-    batches = iter(loader)
-    batch_size = getattr(loader, "batch_size", None) or 1
-    while True:
+def _predicted(predictor: Predictor, example: Example, asked: frozenset[Part]) -> PredictedBatch:
+    """Predict one batch; if it fails, item by item."""
+    batches, parts, failures = [torch.arange(len(example.key))], [], []
+    while batches:
+        chosen = batches.pop(0)
         try:
-            batch = next(batches)
-        except StopIteration:
-            return
-        except InputError as error:  # the loader has moved on and can give the next batch
-            failures.extend([Failure("not loaded", _line(error))] * batch_size)
-            on_items(batch_size)
+            part = _select(example, chosen)
+            observed = part.clip.observed()
+            if isinstance(predictor, DriveFollowing):
+                predictor.follow(part.key)
+            prediction = predictor.predict(observed, asked)
+        except Exception as error:  # whatever a model does wrong, the others are still to be judged
+            if len(chosen) > 1:
+                batches.extend(chosen[:, None])
+            else:
+                failures.append(Failure(example.key[int(chosen)], _line(error)))
             continue
-        yield batch
+        good = _is_complete(prediction).cpu()
+        bad = chosen[~good].tolist()
+        failures.extend(Failure(example.key[i], "not finite or incomplete") for i in bad)
+        if good.all():
+            parts.append((chosen, prediction))
+        elif good.any():
+            parts.append((chosen[good], prediction[good]))
+    return PredictedBatch(example, tuple(parts), tuple(failures))
 
 
 def _select(example: Example, chosen: Tensor) -> Example:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import zlib
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -27,7 +28,7 @@ class AgentPredictor:
         ray_stride: one pixel in `ray_stride` along rows and columns is rendered, at the present frame, by a
             world model that renders; 0 renders nothing.
         futures: number of futures to draw from a stochastic world model. Their random states depend on the
-            order of the clips.
+            first clip of a batch alone, if `follow` names it.
         heads: trained task heads in evaluation mode; None predicts no further tasks.
     """
 
@@ -47,9 +48,15 @@ class AgentPredictor:
         self._follower = None if carried is None else DriveFollower(carried)
         self._keys: Sequence[str] = ()
 
+    @property
+    def carries(self) -> bool:
+        """Return whether it carries agents from frame to frame, so that a drive must stay whole."""
+        return self._follower is not None
+
     def follow(self, keys: Sequence[str]) -> None:
         """Receive the names of the clips of the next call of `predict`; without, no agents are carried on."""
         self._keys = keys
+        self._generator.manual_seed(zlib.crc32(keys[0].encode()))
 
     @torch.no_grad()
     def predict(self, observed: Clip, asked: frozenset[Part]) -> Prediction:

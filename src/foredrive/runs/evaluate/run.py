@@ -1,39 +1,39 @@
 """Evaluate a run on logs: the model and its baselines, in one summary."""
 
+import contextlib
 import dataclasses
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import torch
 from jaxtyping import Bool, Float
 from rich.progress import Progress
 from torch import Tensor
 
-from foredrive.data import ClipDataset, LogPath, collate
-from foredrive.data.task_truth import TaskTruthConfig
+from foredrive.data import LogPath, collate
 from foredrive.errors import InputError
 from foredrive.evaluation.baselines import ConstantVelocity, StandStill
 from foredrive.evaluation.predictor import Prediction
 from foredrive.evaluation.provenance import collect_provenance
 from foredrive.evaluation.results_files import ResultsFiles
-from foredrive.evaluation.run import EvaluationResult, evaluate
+from foredrive.evaluation.run import EvaluationResult, judge, parts_needed, predict_batches
 from foredrive.evaluation.summary import write_summary
-from foredrive.metrics.protocols import STEP_S, STEPS
-from foredrive.models.agent import PlanningAgent
-from foredrive.runs.evaluate.predict import AgentPredictor
+from foredrive.runs.evaluate.inputs import (
+    RENDER_STRIDE,
+    Batches,
+    agent_predictor,
+    open_inputs,
+    plan_batches,
+)
+from foredrive.runs.evaluate.shards import ShardSource, plan_shards, predict_shards
 from foredrive.runs.open_clips import open_clips
 from foredrive.runs.train.baselines import run_baselines
 from foredrive.runs.train.run import Run, load_agent
-from foredrive.runs.train.tasks import TrainedHeads, load_heads
+from foredrive.runs.train.tasks import load_heads
 from foredrive.scene import Example, Trajectory
 
 SUMMARY, RESULTS = "summary.json", "results"
-RENDER_STRIDE = 2
-"""One pixel in this many along rows and columns is rendered and compared."""
-FUTURES = 5
-"""Number of futures drawn from a stochastic world model."""
 
 
 @dataclass(frozen=True)
@@ -52,51 +52,6 @@ class ExamplePrediction:
     """What task heads predict, as a batch of one; None from a run without heads."""
 
 
-def evaluation_data(
-    run: Run,
-    logs: Sequence[LogPath],
-    stride_s: float | None = None,
-    truth: TaskTruthConfig | None = None,
-) -> ClipDataset:
-    """Open the clips of `logs` as the recipe defines them, with the boxes for collisions up to 3 s.
-
-    Args:
-        stride_s: time between the clips' nows, s; None: as in the recipe.
-        truth: truth of further tasks to read.
-    """
-    clips = run.recipe.clips
-    frames = max(clips.future_frames, round(STEPS * STEP_S / clips.frame_dt_s))
-    stride_s = stride_s or clips.now_stride_s
-    tasks = truth or clips.tasks
-    if tasks is not None and tasks.semantics is not None:
-        tasks = dataclasses.replace(tasks, rays=True)
-    config = dataclasses.replace(
-        clips.judged,
-        future_frames=frames,
-        future_images=False,
-        now_stride_s=stride_s,
-        tasks=tasks,
-    )
-    return open_clips(logs, config, run.cache_dir)
-
-
-class _Batches(Iterator[Example]):
-    """Clips in batches. A clip that cannot be read raises an InputError; the next call continues after it."""
-
-    def __init__(self, dataset: ClipDataset, batch_size: int) -> None:
-        self._dataset, self._batch_size = dataset, batch_size
-        self._left = iter(range(len(dataset)))
-        self._read: list[Example] = []
-
-    def __next__(self) -> Example:
-        while len(self._read) < self._batch_size and (index := next(self._left, None)) is not None:
-            self._read.append(self._dataset[index])
-        if not self._read:
-            raise StopIteration
-        batch, self._read = collate(self._read), []
-        return batch
-
-
 def evaluate_run(
     run: Run,
     logs: Sequence[LogPath],
@@ -106,34 +61,44 @@ def evaluate_run(
     views: bool = True,
     stride_s: float | None = None,
     results_files: bool = False,
+    workers: int = 1,
+    on_ray: bool = False,
 ) -> EvaluationResult:
     """Evaluate a trained run on logs and write `out/summary.json`. Clips that cannot be read count as failed.
+
+    The figures do not depend on the number of workers.
 
     Args:
         views: whether to render the camera views and evaluate them too; this takes a quarter of the time.
         stride_s: time between the clips' nows, s; None: as in the recipe.
         results_files: whether to write what the task heads predict to `out/results`, in public formats.
+        workers: processes that predict; 1 predicts in this process. Metrics and baselines are computed here.
+        on_ray: whether the workers are those of a Ray cluster; see `fan_out`.
 
     Raises:
         InputError: the run has not finished a stage, or no clip can be read.
     """
     if batch_size < 1:
         raise InputError(f"the batch size must be at least 1, got {batch_size}")
-    agent, trained = load_agent(run), load_heads(run)
+    inputs = open_inputs(run, logs, stride_s, views)
+    dataset, trained, clips = inputs.dataset, inputs.heads, run.recipe.clips
     if results_files and trained is None:
         raise InputError(f"{run.folder}: has no task heads whose results could be written")
     files = ResultsFiles(out / RESULTS)
-    clips = run.recipe.clips
-    dataset = evaluation_data(run, logs, stride_s, None if trained is None else trained.recipe.truth)
     prior, ego_mlp = run_baselines(run.folder, run.logs, run.recipe, run.cache_dir, clips.past_frames)
     steps, dt_s = clips.horizon_steps, clips.horizon_dt_s
-    device = "cuda" if torch.cuda.is_available() else "cpu"
-    agent.to(device)
-    with Progress() as progress:
+    planned, asked, device = plan_batches(dataset, batch_size), parts_needed(), inputs.device
+    if workers > 1 or on_ray:
+        device = "cpu"
+        shards = plan_shards(dataset, planned, inputs.predictor.carries)
+        source = ShardSource(run.folder.absolute(), tuple(log.absolute() for log in logs), stride_s, views)
+        batches = predict_shards(source, shards, dataset, asked, workers, on_ray=on_ray)
+    else:
+        batches = predict_batches(inputs.predictor, Batches(dataset, planned), asked, device)
+    with Progress() as progress, contextlib.closing(batches):
         task = progress.add_task("evaluate", total=len(dataset))
-        result = evaluate(
-            _predictor(agent, trained, clips.future_frames, RENDER_STRIDE if views else 0, FUTURES),
-            _Batches(dataset, batch_size),
+        result = judge(
+            batches,
             frame_dt_s=clips.frame_dt_s,
             baselines={
                 "stand_still": StandStill(steps, dt_s),
@@ -154,16 +119,6 @@ def evaluate_run(
     return result
 
 
-def _predictor(
-    agent: PlanningAgent[Any], trained: TrainedHeads | None, steps: int, ray_stride: int, futures: int = 0
-) -> AgentPredictor:
-    """Return a predictor with the agent's own heads, or else with those of a probe."""
-    heads = agent.heads
-    if heads is None and trained is not None:
-        heads = trained.heads.to(agent.planner.plan.device)
-    return AgentPredictor(agent, steps, ray_stride, futures, heads)
-
-
 @torch.no_grad()
 def predict_examples(run: Run, logs: Sequence[LogPath], count: int) -> list[ExamplePrediction]:
     """Predict `count` examples spread evenly over the logs; leave out those that cannot be read."""
@@ -172,7 +127,7 @@ def predict_examples(run: Run, logs: Sequence[LogPath], count: int) -> list[Exam
     tasks = clips.tasks if trained is None else trained.recipe.truth
     config = dataclasses.replace(clips.judged, lidar=True, map=True, tasks=tasks)
     dataset = open_clips(logs, config, run.cache_dir)
-    predictor = _predictor(agent, trained, clips.future_frames, RENDER_STRIDE)
+    predictor = agent_predictor(agent, trained, clips.future_frames, RENDER_STRIDE)
     found = []
     for k in range(min(count, len(dataset))):
         try:

@@ -1,0 +1,126 @@
+"""What an evaluation of a run works with: its clips in batches, and the trained agent as a predictor."""
+
+import dataclasses
+import itertools
+from collections import deque
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+
+from foredrive.data import ClipDataset, LogPath, collate
+from foredrive.data.task_truth import TaskTruthConfig
+from foredrive.metrics.protocols import STEP_S, STEPS
+from foredrive.models.agent import PlanningAgent
+from foredrive.runs.evaluate.predict import AgentPredictor
+from foredrive.runs.open_clips import open_clips
+from foredrive.runs.train.run import Run, load_agent
+from foredrive.runs.train.tasks import TrainedHeads, load_heads
+from foredrive.scene import Example
+
+RENDER_STRIDE = 2
+"""One pixel in this many along rows and columns is rendered and compared."""
+FUTURES = 5
+"""Number of futures drawn from a stochastic world model."""
+
+
+def evaluation_data(
+    run: Run,
+    logs: Sequence[LogPath],
+    stride_s: float | None = None,
+    truth: TaskTruthConfig | None = None,
+) -> ClipDataset:
+    """Open the clips of `logs` as the recipe defines them, with the boxes for collisions up to 3 s.
+
+    Args:
+        stride_s: time between the clips' nows, s; None: as in the recipe.
+        truth: truth of further tasks to read.
+    """
+    clips = run.recipe.clips
+    frames = max(clips.future_frames, round(STEPS * STEP_S / clips.frame_dt_s))
+    stride_s = stride_s or clips.now_stride_s
+    tasks = truth or clips.tasks
+    if tasks is not None and tasks.semantics is not None:
+        tasks = dataclasses.replace(tasks, rays=True)
+    config = dataclasses.replace(
+        clips.judged,
+        future_frames=frames,
+        future_images=False,
+        now_stride_s=stride_s,
+        tasks=tasks,
+    )
+    return open_clips(logs, config, run.cache_dir)
+
+
+def plan_batches(dataset: ClipDataset, batch_size: int) -> list[tuple[int, ...]]:
+    """Return the clips of each batch, in order. No batch holds clips of two logs."""
+    planned = []
+    for _, of_log in itertools.groupby(range(len(dataset)), dataset.log_path):
+        clips = tuple(of_log)
+        planned += [clips[first : first + batch_size] for first in range(0, len(clips), batch_size)]
+    return planned
+
+
+class Batches(Iterator[Example]):
+    """Clips in batches. A clip that cannot be read raises an InputError; the next call continues after it.
+
+    Args:
+        planned: the clips of each batch.
+    """
+
+    def __init__(self, dataset: ClipDataset, planned: Sequence[Sequence[int]]) -> None:
+        self._dataset = dataset
+        self._left = deque(deque(clips) for clips in planned)
+        self._read: list[Example] = []
+
+    def __next__(self) -> Example:
+        while self._left:
+            clips = self._left[0]
+            while clips:
+                self._read.append(self._dataset[clips.popleft()])
+            self._left.popleft()
+            if self._read:
+                batch, self._read = collate(self._read), []
+                return batch
+        raise StopIteration
+
+
+@dataclass(frozen=True)
+class EvaluationInputs:
+    """The clips of an evaluation, and the trained agent as a predictor."""
+
+    dataset: ClipDataset
+    predictor: AgentPredictor
+    heads: TrainedHeads | None
+    """The task heads, of the agent or of a probe."""
+    device: str
+    """The agent's device."""
+
+
+def open_inputs(run: Run, logs: Sequence[LogPath], stride_s: float | None, views: bool) -> EvaluationInputs:
+    """Load the agent of a run, and open the clips of logs.
+
+    Args:
+        stride_s: time between the clips' nows, s; None: as in the recipe.
+        views: whether the camera views are rendered.
+
+    Raises:
+        InputError: the run has not finished a stage, or the logs have no clip.
+    """
+    agent, heads = load_agent(run), load_heads(run)
+    dataset = evaluation_data(run, logs, stride_s, None if heads is None else heads.recipe.truth)
+    device = "cuda" if torch.cuda.is_available() else "cpu"
+    ray_stride, steps = RENDER_STRIDE if views else 0, run.recipe.clips.future_frames
+    predictor = agent_predictor(agent.to(device), heads, steps, ray_stride, FUTURES)
+    return EvaluationInputs(dataset, predictor, heads, device)
+
+
+def agent_predictor(
+    agent: PlanningAgent[Any], trained: TrainedHeads | None, steps: int, ray_stride: int, futures: int = 0
+) -> AgentPredictor:
+    """Return a predictor with the agent's own heads, or else with those of a probe."""
+    heads = agent.heads
+    if heads is None and trained is not None:
+        heads = trained.heads.to(agent.planner.plan.device)
+    return AgentPredictor(agent, steps, ray_stride, futures, heads)
