@@ -69,6 +69,9 @@ def reconstruct(
         fid_weights: Evaluate FID too, with this file of the Inception of 2015 that pytorch-fid publishes.
         set: Entries of the recipe to replace, such as representation.schedule.steps=2000; `foredrive recipes
             RECIPE` prints all entries.
+        workers: Number of logs reconstructed at a time, if there are several. On Ray it is the size of a
+            cluster that is started here.
+        ray: Reconstruct on Ray: on the cluster at RAY_ADDRESS, or on a cluster that is started here.
     """
     check_image_size(image_size)
     check_number("--workers", workers, low=1)
