@@ -3,8 +3,8 @@
 The same safety tests are driven in a town and in the rebuild of a recorded drive there. Actors and traffic
 replay in both, so that they differ in what the sensors show alone. Each agent that looks at its sensors
 drives each test once in each world. `collision_agreement` is the share of the pairs in which both or neither
-end in a collision, and `score_correlation` is that of the scores (Pearson). The arms AGENT_KIND tell where it
-breaks.
+end in a collision, and `score_correlation` is that of the scores (Pearson). Arms are AGENT_KIND@TOWN; without
+a kind or a town they are over all, and `all` is both agents. They tell where it breaks.
 
 Pairs are kept in runs/ncap_transfer, so that an interrupted arm goes on with the next pair.
 """
@@ -56,28 +56,35 @@ def tests_in(drive: TownDrive) -> PairedTests:
     return PairedTests(drive, rebuilt_town(drive))
 
 
-def pairs_of(agent: str) -> list[Pair]:
-    """Return the pairs of an agent in all towns; drive those that are missing."""
-    pairs = []
-    for drive in DRIVES:
-        for scenario in load_scenarios(chosen_scenarios(rebuilt_town(drive), SIZE, WORK)):
-            for number in range(SIZE.runs):
-                file = WORK / agent / drive.town / f"{scenario.label}_rep{number}.json"
-                pairs.append(tests_in(drive).pair(AGENTS[agent], scenario, number, file))
-    return pairs
+def pairs_of(agent: str, drive: TownDrive) -> list[Pair]:
+    """Return the pairs of an agent in a town; drive those that are missing."""
+    return [
+        tests_in(drive).pair(
+            AGENTS[agent], scenario, number, WORK / agent / drive.town / f"{scenario.label}_rep{number}.json"
+        )
+        for scenario in load_scenarios(chosen_scenarios(rebuilt_town(drive), SIZE, WORK))
+        for number in range(SIZE.runs)
+    ]
 
 
-def transfer(agents: tuple[str, ...], kind: Threat | None, _: int) -> dict[str, float]:
-    """Return the agreement of the pairs of some agents, of one kind or of all."""
-    pairs = [pair for agent in agents for pair in pairs_of(agent)]
+def transfer(
+    agents: tuple[str, ...], drives: tuple[TownDrive, ...], kind: Threat | None, _: int
+) -> dict[str, float]:
+    """Return the agreement of the pairs of some agents in some towns, of one kind or of all."""
+    pairs = [pair for drive in drives for agent in agents for pair in pairs_of(agent, drive)]
     return agreement([pair for pair in pairs if kind is None or pair.kind == kind.value])
 
 
+EVERYONE = {"all": tuple(AGENTS), **{agent: (agent,) for agent in AGENTS}}
+EVERYWHERE = {"": DRIVES, **{f"@{drive.town}": (drive,) for drive in DRIVES}}
 BENCHMARK = Benchmark(
     question="Does a safety test in a rebuilt world predict the same test in the real one?",
-    arms={agent: functools.partial(transfer, (agent,), None) for agent in AGENTS}
-    | {f"{agent}_{kind}": functools.partial(transfer, (agent,), kind) for agent in AGENTS for kind in Threat}
-    | {"all": functools.partial(transfer, tuple(AGENTS), None)},
+    arms={
+        f"{who}{of_kind}{where}": functools.partial(transfer, agents, drives, kind)
+        for where, drives in EVERYWHERE.items()
+        for who, agents in EVERYONE.items()
+        for of_kind, kind in {"": None, **{f"_{kind}": kind for kind in Threat}}.items()
+    },
     seeds=(0,),
     config=CONFIG,
     decided_by=DECIDED_BY,

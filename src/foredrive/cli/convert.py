@@ -22,6 +22,7 @@ def convert(
     overwrite: bool = False,
     topics: OptionalPath = None,
     propose: bool = False,
+    ray: bool = False,
 ) -> None:
     """Convert a raw data set into 123D logs.
 
@@ -40,6 +41,7 @@ def convert(
         topics: YAML that says which topics of a bag are cameras, lidar and poses; by default the bag's name
             with .topics.yaml, beside it.
         propose: Write this YAML from what the bag holds, and convert nothing.
+        ray: Convert on Ray: on the cluster at RAY_ADDRESS, or on a cluster that is started here.
     """
     check_number("--workers", workers, low=0)
     check_out_folder(out)
@@ -60,7 +62,9 @@ def convert(
     failed, count = {}, 0
     with _progress(dataset) as tick:
         cores = workers or len(os.sched_getaffinity(0))
-        for done in convert_all(source, dataset, out, cores, overwrite=overwrite, topics=topics, tick=tick):
+        for done in convert_all(
+            source, dataset, out, cores, overwrite=overwrite, topics=topics, on_ray=ray, tick=tick
+        ):
             count += 1
             if done.log is None:
                 failed[done.name] = done.failure or ""

@@ -40,6 +40,7 @@ def convert_all(
     *,
     overwrite: bool = False,
     topics: Path | None = None,
+    on_ray: bool = False,
     tick: Callable[[], None] = lambda: None,
 ) -> Iterator[Conversion]:
     """Yield each raw log when it has been converted, has failed, or was there before.
@@ -51,6 +52,7 @@ def convert_all(
         workers: number of logs converted at a time; 1 converts in this process.
         overwrite: whether logs that are there are replaced.
         topics: the YAML of a bag; None: that beside it.
+        on_ray: whether the logs are converted on a Ray cluster; see `fan_out`.
         tick: called after each frame that is converted in this process.
 
     Raises:
@@ -67,7 +69,7 @@ def convert_all(
         else:
             names[id(raw)] = path.name
             todo.append(raw)
-    for raw, result in _converted(todo, out, min(workers, len(todo)), tick):
+    for raw, result in _converted(todo, out, workers, on_ray, tick):
         name = names[id(raw)]
         if isinstance(result, BaseException):
             yield Conversion(name, None, reason(name, result))
@@ -76,11 +78,11 @@ def convert_all(
 
 
 def _converted(
-    todo: list[RawLog], out: Path, workers: int, tick: Callable[[], None]
+    todo: list[RawLog], out: Path, workers: int, on_ray: bool, tick: Callable[[], None]
 ) -> Iterator[tuple[RawLog, LogPath | BaseException]]:
-    if workers > 1:
+    if (workers > 1 and len(todo) > 1) or on_ray:
         work = functools.partial(_convert_here, out=out)
-        with contextlib.closing(fan_out(todo, work, workers)) as results:
+        with contextlib.closing(fan_out(todo, work, workers, on_ray=on_ray)) as results:
             yield from results
         return
     for raw in todo:
