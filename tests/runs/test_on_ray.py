@@ -10,6 +10,8 @@ import pytest
 from file_digests import digests
 
 from benchmarks.common.process_tree import descendants
+from foredrive.data import LogPath
+from foredrive.runs import Run, evaluate_run
 from foredrive.runs.drive.recording import record_drives, record_plan
 from foredrive.sensors.rigs import SURROUND
 from foredrive.towns.campaign import DrivePlan
@@ -65,3 +67,13 @@ def test_a_killed_worker_loses_nothing(tmp_path: Path) -> None:
     for plan in PLANS:
         record_plan(plan, tmp_path / "alone", RIG, threads=1)
     assert digests(tmp_path / "ray") == digests(tmp_path / "alone")
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::ResourceWarning")
+def test_an_evaluation_has_the_figures_of_one_process(trained: Run, log: LogPath, tmp_path: Path) -> None:
+    on_ray = evaluate_run(trained, [log], tmp_path / "ray", batch_size=1, workers=2, on_ray=True)
+    alone = evaluate_run(trained, [log], tmp_path / "alone", batch_size=1)
+    for key, value in alone.summary.items():
+        if isinstance(value, float) and key not in ("wall_s", "peak_rss_gib"):
+            assert on_ray.summary[key] == pytest.approx(value, rel=1e-6, nan_ok=True), key
