@@ -2,8 +2,10 @@
 
 Each representation rebuilds PandaSet 002 (raw, in FOREDRIVE_REAL_DATA/pandaset) from the front camera and
 the lidar of every second frame, and the drive of `rebuild_town.py`, which is judged at the held-out poses,
-2 m and 3 m beside them, and after edits. An arm ARM@LENGTH is one point of a curve: a whole training of a
-share of the recipe's steps, with its own schedule. CPU time is that of the training alone, on all threads.
+2 m and 3 m beside them, and after edits. ARM@kitti rebuilds a drive of 16 s without boxes,
+2011_09_26_drive_0005 (raw, in FOREDRIVE_REAL_DATA/kitti_raw). An arm ARM@LENGTH is one point of a curve: a
+whole training of a share of the recipe's steps, with its own schedule. CPU time is that of the training
+alone, on all threads.
 
 Runs are kept in runs/rebuild_compare, so that an interrupted study continues where it stopped.
 """
@@ -14,9 +16,10 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.common.measuring import forget_peak
-from benchmarks.common.study import pandaset_log
+from benchmarks.common.study import kitti_drive, pandaset_log
 from benchmarks.rebuild_pandaset import FIGURES
 from benchmarks.rebuild_town import DRIVE, judged_town
+from foredrive.data import LogPath
 from foredrive.evaluation.bench import Benchmark, study_identity
 from foredrive.recipes.rebuilding import RebuildRecipe, field_tiny, gaussians_tiny, rescheduled_recipe
 from foredrive.runs.rebuild.reconstruct import reconstruct
@@ -28,6 +31,7 @@ LENGTHS = {"eighth": 1 / 8, "third": 1 / 3, "whole": 1.0}
 """Shares of a recipe's steps."""
 STEP_COUNTS = ("steps", "shrink_steps", "grow_from", "grow_until", "grow_every")
 """Entries of a schedule that are numbers of steps; a shorter training has as many rounds of growth."""
+KITTI_HW = (120, 400)
 RENAMED = {"moving.psnr_db": "psnr_driving_db", "moving.nearest.psnr_db": "nearest.psnr_driving_db"}
 DECIDED_BY = (
     "benchmarks.rebuild_town",
@@ -80,15 +84,30 @@ def on_pandaset(arm: str, length: str) -> Callable[[int], dict[str, float]]:
 
     def measure(seed: int) -> dict[str, float]:
         recipe = dataclasses.replace(shortened(RECIPES[arm], LENGTHS[length]), cameras=("pcam_f0",))
-        recipe = rescheduled_recipe(recipe, seed=seed)
-        forget_peak("cpu")
         log, folder = pandaset_log(ROOT / "pandaset"), WORK / f"{arm}_{length}_seed{seed}"
-        summary = reconstruct(recipe, log, folder, ROOT / "cache").summary
-        names = (*FIGURES, "peak_memory_gib")
-        known = {name: float(value) for name in names if isinstance(value := summary.get(name), float | int)}
-        return {RENAMED.get(name, name) + end: value for name, value in known.items()}
+        return {name + end: value for name, value in rebuilt(recipe, log, folder, seed).items()}
 
     return measure
+
+
+def on_kitti(arm: str) -> Callable[[int], dict[str, float]]:
+    """Return the measurement of KITTI's drive, with the left colour camera: figures kitti.KEY."""
+
+    def measure(seed: int) -> dict[str, float]:
+        recipe = dataclasses.replace(RECIPES[arm], cameras=("image_02",), image_hw=KITTI_HW)
+        found = rebuilt(recipe, kitti_drive(ROOT / "kitti"), WORK / f"{arm}_kitti_seed{seed}", seed)
+        return {f"kitti.{name}": value for name, value in found.items()}
+
+    return measure
+
+
+def rebuilt(recipe: RebuildRecipe[Any], log: LogPath, folder: Path, seed: int) -> dict[str, float]:
+    """Return the figures of a reconstruction, with its peak memory."""
+    forget_peak("cpu")
+    summary = reconstruct(rescheduled_recipe(recipe, seed=seed), log, folder, ROOT / "cache").summary
+    names = (*FIGURES, "peak_memory_gib")
+    known = {name: float(value) for name in names if isinstance(value := summary.get(name), float | int)}
+    return {RENAMED.get(name, name): value for name, value in known.items()}
 
 
 def in_town(arm: str) -> Callable[[int], dict[str, float]]:
@@ -105,7 +124,9 @@ def in_town(arm: str) -> Callable[[int], dict[str, float]]:
 BENCHMARK = Benchmark(
     question="Which representation of a rebuilt log is better: for how much CPU time, and from where?",
     arms={f"{arm}@{length}": on_pandaset(arm, length) for length in LENGTHS for arm in RECIPES}
-    | {f"{arm}@town": in_town(arm) for arm in RECIPES},
+    | {
+        f"{arm}@{where}": of(arm) for where, of in (("town", in_town), ("kitti", on_kitti)) for arm in RECIPES
+    },
     config=CONFIG,
     decided_by=DECIDED_BY,
 )

@@ -79,17 +79,28 @@ def pandaset_log(root: Path) -> LogPath:
     Raises:
         InputError: there is no raw PandaSet here.
     """
+    return _converted_log("pandaset", "pandaset", root)
+
+
+def kitti_drive(root: Path) -> LogPath:
+    """Return the first drive in FOREDRIVE_REAL_DATA/kitti_raw; convert it into `root` if necessary.
+
+    Raises:
+        InputError: there is no KITTI raw here.
+    """
+    return _converted_log("kitti_raw", "kitti-raw", root)
+
+
+def _converted_log(name: str, dataset: str, root: Path) -> LogPath:
+    source = Path(os.environ.get("FOREDRIVE_REAL_DATA", "../shared/data")) / name
     if not root.is_dir():
+        if not source.is_dir():
+            raise InputError(
+                f"{source}: no raw {dataset} logs here; name their parent in FOREDRIVE_REAL_DATA"
+            )
         with atomic_path(root) as temporary:
-            convert(_raw_pandaset(), "pandaset", temporary)
+            convert(source, dataset, temporary)
     return find_logs(root)[0]
-
-
-def _raw_pandaset() -> Path:
-    source = Path(os.environ.get("FOREDRIVE_REAL_DATA", "../shared/data")) / "pandaset"
-    if not source.is_dir():
-        raise InputError(f"{source}: no raw PandaSet logs here; name their parent in FOREDRIVE_REAL_DATA")
-    return source
 
 
 def share_of(logs: Sequence[LogPath], share: float) -> tuple[LogPath, ...]:
