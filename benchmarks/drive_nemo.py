@@ -11,7 +11,9 @@ All is kept in runs/drive_nemo, where an interrupted benchmark continues with th
 """
 
 import dataclasses
+import itertools
 import os
+from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
@@ -34,6 +36,7 @@ from foredrive.runs.shipped import run_folder
 from foredrive.runs.train.run import Run, train_run
 from foredrive.sensors.rigs import DRIVING
 from foredrive.simulation.drive_record import DriveRecord
+from foredrive.simulation.route_sets import load_route_set
 from foredrive.towns.campaign import Campaign, plan_drives
 
 FULL = "nemo_drive_tele"
@@ -48,6 +51,8 @@ PRETRAINED = Path("embedded:nemo_town")
 ROUNDS = 1
 """Rounds of DAgger after the demonstrations of the disturbed expert."""
 DEMONSTRATIONS = "training-short"
+ROUTES_A_TOWN = 4
+"""Number of routes that are demonstrated in each of the seven towns, of eight."""
 JUDGED = {"short": "town05-short", "long": "town05-long"}
 REPETITIONS = 1
 OPEN_LOOP = Campaign(("Town05",), seeds=tuple(range(1, 7)), seconds=60.0, rate_hz=2.0)
@@ -55,7 +60,7 @@ CORES = len(os.sched_getaffinity(0))
 CONFIG = {
     "recipes": {name: dataclasses.asdict(find_recipe(name)) for name in (FULL, *RECIPES.values())},
     "pretraining": str(PRETRAINED),
-    "demonstrations": DEMONSTRATIONS,
+    "demonstrations": [DEMONSTRATIONS, ROUTES_A_TOWN],
     "rounds": ROUNDS,
     "routes": JUDGED,
     "repetitions": REPETITIONS,
@@ -88,10 +93,20 @@ def demonstrations(rounds: int) -> tuple[LogPath, ...]:
     for number in range(rounds + 1):
         student = "disturbed" if number == 0 else f"student:{_student(number - 1).folder.absolute()}"
         folder = WORK / "demonstrations" / f"round{number}"
-        source = TownRoutes(DEMONSTRATIONS, seed=number, conditions="any", rig=DRIVING)
+        source = TownRoutes(
+            DEMONSTRATIONS, seed=number, conditions="any", rig=DRIVING, only=demonstrated_routes()
+        )
         _driven(DriveSuite(student, source), folder)
         folders.append(folder)
     return find_all_logs(folders)
+
+
+def demonstrated_routes() -> tuple[str, ...]:
+    """Return the ids of the first routes of each town."""
+    by_town = defaultdict[str, list[str]](list)
+    for route in load_route_set(DEMONSTRATIONS):
+        by_town[route.town].append(route.id)
+    return tuple(itertools.chain(*(ids[:ROUTES_A_TOWN] for ids in by_town.values())))
 
 
 def _student(rounds: int) -> Run:
