@@ -75,6 +75,8 @@ VERBS: dict[str, Callable[..., Any]] = {
     "view": view,
     "bench": bench,
 }
+SERVERS = ("view", "serve", "search page")
+"""Verbs that send large messages from many threads for hours: memory kept by each thread would add up."""
 DESCRIPTION = (
     "The learning loop of autonomous driving: logs in, 3-D world models and plans out, judged honestly. "
     "--version says which version this is."
@@ -113,7 +115,8 @@ def main(args: Sequence[str] | None = None) -> int:
         return 0
     if " ".join(args[:2]) in VERBS:  # such as `search index`
         args = [" ".join(args[:2]), *args[2:]]
-    keep_freed_memory()
+    if not args or args[0] not in SERVERS:
+        keep_freed_memory()
     interrupt = LastingInterrupt()
     for verb in VERBS.values():
         verb.__doc__ = _reflowed(verb.__doc__ or "")
