@@ -5,6 +5,7 @@ import itertools
 from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -87,9 +88,22 @@ class Batches(Iterator[Example]):
 
 
 @dataclass(frozen=True)
+class EvaluationSource:
+    """The run and the logs of an evaluation; for several machines, in folders that they share."""
+
+    run: Path
+    logs: tuple[LogPath, ...]
+    stride_s: float | None = None
+    """Time between the clips' nows, s; None: as in the recipe."""
+    views: bool = True
+    """Whether the camera views are rendered."""
+
+
+@dataclass(frozen=True)
 class EvaluationInputs:
     """The clips of an evaluation, and the trained agent as a predictor."""
 
+    source: EvaluationSource
     dataset: ClipDataset
     predictor: AgentPredictor
     heads: TrainedHeads | None
@@ -98,22 +112,22 @@ class EvaluationInputs:
     """The agent's device."""
 
 
-def open_inputs(run: Run, logs: Sequence[LogPath], stride_s: float | None, views: bool) -> EvaluationInputs:
+def open_inputs(run: Run, source: EvaluationSource) -> EvaluationInputs:
     """Load the agent of a run, and open the clips of logs.
 
     Args:
-        stride_s: time between the clips' nows, s; None: as in the recipe.
-        views: whether the camera views are rendered.
+        run: the run of `source`.
 
     Raises:
         InputError: the run has not finished a stage, or the logs have no clip.
     """
     agent, heads = load_agent(run), load_heads(run)
-    dataset = evaluation_data(run, logs, stride_s, None if heads is None else heads.recipe.truth)
+    truth = None if heads is None else heads.recipe.truth
+    dataset = evaluation_data(run, source.logs, source.stride_s, truth)
     device = "cuda" if torch.cuda.is_available() else "cpu"
-    ray_stride, steps = RENDER_STRIDE if views else 0, run.recipe.clips.future_frames
+    ray_stride, steps = RENDER_STRIDE if source.views else 0, run.recipe.clips.future_frames
     predictor = agent_predictor(agent.to(device), heads, steps, ray_stride, FUTURES)
-    return EvaluationInputs(dataset, predictor, heads, device)
+    return EvaluationInputs(source, dataset, predictor, heads, device)
 
 
 def agent_predictor(

@@ -22,11 +22,12 @@ from foredrive.evaluation.summary import write_summary
 from foredrive.runs.evaluate.inputs import (
     RENDER_STRIDE,
     Batches,
+    EvaluationSource,
     agent_predictor,
     open_inputs,
     plan_batches,
 )
-from foredrive.runs.evaluate.shards import ShardSource, plan_shards, predict_shards
+from foredrive.runs.evaluate.shards import predict_shards
 from foredrive.runs.open_clips import open_clips
 from foredrive.runs.train.baselines import run_baselines
 from foredrive.runs.train.run import Run, load_agent
@@ -80,20 +81,19 @@ def evaluate_run(
     """
     if batch_size < 1:
         raise InputError(f"the batch size must be at least 1, got {batch_size}")
-    inputs = open_inputs(run, logs, stride_s, views)
+    source = EvaluationSource(run.folder.absolute(), tuple(log.absolute() for log in logs), stride_s, views)
+    inputs = open_inputs(run, source)
     dataset, trained, clips = inputs.dataset, inputs.heads, run.recipe.clips
     if results_files and trained is None:
         raise InputError(f"{run.folder}: has no task heads whose results could be written")
     files = ResultsFiles(out / RESULTS)
     prior, ego_mlp = run_baselines(run.folder, run.logs, run.recipe, run.cache_dir, clips.past_frames)
     steps, dt_s = clips.horizon_steps, clips.horizon_dt_s
-    planned, asked, device = plan_batches(dataset, batch_size), parts_needed(), inputs.device
+    planned, asked = plan_batches(dataset, batch_size), parts_needed()
     if workers > 1 or on_ray:
-        device = "cpu"
-        shards = plan_shards(dataset, planned, inputs.predictor.carries)
-        source = ShardSource(run.folder.absolute(), tuple(log.absolute() for log in logs), stride_s, views)
-        batches = predict_shards(source, shards, dataset, asked, workers, on_ray=on_ray)
+        device, batches = "cpu", predict_shards(inputs, planned, asked, workers, on_ray=on_ray)
     else:
+        device = inputs.device
         batches = predict_batches(inputs.predictor, Batches(dataset, planned), asked, device)
     with Progress() as progress, contextlib.closing(batches):
         task = progress.add_task("evaluate", total=len(dataset))

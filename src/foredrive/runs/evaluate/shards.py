@@ -6,29 +6,18 @@ import itertools
 import pickle
 from collections.abc import Generator, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import torch
 
-from foredrive.data import ClipDataset, LogPath
+from foredrive.data import ClipDataset
 from foredrive.evaluation.predictor import Part
 from foredrive.evaluation.run import Failure, PredictedBatch, predict_batches
-from foredrive.runs.evaluate.inputs import Batches, EvaluationInputs, open_inputs
+from foredrive.runs.evaluate.inputs import Batches, EvaluationInputs, EvaluationSource, open_inputs
 from foredrive.runs.fan_out import fan_out, reason
 from foredrive.runs.train.run import open_run
 
 SHARD_BATCHES = 4
 """Batches of a shard. The limit keeps the memory independent of the length of a log."""
-
-
-@dataclass(frozen=True)
-class ShardSource:
-    """Where a worker finds the agent and the clips; on several machines, in a folder that they share."""
-
-    run: Path
-    logs: tuple[LogPath, ...]
-    stride_s: float | None
-    views: bool
 
 
 @dataclass(frozen=True)
@@ -40,24 +29,25 @@ class Shard:
 
 
 def predict_shards(
-    source: ShardSource,
-    shards: Sequence[Shard],
-    dataset: ClipDataset,
+    inputs: EvaluationInputs,
+    planned: Sequence[tuple[int, ...]],
     asked: frozenset[Part],
     workers: int,
     *,
     on_ray: bool = False,
 ) -> Generator[PredictedBatch, None, None]:
-    """Yield the predicted batches of all shards in order.
+    """Yield the predicted batches in order.
 
     A shard whose process dies twice counts as failed, clip by clip.
 
     Args:
-        dataset: the clips of the source.
+        planned: the clips of each batch.
         workers: as in `fan_out`.
     """
+    dataset = inputs.dataset
+    shards = plan_shards(dataset, planned, inputs.predictor.carries)
     threads = max(1, torch.get_num_threads() // workers)
-    work = functools.partial(predict_shard, source=source, asked=asked, threads=threads)
+    work = functools.partial(predict_shard, source=inputs.source, asked=asked, threads=threads)
     waiting, following = dict[int, list[PredictedBatch]](), 0
     with contextlib.closing(fan_out(shards, work, workers, on_ray=on_ray)) as results:
         for shard, result in results:
@@ -87,7 +77,7 @@ def plan_shards(dataset: ClipDataset, planned: Sequence[tuple[int, ...]], whole_
     return [Shard(number, batches) for number, batches in enumerate(shards)]
 
 
-def predict_shard(shard: Shard, source: ShardSource, asked: frozenset[Part], threads: int) -> bytes:
+def predict_shard(shard: Shard, source: EvaluationSource, asked: frozenset[Part], threads: int) -> bytes:
     """Return the predicted batches of a shard, pickled.
 
     Processes would hand over each tensor by a file descriptor of its own, and run out of them.
@@ -99,6 +89,6 @@ def predict_shard(shard: Shard, source: ShardSource, asked: frozenset[Part], thr
 
 
 @functools.lru_cache(maxsize=1)
-def _opened(source: ShardSource) -> EvaluationInputs:
+def _opened(source: EvaluationSource) -> EvaluationInputs:
     """Open the inputs, and keep them for the next shard."""
-    return open_inputs(open_run(source.run), source.logs, source.stride_s, source.views)
+    return open_inputs(open_run(source.run), source)
