@@ -1,8 +1,6 @@
 """`foredrive convert`."""
 
 import os
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated
 
@@ -10,6 +8,7 @@ import tyro
 
 from foredrive.cli.arguments import OptionalPath, check_number, check_out_folder
 from foredrive.cli.failures import listed_failures
+from foredrive.cli.progress import frame_progress
 from foredrive.errors import InputError
 from foredrive.lazy import importing
 
@@ -60,7 +59,7 @@ def convert(
         from foredrive.runs.convert import convert_all
 
     failed, count = {}, 0
-    with _progress(dataset) as tick:
+    with frame_progress(f"converting {dataset}") as tick:
         cores = workers or len(os.sched_getaffinity(0))
         for done in convert_all(
             source, dataset, out, cores, overwrite=overwrite, topics=topics, on_ray=ray, tick=tick
@@ -86,23 +85,3 @@ def _propose(bag: Path, topics: Path | None) -> None:
     with reading_raw(bag):
         print(propose_topics(bag, file))
     print(f"wrote {file}; check it, then: foredrive convert rosbag {bag} --out DATA")
-
-
-@contextmanager
-def _progress(dataset: str) -> Iterator[Callable[[], None]]:
-    """Show the number of frames and the time; yield the function that counts a frame."""
-    from rich.console import Console
-    from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
-
-    columns = (SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
-    console = Console(stderr=True)
-    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
-        bar = progress.add_task(f"converting {dataset}", total=None)
-        frames = 0
-
-        def tick() -> None:
-            nonlocal frames
-            frames += 1
-            progress.update(bar, description=f"converting {dataset}: {frames} frames")
-
-        yield tick

@@ -163,6 +163,11 @@ def read_track_ids(log: Log) -> dict[str, int]:
     return dict(zip(tokens.tolist(), _track_ids(tokens).tolist(), strict=True))
 
 
+def frames_with_boxes(log: Log) -> Int64[np.ndarray, "_"]:
+    """Return the annotated frames."""
+    return log.rows(_KEY)[0]
+
+
 def box_row(log: Log, frame: int) -> int | None:
     """Return the row of a frame in the box table. Return None if the frame is not annotated."""
     frames, rows = log.rows(_KEY)

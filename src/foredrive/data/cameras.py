@@ -72,7 +72,7 @@ def rig_of_log(log: Log) -> RigPlan:
     cameras = pinhole_cameras(log).values()
     if not cameras:
         raise InputError(f"{log.path.folder}: no pinhole cameras")
-    mounted = [np.linalg.inv(log.T_imu_ego) @ one.camera_to_imu_se3.transformation_matrix for one in cameras]
+    mounted = [camera_mount(log, one) for one in cameras]
     height, width = next((one.height, one.width) for one in cameras)
     return rig_of_cameras(
         CameraRig(
@@ -84,6 +84,12 @@ def rig_of_log(log: Log) -> RigPlan:
             size_hw=(height, width),
         )
     )
+
+
+def camera_mount(log: Log, metadata: PinholeCameraMetadata) -> Float64[np.ndarray, "4 4"]:
+    """Return `T_ego_cam` of a camera at rest: its static extrinsic matrix."""
+    mounted: np.ndarray = np.linalg.inv(log.T_imu_ego) @ metadata.camera_to_imu_se3.transformation_matrix
+    return mounted
 
 
 def find_camera(cameras: dict[str, PinholeCameraMetadata], name: str) -> PinholeCameraMetadata | None:
@@ -187,7 +193,7 @@ def _extrinsics(log: Log, modality_key: str) -> Float64[np.ndarray, "F 4 4"]:
     """
     metadata = log.scene.get_all_modality_metadatas()[modality_key]
     assert isinstance(metadata, PinholeCameraMetadata)
-    mounted = np.linalg.inv(log.T_imu_ego) @ metadata.camera_to_imu_se3.transformation_matrix
+    mounted = camera_mount(log, metadata)
     T_ego_cam = np.tile(mounted, (len(log), 1, 1))
     frames, rows = log.rows(modality_key)
     table = get_modality_table(log.path.folder, modality_key)

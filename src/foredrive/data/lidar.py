@@ -2,8 +2,8 @@
 
 import numpy as np
 import torch
-from jaxtyping import Float
-from py123d.datatypes import Lidar, LidarMergedMetadata, LidarMetadata, ModalityType
+from jaxtyping import Float, Float64, Int64
+from py123d.datatypes import Lidar, LidarID, LidarMergedMetadata, LidarMetadata, ModalityType
 from py123d.datatypes.custom.custom_modality import CustomModality
 from torch import Tensor
 
@@ -46,6 +46,31 @@ def read_sweep(log: Log, frame: int) -> tuple[LidarSweep, bool] | None:
     if misses is not None:
         parts.append(misses)
     return concatenate(parts), misses is not None
+
+
+def frames_with_lidar(log: Log) -> Int64[np.ndarray, "_"]:
+    """Return the frames at which any lidar has a sweep."""
+    found = [
+        log.rows(key)[0]
+        for key, metadata in log.scene.get_all_modality_metadatas().items()
+        if isinstance(metadata, LidarMetadata | LidarMergedMetadata)
+    ]
+    return np.unique(np.concatenate([np.zeros(0, dtype=np.int64), *found]))
+
+
+def main_lidar_mount(log: Log) -> Float64[np.ndarray, "4 4"] | None:
+    """Return `T_ego_lidar` of 123D's LIDAR_TOP, else of the highest lidar. None if the log has no lidar."""
+    sensors: dict[LidarID, LidarMetadata] = {}
+    for metadata in log.scene.get_all_modality_metadatas().values():
+        if isinstance(metadata, LidarMetadata):
+            sensors[metadata.lidar_id] = metadata
+        elif isinstance(metadata, LidarMergedMetadata):
+            sensors |= metadata.lidar_metadatas
+    T_ego_imu = np.linalg.inv(log.T_imu_ego)
+    mounts = {name: T_ego_imu @ one.lidar_to_imu_se3.transformation_matrix for name, one in sensors.items()}
+    if LidarID.LIDAR_TOP in mounts:
+        return mounts[LidarID.LIDAR_TOP]
+    return max(mounts.values(), key=lambda T: float(T[2, 3]), default=None)
 
 
 def _recorded_beams(log: Log, frame: int) -> tuple[Float[np.ndarray, "R 3"] | None, LidarSweep | None]:

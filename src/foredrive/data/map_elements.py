@@ -1,7 +1,7 @@
 """Map elements and map rasters around the ego vehicle, from a log's 123D map."""
 
 import functools
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -37,6 +37,7 @@ MIN_PIECE_M = 0.5
 LEVEL_M = 4.5
 """Maximum height of an element above or below the ego vehicle. Others belong to another level of the road."""
 _DRIVABLE = (MapLayer.LANE, MapLayer.INTERSECTION, MapLayer.CARPARK, MapLayer.GENERIC_DRIVABLE)
+_EVERYWHERE_M = 1e8
 _ERASED_PX = 4
 """Cells by which UniAD draws a line wider where it erases those of the layers before it."""
 
@@ -123,6 +124,23 @@ def read_map_raster(log: Log, frame: int, spec: PlaneSpec, line_px: int) -> MapR
     return MapRaster(spec, torch.from_numpy(layers > 0), known=torch.tensor(found is not None))
 
 
+def read_shared_drivable(log: Log) -> list[list[Line]] | None:
+    """Read the drivable areas of the whole map that a log shares with others, world frame.
+
+    Returns:
+        Outline and holes of each, or None if the log has no map, or one of its own.
+
+    Raises:
+        InputError: the map cannot be read.
+    """
+    with reading(log.path.folder, "its map"):
+        api = log.scene.get_map_api()
+        if api is None or api.get_map_metadata().map_is_per_log:
+            return None
+        everywhere = shapely.box(*(-_EVERYWHERE_M,) * 2, *(_EVERYWHERE_M,) * 2)
+        return _drivable(api.query(everywhere, list(_DRIVABLE), "intersects"))
+
+
 def log_map(log: Log) -> LogMap | None:
     """Read and merge the map around a log's path. Return None if the log has no map.
 
@@ -157,13 +175,18 @@ def _log_map(log: Log) -> LogMap | None:
             line_strings(lane.centerline_3d.array for lane in lanes), MIN_LENGTH_M, directed=True
         ),
     }
-    areas = [item for layer in _DRIVABLE for item in _surfaces(objects[layer])]
     return LogMap(
         lines={kind: [coordinates(line) for line in lines] for kind, lines in kinds.items()},
-        drivable=[_rings(_polygon(item)) for item in areas],
+        drivable=_drivable(objects),
         crossing_edges=[edge for area in crossings for edge in _long_edges(area.exterior)],
         flat=flat,
     )
+
+
+def _drivable(objects: Mapping[MapLayer, Sequence[object]]) -> list[list[Line]]:
+    """Return outline and holes of each drivable area."""
+    areas = (item for layer in _DRIVABLE for item in _surfaces(objects[layer]))
+    return [_rings(_polygon(item)) for item in areas]
 
 
 def _inner_boundaries(lanes: Sequence[Lane]) -> list[LineString]:

@@ -28,7 +28,7 @@ from py123d.datatypes import (
 )
 from py123d.datatypes.detections.box_detections_metadata import BoxDetectionsSE3Metadata
 from py123d.datatypes.modalities.base_modality import BaseModality
-from py123d.geometry import BoundingBoxSE3, PoseSE3, Vector3D
+from py123d.geometry import BoundingBoxSE3, Vector3D
 from py123d.parser.base_dataset_parser import BaseLogParser, ModalitiesSync, ParsedCamera, ParsedLidar
 from py123d.parser.nuscenes.utils.nuscenes_constants import (
     NUSCENES_BOX_DETECTIONS_SE3_METADATA,
@@ -39,15 +39,17 @@ from py123d.parser.nuscenes.utils.nuscenes_constants import (
 from scipy.spatial import KDTree
 
 from foredrive.data.modalities import attributes_modality, visibility_modality
+from foredrive.data.nuscenes_tables import (
+    MIDDLE_OF_LEVEL,
+    attribute_of_row,
+    matrix_of_row,
+    pose_of_matrix,
+)
 from foredrive.data.safe_pickle import load_pickle
 from foredrive.data.written_boxes import LABEL_OF_CATEGORY
-from foredrive.scene import Attribute, Category
-from foredrive.scene.boxes import UNKNOWN
+from foredrive.scene import Category
 
 _SAME_PLACE_M = 0.1
-_MIDDLE_OF_LEVEL = {"1": 0.2, "2": 0.5, "3": 0.7, "4": 0.9}
-"""Visible share that stands for each level, by the level's token."""
-_ATTRIBUTE_OF_LABEL = {attribute.label: attribute for attribute in Attribute}
 
 
 class NuScenesKeyframeParser(BaseLogParser):
@@ -74,8 +76,8 @@ class NuScenesKeyframeParser(BaseLogParser):
         lidar = by_channel["LIDAR_TOP"]
         timestamp = Timestamp.from_us(lidar["timestamp"])
         T_world_ego = self._ego_pose(lidar)
-        ego = EgoStateSE3.from_imu(_pose(T_world_ego), NUSCENES_EGO_STATE_SE3_METADATA, timestamp)
-        T_ego_lidar = _matrix(self._calibration(lidar))
+        ego = EgoStateSE3.from_imu(pose_of_matrix(T_world_ego), NUSCENES_EGO_STATE_SE3_METADATA, timestamp)
+        T_ego_lidar = matrix_of_row(self._calibration(lidar))
         boxes = self._boxes(T_world_ego @ T_ego_lidar, timestamp)
         cameras = [
             self._camera(camera_id, by_channel[channel])
@@ -107,7 +109,7 @@ class NuScenesKeyframeParser(BaseLogParser):
             )
             over_ground = Vector3D.from_array(velocity) if np.isfinite(velocity).all() else None
             detections.append(
-                BoxDetectionSE3(attributes, BoundingBoxSE3(_pose(T), *values[3:6]), over_ground)
+                BoxDetectionSE3(attributes, BoundingBoxSE3(pose_of_matrix(T), *values[3:6]), over_ground)
             )
         metadata: BoxDetectionsSE3Metadata = NUSCENES_BOX_DETECTIONS_SE3_METADATA
         return BoxDetectionsSE3(detections, timestamp, metadata)
@@ -125,15 +127,15 @@ class NuScenesKeyframeParser(BaseLogParser):
             for at, near in zip(np.atleast_1d(nearest).tolist(), near_enough, strict=True)
         ]
         names = {row["token"]: row["name"] for row in self._rows["attribute"]}
-        attributes = [_attribute(row, names) for row in matched]
-        shares = [_MIDDLE_OF_LEVEL[row["visibility_token"]] if row else np.nan for row in matched]
+        attributes = [attribute_of_row(row, names) for row in matched]
+        shares = [MIDDLE_OF_LEVEL[row["visibility_token"]] if row else np.nan for row in matched]
         return [
             attributes_modality(attributes, boxes.timestamp),
             visibility_modality(shares, boxes.timestamp),
         ]
 
     def _lidar(self, row: dict[str, Any], T_ego_lidar: np.ndarray) -> ParsedLidar:
-        sensor = LidarMetadata("LIDAR_TOP", LidarID.LIDAR_TOP, _pose(T_ego_lidar))
+        sensor = LidarMetadata("LIDAR_TOP", LidarID.LIDAR_TOP, pose_of_matrix(T_ego_lidar))
         return ParsedLidar(
             metadata=LidarMergedMetadata({LidarID.LIDAR_TOP: sensor}),
             start_timestamp=Timestamp.from_us(row["timestamp"] - NUSCENES_LIDAR_SWEEP_DURATION_US),
@@ -144,7 +146,7 @@ class NuScenesKeyframeParser(BaseLogParser):
 
     def _camera(self, camera_id: CameraID, row: dict[str, Any]) -> ParsedCamera:
         calibration = self._calibration(row)
-        T_ego_cam = _matrix(calibration)
+        T_ego_cam = matrix_of_row(calibration)
         metadata = PinholeCameraMetadata(
             camera_name=NUSCENES_CAMERA_IDS[camera_id],
             camera_id=camera_id,
@@ -152,13 +154,13 @@ class NuScenesKeyframeParser(BaseLogParser):
             distortion=None,
             width=row["width"],
             height=row["height"],
-            camera_to_imu_se3=_pose(T_ego_cam),
+            camera_to_imu_se3=pose_of_matrix(T_ego_cam),
             is_undistorted=True,
         )
         return ParsedCamera(
             metadata=metadata,
             timestamp=Timestamp.from_us(row["timestamp"]),
-            camera_to_global_se3=_pose(self._ego_pose(row) @ T_ego_cam),
+            camera_to_global_se3=pose_of_matrix(self._ego_pose(row) @ T_ego_cam),
             dataset_root=self._folder,
             relative_path=Path(row["filename"]).name,
         )
@@ -171,25 +173,11 @@ class NuScenesKeyframeParser(BaseLogParser):
         return _find(self._rows["calibrated_sensor"], row["calibrated_sensor_token"])
 
     def _ego_pose(self, row: dict[str, Any]) -> np.ndarray:
-        return _matrix(_find(self._rows["ego_pose"], row["ego_pose_token"]))
-
-
-def _attribute(row: dict[str, Any] | None, names: dict[str, str]) -> int:
-    """Return the `Attribute` of an annotation, or UNKNOWN."""
-    tokens = row["attribute_tokens"] if row is not None else []
-    return _ATTRIBUTE_OF_LABEL[names[tokens[0]]] if tokens else UNKNOWN
+        return matrix_of_row(_find(self._rows["ego_pose"], row["ego_pose_token"]))
 
 
 def _find(rows: list[dict[str, Any]], token: str) -> dict[str, Any]:
     return next(row for row in rows if row["token"] == token)
-
-
-def _matrix(row: dict[str, Any]) -> np.ndarray:
-    return PoseSE3(*row["translation"], *row["rotation"]).transformation_matrix
-
-
-def _pose(T: np.ndarray) -> PoseSE3:
-    return PoseSE3.from_transformation_matrix(T)
 
 
 def _yaw_matrix(yaw: float, xyz: list[float]) -> np.ndarray:

@@ -8,7 +8,7 @@ import torch
 from mcap_protobuf.writer import Writer
 
 from foredrive.data import LogPath
-from foredrive.data.cameras import encoded_image, pinhole_cameras, read_camera
+from foredrive.data.cameras import camera_mount, encoded_image, pinhole_cameras, read_camera
 from foredrive.data.lidar import read_sweep
 from foredrive.data.logs import Log
 from foredrive.data.maps import read_map_patch
@@ -89,9 +89,7 @@ def _write_sensors(mcap: _Mcap, log: Log, frame: int) -> None:
         size_hw = (camera.height, camera.width)
         read = read_camera(log, frame, camera, size_hw, with_image=False)
         exposed_us = t_us + round(read.exposed_dt_s * 1e6)
-        mounted = torch.from_numpy(
-            np.linalg.inv(log.T_imu_ego) @ camera.camera_to_imu_se3.transformation_matrix
-        )
+        mounted = torch.from_numpy(camera_mount(log, camera))
         own = foxglove.camera_frame(name)
         mcap.write("/tf", t_us, foxglove.transform_message(t_us, foxglove.EGO, own, mounted))
         calibration = foxglove.calibration_message(exposed_us, name, read.K, read.dist, size_hw)

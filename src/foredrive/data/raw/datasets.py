@@ -67,7 +67,9 @@ DATASETS: dict[str, RawDataset] = {
     "kitti-raw": RawDataset(_kitti_raw, "velodyne_points/data"),
     "rosbag": RawDataset(find_bags, "BAG.topics.yaml beside a .bag, .db3, .mcap or the folder of a bag"),
     "nerfstudio": RawDataset(find_nerfstudio, "transforms.json"),
-    "nuscenes": RawDataset(py123d_datasets.nuscenes, "v1.0-trainval, v1.0-test or v1.0-mini with scene.json"),
+    "nuscenes": RawDataset(
+        py123d_datasets.nuscenes, "v1.0-trainval, v1.0-test, v1.0-mini or v1.0-NAME with scene.json"
+    ),
     "nuscenes-sweeps": RawDataset(py123d_datasets.nuscenes_sweeps, "the same as for nuscenes"),
     "nuplan": RawDataset(py123d_datasets.nuplan, "nuplan-v1.1/splits/mini, trainval or test"),
     "kitti360": RawDataset(py123d_datasets.kitti360, "calibration/calib_cam_to_pose.txt"),

@@ -6,6 +6,7 @@ sets are read by an allow-list (`safe_pickle`), which takes the place of `pickle
 
 import importlib
 import importlib.util
+import json
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -15,6 +16,7 @@ from py123d.datatypes import BoxDetectionSE3, BoxDetectionsSE3, EgoStateSE3, Log
 from py123d.datatypes.modalities.base_modality import BaseModality
 from py123d.parser.base_dataset_parser import BaseDatasetParser, BaseLogParser, ModalitiesSync
 
+from foredrive.data.nuscenes_tables import NuScenesTablesParser, nuscenes_tables
 from foredrive.data.raw.raw_log import RawLog, folders_with
 from foredrive.data.safe_pickle import PlainPickle, load_records
 from foredrive.errors import InputError
@@ -57,6 +59,21 @@ def _nuscenes(source: Path, name: str) -> Iterator[RawLog]:
             _leave_unknown_speed_out(module)
             maps = root if (root / "maps" / "expansion").is_dir() else None
             yield from _of(module.NuScenesParser(splits, root, maps), root / version)
+    for root in folders_with(source, "v1.0-*/scene.json"):
+        for tables in sorted(root.glob("v1.0-*")):
+            if tables.name not in versions and (tables / "scene.json").is_file():
+                yield from _own_scenes(tables, sweeps=name != "nuscenes")
+
+
+def _own_scenes(tables: Path, *, sweeps: bool) -> Iterator[RawLog]:
+    """Find the scenes of a data set in nuScenes' format. Their splits are those of its splits.json."""
+    noted, split_of = tables / "splits.json", dict[str, str]()
+    if noted.is_file():
+        for split, names in json.loads(noted.read_text()).items():
+            split_of |= dict.fromkeys(names, split)
+    for token, scene in nuscenes_tables(tables).rows["scene"].items():
+        split = f"nuscenes_{split_of.get(scene['name'], 'train')}"
+        yield RawLog(tables, NuScenesTablesParser(tables, split, token, sweeps=sweeps))
 
 
 def _leave_unknown_speed_out(parser: Any) -> None:

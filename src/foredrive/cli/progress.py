@@ -1,0 +1,24 @@
+"""Progress by the number of frames, for verbs that do not know it before."""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+
+@contextmanager
+def frame_progress(doing: str) -> Iterator[Callable[[], None]]:
+    """Show what is done, the number of frames and the time; yield the function that counts a frame."""
+    from rich.console import Console
+    from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+
+    columns = (SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
+    console = Console(stderr=True)
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
+        bar = progress.add_task(doing, total=None)
+        frames = 0
+
+        def tick() -> None:
+            nonlocal frames
+            frames += 1
+            progress.update(bar, description=f"{doing}: {frames} frames")
+
+        yield tick
