@@ -1,4 +1,4 @@
-"""nuScenes mini with one scene of two key frames and the sweeps between them, after its published tables."""
+"""One scene in nuScenes' format: two key frames and the sweeps between them, after its published tables."""
 
 import json
 from pathlib import Path
@@ -14,7 +14,7 @@ AHEAD = [0.5, -0.5, 0.5, -0.5]
 """Of cameras: z ahead, x to the right."""
 
 
-def write(root: Path) -> None:
+def write(root: Path, version: str = "v1.0-mini") -> None:
     """The vehicle drives along x at 4 m/s; a car 10 m ahead of its start drives at 2 m/s."""
     tables: dict[str, list[dict[str, Any]]] = {"sample_data": [], "ego_pose": [], "calibrated_sensor": []}
     tables["visibility"] = [{"token": "4", "level": "v80-100", "description": ""}]
@@ -95,7 +95,7 @@ def write(root: Path) -> None:
             }
         )
         _stream(root, tables, name, [50_000 * k for k in range(11)] if is_lidar else [0, 500_000])
-    folder = root / "v1.0-mini"
+    folder = root / version
     folder.mkdir(parents=True)
     for table, rows in tables.items():
         folder.joinpath(f"{table}.json").write_text(json.dumps(rows))

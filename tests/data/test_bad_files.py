@@ -19,6 +19,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import raw_kitti360
+import raw_nuscenes
 import raw_pandaset
 import test_kitti_object
 import test_kitti_raw
@@ -74,6 +75,10 @@ def kitti_raw(root: Path) -> None:
 
 def kitti360(root: Path) -> None:
     raw_kitti360.write(root / "raw")
+
+
+def own_nuscenes(root: Path) -> None:
+    raw_nuscenes.write(root / "raw", "v1.0-own")
 
 
 def nerfstudio(root: Path) -> None:
@@ -231,6 +236,18 @@ READERS: dict[str, Reader] = {
             "raw/calibration/image_02.yaml",
         ),
     ),
+    "nuscenes": Reader(
+        own_nuscenes,
+        converted("nuscenes-sweeps"),
+        (
+            "raw/v1.0-own/scene.json",
+            "raw/v1.0-own/sample_data.json",
+            "raw/v1.0-own/ego_pose.json",
+            "raw/v1.0-own/calibrated_sensor.json",
+            "raw/v1.0-own/sample_annotation.json",
+            "raw/samples/LIDAR_TOP/LIDAR_TOP-0.pcd.bin",
+        ),
+    ),
     "nerfstudio": Reader(nerfstudio, converted("nerfstudio"), ("raw/transforms.json", "raw/images/a.png")),
     "ros1": Reader(ros1, converted("rosbag"), ("raw/drive.bag", "raw/drive.bag.topics.yaml")),
     "ros2": Reader(ros2, converted("rosbag"), ("raw/drive.mcap",)),
@@ -300,6 +317,12 @@ HARMLESS = {
     ("kitti-raw", "0000000001.txt", "too few"),  # only the first six numbers are read
     ("kitti-raw", "0000000001.bin", "empty"),
     ("kitti-raw", "0000000001.bin", "zeros"),
+    ("nuscenes", "scene.json", "not a number"),  # the number of samples, which is not read
+    ("nuscenes", "scene.json", "texts for numbers"),
+    ("nuscenes", "ego_pose.json", "not a number"),  # the time, which that of the reading stands for
+    ("nuscenes", "LIDAR_TOP-0.pcd.bin", "empty"),
+    ("nuscenes", "LIDAR_TOP-0.pcd.bin", "cut in half"),  # one point is left
+    ("nuscenes", "LIDAR_TOP-0.pcd.bin", "zeros"),
     ("kitti360", "image_02.yaml", "null bytes"),  # in the first line, which is not YAML in OpenCV's files
     ("kitti360", f"{raw_kitti360.DRIVE}.xml", "another root"),  # without any object
     ("av2", "log_map_archive_raw____PIT_city_1.json", "not a number"),  # an empty map has no numbers

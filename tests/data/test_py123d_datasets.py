@@ -25,8 +25,10 @@ from foredrive.data.maps import read_map_patch
 from foredrive.data.raw.datasets import DATASETS
 from foredrive.data.safe_pickle import PlainPickle
 from foredrive.errors import InputError
+from foredrive.scene import Attribute, Visibility
 
 HAS_NUSCENES = importlib.util.find_spec("nuscenes") is not None
+NEEDS_DEVKIT = pytest.mark.skipif(not HAS_NUSCENES, reason="nuscenes-devkit is not installed")
 HAS_TENSORFLOW = importlib.util.find_spec("tensorflow") is not None
 
 
@@ -155,7 +157,7 @@ def test_truckdrive_leaves_unknown_speeds_out(tmp_path: Path) -> None:
     assert boxes.velocity[0, 0].item() == pytest.approx(30.0, abs=0.1)
 
 
-@pytest.mark.skipif(not HAS_NUSCENES, reason="nuscenes-devkit is not installed")
+@NEEDS_DEVKIT
 def test_nuscenes_at_key_frames_and_with_sweeps(tmp_path: Path) -> None:
     raw_nuscenes.write(tmp_path / "raw")
     (path,) = convert(tmp_path / "raw", "nuscenes", tmp_path / "out")
@@ -179,10 +181,34 @@ def test_nuscenes_at_key_frames_and_with_sweeps(tmp_path: Path) -> None:
     assert sweep[0].points_ego[0].tolist() == pytest.approx([6.0, 1.0, 0.8], abs=1e-5)
 
 
-@pytest.mark.skipif(not HAS_NUSCENES, reason="nuscenes-devkit is not installed")
-def test_a_table_cannot_name_files_outside_of_nuscenes(tmp_path: Path) -> None:
-    raw_nuscenes.write(tmp_path / "raw")
-    table = tmp_path / "raw" / "v1.0-mini" / "sample_data.json"
+def test_own_scenes_in_nuscenes_format_need_no_devkit(tmp_path: Path) -> None:
+    """The same tree by our own parser: all is read as it is, and frames between samples have no boxes."""
+    raw_nuscenes.write(tmp_path / "raw", "v1.0-own")
+    (path,) = convert(tmp_path / "raw", "nuscenes", tmp_path / "out")
+    assert path.name == f"nuscenes_train/{raw_nuscenes.SCENE}"
+    log = Log(path)
+    assert (log.t_us - raw_nuscenes.START_US).tolist() == [0, 500_000]
+    assert len(pinhole_cameras(log)) == 6
+    boxes = read_boxes(log, 1)
+    assert boxes is not None
+    assert boxes.centre[0].tolist() == pytest.approx([9.0, 2.0, 0.8])
+    assert boxes.velocity[0].tolist() == pytest.approx([2.0, 0.0])
+    assert (boxes.num_points.item(), boxes.attribute.item()) == (5, Attribute.VEHICLE_MOVING)
+    assert boxes.visibility.item() == Visibility.V80_100
+    (path,) = convert(tmp_path / "raw", "nuscenes-sweeps", tmp_path / "ten")
+    log = Log(path)
+    assert np.diff(log.t_us).tolist() == [50_000] * 10
+    assert read_boxes(log, 4) is None
+    sweep = read_sweep(log, 4)
+    assert sweep is not None
+    assert sweep[0].points_ego[0].tolist() == pytest.approx([6.0, 1.0, 0.8], abs=1e-5)
+    assert len(log.rows("camera.pcam_f0")[0]) == 4  # an image is beside the sweeps 50 ms before and after
+
+
+@pytest.mark.parametrize("version", [pytest.param("v1.0-mini", marks=NEEDS_DEVKIT), "v1.0-own"])
+def test_a_table_cannot_name_files_outside_of_nuscenes(version: str, tmp_path: Path) -> None:
+    raw_nuscenes.write(tmp_path / "raw", version)
+    table = tmp_path / "raw" / version / "sample_data.json"
     table.write_text(table.read_text().replace("samples/CAM_FRONT/", "../secret/"))
     (tmp_path / "secret").mkdir()
     for image in (tmp_path / "raw" / "samples" / "CAM_FRONT").iterdir():

@@ -39,6 +39,7 @@ from py123d.parser.nuscenes.utils.nuscenes_constants import (
 
 from foredrive.data.modalities import attributes_modality, visibility_modality
 from foredrive.data.nuscenes_names import camera_of_channel
+from foredrive.data.raw.guard import reading_raw
 from foredrive.data.written_boxes import LABEL_OF_CATEGORY
 from foredrive.scene import Attribute, Category
 from foredrive.scene.boxes import UNKNOWN
@@ -81,9 +82,7 @@ class NuScenesTables:
 def nuscenes_tables(folder: Path) -> NuScenesTables:
     """Read the tables of a data set. Those of the last two are kept: scenes are read one after the other."""
     rows = {
-        file.stem: {row["token"]: row for row in json.loads(file.read_text())}
-        for file in sorted(folder.glob("*.json"))
-        if file.name != "splits.json"
+        file.stem: _read_table(file) for file in sorted(folder.glob("*.json")) if file.name != "splits.json"
     }
     tables = NuScenesTables(rows, {}, {})
     for reading in sorted(rows["sample_data"].values(), key=lambda row: int(row["timestamp"])):
@@ -128,7 +127,20 @@ class NuScenesTablesParser(BaseLogParser):
         return LogMetadata("nuscenes", self._split, self._scene["name"], location=location)
 
     def iter_modalities_sync(self) -> Iterator[ModalitiesSync]:
-        """Yield the frames: ego pose at the time of the sweep, boxes, lidar, and the images beside it."""
+        """Yield the frames: ego pose at the time of the sweep, boxes, lidar, and the images beside it.
+
+        Raises:
+            InputError: a table is wrong.
+        """
+        frames = self._frames()
+        while True:
+            with reading_raw(self._folder):  # sensor files are read later
+                frame = next(frames, None)
+            if frame is None:
+                return
+            yield frame
+
+    def _frames(self) -> Iterator[ModalitiesSync]:
         readings = self._tables.readings.get(self._scene_token, {})
         cameras = {id_: rows for name, rows in readings.items() if (id_ := self._camera_id(name)) is not None}
         frames = readings.get(LIDAR) or next((cameras[id_] for id_ in sorted(cameras)), [])
@@ -215,6 +227,13 @@ class NuScenesTablesParser(BaseLogParser):
         return T
 
 
+def _read_table(file: Path) -> dict[str, Row]:
+    rows = json.loads(file.read_text())
+    if not isinstance(rows, list):
+        raise TypeError(f"{file.name} is not a list of rows")
+    return {row["token"]: row for row in rows}
+
+
 def attribute_of_row(row: Row | None, names: dict[str, str]) -> int:
     """Return the `Attribute` of an annotation by the names of attributes, or UNKNOWN."""
     tokens = row["attribute_tokens"] if row is not None else []
@@ -224,6 +243,8 @@ def attribute_of_row(row: Row | None, names: dict[str, str]) -> int:
 def matrix_of_row(row: Row) -> np.ndarray:
     """Return the pose of a row with translation and rotation as a matrix [4, 4]."""
     matrix: np.ndarray = PoseSE3(*row["translation"], *row["rotation"]).transformation_matrix
+    if not np.isfinite(matrix).all():
+        raise ValueError(f"the pose of the row {row['token']} is not finite")
     return matrix
 
 

@@ -1,1 +1,1 @@
-"""Export of a trained agent as one graph of plain tensors, for runtimes without this package."""
+"""Export of a trained agent as one graph of plain tensors, and of logs in the formats of other tools."""

@@ -71,9 +71,12 @@ def _own_scenes(tables: Path, *, sweeps: bool) -> Iterator[RawLog]:
     if noted.is_file():
         for split, names in json.loads(noted.read_text()).items():
             split_of |= dict.fromkeys(names, split)
-    for token, scene in nuscenes_tables(tables).rows["scene"].items():
+    scenes = nuscenes_tables(tables).rows["scene"]
+    if not scenes:
+        raise InputError(f"{tables / 'scene.json'}: has no scenes")
+    for token, scene in scenes.items():
         split = f"nuscenes_{split_of.get(scene['name'], 'train')}"
-        yield RawLog(tables, NuScenesTablesParser(tables, split, token, sweeps=sweeps))
+        yield RawLog(tables.parent, NuScenesTablesParser(tables, split, token, sweeps=sweeps))
 
 
 def _leave_unknown_speed_out(parser: Any) -> None:
