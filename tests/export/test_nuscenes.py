@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import raw_nuscenes
 import synthetic_log as world
 import test_maps
 from miniature import write_log
@@ -295,6 +296,41 @@ def test_without_a_map_nothing_is_drivable(tables: Tables) -> None:
     assert (where < np.array(mask.shape[::-1]) - 900).all(), "the devkit draws 57 m around a pose"
 
 
+def test_each_reading_has_the_pose_of_its_own_time(tmp_path: Path) -> None:
+    """Images are exposed 30 ms after the sweeps, at 10 m/s."""
+    t_s = np.arange(11) * 0.1
+    poses = np.tile(np.eye(4), (11, 1, 1))
+    poses[:, 0, 3] = 10.0 * t_s
+    K, image = np.array([[8.0, 0, 8], [0, 8, 8], [0, 0, 1]]), np.zeros((16, 16, 3), np.uint8)
+    log = write_own_log(
+        tmp_path / "data",
+        "late",
+        t_s,
+        poses,
+        cameras=[CameraSpec("front", K, np.eye(4), (16, 16))],
+        images={"front": [image] * 11},
+        image_t_s={"front": t_s + 0.03},
+        sweeps=[Points(np.array([[5.0, 0.0, 0.0]]))] * 11,
+        path=(np.arange(24) * 0.05, np.array([_ahead(0.5 * k) for k in range(24)])),
+    )
+    assert main(["export", "nuscenes", str(log.folder), "--out", str(tmp_path / "out")]) == 0
+    tables = Tables(tmp_path / "out")
+    start = tables.readings("LIDAR_TOP")[0]["timestamp"]
+    for channel, late_s in (("LIDAR_TOP", 0.0), ("CAM_FRONT", 0.03)):
+        for k, row in enumerate(tables.readings(channel)):
+            after_s = (row["timestamp"] - start) * 1e-6
+            assert after_s == pytest.approx(0.1 * k + late_s, abs=1e-5)
+            pose = tables.of["ego_pose"][row["ego_pose_token"]]
+            driven = pose["translation"][0] + tables.rows("log")[0]["world_offset_m"][0]
+            assert driven == pytest.approx(10.0 * after_s, abs=1e-4)
+
+
+def _ahead(x_m: float) -> np.ndarray:
+    T = np.eye(4)
+    T[0, 3] = x_m
+    return T
+
+
 def test_samples_lack_no_sensor(tmp_path: Path) -> None:
     """Frames 0 and 5 have no image; frames 10 to 12 have no sweep."""
     t_s, poses = np.arange(20) * 0.1, np.tile(np.eye(4), (20, 1, 1))
@@ -319,6 +355,35 @@ def test_samples_lack_no_sensor(tmp_path: Path) -> None:
         times = [(row["timestamp"] - start) // 100_000 for row in readings]
         assert times == [k for k in range(20) if k not in lacking]
         assert [time for time, row in zip(times, readings, strict=True) if row["is_key_frame"]] == at
+
+
+def test_a_data_set_in_nuscenes_format_comes_out_as_it_came_in(tmp_path: Path) -> None:
+    """Sweeps at 20 Hz and images at 2 Hz, each of which is beside several sweeps: it is written once."""
+    raw_nuscenes.write(tmp_path / "raw", "v1.0-own")
+    (log,) = convert(tmp_path / "raw", "nuscenes-sweeps", tmp_path / "data")
+    assert main(["export", "nuscenes", str(log.folder), "--out", str(tmp_path / "out")]) == 0
+    before, after = Tables(tmp_path / "raw", "v1.0-own"), Tables(tmp_path / "out")
+    for channel in ("LIDAR_TOP", *raw_nuscenes.CAMERAS):
+        one, other = before.readings(channel), after.readings(channel)
+        for column in ("timestamp", "is_key_frame", "height", "width"):
+            assert [row[column] for row in other] == [row[column] for row in one], (channel, column)
+        for old, new in zip(one, other, strict=True):
+            files = [root.root / row["filename"] for root, row in ((before, old), (after, new))]
+            if channel != "LIDAR_TOP":
+                assert files[1].read_bytes() == files[0].read_bytes()
+            else:  # x ahead there
+                x, y, z, intensity, ring = before.points(old).T
+                np.testing.assert_allclose(after.points(new).T, [-y, x, z, intensity, ring], atol=1e-5)
+    annotations = [
+        sorted(each.rows("sample_annotation"), key=lambda row: row["next"] == "") for each in (before, after)
+    ]
+    offset = [*after.rows("log")[0]["world_offset_m"], 0.0]
+    for old, new in zip(*annotations, strict=True):
+        assert new["size"] == pytest.approx(old["size"])
+        assert np.add(new["translation"], offset) == pytest.approx(old["translation"])
+        assert new["num_lidar_pts"] == old["num_lidar_pts"]
+        assert new["visibility_token"] == old["visibility_token"]
+        assert (new["prev"] == "", new["next"] == "") == (old["prev"] == "", old["next"] == "")
 
 
 def test_the_same_log_gives_the_same_bytes(source: LogPath, root: Path, tmp_path: Path) -> None:
