@@ -11,9 +11,7 @@ All is kept in runs/drive_nemo, where an interrupted benchmark continues with th
 """
 
 import dataclasses
-import itertools
 import os
-from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
@@ -51,16 +49,17 @@ PRETRAINED = Path("embedded:nemo_town")
 ROUNDS = 1
 """Rounds of DAgger after the demonstrations of the disturbed expert."""
 DEMONSTRATIONS = "training-short"
+DEMONSTRATED = ("Town01", "Town02", "Town03", "Town04", "Town06")
 ROUTES_A_TOWN = 4
-"""Number of routes that are demonstrated in each of the seven towns, of eight."""
+"""Number of routes that are demonstrated in each of these towns, of eight. The others take hours more."""
 JUDGED = {"short": "town05-short", "long": "town05-long"}
 REPETITIONS = 1
-OPEN_LOOP = Campaign(("Town05",), seeds=tuple(range(1, 7)), seconds=60.0, rate_hz=2.0)
+OPEN_LOOP = Campaign(("Town05",), seeds=(1, 2), seconds=60.0, rate_hz=2.0)
 CORES = len(os.sched_getaffinity(0))
 CONFIG = {
     "recipes": {name: dataclasses.asdict(find_recipe(name)) for name in (FULL, *RECIPES.values())},
     "pretraining": str(PRETRAINED),
-    "demonstrations": [DEMONSTRATIONS, ROUTES_A_TOWN],
+    "demonstrations": [DEMONSTRATIONS, *DEMONSTRATED, ROUTES_A_TOWN],
     "rounds": ROUNDS,
     "routes": JUDGED,
     "repetitions": REPETITIONS,
@@ -103,10 +102,12 @@ def demonstrations(rounds: int) -> tuple[LogPath, ...]:
 
 def demonstrated_routes() -> tuple[str, ...]:
     """Return the ids of the first routes of each town."""
-    by_town = defaultdict[str, list[str]](list)
-    for route in load_route_set(DEMONSTRATIONS):
-        by_town[route.town].append(route.id)
-    return tuple(itertools.chain(*(ids[:ROUTES_A_TOWN] for ids in by_town.values())))
+    routes = load_route_set(DEMONSTRATIONS)
+    return tuple(
+        route.id
+        for town in DEMONSTRATED
+        for route in [route for route in routes if route.town == town][:ROUTES_A_TOWN]
+    )
 
 
 def _student(rounds: int) -> Run:
