@@ -14,7 +14,7 @@ from foredrive.lazy import importing
 
 
 def export_nuscenes(
-    logs: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="LOG")],
+    logs: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="LOG [LOG ...]")],
     out: Path,
     name: str = "foredrive",
     rate: float = 2.0,
