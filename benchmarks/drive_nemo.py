@@ -24,6 +24,7 @@ from foredrive.evaluation.bench import Benchmark, study_identity
 from foredrive.evaluation.summary import read_summary
 from foredrive.metrics.bootstrap import bootstrap_mean
 from foredrive.recipes import find_recipe
+from foredrive.recipes.config import rescheduled
 from foredrive.runs.drive.agents import IDM, IDM_BY_SIGHT
 from foredrive.runs.drive.compare import values_of
 from foredrive.runs.drive.in_towns import TownRoutes
@@ -46,6 +47,8 @@ RECIPES = {
 }
 """With the last round's arm of `FULL`, the first three are 2 x 2: scorer, futures."""
 PRETRAINED = Path("embedded:nemo_town")
+FINETUNE_STEPS = 600
+"""Of the recipes' 1,500: half an hour on one core, once through the demonstrations."""
 ROUNDS = 1
 """Rounds of DAgger after the demonstrations of the disturbed expert."""
 DEMONSTRATIONS = "training-short"
@@ -59,6 +62,7 @@ CORES = len(os.sched_getaffinity(0))
 CONFIG = {
     "recipes": {name: dataclasses.asdict(find_recipe(name)) for name in (FULL, *RECIPES.values())},
     "pretraining": str(PRETRAINED),
+    "finetune_steps": FINETUNE_STEPS,
     "demonstrations": [DEMONSTRATIONS, *DEMONSTRATED, ROUTES_A_TOWN],
     "rounds": ROUNDS,
     "routes": JUDGED,
@@ -117,6 +121,7 @@ def _student(rounds: int) -> Run:
 def trained(recipe: str, name: str, seed: int, rounds: int = ROUNDS, pretrained: bool = True) -> Run:
     """Return a run on the demonstrations of some rounds, and train what is missing."""
     chosen = seeded(find_recipe(recipe), seed)
+    chosen = dataclasses.replace(chosen, finetune=rescheduled(chosen.finetune, steps=FINETUNE_STEPS))
     start = run_folder(PRETRAINED) if pretrained and recipe.startswith("nemo") else None
     chosen = chosen if pretrained else dataclasses.replace(chosen, pretrain=None)
     folder = WORK / "runs" / f"{name}_seed{seed}"
