@@ -11,11 +11,12 @@ from foredrive.data.boxes import no_boxes
 from foredrive.data.lidar import empty_sweep
 from foredrive.errors import InputError
 from foredrive.rendering.vehicle import LoggedVehicle
-from foredrive.scene import Boxes, CameraRig, Category, Clip, Command, LidarSweep
+from foredrive.scene import BicycleState, Boxes, CameraRig, Category, Clip, Command, LidarSweep
 from foredrive.simulation.corridor_agent import CorridorAgent, returns_in_corridor
 from foredrive.simulation.logged_drive import LoggedDrive
 from foredrive.simulation.observation import KeyFrame, make_clip, no_images
 from foredrive.simulation.replay_expert import ReplayExpert
+from foredrive.simulation.road_users import RoadUsers
 
 YAW = 0.7
 
@@ -137,6 +138,32 @@ def test_the_expert_yields_to_one_who_crosses() -> None:
     crossing = boxes((16.0, -14.0, 1.57, 0.0, 6.0))
     plan = ReplayExpert(logged()).act(seen(0.0, 8.0, near=crossing)).xy[0, 0]
     assert abs(float(plan[3, 0]) - 16.0) > 1.0 or abs(float(plan[3, 1])) > 1.0
+
+
+def test_the_expert_knows_who_will_turn_into_its_path() -> None:
+    """Now the other stands 5 m beside the path; after 2 s it is on it, 16 m ahead of the vehicle's start."""
+    clip = seen(0.0, 8.0, near=boxes((16.0, 5.0, 1.57, 0.0, 0.0)))
+    pose = clip.T_world_ego[0, 0].double().numpy()
+
+    class Told:
+        def ego(self) -> BicycleState:
+            return BicycleState(0.0, 0.0, 0.0, 8.0)
+
+        def users_in(self, after_s: float) -> RoadUsers:
+            foot = pose @ [16.0, 5.0 if after_s < 1.5 else 0.0, 0.0, 1.0]
+            return RoadUsers(
+                track_id=np.array([1]),
+                category=np.array([int(Category.CAR)]),
+                foot_m=foot[None, :3],
+                yaw=np.array([YAW]),
+                half_lw=np.array([[2.2, 0.95]]),
+                velocity_mps=np.zeros((1, 2)),
+            )
+
+    blind = ReplayExpert(logged()).act(clip).xy[0, 0]
+    np.testing.assert_allclose(blind[:, 0].numpy(), [4.0 * k for k in range(1, 7)], atol=0.05)
+    told = ReplayExpert(logged(), Told()).act(clip).xy[0, 0]
+    assert float(told[3, 1].abs()) > 2.0 or float(told[3, 0]) < 16.0 - 2.2 - 3.9
 
 
 def test_the_expert_returns_to_the_path_from_beside_it() -> None:

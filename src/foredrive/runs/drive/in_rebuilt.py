@@ -199,7 +199,7 @@ def _agent_in(name: str, simulator: RebuiltSimulator, sees: Sees | None) -> Agen
     if name == REPLAY:
         return ReplayAgent(simulator.drive, lambda: simulator.scenario.start_s + simulator.state.t_s)
     if name == EXPERT:
-        return ReplayExpert(simulator.drive)
+        return ReplayExpert(simulator.drive, simulator)
     if name == CORRIDOR:
         return CorridorAgent(simulator.drive)
     agent = make_agent(name, lambda: simulator.state.t_s, sees=sees)
