@@ -34,7 +34,7 @@ from foredrive.simulation.simple_agents import plan_of
 
 LOOK_DT_S = 0.25
 LOOK_TIMES_S = LOOK_DT_S * np.arange(1, 17)
-"""Times ahead at which impacts are looked for, s. Plans end after 3 s, where the controller begins to brake."""
+"""Times ahead at which impacts are looked for, s. Plans end after 3 s; the controller brakes from there."""
 ACCELERATIONS_MPS2 = (1.5, 0.0, -1.5, -3.0, -5.0, -7.5)
 ASIDE_M = (0.0, 1.2, -1.2, 2.4, -2.4, 3.6, -3.6)
 """Offsets to the left of the logged path, m. Beyond 6 m a drive ends."""
