@@ -18,7 +18,6 @@ from foredrive.simulation.logged_drive import LoggedDrive
 from foredrive.simulation.logged_lanes import LoggedLanes
 from foredrive.simulation.observation import FRAME_DT_S, FRAME_STEPS, KeyFrame, no_images
 from foredrive.simulation.replayed import comes_from_behind, users_at
-from foredrive.simulation.road_users import RoadUsers
 from foredrive.simulation.route_progress import ARRIVED_M, RouteLine, RouteProgress
 
 REACH_M = 6.0
@@ -174,10 +173,6 @@ class RebuiltSimulator:
                 f"from {scenario.start_s:g} s on, the log drives {way_m:.1f} m in {scenario.length_s:g} s"
             )
         return way_m
-
-    def users_in(self, after_s: float) -> RoadUsers:
-        """Return the actors some seconds from now, in the world frame."""
-        return users_at(self._tracks, self._T_world_scene, self._scenario.start_s + self.state.t_s + after_s)
 
     @property
     def tracks(self) -> ActorTracks:

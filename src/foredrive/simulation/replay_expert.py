@@ -29,6 +29,8 @@ from foredrive.simulation.dynamics import EGO, STEP_S, step
 from foredrive.simulation.logged_drive import LoggedDrive
 from foredrive.simulation.observation import FRAME_DT_S, HORIZON_STEPS
 from foredrive.simulation.plans import fixed_in_world
+from foredrive.simulation.rebuilt import RebuiltSimulator
+from foredrive.simulation.replayed import users_at
 from foredrive.simulation.road_users import Box, RoadUsers, touched
 from foredrive.simulation.simple_agents import plan_of
 
@@ -59,6 +61,23 @@ class ToldWorld(Protocol):
     def users_in(self, after_s: float) -> RoadUsers:
         """Return the road users some seconds from now, in the world frame."""
         ...
+
+
+@dataclass(frozen=True, eq=False)
+class ReplayedWorld:
+    """A `ToldWorld` of the simulator of a rebuilt log."""
+
+    simulator: RebuiltSimulator
+
+    def ego(self) -> BicycleState:
+        """Return the state of the ego vehicle."""
+        return self.simulator.ego()
+
+    def users_in(self, after_s: float) -> RoadUsers:
+        """Return the actors some seconds from now, in the world frame."""
+        simulator = self.simulator
+        t_s = simulator.scenario.start_s + simulator.state.t_s + after_s
+        return users_at(simulator.tracks, simulator.drive.vehicle.T_world_scene, t_s)
 
 
 @dataclass(frozen=True, eq=False)

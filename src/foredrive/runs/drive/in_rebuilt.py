@@ -32,7 +32,7 @@ from foredrive.simulation.logged_lanes import LoggedLanes
 from foredrive.simulation.ncap.outcome import judge
 from foredrive.simulation.observation import FRAME_DT_S
 from foredrive.simulation.rebuilt import RebuiltScenario, RebuiltSimulator
-from foredrive.simulation.replay_expert import ReplayExpert
+from foredrive.simulation.replay_expert import ReplayedWorld, ReplayExpert
 from foredrive.simulation.route_progress import RouteLine
 from foredrive.simulation.simple_agents import ReplayAgent
 from foredrive.simulation.threats import Threat, reference_mps, send_threat
@@ -199,7 +199,7 @@ def _agent_in(name: str, simulator: RebuiltSimulator, sees: Sees | None) -> Agen
     if name == REPLAY:
         return ReplayAgent(simulator.drive, lambda: simulator.scenario.start_s + simulator.state.t_s)
     if name == EXPERT:
-        return ReplayExpert(simulator.drive, simulator)
+        return ReplayExpert(simulator.drive, ReplayedWorld(simulator))
     if name == CORRIDOR:
         return CorridorAgent(simulator.drive)
     agent = make_agent(name, lambda: simulator.state.t_s, sees=sees)
