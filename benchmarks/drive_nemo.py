@@ -48,7 +48,7 @@ RECIPES = {
 """With the last round's arm of `FULL`, the first three are 2 x 2: scorer, futures."""
 PRETRAINED = Path("embedded:nemo_town")
 FINETUNE_STEPS = 600
-"""Of the recipes' 1,500: half an hour on one core, once through the demonstrations."""
+"""Steps of fine-tuning, where the recipes have 1,500: they take half an hour on one core."""
 ROUNDS = 1
 """Rounds of DAgger after the demonstrations of the disturbed expert."""
 DEMONSTRATIONS = "training-short"

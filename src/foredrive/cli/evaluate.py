@@ -48,9 +48,9 @@ def evaluate(
             size of a cluster that is started here.
         ray: Predict on Ray: on the cluster at RAY_ADDRESS, or on a cluster that is started here.
     """
-    run = check_run(run)
     check_number("--workers", workers, low=1)
     check_number("--examples", examples, low=0)
+    run = check_run(run)
     check_out_folder(out)
     if rebuilt is not None:
         check_rebuilt(rebuilt)

@@ -33,7 +33,7 @@ def export_nuscenes(
         out: Root of the data set: the devkit's dataroot.
         name: The tables are in v1.0-NAME: the devkit's version.
         rate: Samples (key frames) a second. The frames between them are sweeps.
-        sweeps: Whether the frames between the samples are written.
+        sweeps: Write the frames between the samples too.
         workers: Number of logs exported at a time; 0: one for each core.
         overwrite: Export logs again that were exported before.
     """

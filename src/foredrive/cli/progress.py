@@ -1,4 +1,4 @@
-"""Progress by the number of frames, for verbs that do not know it before."""
+"""Progress of verbs: frames of a number that is not known before, or jobs of a known number."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -22,3 +22,14 @@ def frame_progress(doing: str) -> Iterator[Callable[[], None]]:
             progress.update(bar, description=f"{doing}: {frames} frames")
 
         yield tick
+
+
+@contextmanager
+def job_progress(doing: str, total: int) -> Iterator[Callable[[], None]]:
+    """Show a progress bar over all jobs; yield the function that advances it by one."""
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeElapsedColumn, TimeRemainingColumn
+
+    columns = (BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())
+    with Progress(doing, *columns) as progress:
+        bar = progress.add_task("", total=total)
+        yield lambda: progress.advance(bar)

@@ -18,6 +18,7 @@ from foredrive.cli.arguments import (
     check_out_folder,
 )
 from foredrive.cli.failures import listed_failures
+from foredrive.cli.progress import job_progress
 from foredrive.data.log_paths import LogPath, find_logs
 from foredrive.errors import InputError
 from foredrive.lazy import importing
@@ -149,11 +150,13 @@ def _rebuild_logs(
     jobs = [(log, out / log.name) for log in found]
     work = functools.partial(work, threads=max(1, torch.get_num_threads() // workers))
     failed = {}
-    with contextlib.closing(fan_out(jobs, work, workers, on_ray=on_ray)) as results:
+    results = fan_out(jobs, work, workers, on_ray=on_ray)
+    with contextlib.closing(results), job_progress("reconstructing logs", len(jobs)) as tick:
         for (log, _), result in results:
             if isinstance(result, BaseException):
                 failed[log.name] = reason(log.name, result)
             else:
                 print(result, flush=True)
+            tick()
     if failed:
         raise InputError(f"{len(failed)} of {len(jobs)} logs failed: {listed_failures(failed)}")

@@ -2,8 +2,6 @@
 
 import os
 import re
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -11,13 +9,12 @@ import tyro
 
 from foredrive.cli.arguments import ImageSize, check_image_size, check_number, check_out_folder, chosen_rig
 from foredrive.cli.failures import listed_failures
+from foredrive.cli.progress import job_progress
 from foredrive.errors import InputError
 from foredrive.lazy import importing
 from foredrive.towns.map.names import check_town
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from foredrive.runs.drive.recording import RecordingResult
     from foredrive.towns.campaign import DrivePlan
 
@@ -88,7 +85,7 @@ def record(
         print(f"next: foredrive view {log.folder} --save {log.folder.name}.png")
         return
     workers = workers or len(os.sched_getaffinity(0))
-    with _progress(len(plans)) as tick:
+    with job_progress("recording drives", len(plans)) as tick:
         done = record_drives(plans, out, cameras, workers, on_ray=ray, tick=tick)
     _tell(done, plans, out)
 
@@ -112,17 +109,6 @@ def _tell(done: "RecordingResult", plans: "list[DrivePlan]", out: Path) -> None:
 
 def _caption(plan: "DrivePlan") -> str:
     return f"{plan.conditions or 'daylight'}\n{plan.vehicles} vehicles, {plan.people} people"
-
-
-@contextmanager
-def _progress(total: int) -> "Iterator[Callable[[], None]]":
-    """Show a progress bar over all drives; yield the function that advances it by one."""
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeElapsedColumn, TimeRemainingColumn
-
-    columns = (BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())
-    with Progress("recording drives", *columns) as progress:
-        bar = progress.add_task("", total=total)
-        yield lambda: progress.advance(bar)
 
 
 def _seeds(text: str) -> tuple[int, ...] | int:

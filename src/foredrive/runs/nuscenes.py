@@ -16,13 +16,13 @@ from foredrive.runs.fan_out import fan_out, reason
 
 @dataclass(frozen=True)
 class ExportedLog:
-    """What became of one log."""
+    """The outcome of one log."""
 
     name: str
     failure: str | None = None
     """The reason in one line if it could not be exported."""
     kept: bool = False
-    """Whether it was exported before."""
+    """True if it was exported before."""
 
 
 def export_nuscenes(

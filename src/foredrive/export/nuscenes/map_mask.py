@@ -22,7 +22,7 @@ MAX_CELLS = 400_000_000
 
 @dataclass(frozen=True)
 class MapMask:
-    """Where a vehicle may drive, and the place of the mask in the world frame."""
+    """A mask of the drivable area, placed in the world frame."""
 
     token: str
     """Logs that share a map have the same mask."""

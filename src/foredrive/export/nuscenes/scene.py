@@ -26,12 +26,12 @@ Tables = dict[str, list[Row]]
 
 @dataclass(frozen=True)
 class SceneOptions:
-    """What of a log is written."""
+    """Select what is written of a log."""
 
     rate_hz: float = 2.0
     """Samples (key frames) a second."""
     sweeps: bool = True
-    """Whether the frames between the samples are written too."""
+    """Write the frames between the samples too."""
 
 
 def write_scene(log: Log, dataroot: Path, options: SceneOptions, tick: Callable[[], None]) -> Tables:

@@ -1,4 +1,4 @@
-"""What an evaluation of a run works with: its clips in batches, and the trained agent as a predictor."""
+"""Open the inputs of an evaluation: the clips in batches, and the trained agent as a predictor."""
 
 import dataclasses
 import itertools
@@ -96,7 +96,7 @@ class EvaluationSource:
     stride_s: float | None = None
     """Time between the clips' nows, s; None: as in the recipe."""
     views: bool = True
-    """Whether the camera views are rendered."""
+    """Render the camera views too."""
 
 
 @dataclass(frozen=True)
