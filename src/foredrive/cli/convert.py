@@ -56,6 +56,7 @@ def convert(
         raise InputError("convert needs --out: the data root to write to")
 
     with importing():
+        from foredrive.data.notices import read_notices
         from foredrive.runs.convert import convert_all
 
     failed, count = {}, 0
@@ -70,6 +71,8 @@ def convert(
             else:
                 kept = " (was there; --overwrite converts it again)" if done.kept else ""
                 print(f"{'kept' if done.kept else 'wrote'} {done.log.folder}{kept}", flush=True)
+                for notice in read_notices(done.log.folder):
+                    print(f"  {notice}", flush=True)
     if failed and count == 1:
         raise InputError(next(iter(failed.values())))
     if failed:

@@ -11,6 +11,7 @@ from py123d.datatypes import LogMetadata
 from py123d.parser.base_dataset_parser import BaseLogParser, BaseMapParser
 
 from foredrive.data.log_paths import LogPath
+from foredrive.data.notices import collecting, write_notices
 from foredrive.data.raw.bag_log import find_bags
 from foredrive.data.raw.datasets import DATASETS
 from foredrive.data.raw.guard import check_finite, check_inside, check_names, reading_raw
@@ -79,7 +80,7 @@ def log_path(metadata: LogMetadata, out: Path) -> LogPath:
 
 
 def convert_log(raw: RawLog, out: Path, tick: Callable[[], None] = lambda: None) -> LogPath:
-    """Convert one raw log, and its map unless that is shared and there.
+    """Convert one raw log, and its map unless that is shared and there. Notices are kept beside the log.
 
     Args:
         raw: the log.
@@ -89,7 +90,7 @@ def convert_log(raw: RawLog, out: Path, tick: Callable[[], None] = lambda: None)
     Raises:
         InputError: a file of it cannot be read, names a file outside of the data set, or it has no frames.
     """
-    with reading_raw(raw.source):
+    with reading_raw(raw.source), collecting():
         metadata = raw.log.get_log_metadata()
         path = log_path(metadata, out)
         if isinstance(raw.log, OwnLog):
@@ -100,6 +101,7 @@ def convert_log(raw: RawLog, out: Path, tick: Callable[[], None] = lambda: None)
                 _write_map(raw.map, scratch, out)
             if not _write_frames(raw.log, metadata, raw.source, scratch, tick):
                 raise InputError(f"{raw.source}: the raw log has no frames")
+            write_notices(scratch / metadata.split / metadata.log_name)
             os.replace(scratch / metadata.split / metadata.log_name, temporary)
     return path
 

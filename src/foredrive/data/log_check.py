@@ -13,6 +13,7 @@ from foredrive.data.cameras import pinhole_cameras, read_camera
 from foredrive.data.lidar import read_sweep
 from foredrive.data.log_paths import LogPath
 from foredrive.data.logs import Log
+from foredrive.data.notices import read_notices
 from foredrive.errors import InputError
 from foredrive.scene import Boxes
 
@@ -78,7 +79,8 @@ def check_log(path: LogPath) -> LogCheck:
     log = Log(path)
     streams = list(_streams(log))
     checks: tuple[Callable[[Log], Iterator[Finding]], ...] = (_poses, _images, _sweeps, _boxes)
-    findings = [*_gaps(log, streams)]
+    findings = [Finding("note", "conversion", notice) for notice in read_notices(path.folder)]
+    findings += _gaps(log, streams)
     for check in checks:
         findings += check(log)
     step_m = np.linalg.norm(np.diff(log.T_world_ego[:, :3, 3], axis=0), axis=-1)

@@ -68,6 +68,7 @@ from foredrive.data.modalities import (
     pack_plan,
     visibility_modality,
 )
+from foredrive.data.notices import write_notices
 from foredrive.data.setting import Setting, pack_setting
 from foredrive.data.written_boxes import box_modalities
 from foredrive.errors import InputError
@@ -206,6 +207,7 @@ class LogWriter:
             self._writer.close()
             written = self._final.parent / self._metadata.split / self._metadata.log_name
             _date_route_by(written, self._previous.t_us)
+            write_notices(written)
             os.replace(written, self._final)
 
     def write(self, frame: Frame) -> None:
