@@ -12,6 +12,7 @@ from foredrive.data.cameras import pinhole_cameras, read_camera
 from foredrive.data.convert import convert
 from foredrive.data.lidar import read_sweep
 from foredrive.data.logs import Log
+from foredrive.data.notices import read_notices
 from foredrive.errors import InputError
 from foredrive.geometry.boxes import box_corners, points_in_boxes
 from foredrive.geometry.projection import project
@@ -85,10 +86,91 @@ def test_what_is_not_labelled_has_no_boxes(made: Path, tmp_path: Path) -> None:
 
 def test_a_damaged_frame_is_named(made: Path, tmp_path: Path) -> None:
     calibration = made / "training" / "calib" / "000007.txt"
-    calibration.write_text(CALIBRATION.replace("Tr_imu_to_velo", "other"))
+    calibration.write_text(CALIBRATION.replace("Tr_velo_to_cam", "other"))
     with pytest.raises(InputError, match=r"training: cannot read the raw log.*in calib/000007.txt"):
         convert(made, "kitti-object", tmp_path / "out")
     assert not list((tmp_path / "out").rglob("*.arrow"))
+
+
+def test_rows_that_are_no_labels_cost_themselves_alone(made: Path, tmp_path: Path) -> None:
+    """Byte order mark, CRLF, blank lines, a cut row, a row of the tracking benchmark, an unknown class."""
+    row = LABELS.splitlines()[0]
+    rows = [
+        row,
+        "",
+        row[:30],
+        f"0 3 {row}",
+        row.replace("Car", "Lorry"),
+        row.replace("Car", "Zeppelin"),
+        "",
+        "",
+    ]
+    label = made / "training" / "label_2" / "000007.txt"
+    label.write_bytes(b"\xef\xbb\xbf" + "\r\n".join(rows).encode())
+    (path,) = convert(made, "kitti-object", tmp_path / "out")
+    boxes = read_boxes(Log(path), 0)
+    assert boxes.category.tolist() == [Category.CAR, Category.TRUCK, Category.OTHER]
+    rows_left_out, unknown = read_notices(path.folder)
+    assert rows_left_out.startswith(
+        "label_2/000007.txt: unreadable rows, left out: 2 (line 3: not 15 columns"
+    )
+    assert unknown == "label_2/000007.txt: boxes of unknown classes, read as OTHER: 1 ('Zeppelin')"
+
+
+def test_labels_without_any_readable_row_are_refused(made: Path, tmp_path: Path) -> None:
+    (made / "training" / "label_2" / "000007.txt").write_text("0 3 " + LABELS.splitlines()[0])
+    with pytest.raises(
+        InputError, match=r"label_2/000007.txt: none of its rows can be read; line 1: not 15 col"
+    ):
+        convert(made, "kitti-object", tmp_path / "out")
+
+
+@pytest.mark.parametrize("columns", [3, 5, 6])
+def test_points_of_other_columns_are_refused(columns: int, made: Path, tmp_path: Path) -> None:
+    """The number of rows is one at which the size alone would fit four columns."""
+    rng = np.random.default_rng(0)
+    rows = np.zeros((60, columns), np.float32)
+    rows[:, :3] = rng.uniform(-40, 40, (60, 3))
+    rows[:, 3:4] = rng.uniform(0, 1, (60, 1)) if columns > 3 else 0
+    rows[:, 4:5] = np.arange(60)[:, None] % 32 if columns > 4 else 0
+    rows.tofile(made / "training" / "velodyne" / "000007.bin")
+    with pytest.raises(InputError, match=rf"not rows of 4 columns .*; {columns} columns would fit"):
+        convert(made, "kitti-object", tmp_path / "out")
+
+
+def test_intensities_of_another_scale_are_divided_and_noted(made: Path, tmp_path: Path) -> None:
+    points = np.array([[10.0, -2.0, -1.0, 51.0], [0.0, 5.0, -1.73, 204.0]], dtype=np.float32)
+    points.tofile(made / "training" / "velodyne" / "000007.bin")
+    (path,) = convert(made, "kitti-object", tmp_path / "out")
+    assert read_sweep(Log(path), 0)[0].intensity.tolist() == pytest.approx([0.2, 0.8])
+    assert read_notices(path.folder) == ["velodyne/000007.bin: intensities up to 204 were divided by 255"]
+
+
+def test_an_export_without_imu_and_second_camera(made: Path, tmp_path: Path) -> None:
+    """Its image is a JPEG. The ego frame is 1.73 m below the lidar, with the same axes."""
+    folder = made / "training"
+    lines = [line for line in CALIBRATION.splitlines() if not line.startswith(("P3", "Tr_imu"))]
+    (folder / "calib" / "000007.txt").write_text("\n".join(lines))
+    with Image.open(folder / "image_2" / "000007.png") as image:
+        image.save(folder / "image_2" / "000007.jpg")
+    (folder / "image_2" / "000007.png").unlink()
+    (path,) = convert(made, "kitti-object", tmp_path / "out")
+    log = Log(path)
+    points = torch.tensor([[10.0, -2.0, 0.73], [0.0, 5.0, 0.0]])
+    torch.testing.assert_close(read_sweep(log, 0)[0].points_ego, points, atol=1e-4, rtol=0)
+    camera = read_camera(log, 0, pinhole_cameras(log)["image_2"], (32, 64), with_image=True)
+    assert camera.image.float().mean((1, 2)).tolist() == pytest.approx([10, 200, 30], abs=3)
+    (notice,) = read_notices(path.folder)
+    assert notice.startswith("calib/000007.txt: no Tr_imu_to_velo; the ego frame is taken to be 1.73 m below")
+
+
+def test_a_frame_without_lidar_has_its_image_and_boxes(made: Path, tmp_path: Path) -> None:
+    (made / "training" / "velodyne" / "000007.bin").unlink()
+    (path,) = convert(made, "kitti-object", tmp_path / "out")
+    log = Log(path)
+    assert read_sweep(log, 0) is None
+    assert len(read_boxes(log, 0).category) == 2
+    assert read_camera(log, 0, pinhole_cameras(log)["image_2"], (32, 64), with_image=True).image is not None
 
 
 @pytest.mark.real

@@ -13,6 +13,7 @@ from foredrive.data.cameras import pinhole_cameras, read_camera
 from foredrive.data.convert import convert
 from foredrive.data.lidar import read_sweep
 from foredrive.data.logs import Log
+from foredrive.data.notices import read_notices
 from foredrive.errors import InputError
 
 DRIVE = "2011_09_26_drive_0005_sync"
@@ -71,8 +72,10 @@ def test_points_lie_where_the_vehicle_was_at_their_times(made: Path, tmp_path: P
     (path,) = convert(made, "kitti-raw", tmp_path / "out")
     assert path.folder.parts[-2:] == ("kitti-raw_train", DRIVE)
     log = Log(path)
-    assert len(log) == 3
-    assert np.diff(log.T_world_ego[:, :3, 3], axis=0) == pytest.approx(np.array([[1.0, 0, 0]] * 2), abs=1e-3)
+    assert len(log) == 4
+    assert np.diff(log.T_world_ego[:, :3, 3], axis=0) == pytest.approx(np.array([[1.0, 0, 0]] * 3), abs=1e-3)
+    assert read_sweep(log, 3) is None
+    assert read_notices(path.folder) == ["velodyne_points: missing sweeps: 1 (0000000003)"]
     sweep, misses_known = read_sweep(log, 1)
     assert not misses_known
     assert read_boxes(log, 1) is None
@@ -125,7 +128,45 @@ def test_a_lost_sweep_has_an_empty_line_of_times(made: Path, tmp_path: Path) -> 
     lines = (folder / "timestamps.txt").read_text().split("\n")
     (folder / "timestamps.txt").write_text("\n".join([lines[0], "", *lines[2:]]))
     (path,) = convert(made, "kitti-raw", tmp_path / "out")
-    assert np.diff(Log(path).t_us).tolist() == [200_000]
+    log = Log(path)
+    assert np.diff(log.t_us).tolist() == [100_000] * 3  # the image of that frame has a time
+    assert [read_sweep(log, frame) is None for frame in range(4)] == [False, True, False, True]
+    assert read_notices(path.folder) == ["velodyne_points: missing sweeps: 2 (0000000001; 0000000003)"]
+
+
+def test_damaged_files_cost_themselves_alone(made: Path, tmp_path: Path) -> None:
+    """A cut image, a cut sweep, a cut record of OXTS and a frame without any time."""
+    drive = made / "2011_09_26" / DRIVE
+    image = drive / "image_02" / "data" / f"{0:010d}.png"
+    image.write_bytes(image.read_bytes()[:40])
+    sweep = drive / "velodyne_points" / "data" / f"{1:010d}.bin"
+    sweep.write_bytes(sweep.read_bytes()[:-3])
+    (drive / "oxts" / "data" / f"{2:010d}.txt").write_text("49.0 8.4")
+    for stream in ("image_02", "image_03", "velodyne_points"):
+        lines = (drive / stream / "timestamps.txt").read_text().split("\n")
+        (drive / stream / "timestamps.txt").write_text("\n".join([*lines[:3], "", *lines[4:]]))
+    (path,) = convert(made, "kitti-raw", tmp_path / "out")
+    log = Log(path)
+    assert log.T_world_ego[:, 0, 3] - log.T_world_ego[0, 0, 3] == pytest.approx([0.0, 1.0, 2.0], abs=1e-3)
+    camera = pinhole_cameras(log)["image_02"]
+    images = [read_camera(log, frame, camera, (16, 32), with_image=True).image for frame in range(3)]
+    assert [image is None for image in images] == [True, False, False]
+    assert [read_sweep(log, frame) is None for frame in range(3)] == [False, True, False]
+    notices = read_notices(path.folder)
+    parts = (
+        "oxts: unreadable rec",
+        "image_02: unreadable f",
+        "velodyne_points: unreadable f",
+        f"{DRIVE}: frames w",
+    )
+    assert [notice.startswith(part) for notice, part in zip(notices, parts, strict=True)] == [True] * 4
+
+
+def test_a_drive_whose_sweeps_are_all_damaged_is_refused(made: Path, tmp_path: Path) -> None:
+    for sweep in (made / "2011_09_26" / DRIVE / "velodyne_points" / "data").iterdir():
+        sweep.write_bytes(b"not points.")
+    with pytest.raises(InputError, match=r"velodyne_points: none of its files can be read; 0000000000\.bin"):
+        convert(made, "kitti-raw", tmp_path / "out")
 
 
 def test_a_drive_of_one_record_stands(made: Path, tmp_path: Path) -> None:
@@ -133,7 +174,7 @@ def test_a_drive_of_one_record_stands(made: Path, tmp_path: Path) -> None:
         (made / "2011_09_26" / DRIVE / "oxts" / "data" / f"{frame:010d}.txt").unlink()
     (path,) = convert(made, "kitti-raw", tmp_path / "out")
     log = Log(path)
-    assert len(log) == 3
+    assert len(log) == 4
     assert np.ptp(log.T_world_ego[:, :3, 3], axis=0).tolist() == [0.0, 0.0, 0.0]
 
 

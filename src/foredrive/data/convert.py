@@ -8,13 +8,13 @@ from py123d.api.map.arrow.arrow_map_writer import ArrowMapWriter
 from py123d.api.scene.arrow.arrow_log_writer import ArrowLogWriter
 from py123d.api.scene.arrow.utils.log_writer_config import LogWriterConfig
 from py123d.datatypes import LogMetadata
-from py123d.parser.base_dataset_parser import BaseLogParser, BaseMapParser
+from py123d.parser.base_dataset_parser import BaseLogParser, BaseMapParser, ModalitiesSync
 
 from foredrive.data.log_paths import LogPath
 from foredrive.data.notices import collecting, write_notices
 from foredrive.data.raw.bag_log import find_bags
 from foredrive.data.raw.datasets import DATASETS
-from foredrive.data.raw.guard import check_finite, check_inside, check_names, reading_raw
+from foredrive.data.raw.guard import SensorFiles, check_finite, check_inside, check_names, reading_raw
 from foredrive.data.raw.raw_log import OwnLog, RawLog
 from foredrive.errors import InputError
 from foredrive.files import atomic_path
@@ -117,14 +117,16 @@ def _write_frames(
     )
     writer = ArrowLogWriter(config, scratch, scratch)
     writer.reset(metadata)
-    frames = 0
+    files, frames = SensorFiles(source, metadata.dataset), 0
     for frame in log.iter_modalities_sync():
         for modality in frame.modalities:
             check_inside(modality, source)
             check_finite(modality, source)
-        writer.write_sync(frame)
+        loaded = [modality for parsed in frame.modalities if (modality := files.load(parsed)) is not None]
+        writer.write_sync(ModalitiesSync(frame.timestamp, loaded))
         frames += 1
         tick()
+    files.check()
     writer.close()
     return frames
 

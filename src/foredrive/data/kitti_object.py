@@ -1,16 +1,18 @@
 """A 123D parser for frames of KITTI's object benchmark (Geiger et al. 2012), which belong to no drive.
 
-Each frame of training/ or testing/ (image_2, image_3 if present, velodyne, calib, label_2) becomes a log of
-one frame. Its time and place are unknown, so the time is 0 and the origin of the world is the IMU.
+Each frame of training/ or testing/ becomes a log of one frame. It has a file in calib/, and in image_2/,
+image_3/, velodyne/ and label_2/ where the frame has images, points and labels. Its time and place are
+unknown, so the time is 0 and the origin of the world is the IMU. Exports of other data sets in this format
+are read too: images of any kind, calibrations without IMU.
 """
 
+import functools
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float64
-from PIL import Image
 from py123d.datatypes import (
     BoxDetectionAttributes,
     BoxDetectionSE3,
@@ -33,23 +35,20 @@ from py123d.parser.base_dataset_parser import BaseLogParser, ModalitiesSync
 from py123d.parser.kitti360.utils.kitti360_constants import KITTI360_EGO_STATE_SE3_METADATA
 from py123d.parser.registry import NuScenesBoxDetectionLabel
 
+from foredrive.data.category_names import category_or_other
+from foredrive.data.logs import imu_from_ego
 from foredrive.data.modalities import attributes_modality
+from foredrive.data.notices import note
+from foredrive.data.raw.guard import PartReader
+from foredrive.data.raw.images import read_rgb
+from foredrive.data.raw.point_files import KITTI, IntensityScale, read_points
 from foredrive.data.written_boxes import LABEL_OF_CATEGORY
-from foredrive.scene import Attribute, Category
+from foredrive.errors import InputError
+from foredrive.scene import Attribute
 from foredrive.scene.boxes import UNKNOWN
 
 _NOW = Timestamp.from_us(0)
 _CAMERAS = {"image_2": ("P2", CameraID.PCAM_STEREO_L), "image_3": ("P3", CameraID.PCAM_STEREO_R)}
-_CATEGORY = {
-    "Car": Category.CAR,
-    "Van": Category.CAR,
-    "Truck": Category.TRUCK,
-    "Pedestrian": Category.PEDESTRIAN,
-    "Person_sitting": Category.PEDESTRIAN,
-    "Cyclist": Category.BICYCLE,
-    "Tram": Category.OTHER,
-    "Misc": Category.OTHER,
-}
 _ATTRIBUTE = {
     "Cyclist": Attribute.CYCLE_WITH_RIDER,
     "Person_sitting": Attribute.PEDESTRIAN_SITTING_LYING_DOWN,
@@ -57,6 +56,10 @@ _ATTRIBUTE = {
 """nuScenes' attributes that a class of KITTI implies. KITTI's levels of occlusion are no shares, so the
 visibility stays unknown."""
 _NOT_LABELLED = "DontCare"
+_COLUMNS = 15
+"""Class, truncation, occlusion, alpha, box in the image, size, place and turn of a label; more may follow."""
+_HEIGHT_M = 1.73
+"""Height of the lidar of KITTI above the ground, which stands for that of a lidar whose mount no file has."""
 
 
 class KittiObjectParser(BaseLogParser):
@@ -76,32 +79,37 @@ class KittiObjectParser(BaseLogParser):
         return LogMetadata("kitti", self._split, self._frame, location=None)
 
     def iter_modalities_sync(self) -> Iterator[ModalitiesSync]:
-        """Yield the frame: lidar, cameras and, for training frames, boxes."""
+        """Yield the frame: what is there of lidar, cameras and boxes."""
         calibration = _Calibration.read(self._file("calib", "txt"))
-        ego = EgoStateSE3.from_imu(PoseSE3.identity(), KITTI360_EGO_STATE_SE3_METADATA, _NOW)
-        found: list[BaseModality] = [ego, self._lidar(calibration)]
+        modalities: list[BaseModality] = [
+            EgoStateSE3.from_imu(PoseSE3.identity(), KITTI360_EGO_STATE_SE3_METADATA, _NOW)
+        ]
+        if self._file("velodyne", "bin").is_file():
+            modalities.append(self._lidar(calibration))
         for kind in _CAMERAS:
-            if self._file(kind, "png").is_file():
-                found.append(self._camera(kind, calibration))
+            image = next(iter(sorted((self._folder / kind).glob(f"{self._frame}.*"))), None)
+            if image is not None:
+                modalities.append(self._camera(kind, image, calibration))
         if self._file("label_2", "txt").is_file():
-            found += self._boxes(calibration)
-        yield ModalitiesSync(_NOW, found)
+            modalities += self._boxes(calibration)
+        yield ModalitiesSync(_NOW, modalities)
 
     def _lidar(self, calibration: "_Calibration") -> Lidar:
-        points = np.fromfile(self._file("velodyne", "bin"), dtype=np.float32).reshape(-1, 4)
+        file = self._file("velodyne", "bin")
+        points = read_points(file, KITTI)
         T = calibration.T_imu_velo
+        intensity = IntensityScale(f"velodyne/{file.name}")(points[:, 3])
         return Lidar(
             timestamp=_NOW,
             timestamp_end=_NOW,
             metadata=LidarMetadata("velodyne", LidarID.LIDAR_TOP, _pose(T)),
             point_cloud_3d=(points[:, :3] @ T[:3, :3].T + T[:3, 3]).astype(np.float32),
-            point_cloud_features={"intensity": np.round(points[:, 3] * 255).astype(np.uint8)},
+            point_cloud_features={"intensity": np.round(intensity * 255).astype(np.uint8)},
         )
 
-    def _camera(self, kind: str, calibration: "_Calibration") -> Camera:
+    def _camera(self, kind: str, file: Path, calibration: "_Calibration") -> Camera:
         name, camera_id = _CAMERAS[kind]
-        with Image.open(self._file(kind, "png")) as opened:
-            image = np.asarray(opened.convert("RGB"))
+        image = read_rgb(file)
         K, T_imu_cam = calibration.camera(name)
         metadata = PinholeCameraMetadata(
             camera_name=kind,
@@ -116,27 +124,58 @@ class KittiObjectParser(BaseLogParser):
         return Camera(metadata, image, _pose(T_imu_cam), _NOW)
 
     def _boxes(self, calibration: "_Calibration") -> list[BaseModality]:
-        """Return the boxes and their attributes."""
+        """Return the boxes and their attributes. A row that is none is left out."""
+        file = self._file("label_2", "txt")
         detections, known = [], []
-        for number, line in enumerate(self._file("label_2", "txt").read_text().splitlines()):
-            kind, *words = line.split()
-            if kind == _NOT_LABELLED:
+        read = PartReader(f"label_2/{file.name}", "rows")
+        for number, line in enumerate(file.read_text(encoding="utf-8-sig").splitlines()):
+            if not line.strip() or line.split()[0] == _NOT_LABELLED:
                 continue
-            height, width, length, x, y, z, turn = (float(word) for word in words[7:14])
-            T_rect_box = np.eye(4)  # box axes: forward, left, up; `turn` is about y, which points down
-            T_rect_box[:3, 0] = [np.cos(turn), 0.0, -np.sin(turn)]
-            T_rect_box[:3, 1] = [np.sin(turn), 0.0, np.cos(turn)]
-            T_rect_box[:3, 2] = [0.0, -1.0, 0.0]
-            T_rect_box[:3, 3] = [x, y - 0.5 * height, z]  # labels give the centre of the bottom face
-            pose = _pose(calibration.T_imu_rect @ T_rect_box)
-            attributes = BoxDetectionAttributes(LABEL_OF_CATEGORY[_CATEGORY[kind]], str(number), None)
-            detections.append(BoxDetectionSE3(attributes, BoundingBoxSE3(pose, length, width, height), None))
-            known.append(_ATTRIBUTE.get(kind, UNKNOWN))
+            label = read(f"line {number + 1}", functools.partial(_Label.of, line))
+            if label is None:
+                continue
+            pose = _pose(calibration.T_imu_rect @ label.T_rect_box)
+            category = category_or_other(label.kind, f"label_2/{file.name}")
+            attributes = BoxDetectionAttributes(LABEL_OF_CATEGORY[category], str(number), None)
+            box = BoundingBoxSE3(pose, *label.size_lwh_m)
+            detections.append(BoxDetectionSE3(attributes, box, None))
+            known.append(_ATTRIBUTE.get(label.kind, UNKNOWN))
+        read.check()
         boxes = BoxDetectionsSE3(detections, _NOW, BoxDetectionsSE3Metadata(NuScenesBoxDetectionLabel))
         return [boxes, attributes_modality(known, _NOW)]
 
     def _file(self, kind: str, suffix: str) -> Path:
         return self._folder / kind / f"{self._frame}.{suffix}"
+
+
+@dataclass(frozen=True)
+class _Label:
+    """One labelled object."""
+
+    kind: str
+    size_lwh_m: tuple[float, float, float]
+    T_rect_box: Float64[np.ndarray, "4 4"]
+    """Box axes: forward, left, up. The origin is the centre of the box."""
+
+    @classmethod
+    def of(cls, line: str) -> "_Label":
+        """Return the object of a row of a label file.
+
+        Raises:
+            InputError: it is no such row, or the object has no size.
+        """
+        kind, *words = line.split()
+        if len(words) < _COLUMNS - 1 or kind.replace(".", "").lstrip("-").isdigit():
+            raise InputError(f"not {_COLUMNS} columns that begin with a class")
+        height, width, length, x, y, z, turn = (float(word) for word in words[7:14])
+        if not np.isfinite([x, y, z, turn]).all() or not min(height, width, length) > 0:
+            raise InputError("an object without place or size")
+        T_rect_box = np.eye(4)  # `turn` is about y of the camera, which points down
+        T_rect_box[:3, 0] = [np.cos(turn), 0.0, -np.sin(turn)]
+        T_rect_box[:3, 1] = [np.sin(turn), 0.0, np.cos(turn)]
+        T_rect_box[:3, 2] = [0.0, -1.0, 0.0]
+        T_rect_box[:3, 3] = [x, y - 0.5 * height, z]  # labels give the centre of the bottom face
+        return cls(kind, (length, width, height), T_rect_box)
 
 
 @dataclass(frozen=True)
@@ -149,15 +188,22 @@ class _Calibration:
 
     @classmethod
     def read(cls, file: Path) -> "_Calibration":
-        """Read a calibration file."""
+        """Read a calibration file. Without Tr_imu_to_velo the ego frame is `_HEIGHT_M` below the lidar."""
         values = {}
-        for line in file.read_text().splitlines():
+        for line in file.read_text(encoding="utf-8-sig").splitlines():
             name, _, numbers = line.partition(":")
             if numbers:
-                values[name] = np.array([float(word) for word in numbers.split()])
-        T_imu_velo = np.linalg.inv(_rigid(values["Tr_imu_to_velo"].reshape(3, 4)))
+                values[name.strip()] = np.array([float(word) for word in numbers.split()])
+        if "Tr_imu_to_velo" in values:
+            T_imu_velo = np.linalg.inv(_rigid(values["Tr_imu_to_velo"].reshape(3, 4)))
+        else:
+            text = f"no Tr_imu_to_velo; the ego frame is taken to be {_HEIGHT_M} m below the lidar"
+            note(f"calib/{file.name}", text)
+            T_ego_velo = np.eye(4)
+            T_ego_velo[2, 3] = _HEIGHT_M
+            T_imu_velo = imu_from_ego(KITTI360_EGO_STATE_SE3_METADATA) @ T_ego_velo
         T_rect_velo = _rigid(values["R0_rect"].reshape(3, 3)) @ _rigid(values["Tr_velo_to_cam"].reshape(3, 4))
-        projections = {name: values[name].reshape(3, 4) for name, _ in _CAMERAS.values()}
+        projections = {name: values[name].reshape(3, 4) for name, _ in _CAMERAS.values() if name in values}
         return cls(T_imu_velo, T_imu_velo @ np.linalg.inv(T_rect_velo), projections)
 
     def camera(self, name: str) -> tuple[Float64[np.ndarray, "3 3"], Float64[np.ndarray, "4 4"]]:

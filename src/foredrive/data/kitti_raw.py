@@ -9,6 +9,7 @@ the vehicle puts it where it was at the time of the frame. The points of a file 
 front, top row first: where their azimuth begins anew, the next channel begins.
 """
 
+import functools
 from collections.abc import Iterator
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -17,7 +18,6 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float64, Int64
-from PIL import Image
 from py123d.datatypes import (
     Camera,
     CameraID,
@@ -35,6 +35,12 @@ from py123d.geometry import PoseSE3
 from py123d.parser.base_dataset_parser import BaseLogParser, ModalitiesSync
 from py123d.parser.kitti360.utils.kitti360_constants import KITTI360_EGO_STATE_SE3_METADATA
 from scipy.spatial.transform import Rotation, Slerp
+
+from foredrive.data.notices import note
+from foredrive.data.raw.guard import PartReader
+from foredrive.data.raw.images import read_rgb
+from foredrive.data.raw.point_files import KITTI, IntensityScale, read_points
+from foredrive.errors import InputError
 
 _CAMERAS = {"image_02": ("02", CameraID.PCAM_STEREO_L), "image_03": ("03", CameraID.PCAM_STEREO_R)}
 _EARTH_M = 6_378_137.0
@@ -60,31 +66,66 @@ class KittiRawParser(BaseLogParser):
         return LogMetadata("kitti-raw", self._split, self._folder.name, location=None)
 
     def iter_modalities_sync(self) -> Iterator[ModalitiesSync]:
-        """Yield the frames that have a sweep: ego pose, lidar and the colour cameras."""
-        times_us = _times_us(self._folder / _LIDAR / "timestamps.txt")
-        spans_us = self._spans_us(times_us)
+        """Yield the frames that have a sweep or an image: ego pose, lidar and the colour cameras.
+
+        The time of a frame is that of the sweep, or of an image where the lidar has none.
+        """
+        times_us = {
+            name: _times_us(self._folder / name / "timestamps.txt")
+            for name in (_LIDAR, *_CAMERAS)
+            if name == _LIDAR or (self._folder / name / "data").is_dir()
+        }
+        spans_us = self._spans_us(times_us[_LIDAR])
         path = _Path.read(self._folder / "oxts")
-        for sweep in sorted((self._folder / _LIDAR / "data").glob("*.bin")):
-            frame = int(sweep.stem)
-            t_us = int(times_us[frame])
+        _ = self._calibration  # a log without one is refused; it is no matter of single files
+        readers = {name: PartReader(name, "files") for name in (_LIDAR, *_CAMERAS)}
+        scale = IntensityScale(_LIDAR)
+        for frame, files in self._files().items():
+            t_us = next((t for stream in times_us.values() if (t := _time_of(stream, frame))), 0)
+            if not t_us:
+                note(self._folder.name, "frames without a time, left out", f"{frame:010d}")
+                continue
+            modalities: list[BaseModality] = []
+            for name, file in files.items():
+                if name != _LIDAR:
+                    load = functools.partial(self._camera, name, file, _time_of(times_us[name], frame), path)
+                else:
+                    load = functools.partial(self._lidar, file, t_us, spans_us[frame], path, scale)
+                loaded = readers[name](file.name, load)
+                modalities += [] if loaded is None else [loaded]
+            if _LIDAR not in files:
+                note(_LIDAR, "missing sweeps", f"{frame:010d}")
             now = Timestamp.from_us(t_us)
             pose = _pose(path.at(np.array([t_us]))[0])
-            found: list[BaseModality] = [
-                EgoStateSE3.from_imu(pose, KITTI360_EGO_STATE_SE3_METADATA, now),
-                self._lidar(sweep, t_us, spans_us[frame], path),
-            ]
-            found += [camera for name in _CAMERAS for camera in self._camera(name, sweep.stem, path)]
-            yield ModalitiesSync(now, found)
+            ego = EgoStateSE3.from_imu(pose, KITTI360_EGO_STATE_SE3_METADATA, now)
+            yield ModalitiesSync(now, [ego, *modalities])
+        for reader in readers.values():
+            reader.check()
 
-    def _lidar(self, file: Path, t_us: int, span_us: Int64[np.ndarray, "2"], path: "_Path") -> Lidar:
-        points = np.fromfile(file, dtype=np.float32).reshape(-1, 4)
+    def _files(self) -> dict[int, dict[str, Path]]:
+        """Return the files of each frame by stream."""
+        files: dict[int, dict[str, Path]] = {}
+        for name in (_LIDAR, *_CAMERAS):
+            for file in sorted((self._folder / name / "data").glob("*.bin" if name == _LIDAR else "*.*")):
+                files.setdefault(int(file.stem), {})[name] = file
+        return dict(sorted(files.items()))
+
+    def _lidar(
+        self,
+        file: Path,
+        t_us: int,
+        span_us: Int64[np.ndarray, "2"],
+        path: "_Path",
+        scale: IntensityScale,
+    ) -> Lidar:
+        points = read_points(file, KITTI)
         xyz = points[:, :3].astype(np.float64)
         azimuth = np.arctan2(xyz[:, 1], xyz[:, 0])
         share = 0.5 * (1 - azimuth / np.pi)  # 0 at the rear, ½ ahead, clockwise
         at_us = (span_us[0] + share * (span_us[1] - span_us[0])).astype(np.int64)
         T_imu_velo = self._calibration.T_imu_velo
         features = {
-            "intensity": np.round(points[:, 3] * 255).astype(np.uint8),
+            "intensity": np.round(scale(points[:, 3]) * 255).astype(np.uint8),
             "timestamps": at_us,
         }
         channel = _channels(azimuth)
@@ -98,15 +139,16 @@ class KittiRawParser(BaseLogParser):
             point_cloud_features=features,
         )
 
-    def _camera(self, name: str, stem: str, path: "_Path") -> list[Camera]:
-        """Return the camera's image, or nothing if the frame has none."""
+    def _camera(self, name: str, file: Path, t_us: int, path: "_Path") -> Camera:
+        """Return the camera with an image.
+
+        Raises:
+            InputError: the image cannot be read, or has no time.
+        """
+        if not t_us:
+            raise InputError(f"{name}/timestamps.txt has no time of it")
         number, camera_id = _CAMERAS[name]
-        file = self._folder / name / "data" / f"{stem}.png"
-        if not file.is_file():
-            return []
-        with Image.open(file) as opened:
-            image = np.asarray(opened.convert("RGB"))
-        t_us = int(_times_us(self._folder / name / "timestamps.txt")[int(stem)])
+        image = read_rgb(file)
         K, T_imu_cam = self._calibration.camera(number, (image.shape[1], image.shape[0]))
         metadata = PinholeCameraMetadata(
             camera_name=name,
@@ -119,7 +161,7 @@ class KittiRawParser(BaseLogParser):
             is_undistorted=True,
         )
         T_world_cam = path.at(np.array([t_us]))[0] @ T_imu_cam
-        return [Camera(metadata, image, _pose(T_world_cam), Timestamp.from_us(t_us))]
+        return Camera(metadata, image, _pose(T_world_cam), Timestamp.from_us(t_us))
 
     @cached_property
     def _calibration(self) -> "_Calibration":
@@ -148,9 +190,13 @@ class _Path:
         Positions are in the Mercator projection at the first latitude, as in KITTI's development kit.
         """
         t_us = _times_us(folder / "timestamps.txt")
-        files = sorted((folder / "data").glob("*.txt"))
-        rows = np.array([[float(word) for word in file.read_text().split()[:6]] for file in files])
-        frames = np.array([int(file.stem) for file in files])
+        read, records = PartReader("oxts", "records"), dict[int, list[float]]()
+        for file in sorted((folder / "data").glob("*.txt")):
+            record = read(file.name, functools.partial(_record, file, _time_of(t_us, int(file.stem))))
+            if record is not None:
+                records[int(file.stem)] = record
+        read.check()
+        rows, frames = np.array(list(records.values())), np.array(list(records))
         latitude, longitude = np.radians(rows[:, 0]), np.radians(rows[:, 1])
         scale_m = np.cos(latitude[0]) * _EARTH_M
         north_m = scale_m * np.log(np.tan(0.25 * np.pi + 0.5 * latitude))
@@ -226,17 +272,34 @@ def _channels(azimuth: Float64[np.ndarray, "P"]) -> np.ndarray | None:
 def _numbers(file: Path) -> dict[str, Float64[np.ndarray, "K"]]:
     """Return the entries of a calibration file that are numbers."""
     found = {}
-    for line in file.read_text().splitlines():
+    for line in file.read_text(encoding="utf-8-sig").splitlines():
         name, _, words = line.partition(":")
         if name.startswith(("R", "T", "P_rect", "S_rect")):
             found[name] = np.array([float(word) for word in words.split()])
     return found
 
 
+def _record(file: Path, t_us: int) -> list[float]:
+    """Return latitude, longitude, altitude, roll, pitch and yaw of OXTS' record of one time.
+
+    Raises:
+        InputError: the record lacks one of them, or has no time.
+    """
+    values = [float(word) for word in file.read_text(encoding="utf-8-sig").split()[:6]]
+    if len(values) < 6 or not np.isfinite(values).all() or not t_us:
+        raise InputError("not six finite numbers with a time")
+    return values
+
+
+def _time_of(times_us: Int64[np.ndarray, "N"], frame: int) -> int:
+    """Return the time of a frame, or 0 where it has none."""
+    return int(times_us[frame]) if frame < len(times_us) else 0
+
+
 def _times_us(file: Path) -> Int64[np.ndarray, "N"]:
     """Return the times of a file with one in each line. The lines of lost frames are empty; they give 0."""
     found = []
-    for line in file.read_text().rstrip().split("\n"):
+    for line in file.read_text(encoding="utf-8-sig").rstrip().split("\n"):
         if not line.strip():
             found.append(0)
         else:

@@ -53,7 +53,7 @@ class Log:
         if not isinstance(vehicle, EgoStateSE3Metadata):
             raise InputError(f"{path.folder}: a log without ego poses (no {_EGO}.arrow)")
         self.vehicle = vehicle
-        self.T_imu_ego = _imu_from_ego(vehicle)
+        self.T_imu_ego = imu_from_ego(vehicle)
         ego_t_us, T_world_ego, speed_mps = self._read_ego()
         self._iterations, ego_rows = self._read_sync(ego_t_us)
         self.t_us, self.T_world_ego = ego_t_us[ego_rows], T_world_ego[ego_rows]
@@ -188,7 +188,8 @@ class Log:
         return sync_rows, ego_rows
 
 
-def _imu_from_ego(vehicle: EgoStateSE3Metadata) -> Float64[np.ndarray, "4 4"]:
+def imu_from_ego(vehicle: EgoStateSE3Metadata) -> Float64[np.ndarray, "4 4"]:
+    """Return T_imu_ego of a vehicle as 123D describes it."""
     T_rear_ego = np.eye(4)
     T_rear_ego[2, 3] = vehicle.rear_axle_to_center_vertical - vehicle.half_height
     return vehicle.rear_axle_to_imu_se3.transformation_matrix @ T_rear_ego

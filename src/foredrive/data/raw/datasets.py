@@ -48,10 +48,11 @@ def _nuscenes_keyframe(source: Path) -> Iterator[RawLog]:
 
 
 def _kitti_object(source: Path) -> Iterator[RawLog]:
-    for folder in folders_with(source, "velodyne"):
+    for folder in folders_with(source, "calib"):
         split = "kitti_test" if folder.name == "testing" else "kitti_train"
-        for sweep in sorted(folder.glob("velodyne/*.bin")):
-            yield RawLog(folder, KittiObjectParser(folder, sweep.stem, split))
+        sensed = [*folder.glob("velodyne/*.bin"), *folder.glob("image_2/*.*")]
+        for frame in sorted({file.stem for file in sensed}):
+            yield RawLog(folder, KittiObjectParser(folder, frame, split))
 
 
 def _kitti_raw(source: Path) -> Iterator[RawLog]:
@@ -63,7 +64,7 @@ DATASETS: dict[str, RawDataset] = {
     "pandaset": RawDataset(_pandaset, "annotations/cuboids"),
     "av2": RawDataset(_av2, "city_SE3_egovehicle.feather"),
     "nuscenes-keyframe": RawDataset(_nuscenes_keyframe, "v1.0-*/sample_data.json"),
-    "kitti-object": RawDataset(_kitti_object, "velodyne/*.bin"),
+    "kitti-object": RawDataset(_kitti_object, "calib/*.txt beside velodyne/*.bin or image_2/*.png"),
     "kitti-raw": RawDataset(_kitti_raw, "velodyne_points/data"),
     "rosbag": RawDataset(find_bags, "BAG.topics.yaml beside a .bag, .db3, .mcap or the folder of a bag"),
     "nerfstudio": RawDataset(find_nerfstudio, "transforms.json"),

@@ -1,20 +1,27 @@
-"""Reading of raw files by other people's parsers: errors of one line, and paths that stay in their folder."""
+"""Reading of raw files: errors of one line, paths that stay in their folder, damaged parts left out."""
 
 import contextlib
 import os
 import re
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
-from py123d.datatypes import BoxDetectionsSE3, Camera, EgoStateSE3, LogMetadata, MapMetadata
+from PIL import Image
+from py123d.common.io.lidar.path_lidar_io import load_point_cloud_data_from_path
+from py123d.datatypes import BoxDetectionsSE3, Camera, EgoStateSE3, Lidar, LogMetadata, MapMetadata
 from py123d.datatypes.modalities.base_modality import BaseModality
+from py123d.datatypes.sensors.lidar import LidarMergedMetadata
 from py123d.parser.base_dataset_parser import ParsedCamera, ParsedLidar, ParsedRadar
 
 from foredrive.data.arrow_files import REFUSES_WRITING
+from foredrive.data.notices import note
+from foredrive.data.raw.images import read_rgb
 from foredrive.errors import InputError
+
+T = TypeVar("T")
 
 _NAME = re.compile(r"[\w-][\w.+-]*")
 _READ_MODES = ("r", "rb", "rt", None)
@@ -44,6 +51,105 @@ def reading_raw(source: Path) -> Iterator[None]:
             if isinstance(error, OSError) and error.errno in REFUSES_WRITING:
                 raise
             raise InputError(f"{source}: cannot read the raw log: {_reason(error)}{_place(error)}") from error
+
+
+class PartReader:
+    """Reads parts of one kind. Damaged ones are left out with a notice, unless all are damaged.
+
+    Args:
+        subject: what the parts belong to: a topic, camera or folder.
+        parts: their plural noun, such as "messages".
+    """
+
+    def __init__(self, subject: str, parts: str) -> None:
+        self._subject, self._parts = subject, parts
+        self._first: str | None = None
+        self._whole = 0
+
+    def __call__(self, place: str, read: Callable[[], T]) -> T | None:
+        """Return one part, or None and a notice if it cannot be read.
+
+        Args:
+            place: names the part: its number, file and time.
+            read: reads it.
+        """
+        try:
+            part = read()
+        except Exception as error:  # damaged files make foreign decoders raise errors of any class
+            if isinstance(error, OSError) and error.errno in REFUSES_WRITING:
+                raise
+            fault = f"{place}: {_reason(error)}"
+            self._first = self._first or fault
+            note(self._subject, f"unreadable {self._parts}, left out", fault)
+            return None
+        self._whole += 1
+        return part
+
+    def check(self) -> None:
+        """Check that not all parts were damaged.
+
+        Raises:
+            InputError: none could be read.
+        """
+        if self._first is not None and not self._whole:
+            raise InputError(f"{self._subject}: none of its {self._parts} can be read; {self._first}")
+
+
+class SensorFiles:
+    """Loads the sensor files of a log's frames. A frame loses an image or a sweep that cannot be read."""
+
+    def __init__(self, source: Path, dataset: str) -> None:
+        self._source, self._dataset = source, dataset
+        self._readers: dict[str, PartReader] = {}
+
+    def load(self, modality: BaseModality) -> BaseModality | None:
+        """Return a modality with its sensor data, or None if these cannot be read."""
+        if isinstance(modality, ParsedCamera):
+            return self._read(modality.metadata.camera_name, "images", modality, _whole_image)
+        if isinstance(modality, ParsedLidar):
+            return self._read("lidar", "sweeps", modality, self._sweep)
+        return modality
+
+    def check(self) -> None:
+        """Check that each sensor has readable data at one time at least."""
+        for reader in self._readers.values():
+            reader.check()
+
+    def _read(self, name: str, parts: str, modality: T, load: Callable[[T], BaseModality]) -> Any:
+        reader = self._readers.setdefault(name, PartReader(f"{self._source.name}, {name}", parts))
+        place = str(getattr(modality, "_relative_path", None) or modality.timestamp.time_us)  # type: ignore[attr-defined]
+        return reader(place, lambda: load(modality))
+
+    def _sweep(self, parsed: ParsedLidar) -> Lidar:
+        """Load a sweep as py123d's writer would."""
+        root, relative = parsed._dataset_root, parsed._relative_path
+        metadata = parsed.metadata
+        lidars = dict(metadata) if isinstance(metadata, LidarMergedMetadata) else None
+        points, features = load_point_cloud_data_from_path(
+            relative,
+            self._dataset,
+            parsed._iteration,
+            root,
+            lidar_metadatas=lidars,
+            load_kwargs=parsed.load_kwargs,
+        )
+        return Lidar(parsed.start_timestamp, parsed.end_timestamp, metadata, points, features)
+
+
+def _whole_image(parsed: ParsedCamera) -> BaseModality:
+    """Return a camera whose JPEG is whole, or with its decoded image.
+
+    JPEGs go into the log as they are. Decoding them at an eighth of their size finds those that are cut.
+    """
+    if not parsed.has_file_path or parsed.exposure_factor is not None:
+        return parsed
+    file = Path(parsed._dataset_root) / parsed._relative_path
+    if not parsed.has_jpeg_file_path:
+        return Camera(parsed.metadata, read_rgb(file), parsed.camera_to_global_se3, parsed.timestamp)
+    with Image.open(file) as opened:
+        opened.draft("RGB", (opened.width // 8, opened.height // 8))
+        opened.load()
+    return parsed
 
 
 @contextlib.contextmanager

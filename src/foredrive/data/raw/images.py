@@ -1,0 +1,59 @@
+"""Decoding of images of other people: 8-bit RGB, or a clear refusal."""
+
+import io
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Shaped, UInt8
+from PIL import Image, UnidentifiedImageError
+
+from foredrive.errors import InputError
+
+_DEEP_MODES = ("I;16", "I;16B", "I;16L", "I;16N", "I", "F")
+"""Pillow's modes of grey images with more than 8 bits. Its conversion to RGB would clip them to white."""
+
+
+def decoded(image: Path | str | bytes) -> Shaped[np.ndarray, "H W *channels"]:
+    """Return an image as uint8 RGB [H, W, 3], or as grey [H, W] if it is grey with more than 8 bits.
+
+    Raises:
+        InputError: it cannot be decoded.
+    """
+    name = "an image" if isinstance(image, bytes) else image
+    try:
+        with Image.open(io.BytesIO(image) if isinstance(image, bytes) else image) as opened:
+            return np.asarray(opened if opened.mode in _DEEP_MODES else opened.convert("RGB"))
+    except (OSError, UnidentifiedImageError, Image.DecompressionBombError, SyntaxError, ValueError) as error:
+        raise InputError(f"{name}: cannot read the image: {error}") from error
+
+
+def read_rgb(
+    image: Path | str | bytes, value_range: tuple[float, float] | None = None
+) -> UInt8[np.ndarray, "H W 3"]:
+    """Return an image file, or its bytes, as RGB.
+
+    Args:
+        image: path of the file, or its content.
+        value_range: values of a grey image with more than 8 bits that become 0 and 255.
+
+    Raises:
+        InputError: it cannot be decoded, or has more than 8 bits and no range is given.
+    """
+    pixels = decoded(image)
+    if pixels.ndim == 3:
+        return pixels
+    if value_range is None:
+        low, high = pixels.min(), pixels.max()
+        name = "an image" if isinstance(image, bytes) else image
+        raise InputError(f"{name}: it has more than 8 bits ({low} to {high}); scale it to 8 bits")
+    return grey_to_rgb(pixels, value_range)
+
+
+def grey_to_rgb(
+    pixels: Shaped[np.ndarray, "H W"], value_range: tuple[float, float]
+) -> UInt8[np.ndarray, "H W 3"]:
+    """Return a grey image as RGB, with the ends of `value_range` at 0 and 255."""
+    low, high = value_range
+    share = (pixels.astype(np.float64) - low) / max(high - low, 1e-12)
+    grey = np.round(255 * share.clip(0, 1)).astype(np.uint8)
+    return np.repeat(grey[..., None], 3, axis=-1)
