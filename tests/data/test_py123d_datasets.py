@@ -4,16 +4,21 @@ import importlib.util
 import io
 import json
 import pickle
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+import raw_av2
 import raw_kitti360
 import raw_nuscenes
 import raw_waymo
 from PIL import Image
 from plyfile import PlyData, PlyElement
+from py123d.datatypes import CameraID
 from py123d.parser.truckdrive.truckdrive_constants import LABEL_MAPPING, MAPPED_CATEGORIES
+from scipy.spatial.transform import Rotation
 from test_raw_pandaset import Intruder
 
 from foredrive.data.boxes import read_boxes
@@ -22,10 +27,12 @@ from foredrive.data.convert import convert
 from foredrive.data.lidar import read_sweep
 from foredrive.data.logs import Log
 from foredrive.data.maps import read_map_patch
+from foredrive.data.notices import read_notices
 from foredrive.data.raw.datasets import DATASETS
 from foredrive.data.safe_pickle import PlainPickle
 from foredrive.errors import InputError
-from foredrive.scene import Attribute, Visibility
+from foredrive.scene import Attribute, Category, Visibility
+from foredrive.scene.boxes import UNKNOWN
 
 HAS_NUSCENES = importlib.util.find_spec("nuscenes") is not None
 NEEDS_DEVKIT = pytest.mark.skipif(not HAS_NUSCENES, reason="nuscenes-devkit is not installed")
@@ -203,6 +210,105 @@ def test_own_scenes_in_nuscenes_format_need_no_devkit(tmp_path: Path) -> None:
     assert sweep is not None
     assert sweep[0].points_ego[0].tolist() == pytest.approx([6.0, 1.0, 0.8], abs=1e-5)
     assert len(log.rows("camera.pcam_f0")[0]) == 4  # an image is beside the sweeps 50 ms before and after
+
+
+def changed(table: Path, change: Callable[[dict[str, Any]], dict[str, Any] | None]) -> None:
+    """Replace each row of a table by what `change` makes of it; None leaves it out."""
+    rows = [change(row) for row in json.loads(table.read_bytes())]
+    text = json.dumps([row for row in rows if row is not None])
+    table.write_bytes(b"\xef\xbb\xbf" + text.encode())  # some programs begin with a byte order mark
+
+
+def test_own_scenes_may_lack_the_lidar_and_most_columns(tmp_path: Path) -> None:
+    """Names as of Lyft, no sizes of images, no visibilities, a camera that looks back to the left."""
+    tables = tmp_path / "raw" / "v1.02-own"
+    raw_nuscenes.write(tmp_path / "raw", tables.name)
+    changed(
+        tables / "sample_data.json", lambda row: None if "LIDAR" in row["token"] else row | {"width": None}
+    )
+    missing = ("visibility_token", "attribute_tokens", "num_lidar_pts")
+    changed(
+        tables / "sample_annotation.json",
+        lambda row: {key: value for key, value in row.items() if key not in missing},
+    )
+    for name in ("visibility", "attribute"):
+        (tables / f"{name}.json").unlink()
+    changed(tables / "category.json", lambda row: row | {"name": "Pedestrian"})
+    names = {"CAM_BACK_LEFT": "rear-left"}
+    changed(tables / "sensor.json", lambda row: row | {"channel": names.get(row["channel"], row["channel"])})
+    turned = Rotation.from_euler("z", 120, degrees=True) * Rotation.from_quat([-0.5, 0.5, -0.5, 0.5])
+    back_left = {"rotation": np.roll(turned.as_quat(), 1).tolist()}
+    changed(
+        tables / "calibrated_sensor.json",
+        lambda row: row | (back_left if row["token"] == "cal-CAM_BACK_LEFT" else {}),
+    )
+    (path,) = convert(tmp_path / "raw", "nuscenes", tmp_path / "out")
+    log = Log(path)
+    cameras = pinhole_cameras(log)
+    assert cameras["rear-left"].camera_id == CameraID.PCAM_L1
+    assert (cameras["rear-left"].width, cameras["rear-left"].height) == (32, 16)
+    assert len(cameras) == 6
+    assert read_sweep(log, 0) is None
+    boxes = read_boxes(log, 0)
+    assert boxes is not None
+    assert boxes.category.tolist() == [Category.PEDESTRIAN]
+    assert (boxes.num_points.item(), boxes.attribute.item(), boxes.visibility.item()) == (UNKNOWN,) * 3
+    assert read_notices(path.folder) == []
+
+
+def test_unknown_classes_of_own_scenes_are_counted(tmp_path: Path) -> None:
+    raw_nuscenes.write(tmp_path / "raw", "v1.0-own")
+    changed(tmp_path / "raw" / "v1.0-own" / "category.json", lambda row: row | {"name": "hovercraft"})
+    (path,) = convert(tmp_path / "raw", "nuscenes", tmp_path / "out")
+    told = "sample_annotation: boxes of unknown classes, read as OTHER: 2 ('hovercraft'; 'hovercraft')"
+    assert read_notices(path.folder) == [told]
+
+
+def test_a_damaged_sensor_file_costs_itself_alone(tmp_path: Path) -> None:
+    """Of three streams of a scene: a cut JPEG, a missing image, and a sweep with half a point."""
+    raw_nuscenes.write(tmp_path / "raw", "v1.0-own")
+    samples = tmp_path / "raw" / "samples"
+    cut = samples / "CAM_FRONT" / "CAM_FRONT-0.jpg"
+    cut.write_bytes(cut.read_bytes()[:-200])
+    (samples / "CAM_BACK" / "CAM_BACK-500000.jpg").unlink()
+    sweep = samples / "LIDAR_TOP" / "LIDAR_TOP-500000.pcd.bin"
+    sweep.write_bytes(sweep.read_bytes()[:30])
+    (path,) = convert(tmp_path / "raw", "nuscenes", tmp_path / "out")
+    log = Log(path)
+    assert log.rows("camera.pcam_f0")[0].tolist() == [1]
+    assert log.rows("camera.pcam_b0")[0].tolist() == [0]
+    assert log.rows("camera.pcam_l0")[0].tolist() == [0, 1]
+    assert [read_sweep(log, frame) is None for frame in range(2)] == [False, True]
+    lidar, front, back = sorted(read_notices(path.folder), key=lambda line: "CAM" in line)
+    assert "lidar: unreadable sweeps, left out: 1 (samples/LIDAR_TOP/LIDAR_TOP-500000.pcd.bin: " in lidar
+    assert "CAM_FRONT: unreadable images, left out: 1 (samples/CAM_FRONT/CAM_FRONT-0.jpg: " in front
+    assert "CAM_BACK: unreadable images, left out: 1 (samples/CAM_BACK/CAM_BACK-500000.jpg: " in back
+
+
+def test_sweeps_of_four_columns_in_nuscenes_format_are_refused(tmp_path: Path) -> None:
+    """Twenty numbers are five rows of four columns, and four of five."""
+    raw_nuscenes.write(tmp_path / "raw", "v1.0-own")
+    for file in (tmp_path / "raw").rglob("*.pcd.bin"):
+        np.array([[5, -1, -1, 20], [8, 0.5, 0, 30]] * 10, np.float32).tofile(file)
+    with pytest.raises(InputError, match=r"none of its sweeps can be read.*4 columns would fit"):
+        convert(tmp_path / "raw", "nuscenes", tmp_path / "out")
+
+
+@pytest.mark.filterwarnings("ignore:The inplace keyword")  # of pandas, in py123d's parser
+@pytest.mark.parametrize("cameras", [False, True])
+def test_an_argoverse_log_of_the_test_split_has_no_boxes(cameras: bool, tmp_path: Path) -> None:
+    """Two sweeps, no annotations; the boxes are unknown, which is not the same as none."""
+    folder = tmp_path / "raw" / "test" / "0-1"
+    raw_av2.write(folder, cameras=cameras)
+    (path,) = convert(tmp_path / "raw", "av2", tmp_path / "out")
+    assert path.name == "av2-sensor_test/0-1"
+    log = Log(path)
+    assert np.diff(log.t_us).tolist() == [100_000]
+    assert read_boxes(log, 0) is None
+    sweep = read_sweep(log, 1)
+    assert sweep is not None
+    assert sweep[0].points_ego[:, 0].tolist() == pytest.approx([11.0, 21.0], abs=0.05)
+    assert len(pinhole_cameras(log)) == (1 if cameras else 0)
 
 
 @pytest.mark.parametrize("version", [pytest.param("v1.0-mini", marks=NEEDS_DEVKIT), "v1.0-own"])

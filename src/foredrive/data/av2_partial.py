@@ -1,7 +1,7 @@
-"""A 123D parser for Argoverse 2 sensor logs without cameras, calibration or most sweeps.
+"""123D parsers for Argoverse 2 sensor logs that lack cameras, calibration, annotations or most sweeps.
 
-py123d's own parser steps from sweep to sweep and needs the folders of all cameras. This parser steps from one
-annotated time to the next and uses the available sweeps.
+py123d's own parser steps from sweep to sweep, needs the folders of all cameras, and writes empty frames of
+boxes where a log has no annotations, as in the test split.
 """
 
 from collections.abc import Iterator
@@ -33,6 +33,8 @@ from py123d.parser.av2.utils.av2_constants import (
 from py123d.parser.base_dataset_parser import BaseLogParser, ModalitiesSync, ParsedLidar
 from py123d.parser.registry import AV2SensorBoxDetectionLabel
 
+from foredrive.data.notices import note
+
 _POSE = ["tx_m", "ty_m", "tz_m", "qw", "qx", "qy", "qz"]
 _SIZE = ["length_m", "width_m", "height_m"]
 _EGO_CATEGORY = "EGO_VEHICLE"
@@ -44,7 +46,7 @@ class Av2PartialParser(BaseLogParser):
     """Parser of an AV2 sensor log without images.
 
     Args:
-        folder: folder of the log. It must have annotations*.feather, city_SE3_egovehicle.feather and map/.
+        folder: folder of the log. It must have city_SE3_egovehicle.feather and map/.
         split: 123D split, e.g. av2-sensor_val.
     """
 
@@ -59,21 +61,33 @@ class Av2PartialParser(BaseLogParser):
         return LogMetadata("av2-sensor", self._split, self._folder.name, location, map_metadata)
 
     def iter_modalities_sync(self) -> Iterator[ModalitiesSync]:
-        """Yield ego pose and boxes at every annotated time, and the sweep of that time if there is one."""
-        annotations = feather.read_table(next(self._folder.glob("annotations*.feather")))
+        """Yield the ego pose at each time of a sweep or of annotations, with what there is of the two."""
+        file = next(iter(sorted(self._folder.glob("annotations*.feather"))), None)
+        annotations = None if file is None else feather.read_table(file)
         poses = feather.read_table(self._folder / "city_SE3_egovehicle.feather")
         row_at = {t_ns: row for row, t_ns in enumerate(poses["timestamp_ns"].to_pylist())}
         pose_rows = _columns(poses, _POSE)
         lidars = self._lidars()
-        annotated_ns = annotations["timestamp_ns"].to_numpy()
-        for timestamp_ns in np.unique(annotated_ns).tolist():
+        empty = np.zeros(0, np.int64)
+        annotated_ns = empty if annotations is None else annotations["timestamp_ns"].to_numpy()
+        sweeps = {int(sweep.stem): sweep for sweep in self._folder.glob("sensors/lidar/*.feather")}
+        if sweeps and not lidars:
+            note("lidar", "left out; calibration/egovehicle_SE3_sensor.feather is missing")
+            sweeps = {}
+        for timestamp_ns in sorted({*annotated_ns.tolist(), *sweeps}):
+            if timestamp_ns not in row_at:
+                note("city_SE3_egovehicle.feather", "times without a pose, left out", f"{timestamp_ns} ns")
+                continue
             timestamp = Timestamp.from_ns(timestamp_ns)
             pose = PoseSE3.from_array(pose_rows[row_at[timestamp_ns]])
-            ego = EgoStateSE3.from_imu(pose, AV2_SENSOR_EGO_STATE_SE3_METADATA, timestamp)
-            boxes = _boxes(annotations.filter(pa.array(annotated_ns == timestamp_ns)), pose, timestamp)
-            modalities: list[BaseModality] = [ego, boxes]
-            sweep = self._folder / "sensors" / "lidar" / f"{timestamp_ns}.feather"
-            if lidars and sweep.is_file():
+            modalities: list[BaseModality] = [
+                EgoStateSE3.from_imu(pose, AV2_SENSOR_EGO_STATE_SE3_METADATA, timestamp)
+            ]
+            rows = annotated_ns == timestamp_ns
+            if annotations is not None and rows.any():
+                modalities.append(_boxes(annotations.filter(pa.array(rows)), pose, timestamp))
+            sweep = sweeps.get(timestamp_ns)
+            if sweep is not None:
                 modalities.append(
                     ParsedLidar(
                         metadata=LidarMergedMetadata(lidars),
@@ -94,6 +108,23 @@ class Av2PartialParser(BaseLogParser):
         return {
             id_: LidarMetadata(name, id_, PoseSE3.from_array(mounted[name])) for id_, name in _LIDARS.items()
         }
+
+
+class WithoutBoxes(BaseLogParser):
+    """A parser of a log without annotations, whose frames have no boxes in place of empty lists of them."""
+
+    def __init__(self, parser: BaseLogParser) -> None:
+        self._parser = parser
+
+    def get_log_metadata(self) -> LogMetadata:
+        """Return the log's metadata."""
+        return self._parser.get_log_metadata()
+
+    def iter_modalities_sync(self) -> Iterator[ModalitiesSync]:
+        """Yield the frames."""
+        for frame in self._parser.iter_modalities_sync():
+            sensed = [one for one in frame.modalities if not isinstance(one, BoxDetectionsSE3)]
+            yield ModalitiesSync(frame.timestamp, sensed)
 
 
 def _boxes(rows: pa.Table, ego: PoseSE3, timestamp: Timestamp) -> BoxDetectionsSE3:

@@ -40,10 +40,10 @@ from scipy.spatial import KDTree
 
 from foredrive.data.modalities import attributes_modality, visibility_modality
 from foredrive.data.nuscenes_tables import (
-    MIDDLE_OF_LEVEL,
     attribute_of_row,
     matrix_of_row,
     pose_of_matrix,
+    visible_share,
 )
 from foredrive.data.safe_pickle import load_pickle
 from foredrive.data.written_boxes import LABEL_OF_CATEGORY
@@ -64,7 +64,7 @@ class NuScenesKeyframeParser(BaseLogParser):
         self._folder = Path(folder)
         self._split = split
         tables = next(self._folder.glob("v1.0-*"))
-        self._rows = {file.stem: json.loads(file.read_text()) for file in tables.glob("*.json")}
+        self._rows = {file.stem: json.loads(file.read_bytes()) for file in tables.glob("*.json")}
 
     def get_log_metadata(self) -> LogMetadata:
         """Return the log's metadata with the scene's name. The folder has no table with the location."""
@@ -128,7 +128,7 @@ class NuScenesKeyframeParser(BaseLogParser):
         ]
         names = {row["token"]: row["name"] for row in self._rows["attribute"]}
         attributes = [attribute_of_row(row, names) for row in matched]
-        shares = [MIDDLE_OF_LEVEL[row["visibility_token"]] if row else np.nan for row in matched]
+        shares = [visible_share(row) if row else np.nan for row in matched]
         return [
             attributes_modality(attributes, boxes.timestamp),
             visibility_modality(shares, boxes.timestamp),

@@ -6,13 +6,13 @@ any folder v1.0-NAME, such as those of `foredrive export nuscenes`, with the cam
 
 import functools
 import json
-import logging
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from PIL import Image
 from py123d.datatypes import (
     BoxDetectionAttributes,
     BoxDetectionSE3,
@@ -37,11 +37,14 @@ from py123d.parser.nuscenes.utils.nuscenes_constants import (
     NUSCENES_LIDAR_SWEEP_DURATION_US,
 )
 
+from foredrive.data.camera_streams import CameraSpec, camera_ids
+from foredrive.data.category_names import category_or_other
 from foredrive.data.modalities import attributes_modality, visibility_modality
+from foredrive.data.notices import note
 from foredrive.data.nuscenes_names import camera_of_channel
 from foredrive.data.raw.guard import reading_raw
 from foredrive.data.written_boxes import LABEL_OF_CATEGORY
-from foredrive.scene import Attribute, Category
+from foredrive.scene import Attribute
 from foredrive.scene.boxes import UNKNOWN
 
 Row = dict[str, Any]
@@ -52,7 +55,6 @@ MIDDLE_OF_LEVEL = {"1": 0.2, "2": 0.5, "3": 0.7, "4": 0.9, "": np.nan}
 _ATTRIBUTE_OF_LABEL = {attribute.label: attribute for attribute in Attribute}
 _MAX_APART_US = 50_000
 """Largest time between a sweep of the lidar and an image beside it, for frames that are no samples."""
-_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,7 +91,7 @@ def nuscenes_tables(folder: Path) -> NuScenesTables:
         scene = rows["sample"][reading["sample_token"]]["scene_token"]
         of_scene = tables.readings.setdefault(scene, {})
         of_scene.setdefault(tables.channel(reading), []).append(reading)
-    for box in rows["sample_annotation"].values():
+    for box in rows.get("sample_annotation", {}).values():
         tables.boxes.setdefault(box["sample_token"], []).append(box)
     return tables
 
@@ -123,7 +125,7 @@ class NuScenesTablesParser(BaseLogParser):
 
     def get_log_metadata(self) -> LogMetadata:
         """Return the log's metadata with the scene's name."""
-        location = self._tables.log(self._scene)["location"] or None
+        location = self._tables.log(self._scene).get("location") or None
         return LogMetadata("nuscenes", self._split, self._scene["name"], location=location)
 
     def iter_modalities_sync(self) -> Iterator[ModalitiesSync]:
@@ -142,8 +144,8 @@ class NuScenesTablesParser(BaseLogParser):
 
     def _frames(self) -> Iterator[ModalitiesSync]:
         readings = self._tables.readings.get(self._scene_token, {})
-        cameras = {id_: rows for name, rows in readings.items() if (id_ := self._camera_id(name)) is not None}
-        frames = readings.get(LIDAR) or next((cameras[id_] for id_ in sorted(cameras)), [])
+        cameras = {camera_id: readings[name] for name, camera_id in self._camera_ids(readings).items()}
+        frames = readings.get(LIDAR) or max(cameras.values(), key=len, default=[])
         for frame in frames:
             if not (frame["is_key_frame"] or self._sweeps):
                 continue
@@ -161,28 +163,40 @@ class NuScenesTablesParser(BaseLogParser):
                 found += [] if beside is None else [self._camera(camera_id, beside)]
             yield ModalitiesSync(timestamp, found)
 
-    def _camera_id(self, channel: str) -> CameraID | None:
-        found = camera_of_channel(channel)
-        if found is None and channel.startswith("CAM"):
-            _log.warning("%s: 123D has no camera for %s, which is left out", self._folder, channel)
-        return found
+    def _camera_ids(self, readings: dict[str, list[Row]]) -> dict[str, CameraID]:
+        """Return 123D's cameras of the channels with images: by the names of channels, else by direction."""
+        specs, channels = [], {}
+        for channel, rows in readings.items():
+            calibration = self._tables.calibration(rows[0])
+            if len(calibration["camera_intrinsic"]) == 0:
+                if channel != LIDAR and not channel.startswith("RADAR"):
+                    note(channel, f"left out; the only lidar that is read is {LIDAR}")
+                continue
+            named = camera_of_channel(channel)
+            name = channel if named is None else named.name
+            channels[name] = channel
+            K = np.array(calibration["camera_intrinsic"], np.float64)
+            specs.append(CameraSpec(name, K, matrix_of_row(calibration), (0, 0)))
+        return {channels[spec.name]: camera_id for spec, camera_id in camera_ids(specs)}
 
     def _boxes(self, sample_token: str, timestamp: Timestamp) -> list[BaseModality]:
         """Return boxes, attributes and visibilities of a sample. Velocities follow from the tracks."""
         rows, tables = self._tables.boxes.get(sample_token, []), self._tables.rows
-        names = {token: row["name"] for token, row in tables["attribute"].items()}
+        names = {token: row["name"] for token, row in tables.get("attribute", {}).items()}
         detections = []
         for row in rows:
             category = tables["category"][tables["instance"][row["instance_token"]]["category_token"]]["name"]
-            label = NUSCENES_DETECTION_NAME_DICT.get(category, LABEL_OF_CATEGORY[Category.OTHER])
+            label = NUSCENES_DETECTION_NAME_DICT.get(category)
+            if label is None:
+                label = LABEL_OF_CATEGORY[category_or_other(category, "sample_annotation")]
             width, length, height = row["size"]
             box = BoundingBoxSE3(pose_of_matrix(self._in_world(row)), length, width, height)
-            described = BoxDetectionAttributes(label, row["instance_token"], row["num_lidar_pts"])
+            described = BoxDetectionAttributes(label, row["instance_token"], row.get("num_lidar_pts"))
             detections.append(BoxDetectionSE3(described, box, None))
         return [
             BoxDetectionsSE3(detections, timestamp, NUSCENES_BOX_DETECTIONS_SE3_METADATA),
             attributes_modality([attribute_of_row(row, names) for row in rows], timestamp),
-            visibility_modality([MIDDLE_OF_LEVEL[row["visibility_token"]] for row in rows], timestamp),
+            visibility_modality([visible_share(row) for row in rows], timestamp),
         ]
 
     def _lidar(self, row: Row) -> ParsedLidar:
@@ -199,13 +213,14 @@ class NuScenesTablesParser(BaseLogParser):
     def _camera(self, camera_id: CameraID, row: Row) -> ParsedCamera:
         calibration = self._tables.calibration(row)
         T_ego_cam = matrix_of_row(calibration)
+        width, height = self._size(row)
         metadata = PinholeCameraMetadata(
             camera_name=self._tables.channel(row),
             camera_id=camera_id,
             intrinsics=PinholeIntrinsics.from_camera_matrix(np.array(calibration["camera_intrinsic"])),
             distortion=None,
-            width=row["width"],
-            height=row["height"],
+            width=width,
+            height=height,
             camera_to_imu_se3=pose_of_matrix(T_ego_cam),
             is_undistorted=True,
         )
@@ -216,6 +231,13 @@ class NuScenesTablesParser(BaseLogParser):
             dataset_root=self._folder.parent,
             relative_path=Path(row["filename"]),
         )
+
+    def _size(self, row: Row) -> tuple[int, int]:
+        """Return width and height of an image, from its file where the table has none."""
+        if row.get("width") and row.get("height"):
+            return int(row["width"]), int(row["height"])
+        with Image.open(self._folder.parent / row["filename"]) as opened:
+            return opened.size
 
     def _ego_pose(self, reading: Row) -> np.ndarray:
         return self._in_world(self._tables.rows["ego_pose"][reading["ego_pose_token"]])
@@ -228,7 +250,7 @@ class NuScenesTablesParser(BaseLogParser):
 
 
 def _read_table(file: Path) -> dict[str, Row]:
-    rows = json.loads(file.read_text())
+    rows = json.loads(file.read_bytes())  # bytes may begin with a byte order mark
     if not isinstance(rows, list):
         raise TypeError(f"{file.name} is not a list of rows")
     return {row["token"]: row for row in rows}
@@ -236,8 +258,13 @@ def _read_table(file: Path) -> dict[str, Row]:
 
 def attribute_of_row(row: Row | None, names: dict[str, str]) -> int:
     """Return the `Attribute` of an annotation by the names of attributes, or UNKNOWN."""
-    tokens = row["attribute_tokens"] if row is not None else []
-    return _ATTRIBUTE_OF_LABEL.get(names[tokens[0]], UNKNOWN) if tokens else UNKNOWN
+    tokens = row.get("attribute_tokens") if row is not None else None
+    return _ATTRIBUTE_OF_LABEL.get(names.get(tokens[0], ""), UNKNOWN) if tokens else UNKNOWN
+
+
+def visible_share(row: Row) -> float:
+    """Return the visible share of an annotation, NaN where no level is known."""
+    return MIDDLE_OF_LEVEL.get(str(row.get("visibility_token") or ""), np.nan)
 
 
 def matrix_of_row(row: Row) -> np.ndarray:

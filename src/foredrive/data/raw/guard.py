@@ -19,6 +19,7 @@ from py123d.parser.base_dataset_parser import ParsedCamera, ParsedLidar, ParsedR
 from foredrive.data.arrow_files import REFUSES_WRITING
 from foredrive.data.notices import note
 from foredrive.data.raw.images import read_rgb
+from foredrive.data.raw.point_files import NUSCENES, read_points
 from foredrive.errors import InputError
 
 T = TypeVar("T")
@@ -125,6 +126,8 @@ class SensorFiles:
         root, relative = parsed._dataset_root, parsed._relative_path
         metadata = parsed.metadata
         lidars = dict(metadata) if isinstance(metadata, LidarMergedMetadata) else None
+        if str(relative).endswith(".pcd.bin"):
+            read_points(Path(root) / relative, NUSCENES)  # its loader takes any number of columns for five
         points, features = load_point_cloud_data_from_path(
             relative,
             self._dataset,

@@ -59,8 +59,8 @@ def _nuscenes(source: Path, name: str) -> Iterator[RawLog]:
             _leave_unknown_speed_out(module)
             maps = root if (root / "maps" / "expansion").is_dir() else None
             yield from _of(module.NuScenesParser(splits, root, maps), root / version)
-    for root in folders_with(source, "v1.0-*/scene.json"):
-        for tables in sorted(root.glob("v1.0-*")):
+    for root in folders_with(source, "v[0-9]*-*/scene.json"):
+        for tables in sorted(root.glob("v[0-9]*-*")):
             if tables.name not in versions and (tables / "scene.json").is_file():
                 yield from _own_scenes(tables, sweeps=name != "nuscenes")
 
@@ -69,7 +69,7 @@ def _own_scenes(tables: Path, *, sweeps: bool) -> Iterator[RawLog]:
     """Find the scenes of a data set in nuScenes' format. Their splits are those of its splits.json."""
     noted, split_of = tables / "splits.json", dict[str, str]()
     if noted.is_file():
-        for split, names in json.loads(noted.read_text()).items():
+        for split, names in json.loads(noted.read_bytes()).items():
             split_of |= dict.fromkeys(names, split)
     scenes = nuscenes_tables(tables).rows["scene"]
     if not scenes:
