@@ -1,6 +1,7 @@
 """Small bags of a vehicle that drives at 10 m/s and turns, written by the libraries that write real ones."""
 
 import io
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -203,13 +204,20 @@ def write_ros1(path: Path) -> None:
             writer.write(opened[topic], t_ns, messages.store.serialize_ros1(message, kind))
 
 
+Recording = list[tuple[str, int, Any]]
+
+
 def write_ros2(
-    path: Path, storage: StoragePlugin = StoragePlugin.SQLITE3, skip: tuple[str, ...] = ()
+    path: Path,
+    storage: StoragePlugin = StoragePlugin.SQLITE3,
+    skip: tuple[str, ...] = (),
+    change: Callable[[Messages, Recording], Recording] = lambda made, recording: recording,
 ) -> None:
+    """Write the recording, without the topics of `skip`, as `change` makes it."""
     messages = Messages(2)
     with Writer2(path, version=9, storage_plugin=storage) as writer:
         opened: dict[str, Any] = {}
-        for topic, t_ns, message in messages.recording():
+        for topic, t_ns, message in change(messages, messages.recording()):
             if topic in skip:
                 continue
             kind = message.__msgtype__

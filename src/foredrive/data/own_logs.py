@@ -6,15 +6,14 @@ Camera frames have x to the right, y down and z ahead. The world frame is any fr
 
 import dataclasses
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float64, Shaped, UInt8
-from PIL import Image, UnidentifiedImageError
+from jaxtyping import Float64, Int64, Shaped, UInt8
 from py123d.datatypes import EgoStateSE3Metadata
 from py123d.geometry import PoseSE3
 
@@ -22,6 +21,7 @@ from foredrive.data.camera_streams import CameraSpec
 from foredrive.data.ego_path import interpolated_poses
 from foredrive.data.log_paths import LogPath
 from foredrive.data.log_writer import Frame, LogWriter
+from foredrive.data.raw.images import read_rgb
 from foredrive.errors import InputError
 from foredrive.scene import Boxes, Category, LidarSweep
 from foredrive.scene.boxes import unlabelled
@@ -93,6 +93,7 @@ def write_log(
     vehicle: Vehicle = Vehicle(),
     path: tuple[Num, Num] | None = None,
     split: str = "own_train",
+    tick: Callable[[], None] = lambda: None,
 ) -> LogPath:
     """Write sensor data as a 123D log. An existing log of the same name is replaced.
 
@@ -116,6 +117,7 @@ def write_log(
         path: times [P] and poses [P, 4, 4] of the vehicle at a higher rate. They tell where it was when
             images and points between the frames were measured. Default: those of the frames.
         split: a name that ends in _train, _val or _test.
+        tick: called after each frame.
 
     Raises:
         InputError: numbers of entries differ, times do not increase, an image cannot be read or has another
@@ -154,6 +156,7 @@ def write_log(
                 misses_known=False,
             )
             writer.write(sensed)
+            tick()
     return LogPath(writer.folder.absolute(), Path(out).absolute() / "maps")
 
 
@@ -192,17 +195,18 @@ class _Drive:
             raise InputError(f"{name}: a time or a pose is not finite")
         if np.abs(t_s).max() > _MAX_S:
             raise InputError(f"{name}: times are in seconds; {np.abs(t_s).max():g} s may be in ns, ms or µs")
-        if (np.diff(t_s) < 1e-6).any():
+        t_us = np.round(t_s * 1e6).astype(np.int64)  # whole numbers, because doubles may be off by one
+        if (np.diff(t_us) < 1).any():
             raise InputError(f"{name}: times must increase, by a microsecond at least")
         R = T_world_ego[:, :3, :3]
         if not np.allclose(R @ R.mT, np.eye(3), atol=1e-3) or (np.linalg.det(R) < 0).any():
             raise InputError(f"{name}: T_world_ego holds a rotation that is none")
         if not np.allclose(T_world_ego[:, 3], [0, 0, 0, 1], atol=1e-6):
             raise InputError(f"{name}: the last row of each T_world_ego must be 0, 0, 0, 1")
-        velocity = _rates(T_world_ego[:, :3, 3], t_s)
-        acceleration = _rates(velocity, t_s)
+        velocity = _rates(T_world_ego[:, :3, 3], t_us)
+        acceleration = _rates(velocity, t_us)
         return cls(
-            np.round(t_s * 1e6).astype(np.int64),
+            t_us,
             T_world_ego,
             np.einsum("tji,tj->ti", R, velocity),
             np.einsum("tji,tj->ti", R, acceleration),
@@ -225,11 +229,11 @@ class _Drive:
         return list(zip(t_us.astype(np.int64).tolist(), self.poses_at(t_us), strict=True))
 
 
-def _rates(values: Float64[np.ndarray, "T 3"], t_s: Float64[np.ndarray, "T"]) -> Float64[np.ndarray, "T 3"]:
-    """Return the rate of change since the frame before; the first frame's is that of the second."""
-    if len(t_s) == 1:
+def _rates(values: Float64[np.ndarray, "T 3"], t_us: Int64[np.ndarray, "T"]) -> Float64[np.ndarray, "T 3"]:
+    """Return the rate of change (per s) since the frame before; the first frame's is that of the second."""
+    if len(t_us) == 1:
         return np.zeros_like(values)
-    rate = np.diff(values, axis=0) / np.diff(t_s)[:, None]
+    rate = np.diff(values, axis=0) / (np.diff(t_us)[:, None] * 1e-6)
     return np.concatenate([rate[:1], rate])
 
 
@@ -270,11 +274,7 @@ def _rgb(image: Path | str | Num, where: str) -> RGB:
                 f"{where}: an image must be uint8 [H, W, 3], not {image.dtype} {list(image.shape)}"
             )
         return image
-    try:
-        with Image.open(image) as opened:
-            return np.asarray(opened.convert("RGB"))
-    except (OSError, UnidentifiedImageError, Image.DecompressionBombError) as error:
-        raise InputError(f"{image}: cannot read the image: {error}") from error
+    return read_rgb(image)
 
 
 def _sweep(

@@ -5,6 +5,7 @@ ROS messages are read by the definitions that come with `rosbags`, not by those 
 """
 
 import contextlib
+import functools
 import importlib.util
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator
@@ -13,8 +14,6 @@ from pathlib import Path
 from typing import Any
 
 from foredrive.errors import InputError
-
-Messages = Iterator[tuple[str, Any]]
 
 KINDS = {
     "sensor_msgs/msg/Image": "image",
@@ -38,6 +37,17 @@ KINDS = {
 
 
 @dataclass(frozen=True)
+class Message:
+    """One message as it lies in a bag."""
+
+    topic: str
+    recorded_s: float
+    """When the recorder received it, s. The stamp of what it measured is in its content."""
+    decode: Callable[[], Any]
+    """Returns its content; raises an error of any class if the message is damaged."""
+
+
+@dataclass(frozen=True)
 class Topic:
     """One topic of a bag."""
 
@@ -56,8 +66,8 @@ class Bag:
     """An open bag."""
 
     topics: dict[str, Topic]
-    read: Callable[[Collection[str]], Messages]
-    """Yields topic and message of the named topics, in the order of the bag."""
+    read: Callable[[Collection[str]], Iterator[Message]]
+    """Yields the messages of the named topics in the order of the bag."""
 
 
 @contextlib.contextmanager
@@ -94,10 +104,11 @@ def _open_ros(path: Path) -> Iterator[Bag]:
             name: Topic(name, info.msgtype or "", info.msgcount) for name, info in reader.topics.items()
         }
 
-        def read(names: Collection[str]) -> Messages:
+        def read(names: Collection[str]) -> Iterator[Message]:
             wanted = [one for one in reader.connections if one.topic in names]
-            for connection, _, data in reader.messages(connections=wanted) if wanted else ():
-                yield connection.topic, decode(data, connection.msgtype)
+            for connection, t_ns, data in reader.messages(connections=wanted) if wanted else ():
+                content = functools.partial(decode, data, connection.msgtype)
+                yield Message(connection.topic, t_ns * 1e-9, content)
 
         yield Bag(topics, read)
 
@@ -131,10 +142,19 @@ def _open_foxglove(path: Path) -> Iterator[Bag]:
         if one.schema_id in summary.schemas
     }
 
-    def read(names: Collection[str]) -> Messages:
+    decoders = DecoderFactory()
+
+    def decoded(schema: Any, channel: Any, data: bytes) -> Any:
+        decoder = decoders.decoder_for(channel.message_encoding, schema)
+        if decoder is None:
+            raise InputError(f"messages of encoding {channel.message_encoding!r} are not read")
+        return decoder(data)
+
+    def read(names: Collection[str]) -> Iterator[Message]:
         with path.open("rb") as opened:
-            reader = make_reader(opened, decoder_factories=[DecoderFactory()])
-            for found in reader.iter_decoded_messages(topics=list(names)) if names else ():
-                yield found.channel.topic, found.decoded_message
+            reader = make_reader(opened)
+            for schema, channel, message in reader.iter_messages(topics=list(names)) if names else ():
+                content = functools.partial(decoded, schema, channel, message.data)
+                yield Message(channel.topic, message.log_time * 1e-9, content)
 
     yield Bag(topics, read)

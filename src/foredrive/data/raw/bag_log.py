@@ -1,34 +1,44 @@
 """Logs from bags: the frames are the sweeps, or the images of the first camera in a bag without lidar."""
 
+import functools
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, overload
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float64, UInt8
 from py123d.datatypes import LogMetadata
+from scipy.spatial.transform import Rotation
 
 from foredrive.data.camera_streams import CameraSpec
 from foredrive.data.log_paths import LogPath
+from foredrive.data.notices import note
 from foredrive.data.own_logs import Points, write_log
-from foredrive.data.raw.bag_files import Bag, open_bag
+from foredrive.data.raw.bag_files import Bag, Message, open_bag
+from foredrive.data.raw.bag_index import BagIndex, index_bag, transforms
 from foredrive.data.raw.bag_messages import (
     Calibration,
-    Placed,
     frame_of,
-    read_calibration,
     read_cloud,
     read_image,
-    read_placed,
+    read_pixels,
+    seconds_since_stamp,
     stamp_us,
+    time_unit,
 )
-from foredrive.data.raw.bag_topics import BagTopics, read_topics, topics_file
+from foredrive.data.raw.bag_topics import (
+    DEFAULT_PERIOD_S,
+    BagTopics,
+    CameraTopics,
+    Mount,
+    read_topics,
+    topics_file,
+)
 from foredrive.data.raw.frame_tree import FrameTree
+from foredrive.data.raw.guard import PartReader
 from foredrive.data.raw.raw_log import RawLog
 from foredrive.errors import InputError
-
-_LEVEL = np.eye(4)
 
 
 def find_bags(source: Path, topics: Path | None = None) -> Iterator[RawLog]:
@@ -48,18 +58,6 @@ def find_bags(source: Path, topics: Path | None = None) -> Iterator[RawLog]:
         yield RawLog(bag, BagLog(bag, read_topics(file)))
 
 
-@dataclass
-class _Found:
-    """Times, transforms and calibrations that a first pass over a bag finds."""
-
-    posed: list[Placed] = field(default_factory=list)
-    """From the topic of poses, whose parents go before those of the transforms."""
-    placed: list[Placed] = field(default_factory=list)
-    stamps_us: dict[str, list[int]] = field(default_factory=dict)
-    frames: dict[str, str] = field(default_factory=dict)
-    calibrations: dict[str, Calibration] = field(default_factory=dict)
-
-
 @dataclass(frozen=True)
 class BagLog:
     """One bag with its topics, as a log that writes itself."""
@@ -76,35 +74,49 @@ class BagLog:
         topics = self.topics
         with open_bag(self.bag) as bag:
             self._check_topics(bag)
-            found = _first_pass(bag, topics)
-            tree = FrameTree([*found.posed, *found.placed])
-            times_us = self._frame_times(found, tree)
-            T_ego_origin = _LEVEL.copy()
+            index = index_bag(bag, topics)
+            tree = FrameTree(transforms(index, topics))
+            times_us = self._frame_times(index, tree)
+            T_ego_origin = np.eye(4)
             T_ego_origin[:3, 3] = topics.ego_origin_m
-            pose = tree.pose(topics.world_frame, topics.ego_frame, times_us.astype(np.float64)) @ T_ego_origin
+            poses = (
+                tree.pose(topics.world_frame, topics.ego_frame, times_us.astype(np.float64)) @ T_ego_origin
+            )
 
-            def mounted(frame: str) -> Float64[np.ndarray, "4 4"]:
-                T = tree.between(topics.ego_frame, frame, int(times_us[0]))
+            def mounted(topic: str, frame: str | None, mount: Mount | None) -> Float64[np.ndarray, "4 4"]:
+                if mount is not None:
+                    T = _matrix(mount)
+                else:
+                    sensor = frame or frame_of(index.first[topic])
+                    T = tree.between(topics.ego_frame, sensor, int(times_us[0]))
                 return np.asarray(np.linalg.inv(T_ego_origin) @ T)
 
             images, image_t_s, cameras = {}, {}, []
             for name, camera in topics.cameras.items():
-                calibration = found.calibrations[camera.info]
-                T_ego_cam = mounted(camera.frame or found.frames[camera.images])
+                calibration = _calibration(camera, index)
+                T_ego_cam = mounted(camera.images, camera.frame, camera.mount)
                 spec = CameraSpec(name, calibration.K, T_ego_cam, calibration.size_hw, dist=calibration.dist)
                 cameras.append(spec)
-                stream = _Stream(bag, camera.images, found.stamps_us[camera.images], times_us, read_image)
+                read = functools.partial(_sized_image, size_hw=spec.size_hw, value_range=camera.value_range)
+                stream = _Stream(bag, camera.images, index.stamps[camera.images], times_us, read)
                 images[name], image_t_s[name] = stream, stream.t_us * 1e-6
+                if camera.value_range is not None:
+                    low, high = camera.value_range
+                    note(camera.images, f"images of 16 bits; {low:g} became 0 and {high:g} became 255")
             sweeps, position = None, np.array([0.0, 0.0, 1.8])
             if topics.lidar is not None:
-                T_ego_lidar = mounted(topics.lidar.frame or found.frames[topics.lidar.topic])
-                position, stamps = T_ego_lidar[:3, 3], found.stamps_us[topics.lidar.topic]
-                sweeps = _Stream(bag, topics.lidar.topic, stamps, times_us, self._points(T_ego_lidar), tick)
+                lidar = topics.lidar
+                T_ego_lidar = mounted(lidar.topic, lidar.frame, lidar.mount)
+                points = self._points(T_ego_lidar, self._time_unit(index))
+                position, stamps = T_ego_lidar[:3, 3], index.stamps[lidar.topic]
+                sweeps = _Stream(bag, lidar.topic, stamps, times_us, points)
+            for stream in [*images.values(), *([] if sweeps is None else [sweeps])]:
+                stream.check()
             return write_log(
                 out,
                 topics.name,
                 times_us * 1e-6,
-                pose,
+                poses,
                 cameras=cameras,
                 images=images,
                 image_t_s=image_t_s,
@@ -112,6 +124,7 @@ class BagLog:
                 lidar_position_m=tuple(position.tolist()),
                 path=self._path(tree, times_us, T_ego_origin),
                 split=topics.split,
+                tick=tick,
             )
 
     def _path(
@@ -123,21 +136,60 @@ class BagLog:
         poses = tree.pose(topics.world_frame, topics.ego_frame, at_us.astype(np.float64))
         return at_us * 1e-6, poses @ T_ego_origin
 
-    def _points(self, T_ego_lidar: Float64[np.ndarray, "4 4"]) -> Callable[[Any], Points]:
+    def _time_unit(self, index: BagIndex) -> str | None:
+        """Return the unit of the times of points, or None if they have none or these are not used.
+
+        Raises:
+            InputError: the times fit no unit.
+        """
         assert self.topics.lidar is not None
-        scale, compensated = self.topics.lidar.intensity_max, self.topics.lidar.compensated
+        lidar = self.topics.lidar
+        first = index.first[lidar.topic]
+        times = read_cloud(first).times
+        if lidar.point_times is not None or times is None:
+            return None if lidar.point_times == "none" else lidar.point_times
+        stamps_us = np.unique(index.stamps_us(lidar.topic))
+        period_s = float(np.median(np.diff(stamps_us))) * 1e-6 if len(stamps_us) > 1 else DEFAULT_PERIOD_S
+        unit = time_unit(times, stamp_us(first), period_s)
+        if unit is None:
+            span = f"{times.min():g} to {times.max():g}"
+            raise InputError(
+                f"{self.bag}: the times of points in {lidar.topic} ({span}) fit no unit; "
+                "write `point_times: s`, ms, us, ns or none to its entry in the YAML"
+            )
+        note(lidar.topic, f"times of points were read as {unit}")
+        return unit
+
+    def _points(self, T_ego_lidar: Float64[np.ndarray, "4 4"], unit: str | None) -> Callable[[Any], Points]:
+        assert self.topics.lidar is not None
+        lidar = self.topics.lidar
 
         def read(message: Any) -> Points:
             cloud = read_cloud(message)
             xyz = cloud.xyz_m @ T_ego_lidar[:3, :3].T + T_ego_lidar[:3, 3]
-            intensity = None if cloud.intensity is None else np.nan_to_num(cloud.intensity / scale).clip(0, 1)
+            intensity = (
+                None if cloud.intensity is None else np.nan_to_num(cloud.intensity / lidar.intensity_max)
+            )
+            if intensity is not None and (intensity > 1).any():
+                largest = f"up to {intensity.max() * lidar.intensity_max:g}"
+                note(lidar.topic, f"sweeps with intensities above {lidar.intensity_max:g}, clipped", largest)
+            dt_s = None
+            if unit is not None and cloud.times is not None:
+                dt_s = seconds_since_stamp(cloud.times, stamp_us(message), unit)
             fits = cloud.channel is not None and ((cloud.channel >= 0) & (cloud.channel <= 255)).all()
-            return Points(xyz, intensity, cloud.dt_s, cloud.channel if fits else None, compensated)
+            return Points(
+                xyz,
+                None if intensity is None else intensity.clip(0, 1),
+                dt_s,
+                cloud.channel if fits else None,
+                lidar.compensated,
+            )
 
         return read
 
     def _check_topics(self, bag: Bag) -> None:
-        named = [one for camera in self.topics.cameras.values() for one in (camera.images, camera.info)]
+        cameras = self.topics.cameras.values()
+        named = [topic for camera in cameras for topic in (camera.images, camera.info) if topic is not None]
         named += [self.topics.lidar.topic] if self.topics.lidar else []
         for topic in [*named, *([self.topics.pose] if self.topics.pose else [])]:
             if topic not in bag.topics or not bag.topics[topic].count:
@@ -146,11 +198,11 @@ class BagLog:
         if not named:
             raise InputError(f"{self.bag}: its topics name neither cameras nor a lidar")
 
-    def _frame_times(self, found: _Found, tree: FrameTree) -> np.ndarray:
+    def _frame_times(self, index: BagIndex, tree: FrameTree) -> np.ndarray:
         """Return the times of the frames, as far as there are poses."""
         topics = self.topics
         first = topics.lidar.topic if topics.lidar else next(iter(topics.cameras.values())).images
-        stamps = np.unique(np.array(found.stamps_us[first], np.int64))
+        stamps = np.unique(index.stamps_us(first))
         for frame in (topics.world_frame, topics.ego_frame):
             if frame not in tree.frames:
                 known = ", ".join(sorted(tree.frames)) or "none"
@@ -164,63 +216,87 @@ class BagLog:
         return kept
 
 
-def _first_pass(bag: Bag, topics: BagTopics) -> _Found:
-    found = _Found()
-    infos = {camera.info for camera in topics.cameras.values()}
-    sensed = {camera.images for camera in topics.cameras.values()}
-    sensed |= {topics.lidar.topic} if topics.lidar else set()
-    tf = {one.name for one in bag.topics.values() if one.kind == "tf"}
-    wanted = infos | sensed | tf | ({topics.pose} if topics.pose else set())
-    for topic, message in bag.read(wanted):
-        if topic in infos:
-            if topic not in found.calibrations:
-                found.calibrations[topic] = read_calibration(message)
-        elif topic in sensed:
-            found.stamps_us.setdefault(topic, []).append(stamp_us(message))
-            found.frames.setdefault(topic, frame_of(message))
-        elif topic == topics.pose:
-            for one in read_placed(message):
-                T = one.T_parent_child
-                found.posed.append(Placed(one.parent, one.child or topics.ego_frame, one.t_us, T))
-        else:
-            found.placed += read_placed(message)
-    return found
+def _calibration(camera: CameraTopics, index: BagIndex) -> Calibration:
+    """Return the calibration of a camera: that of its topic, or the given one at the size of its images."""
+    if camera.intrinsics is None:
+        assert camera.info is not None
+        return index.calibrations[camera.info]
+    lens = camera.intrinsics
+    K = np.array([[lens.fx, 0, lens.cx + 0.5], [0, lens.fy, lens.cy + 0.5], [0, 0, 1]])
+    dist = np.zeros(5)
+    dist[: len(lens.distortion)] = lens.distortion
+    height, width = read_pixels(index.first[camera.images]).shape[:2]
+    return Calibration(K, dist, (height, width))
+
+
+def _matrix(mount: Mount) -> Float64[np.ndarray, "4 4"]:
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_quat(mount.quaternion_wxyz, scalar_first=True).as_matrix()
+    T[:3, 3] = mount.position_m
+    return T
+
+
+def _sized_image(
+    message: Any, *, size_hw: tuple[int, int], value_range: tuple[float, float] | None
+) -> UInt8[np.ndarray, "H W 3"]:
+    """Return an image, which must have the size of the calibration."""
+    image = read_image(message, value_range)
+    if image.shape[:2] != size_hw:
+        raise InputError(f"an image of {image.shape[:2]}, but the calibration is of {size_hw}")
+    return image
 
 
 class _Stream(Sequence[Any]):
     """The messages of a topic nearest to each frame, read when they are asked for, best in their order.
 
-    Frames without a message within half of the frames' usual period have None.
+    Frames without a readable message within half of the frames' usual period have None.
     """
 
     def __init__(
         self,
         bag: Bag,
         topic: str,
-        stamps_us: list[int],
+        stamps: list[tuple[int, int]],
         times_us: np.ndarray,
         decode: Callable[[Any], Any],
-        tick: Callable[[], None] = lambda: None,
     ) -> None:
-        stamps = np.array(stamps_us, np.int64)
-        if (np.diff(stamps) < 0).any():
-            raise InputError(f"the stamps of {topic} run backwards at message {np.diff(stamps).argmin() + 1}")
-        after = np.searchsorted(stamps, times_us).clip(1, max(len(stamps) - 1, 1))
+        numbers, stamps_us = np.array(stamps, np.int64).reshape(-1, 2).T
+        for row in np.flatnonzero(np.diff(stamps_us) < 0) + 1:
+            place = f"message {numbers[row]}, {stamps_us[row] * 1e-6:.3f} s"
+            note(topic, "messages out of order, sorted by their stamps", place)
+        order = np.argsort(stamps_us, kind="stable")
+        numbers, stamps_us = numbers[order], stamps_us[order]
+        after = np.searchsorted(stamps_us, times_us).clip(1, max(len(stamps_us) - 1, 1))
         before = after - 1
-        after = after.clip(0, len(stamps) - 1)
-        self._at = np.where(times_us - stamps[before] <= stamps[after] - times_us, before, after)
+        after = after.clip(0, len(stamps_us) - 1)
+        nearest = np.where(times_us - stamps_us[before] <= stamps_us[after] - times_us, before, after)
         period_us = float(np.median(np.diff(times_us))) if len(times_us) > 1 else 1e5
-        self._there = np.abs(stamps[self._at] - times_us) <= 0.5 * period_us
-        self.t_us = np.where(self._there, stamps[self._at], times_us)
-        self._bag, self._topic, self._decode, self._tick = bag, topic, decode, tick
+        self._exists = np.abs(stamps_us[nearest] - times_us) <= 0.5 * period_us
+        self.t_us = np.where(self._exists, stamps_us[nearest], times_us)
+        self._numbers = numbers[nearest]
+        frames = np.flatnonzero(self._exists)
+        self._last_frame = dict(zip(self._numbers[frames].tolist(), frames.tolist(), strict=True))
+        self._read = PartReader(topic, "messages")
+        self._bag, self._topic, self._decode = bag, topic, decode
         self._rewind()
 
     def _rewind(self) -> None:
-        self._messages = enumerate(message for _, message in self._bag.read([self._topic]))
-        self._current: tuple[int, Any] = (-1, None)
+        self._messages = enumerate(self._bag.read([self._topic]))
+        self._position = -1
+        self._ahead: dict[int, Message] = {}
+
+    def _message(self, number: int) -> Message:
+        """Return a message by its number. Those passed on the way are kept if a later frame needs them."""
+        if number <= self._position and number not in self._ahead:
+            self._rewind()
+        while self._position < number:
+            self._position, message = next(self._messages)
+            if self._position in self._last_frame:
+                self._ahead[self._position] = message
+        return self._ahead[number]
 
     def __len__(self) -> int:
-        return len(self._at)
+        return len(self.t_us)
 
     @overload
     def __getitem__(self, frame: int) -> Any: ...
@@ -228,14 +304,22 @@ class _Stream(Sequence[Any]):
     def __getitem__(self, frame: slice) -> Sequence[Any]: ...
     def __getitem__(self, frame: int | slice) -> Any:
         assert isinstance(frame, int)
-        self._tick()
-        if not self._there[frame]:
-            return None
-        if self._current[0] > self._at[frame]:
+        part = None
+        if self._exists[frame]:
+            number = int(self._numbers[frame])
+            message = self._message(number)
+            if self._last_frame[number] == frame:
+                del self._ahead[number]
+            place = f"message {number}, {self.t_us[frame] * 1e-6:.3f} s"
+            part = self._read(place, lambda: self._decode(message.decode()))
+        return part
+
+    def check(self) -> None:
+        """Check that one of the messages can be read.
+
+        Raises:
+            InputError: none can.
+        """
+        if any(self[frame] is not None for frame in range(len(self))):
             self._rewind()
-        while self._current[0] < self._at[frame]:
-            self._current = next(self._messages)
-        try:
-            return self._decode(self._current[1])
-        except InputError as error:
-            raise InputError(f"{self._topic}, message {self._current[0]}: {error}") from error
+        self._read.check()

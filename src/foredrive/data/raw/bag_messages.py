@@ -1,16 +1,15 @@
 """Reading of single messages of ROS and Foxglove into arrays: images, calibrations, points, poses."""
 
-import io
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
 import cv2
 import numpy as np
-from jaxtyping import Float64, UInt8
-from PIL import Image
+from jaxtyping import Float64, Shaped, UInt8
 from scipy.spatial.transform import Rotation
 
+from foredrive.data.raw.images import decoded, grey_to_rgb
 from foredrive.errors import InputError
 
 _NUMPY_OF_ROS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
@@ -25,7 +24,8 @@ _TO_RGB = {
     "8UC3": cv2.COLOR_BGR2RGB,
     "mono8": cv2.COLOR_GRAY2RGB,
     "8UC1": cv2.COLOR_GRAY2RGB,
-    "mono16": cv2.COLOR_GRAY2RGB,
+    "mono16": None,
+    "16UC1": None,
     "bayer_rggb8": cv2.COLOR_BayerRGGB2RGB,
     "bayer_bggr8": cv2.COLOR_BayerBGGR2RGB,
     "bayer_gbrg8": cv2.COLOR_BayerGBRG2RGB,
@@ -37,10 +37,18 @@ _TO_RGB = {
 }
 """OpenCV's conversions of ROS' and Foxglove's encodings. A Bayer pattern is named by its first two rows."""
 _CHANNELS = {"rgb8": 3, "bgr8": 3, "8UC3": 3, "rgba8": 4, "bgra8": 4}
+_DEEP = ("mono16", "16UC1")
 _PAIRED = ("uyvy", "yuv422", "yuyv", "yuv422_yuy2")
-_MAX_RELATIVE_S = 1e4
 _INTENSITY, _CHANNEL = ("intensity", "i", "reflectivity"), ("ring", "channel", "line", "laser_id")
 _TIMES = ("t", "time", "timestamp", "time_stamp", "offset_time", "time_offset")
+UNITS_NS = {"s": 10**9, "ms": 10**6, "us": 1000, "ns": 1}
+_MAX_SHARE, _MIN_SHARE = 1.5, 0.05
+"""The times of the points of a sweep cover more and less than these shares of the time between sweeps."""
+_MAX_OFF_STAMP_S = 1.0
+"""Largest difference of the time of a point and the stamp of its message."""
+_MIN_RESOLUTION_S = 1e-3
+"""Absolute times in 32 bits have a resolution of minutes."""
+_DAY_S = 86_400.0
 
 
 @dataclass(frozen=True)
@@ -60,8 +68,8 @@ class Cloud:
     xyz_m: Float64[np.ndarray, "N 3"]
     intensity: Float64[np.ndarray, "N"] | None
     """As stored."""
-    dt_s: Float64[np.ndarray, "N"] | None
-    """Since the stamp of the message."""
+    times: Shaped[np.ndarray, "N"] | None
+    """As stored; `seconds_since_stamp` knows their unit and origin."""
     channel: Float64[np.ndarray, "N"] | None
 
 
@@ -90,20 +98,39 @@ def frame_of(message: Any) -> str:
     return str(name).lstrip("/")
 
 
-def read_image(message: Any) -> UInt8[np.ndarray, "H W 3"]:
+def read_image(message: Any, value_range: tuple[float, float] | None = None) -> UInt8[np.ndarray, "H W 3"]:
     """Return an image as RGB.
+
+    Args:
+        message: an Image, CompressedImage or RawImage.
+        value_range: values of an image with 16 bits that become 0 and 255.
+
+    Raises:
+        InputError: the encoding is not known, the data do not fit it, or 16 bits have no range.
+    """
+    pixels = read_pixels(message)
+    if pixels.ndim == 3:
+        return pixels
+    if value_range is None:
+        raise InputError(
+            f"an image of 16 bits ({pixels.min()} to {pixels.max()}); the YAML needs its `value_range`"
+        )
+    return grey_to_rgb(pixels, value_range)
+
+
+def read_pixels(message: Any) -> Shaped[np.ndarray, "H W *channels"]:
+    """Return an image as uint8 RGB [H, W, 3], or as grey [H, W] if it has 16 bits.
 
     Raises:
         InputError: the encoding is not known, or the data do not fit it.
     """
     if not hasattr(message, "encoding"):
-        with Image.open(io.BytesIO(bytes(message.data))) as opened:
-            return np.asarray(opened.convert("RGB"))
+        return decoded(bytes(message.data))
     encoding = message.encoding
     if encoding not in _TO_RGB:
         raise InputError(f"images of encoding {encoding!r} are not read; there are: {', '.join(_TO_RGB)}")
     step, height, width = int(message.step), int(message.height), int(message.width)
-    depth = np.dtype("u2" if encoding == "mono16" else "u1")
+    depth = np.dtype("u2" if encoding in _DEEP else "u1")
     channels = 2 if encoding in _PAIRED else _CHANNELS.get(encoding, 1)
     data = np.frombuffer(bytes(message.data), np.uint8)
     row = width * channels * depth.itemsize
@@ -112,7 +139,7 @@ def read_image(message: Any) -> UInt8[np.ndarray, "H W 3"]:
     pixels = np.ascontiguousarray(data.reshape(height, step)[:, :row])
     if depth.itemsize == 2:
         big = bool(getattr(message, "is_bigendian", 0))
-        pixels = (pixels.view(depth.newbyteorder(">" if big else "<")) >> 8).astype(np.uint8)
+        return pixels.view(depth.newbyteorder(">" if big else "<")).reshape(height, width)
     pixels = pixels.reshape((height, width) if channels == 1 else (height, width, channels))
     code = _TO_RGB[encoding]
     return pixels if code is None else np.asarray(cv2.cvtColor(pixels, code))
@@ -129,7 +156,8 @@ def read_calibration(message: Any) -> Calibration:
     model = message.distortion_model
     if K.size != 9 or not np.isfinite(K).all() or K[0] <= 0 or K[4] <= 0:
         raise InputError(f"a camera without a calibration (K is {K.tolist()})")
-    if dist.any() and (model not in ("plumb_bob", "rational_polynomial", "") or dist[5:].any()):
+    # Without coefficients an equidistant lens is still a fisheye, so its name alone decides.
+    if model not in ("plumb_bob", "rational_polynomial", "") or dist[5:].any():
         raise InputError(f"lenses of the model {model!r} are not read; undistort the images first")
     K = K.reshape(3, 3)
     K[:2, 2] += 0.5
@@ -159,7 +187,7 @@ def read_cloud(message: Any) -> Cloud:
     return Cloud(
         xyz[kept],
         None if intensity is None else intensity.astype(np.float64),
-        _since_stamp_s(column(_TIMES), stamp_us(message)),
+        column(_TIMES),
         None if channel is None else channel.astype(np.float64),
     )
 
@@ -189,20 +217,51 @@ def _cells(message: Any) -> np.ndarray:
     return np.frombuffer(data, np.dtype(layout), count)  # type: ignore[call-overload]
 
 
-def _since_stamp_s(times: np.ndarray | None, stamp_us: int) -> Float64[np.ndarray, "N"] | None:
-    """Return times since the message's stamp. Whole numbers are ns; large ones count from the epoch."""
-    if times is None or not times.size:
+def time_unit(times: Shaped[np.ndarray, "N"], stamp_us: int, period_s: float) -> str | None:
+    """Return the unit of the times of a sweep's points, or None if they fit no unit.
+
+    Absolute times lie around the stamp of the message, and relative ones cover about the time between two
+    sweeps. Relative times that are much shorter, as of a flash lidar, are ns where they are whole numbers and
+    s elsewhere.
+
+    Args:
+        times: as stored.
+        stamp_us: stamp of their message, µs.
+        period_s: time between two sweeps.
+    """
+    values = times.astype(np.float64)
+    if not values.size or not np.isfinite(values).all():
         return None
-    if times.dtype.kind in "iu":
-        largest_s = float(np.abs(times.astype(np.float64)).max()) * 1e-9
-        since = times.astype(np.int64) - (stamp_us * 1000 if largest_s > _MAX_RELATIVE_S else 0)
-        return since * 1e-9
-    seconds = times.astype(np.float64)
-    if not np.isfinite(seconds).all():
-        return None
-    if np.abs(seconds).max() <= _MAX_RELATIVE_S:
-        return seconds
-    return seconds - stamp_us * 1e-6
+    largest = float(np.abs(values).max())
+    step = float(np.spacing(np.abs(times).max())) if times.dtype.kind == "f" else 1.0
+    for unit, ns in UNITS_NS.items():
+        off_s = float(np.abs(values * (ns * 1e-9) - stamp_us * 1e-6).max())
+        if off_s <= _MAX_OFF_STAMP_S < largest * ns * 1e-9 and step * ns * 1e-9 < _MIN_RESOLUTION_S:
+            return unit
+    fitting = [unit for unit, ns in UNITS_NS.items() if largest * ns * 1e-9 <= _MAX_SHARE * period_s]
+    if fitting and largest * UNITS_NS[fitting[0]] * 1e-9 >= _MIN_SHARE * period_s:
+        return fitting[0]
+    usual = "ns" if times.dtype.kind in "iu" else "s"
+    return usual if usual in fitting else None
+
+
+def seconds_since_stamp(times: Shaped[np.ndarray, "N"], stamp_us: int, unit: str) -> Float64[np.ndarray, "N"]:
+    """Return the times of points since the stamp of their message. Times beyond a day are absolute.
+
+    Raises:
+        InputError: a time is not finite, or far from the stamp.
+    """
+    ns = UNITS_NS[unit]
+    values = times.astype(np.float64)
+    absolute = bool(values.size) and np.abs(values).max() * ns * 1e-9 > _DAY_S
+    if absolute and times.dtype.kind in "iu":  # exact, as whole numbers of ns
+        since_s = (times.astype(np.int64) * ns - stamp_us * 1000) * 1e-9
+    else:
+        since_s = (values - (stamp_us * 1000 / ns if absolute else 0.0)) * (ns * 1e-9)
+    if not np.isfinite(since_s).all() or np.abs(since_s).max(initial=0.0) > _MAX_OFF_STAMP_S:
+        furthest_s = float(np.abs(since_s).max())
+        raise InputError(f"point times in {unit} that are up to {furthest_s:g} s away from the stamp")
+    return since_s
 
 
 def read_placed(message: Any) -> Iterator[Placed]:

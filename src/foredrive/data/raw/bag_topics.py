@@ -1,19 +1,45 @@
 """The YAML that says which topics of a bag are cameras, lidar and poses, and a proposal of it."""
 
 import itertools
-from collections.abc import Iterator
+import math
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any, Literal, TypeVar
 
 import yaml
-from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    FiniteFloat,
+    PositiveFloat,
+    TypeAdapter,
+    ValidationError,
+    field_validator,
+    model_validator,
+)
 
+from foredrive.data.notices import collecting
 from foredrive.data.raw.bag_files import Bag, Topic, open_bag
-from foredrive.data.raw.bag_messages import Placed, read_cloud, read_placed
+from foredrive.data.raw.bag_messages import (
+    Placed,
+    frame_of,
+    read_cloud,
+    read_pixels,
+    read_placed,
+    stamp_us,
+    time_unit,
+)
 from foredrive.data.raw.frame_tree import FrameTree
 from foredrive.errors import InputError
 from foredrive.files import atomic_path
 
+T = TypeVar("T")
 _EGO_NAMES = ("base_link", "base_footprint", "ego", "ego_vehicle", "vehicle", "imu_link", "imu")
+_RANGE_IMAGES = 10
+"""Images whose values are looked at for the range of a camera with 16 bits."""
+DEFAULT_PERIOD_S = 0.1
+"""Time between sweeps where there is one alone."""
 _WORLD_NAMES = ("map", "odom", "world", "global", "earth", "utm")
 
 
@@ -21,24 +47,66 @@ class _Strict(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
+class Intrinsics(_Strict):
+    """Calibration of a camera as a CameraInfo has it: px, pixel centres at whole numbers."""
+
+    fx: PositiveFloat
+    fy: PositiveFloat
+    cx: FiniteFloat
+    cy: FiniteFloat
+    distortion: tuple[FiniteFloat, ...] = Field((), max_length=5)
+    """OpenCV's k1 k2 p1 p2 k3."""
+
+
+class Mount(_Strict):
+    """Pose of a sensor's frame in `ego_frame`, for bags whose transforms lack it."""
+
+    position_m: tuple[FiniteFloat, FiniteFloat, FiniteFloat]
+    quaternion_wxyz: tuple[FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat]
+
+    @field_validator("quaternion_wxyz")
+    @classmethod
+    def _is_rotation(cls, quaternion: tuple[float, ...]) -> tuple[float, ...]:
+        if not 0.9 < math.hypot(*quaternion) < 1.1:
+            raise ValueError("a rotation is a quaternion of length 1")
+        return quaternion
+
+
 class CameraTopics(_Strict):
     """The topics of one camera."""
 
     images: str
-    info: str
+    info: str | None = None
+    """Topic of its CameraInfo. None: `intrinsics` are given."""
+    intrinsics: Intrinsics | None = None
     frame: str | None = None
     """The optical frame: x to the right, y down, z ahead. None: as the images say."""
+    mount: Mount | None = None
+    """Pose of the optical frame. None: as the transforms say."""
+    value_range: tuple[FiniteFloat, FiniteFloat] | None = None
+    """Values of images of 16 bits that become 0 and 255."""
+
+    @model_validator(mode="after")
+    def _has_calibration(self) -> "CameraTopics":
+        if (self.info is None) == (self.intrinsics is None):
+            raise ValueError("a camera needs either the topic `info` or its `intrinsics`")
+        return self
 
 
 class LidarTopic(_Strict):
     """The topic of the lidar."""
 
     topic: str
-    intensity_max: float = 255.0
+    intensity_max: PositiveFloat = 255.0
     """Stored intensity that is 1."""
+    point_times: Literal["s", "ms", "us", "ns", "none"] | None = None
+    """Unit of the points' times, absolute or since the message's stamp; "none": they are not used. None: the
+    unit that fits."""
     compensated: bool = False
     """True if the driver of the lidar has removed the vehicle's motion within a sweep."""
     frame: str | None = None
+    mount: Mount | None = None
+    """Pose of the lidar's frame. None: as the transforms say."""
 
 
 class BagTopics(_Strict):
@@ -84,90 +152,202 @@ def read_topics(file: Path) -> BagTopics:
 def propose_topics(bag: Path, file: Path) -> str:
     """Write a YAML of what a bag holds, and return it. An existing file is not replaced.
 
+    Its comments list all topics, and say of those with images, points or poses that are not used why.
+
     Raises:
         InputError: the file is there, or the bag cannot be read or has no images and points.
     """
     if file.exists():
         raise InputError(f"{file}: is there already; remove it to propose topics anew")
-    with open_bag(bag) as opened:
-        found = _proposal(opened, bag)
-        lines = [f"# {topic.name}: {topic.type}, {topic.count} messages" for topic in opened.topics.values()]
+    with open_bag(bag) as opened, collecting():
+        proposal = _Proposal(opened)
+        topics = proposal.topics(bag)
+        lines = [
+            f"# {topic.name}: {topic.type}, {topic.count} messages{proposal.reason(topic)}"
+            for topic in sorted(opened.topics.values(), key=lambda one: one.name)
+        ]
     text = "\n".join(
-        [f"# Topics of {bag.name}, proposed by foredrive convert rosbag; all topics:", *sorted(lines), ""]
-    ) + yaml.safe_dump(found.model_dump(exclude_defaults=True), sort_keys=False)
+        [
+            f"# Topics of {bag.name}, proposed by foredrive convert rosbag; all topics:",
+            *lines,
+            yaml.safe_dump(topics.model_dump(exclude_defaults=True), sort_keys=False),
+            *proposal.hints,
+        ]
+    )
     with atomic_path(file) as temporary:
         temporary.write_text(text)
     return text
 
 
-def _proposal(bag: Bag, path: Path) -> BagTopics:
-    by_kind: dict[str, list[Topic]] = {}
-    for topic in bag.topics.values():
-        if topic.kind is not None and topic.count:
-            by_kind.setdefault(topic.kind, []).append(topic)
-    if not {"image", "points"} & set(by_kind):
-        raise InputError(
-            f"{path}: no topic with images or points; there are: {', '.join(bag.topics) or 'none'}"
+class _Proposal:
+    """The use of a bag's topics, found by their types, names and first messages."""
+
+    def __init__(self, bag: Bag) -> None:
+        self._bag = bag
+        self._left_out: dict[str, str] = {}
+        self.hints: list[str] = []
+        """Comments with entries that a user may complete."""
+
+    def reason(self, topic: Topic) -> str:
+        """Return why a topic is left out, for behind its name."""
+        if topic.kind is None:
+            return "; messages of this type are not read"
+        return f"; left out: {self._left_out[topic.name]}" if topic.name in self._left_out else ""
+
+    def topics(self, path: Path) -> BagTopics:
+        """Return the proposal.
+
+        Raises:
+            InputError: there are neither images nor points.
+        """
+        by_kind: dict[str, list[Topic]] = {}
+        for topic in self._bag.topics.values():
+            if topic.kind is not None and topic.count:
+                by_kind.setdefault(topic.kind, []).append(topic)
+        if not {"image", "points"} & set(by_kind):
+            names = ", ".join(self._bag.topics) or "none"
+            raise InputError(f"{path}: no topic with images or points; there are: {names}")
+        world, ego, pose = self._poses(by_kind)
+        lidar = max(by_kind.get("points", []), key=lambda one: one.count, default=None)
+        for topic in by_kind.get("points", []):
+            if topic is not lidar:
+                self._left_out[topic.name] = "one lidar is read"
+        return BagTopics(
+            name=_plain(path.stem),
+            world_frame=world,
+            ego_frame=ego,
+            pose=pose,
+            cameras=dict(self._cameras(by_kind.get("image", []), by_kind.get("info", []))),
+            lidar=None if lidar is None else self._lidar(lidar),
         )
-    pose = next((one.name for kind in ("odometry", "pose") for one in by_kind.get(kind, [])), None)
-    names = [one.name for kind in ("tf", "odometry", "pose") for one in by_kind.get(kind, [])]
-    placed = [one for _, message in bag.read(names) for one in read_placed(message)]
-    world, ego = _world_and_ego(placed, pose is not None)
-    lidar = max(by_kind.get("points", []), key=lambda one: one.count, default=None)
-    return BagTopics(
-        name=_plain(path.stem),
-        world_frame=world,
-        ego_frame=ego,
-        pose=pose,
-        cameras=dict(_cameras(by_kind.get("image", []), by_kind.get("info", []), bag)),
-        lidar=None if lidar is None else _lidar(lidar, bag),
-    )
+
+    def _first(self, topic: str, count: int = 1) -> list[Any]:
+        """Return the first messages of a topic that can be decoded."""
+        contents = (_attempt(message.decode) for message in self._bag.read([topic]))
+        return list(itertools.islice((content for content in contents if content is not None), count))
+
+    def _poses(self, by_kind: dict[str, list[Topic]]) -> tuple[str, str, str | None]:
+        """Return the frames of the world and the vehicle, and the topic of poses if one is needed.
+
+        The frames are those of the usual names, else the first that moves. A topic of poses in a frame that
+        moves with the vehicle tells nothing of its path.
+        """
+        tf: list[Placed] = []
+        for message in self._bag.read([one.name for one in by_kind.get("tf", [])]):
+            content = _attempt(message.decode)
+            tf += [] if content is None else _attempt(_placed, content) or []
+        candidates: dict[str, Placed] = {}
+        for topic in [*by_kind.get("odometry", []), *by_kind.get("pose", [])]:
+            for content in self._first(topic.name):
+                placed = _attempt(_placed, content)
+                candidates |= {topic.name: placed[0]} if placed else {}
+        stated = [*tf, *(one for one in candidates.values() if one.child)]
+        tree = FrameTree(stated)
+        names = {name.lower(): name for name in sorted(tree.frames)}
+        ego = next((names[name] for name in _EGO_NAMES if name in names), None)
+        ego = ego or (stated[0].child if stated else _EGO_NAMES[0])
+        pose = None
+        for topic_name, one in candidates.items():
+            if one.parent == ego or tree.is_below(one.parent, ego):
+                self._left_out[topic_name] = f"its frame {one.parent} moves with {ego}"
+            elif pose is None:
+                pose = topic_name
+            else:
+                self._left_out[topic_name] = f"poses are those of {pose}"
+        if pose is not None:
+            return candidates[pose].parent, ego, pose
+        above = [name for name in _WORLD_NAMES if name in names and tree.is_below(ego, names[name])]
+        world = names[above[0]] if above else (stated[0].parent if stated else _WORLD_NAMES[0])
+        return world, ego, None
+
+    def _cameras(self, images: list[Topic], infos: list[Topic]) -> Iterator[tuple[str, CameraTopics]]:
+        """Yield a camera for each topic of images that has a calibration of its own."""
+        used: dict[str, str] = {}
+        names: set[str] = set()
+        frames = {topic.name: [frame_of(content) for content in self._first(topic.name)] for topic in infos}
+        for topic in sorted(images, key=lambda one: (not one.type.endswith("CompressedImage"), one.name)):
+            first = self._first(topic.name)
+            if not first:
+                self._left_out[topic.name] = "none of its messages can be read"
+                continue
+            frame = [frame_of(content) for content in first]
+            info = _calibration_of(topic.name, frame, frames)
+            name = _camera_name(topic.name, names)
+            if info is None:
+                self._left_out[topic.name] = "it has no CameraInfo"
+                self.hints += [
+                    f"# {topic.name} has no CameraInfo. It is a camera with a calibration as of one:",
+                    "# cameras:",
+                    f"#   {name}: {{images: {topic.name}, intrinsics: {{fx: , fy: , cx: , cy: }}}}",
+                ]
+            elif info in used:
+                self._left_out[topic.name] = f"the same camera as {used[info]}"
+            else:
+                used[info] = topic.name
+                names.add(name)
+                yield name, CameraTopics(images=topic.name, info=info, value_range=self._range(topic.name))
+
+    def _range(self, topic: str) -> tuple[float, float] | None:
+        """Return the smallest and the largest value of some images of 16 bits, or None for others."""
+        read = (_attempt(read_pixels, content) for content in self._first(topic, _RANGE_IMAGES))
+        grey = [pixels for pixels in read if pixels is not None]
+        if not grey or grey[0].ndim == 3:
+            return None
+        return float(min(pixels.min() for pixels in grey)), float(max(pixels.max() for pixels in grey))
+
+    def _lidar(self, topic: Topic) -> LidarTopic:
+        first = self._first(topic.name, 2)
+        if not first:
+            raise InputError(f"{topic.name}: none of its messages can be read")
+        cloud = read_cloud(first[0])
+        largest = 0.0 if cloud.intensity is None or not cloud.intensity.size else float(cloud.intensity.max())
+        scale = next((scale for scale in (1.0, 255.0, 65_535.0) if largest <= scale), largest)
+        stamps_us = [stamp_us(content) for content in first]
+        period_s = (stamps_us[-1] - stamps_us[0]) * 1e-6 or DEFAULT_PERIOD_S
+        unit = None if cloud.times is None else time_unit(cloud.times, stamps_us[0], period_s)
+        return LidarTopic(
+            topic=topic.name,
+            intensity_max=scale,
+            point_times=unit,  # type: ignore[arg-type]
+            compensated=cloud.times is None,
+        )
 
 
-def _world_and_ego(placed: list[Placed], has_pose: bool) -> tuple[str, str]:
-    """Return the frames of the world and of the vehicle: by their usual names, else the first that moves."""
-    own = [one for one in placed if not one.child]
-    frames = FrameTree(one for one in placed if one.child).frames
-    lower = {name.lower(): name for name in sorted(frames)}
-    ego = next((lower[name] for name in _EGO_NAMES if name in lower), None)
-    world = next((lower[name] for name in _WORLD_NAMES if name in lower), None)
-    if has_pose and own:
-        world = own[0].parent
-    moving = [one for one in placed if one.child]
-    if ego is None or world is None:
-        ego = ego or (moving[0].child if moving else "base_link")
-        world = world or (moving[0].parent if moving else "map")
-    return world, ego
+def _attempt(read: Callable[..., T], *message: Any) -> T | None:
+    """Return what a function reads of a message, or None if that is damaged; the conversion names it."""
+    try:
+        return read(*message)
+    except Exception:  # foreign decoders raise errors of any class
+        return None
 
 
-def _cameras(images: list[Topic], infos: list[Topic], bag: Bag) -> Iterator[tuple[str, CameraTopics]]:
-    """Yield a camera for each topic of images with the calibration that shares most of its name."""
-    taken: set[str] = set()
-    for topic in sorted(images, key=lambda one: (not one.type.endswith("CompressedImage"), one.name)):
-        info = max(infos, key=lambda one: _shared(one.name, topic.name), default=None)
-        if info is None or info.name in taken:
-            continue
-        taken.add(info.name)
-        parts = [part for part in topic.name.split("/") if part]
-        kinds = ("image", "compressed", "raw", "color", "rect", "rgb")
-        named = [part for part in parts if not any(part.startswith(kind) for kind in kinds)]
-        yield _plain(named[-1] if named else parts[-1]), CameraTopics(images=topic.name, info=info.name)
+def _placed(content: Any) -> list[Placed]:
+    return list(read_placed(content))
 
 
-def _lidar(topic: Topic, bag: Bag) -> LidarTopic:
-    _, message = next(bag.read([topic.name]))
-    cloud = read_cloud(message)
-    largest = 0.0 if cloud.intensity is None or not cloud.intensity.size else float(cloud.intensity.max())
-    scale = next((scale for scale in (1.0, 255.0, 65_535.0) if largest <= scale), largest)
-    return LidarTopic(topic=topic.name, intensity_max=scale, compensated=cloud.dt_s is None)
+def _calibration_of(images: str, frame: list[str], frames: dict[str, list[str]]) -> str | None:
+    """Return the topic of CameraInfo that belongs to a topic of images.
+
+    That is the one in the nearest namespace around it. One in the root, or in another namespace, could belong
+    to any camera, so it must name the same frame.
+    """
+    spaces = {info: info.rpartition("/")[0] for info in frames}
+    around = [info for info, space in spaces.items() if space and images.startswith(f"{space}/")]
+    if around:
+        return max(around, key=lambda info: len(spaces[info]))
+    return next((info for info, named in frames.items() if named and named == frame and named[0]), None)
 
 
-def _shared(first: str, second: str) -> int:
-    """Return the number of leading parts that two topics share."""
-    pairs = zip(first.split("/"), second.split("/"), strict=False)
-    return len(list(itertools.takewhile(lambda pair: pair[0] == pair[1], pairs)))
+def _camera_name(topic: str, used: set[str]) -> str:
+    """Return a name for the camera of a topic: the last part that is no word for images."""
+    parts = [part for part in topic.split("/") if part]
+    kinds = ("image", "compressed", "raw", "color", "rect", "rgb")
+    named = [part for part in parts if not any(part.startswith(kind) for kind in kinds)]
+    name = _plain(named[-1] if named else parts[-1])
+    return name if name not in used else _plain("_".join(parts))
 
 
 def _plain(name: str) -> str:
     """Return a name of letters, digits, dots, dashes and underscores."""
-    return "".join(each if each.isalnum() or each in "._-" else "_" for each in name).lstrip(".") or "bag"
+    letters = "".join(letter if letter.isalnum() or letter in "._-" else "_" for letter in name)
+    return letters.lstrip(".") or "bag"

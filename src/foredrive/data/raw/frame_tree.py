@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from foredrive.data.ego_path import interpolated_poses
+from foredrive.data.notices import note
 from foredrive.data.raw.bag_messages import Placed
 from foredrive.errors import InputError
 
@@ -21,8 +22,14 @@ class FrameTree:
         self._parent: dict[str, str] = {}
         poses: dict[str, dict[int, np.ndarray]] = {}
         for one in placed:
-            if self._parent.setdefault(one.child, one.parent) == one.parent and one.child != one.parent:
+            if one.child == one.parent:
+                continue
+            parent = self._parent.setdefault(one.child, one.parent)
+            if parent == one.parent:
                 poses.setdefault(one.child, {})[one.t_us] = one.T_parent_child
+            else:
+                place = f"{one.child} in {one.parent}, at {one.t_us * 1e-6:.3f} s"
+                note("transforms", f"second parents of a frame, beside {parent}, left out", place)
         self._times = {child: np.array(sorted(found), np.int64) for child, found in poses.items()}
         self._poses = {
             child: np.stack([poses[child][t_us] for t_us in times.tolist()])
@@ -33,6 +40,10 @@ class FrameTree:
     def frames(self) -> set[str]:
         """Return the names of all frames."""
         return set(self._parent) | set(self._parent.values())
+
+    def is_below(self, frame: str, top: str) -> bool:
+        """Return whether a frame is attached to another, over any number of frames."""
+        return frame != top and top in {self._parent[one] for one in self._chain(frame)}
 
     def span_us(self, top: str, frame: str) -> tuple[int, int]:
         """Return the times between which all moving frames from `frame` up to `top` have poses."""

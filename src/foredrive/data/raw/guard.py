@@ -65,6 +65,7 @@ class PartReader:
     def __init__(self, subject: str, parts: str) -> None:
         self._subject, self._parts = subject, parts
         self._first: str | None = None
+        self._faults: set[str] = set()
         self._whole = 0
 
     def __call__(self, place: str, read: Callable[[], T]) -> T | None:
@@ -81,7 +82,9 @@ class PartReader:
                 raise
             fault = f"{place}: {_reason(error)}"
             self._first = self._first or fault
-            note(self._subject, f"unreadable {self._parts}, left out", fault)
+            if fault not in self._faults:  # a part may be asked for again
+                self._faults.add(fault)
+                note(self._subject, f"unreadable {self._parts}, left out", fault)
             return None
         self._whole += 1
         return part

@@ -19,12 +19,12 @@ def decoded(image: Path | str | bytes) -> Shaped[np.ndarray, "H W *channels"]:
     Raises:
         InputError: it cannot be decoded.
     """
-    name = "an image" if isinstance(image, bytes) else image
+    name = "" if isinstance(image, bytes) else f"{image}: "
     try:
         with Image.open(io.BytesIO(image) if isinstance(image, bytes) else image) as opened:
             return np.asarray(opened if opened.mode in _DEEP_MODES else opened.convert("RGB"))
     except (OSError, UnidentifiedImageError, Image.DecompressionBombError, SyntaxError, ValueError) as error:
-        raise InputError(f"{name}: cannot read the image: {error}") from error
+        raise InputError(f"{name}cannot read the image: {error}") from error
 
 
 def read_rgb(
