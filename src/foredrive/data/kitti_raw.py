@@ -286,8 +286,10 @@ def _record(file: Path, t_us: int) -> list[float]:
         InputError: the record lacks one of them, or has no time.
     """
     values = [float(word) for word in file.read_text(encoding="utf-8-sig").split()[:6]]
-    if len(values) < 6 or not np.isfinite(values).all() or not t_us:
-        raise InputError("not six finite numbers with a time")
+    if len(values) < 6 or not np.isfinite(values).all():
+        raise InputError("not six finite numbers")
+    if not t_us:
+        raise InputError("oxts/timestamps.txt has no time of it")
     return values
 
 

@@ -37,6 +37,7 @@ from foredrive.data.raw.bag_topics import (
 )
 from foredrive.data.raw.frame_tree import FrameTree
 from foredrive.data.raw.guard import PartReader
+from foredrive.data.raw.images import check_size
 from foredrive.data.raw.raw_log import RawLog
 from foredrive.errors import InputError
 
@@ -97,7 +98,7 @@ class BagLog:
                 T_ego_cam = mounted(camera.images, camera.frame, camera.mount)
                 spec = CameraSpec(name, calibration.K, T_ego_cam, calibration.size_hw, dist=calibration.dist)
                 cameras.append(spec)
-                read = functools.partial(_sized_image, size_hw=spec.size_hw, value_range=camera.value_range)
+                read = functools.partial(_image, size_hw=spec.size_hw, value_range=camera.value_range)
                 stream = _Stream(bag, camera.images, index.stamps[camera.images], times_us, read)
                 images[name], image_t_s[name] = stream, stream.t_us * 1e-6
                 if camera.value_range is not None:
@@ -236,14 +237,10 @@ def _matrix(mount: Mount) -> Float64[np.ndarray, "4 4"]:
     return T
 
 
-def _sized_image(
+def _image(
     message: Any, *, size_hw: tuple[int, int], value_range: tuple[float, float] | None
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """Return an image, which must have the size of the calibration."""
-    image = read_image(message, value_range)
-    if image.shape[:2] != size_hw:
-        raise InputError(f"an image of {image.shape[:2]}, but the calibration is of {size_hw}")
-    return image
+    return check_size(read_image(message, value_range), size_hw)
 
 
 class _Stream(Sequence[Any]):

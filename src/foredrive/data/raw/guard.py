@@ -46,8 +46,10 @@ def reading_raw(source: Path) -> Iterator[None]:
     with _noting_opened(source):
         try:
             yield
-        except InputError:
-            raise
+        except InputError as error:
+            if source.name in str(error):
+                raise
+            raise InputError(f"{source}: {error}") from error
         except Exception as error:
             if isinstance(error, OSError) and error.errno in REFUSES_WRITING:
                 raise

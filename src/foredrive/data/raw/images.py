@@ -57,3 +57,16 @@ def grey_to_rgb(
     share = (pixels.astype(np.float64) - low) / max(high - low, 1e-12)
     grey = np.round(255 * share.clip(0, 1)).astype(np.uint8)
     return np.repeat(grey[..., None], 3, axis=-1)
+
+
+def check_size(image: UInt8[np.ndarray, "H W 3"], size_hw: tuple[int, int]) -> UInt8[np.ndarray, "H W 3"]:
+    """Return an image, which must have the size of its camera's calibration.
+
+    Raises:
+        InputError: it has another one.
+    """
+    if image.shape[:2] != size_hw:
+        (height, width), (rows, columns) = size_hw, image.shape[:2]
+        calibrated = f"the calibration is of {width} x {height} px"
+        raise InputError(f"an image of {columns} x {rows} px; {calibrated}")
+    return image

@@ -1,39 +1,51 @@
 """Folders with a transforms.json of nerfstudio: images with poses and pinhole calibrations.
 
 A camera's frame there has x to the right, y up and z back (OpenGL), and the world's z is up. There is no
-vehicle: the ego frame is that of a vehicle that carries the camera level at `HEIGHT_M` and looks ahead along
-it. Lengths are the file's units, which are metres only if its poses were scaled so.
+vehicle: the ego frame is that of a vehicle that carries the camera with most images level at `HEIGHT_M` and
+looks ahead along it. Lengths are the file's units, which are metres only if its poses were scaled so. Which
+image is of which camera is found by `camera_split`.
 """
 
-import itertools
 import json
 import os
-from collections.abc import Callable, Iterator
+import re
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, overload
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float64, Int64, UInt8
 from py123d.datatypes import LogMetadata
 
 from foredrive.data.camera_streams import CameraSpec
+from foredrive.data.ego_path import interpolated_poses
 from foredrive.data.log_paths import LogPath
+from foredrive.data.notices import note
 from foredrive.data.own_logs import write_log
+from foredrive.data.raw.camera_split import PosedImage, RigCamera, split_into_cameras
+from foredrive.data.raw.guard import PartReader
+from foredrive.data.raw.images import check_size, decoded, read_rgb
 from foredrive.data.raw.raw_log import RawLog, folders_with
 from foredrive.errors import InputError
 
-HEIGHT_M, PERIOD_S = 1.5, 0.1
-"""Height of the camera above the ground, and the time between frames without times."""
+HEIGHT_M = 1.5
+"""Height of the camera above the ground."""
 
 _SPLIT = "own_train"
 _FILE = "transforms.json"
-_PINHOLE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE")
+_PINHOLE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
+_OTHER_LENS = re.compile("fish|equirect|omni|spheric|panoram|ftheta|f_theta", re.IGNORECASE)
+"""Entries of transforms.json in any dialect that say, if they are set, that a lens is no pinhole."""
 _INTRINSICS = ("w", "h", "fl_x", "fl_y", "cx", "cy")
 _DISTORTION = ("k1", "k2", "p1", "p2", "k3")
+_CAMERA_KEYS = ("camera_id", "camera_name", "camera_label", "camera", "cam_id", "cam", "sensor_id")
+"""Entries of a frame that name its camera."""
 _T_EGO_CAM = np.array([[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, HEIGHT_M], [0, 0, 0, 1]], np.float64)
 _OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+_RANGE_IMAGES, _RANGE_PERCENT = 20, (0.1, 99.9)
+"""Images of a camera with 16 bits whose values are looked at, and the percentiles that become 0 and 255."""
 
 
 def find_nerfstudio(source: Path) -> Iterator[RawLog]:
@@ -53,60 +65,41 @@ class NerfstudioLog:
         return LogMetadata("own", _SPLIT, self.folder.resolve().name, location=None)
 
     def write(self, out: Path, tick: Callable[[], None]) -> LogPath:
-        """Write the images in the order of their times, or of their names where there are none."""
-        frames = sorted(self._frames, key=lambda one: (one.t_s or 0.0, one.file.name))
-        timed = all(one.t_s is not None for one in frames)
-        groups = [
-            list(found) for _, found in itertools.groupby(frames, lambda one: one.t_s if timed else id(one))
-        ]
-        kinds = list(dict.fromkeys(one.intrinsics for one in frames))
-        names = ["front"] if len(kinds) == 1 else [f"camera_{number}" for number in range(len(kinds))]
-        if any(len({one.intrinsics for one in group}) < len(group) for group in groups):
-            raise InputError(f"{self.folder / _FILE}: two images of one camera have the same time")
-        rig = [self._camera(name, kind) for name, kind in zip(names, kinds, strict=True)]
-        if any(len(group) > 1 for group in groups):
-            rig = self._rig(rig, kinds, groups)
-        T_cam_ego = {kind: np.linalg.inv(one.T_ego_cam) for kind, one in zip(kinds, rig, strict=True)}
-        T_world_ego = np.stack([group[0].T_world_cam @ T_cam_ego[group[0].intrinsics] for group in groups])
-        images: dict[str, list[Path | None]] = {name: [] for name in names}
-        for group in groups:
-            files = {one.intrinsics: one.file for one in group}
-            for name, kind in zip(names, kinds, strict=True):
-                images[name].append(files.get(kind))
-            tick()
-        t_s = np.array(
-            [group[0].t_s if timed else PERIOD_S * k for k, group in enumerate(groups)], np.float64
+        """Write the images in the order of their times, or of the numbers in their names without times."""
+        cameras = split_into_cameras(self._frames, str(self.folder / _FILE))
+        base = cameras[0]
+        t_us, T_world_cam = _frames_of(cameras)
+        rig, images, image_t_s = [], {}, {}
+        for camera in cameras:
+            T_ego_cam = _T_EGO_CAM @ camera.T_base_cam
+            spec = _camera(camera.name, camera.lens, T_ego_cam)
+            files, times_us = _beside(camera, t_us)
+            images[camera.name] = _ImageFiles(self.folder, spec, files)
+            images[camera.name].check()
+            image_t_s[camera.name] = times_us * 1e-6
+            rig.append(spec)
+        return write_log(
+            out,
+            self.get_log_metadata().log_name,
+            t_us * 1e-6,
+            T_world_cam @ np.linalg.inv(_T_EGO_CAM),
+            cameras=rig,
+            images=images,
+            image_t_s=image_t_s,
+            path=(base.t_us * 1e-6, base.T_world_cam @ np.linalg.inv(_T_EGO_CAM)),
+            split=_SPLIT,
+            tick=tick,
         )
-        name = self.get_log_metadata().log_name
-        return write_log(out, name, t_s, T_world_ego, cameras=rig, images=images, split=_SPLIT)
-
-    def _camera(self, name: str, intrinsics: tuple[float, ...]) -> CameraSpec:
-        width, height, fx, fy, cx, cy, *dist = intrinsics
-        K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
-        return CameraSpec(name, K, _T_EGO_CAM, (int(height), int(width)), dist=np.array(dist))
-
-    @staticmethod
-    def _rig(
-        rig: list[CameraSpec], kinds: list[tuple[float, ...]], groups: list[list["_Frame"]]
-    ) -> list[CameraSpec]:
-        """Place cameras that are exposed together by their poses at the first time at which all are there."""
-        whole = max(groups, key=len)
-        first = np.linalg.inv(whole[0].T_world_cam)
-        T = {one.intrinsics: _T_EGO_CAM @ first @ one.T_world_cam for one in whole}
-        return [
-            CameraSpec(spec.name, spec.K, T.get(kind, _T_EGO_CAM), spec.size_hw, dist=spec.dist)
-            for spec, kind in zip(rig, kinds, strict=True)
-        ]
 
     @cached_property
-    def _frames(self) -> list["_Frame"]:
+    def _frames(self) -> list[PosedImage]:
         """Read and check the file.
 
         Raises:
             InputError: an entry is missing or wrong, a lens is no pinhole, an image lies elsewhere.
         """
         file = self.folder / _FILE
-        whole = json.loads(file.read_text())
+        whole = json.loads(file.read_bytes())  # bytes may begin with a byte order mark
         if not isinstance(whole, dict) or not isinstance(whole.get("frames"), list) or not whole["frames"]:
             raise InputError(f"{file}: it has no frames")
         return [
@@ -114,31 +107,128 @@ class NerfstudioLog:
         ]
 
 
-@dataclass(frozen=True)
-class _Frame:
-    file: Path
-    T_world_cam: Float64[np.ndarray, "4 4"]
-    t_s: float | None
-    intrinsics: tuple[float, ...]
+class _ImageFiles(Sequence[Any]):
+    """The images of a camera, read when they are asked for. One that cannot be read is None."""
+
+    def __init__(self, folder: Path, spec: CameraSpec, files: list[Path | None]) -> None:
+        self._folder, self._size_hw, self._files = folder, spec.size_hw, files
+        self._read = PartReader(spec.name, "images")
+        self._range = self._value_range(spec.name)
+
+    def __len__(self) -> int:
+        return len(self._files)
+
+    @overload
+    def __getitem__(self, frame: int) -> Any: ...
+    @overload
+    def __getitem__(self, frame: slice) -> Sequence[Any]: ...
+    def __getitem__(self, frame: int | slice) -> Any:
+        assert isinstance(frame, int)
+        file = self._files[frame]
+        return None if file is None else self._read(self._name(file), lambda: self._image(file))
+
+    def check(self) -> None:
+        """Check that one of the images can be read.
+
+        Raises:
+            InputError: none can.
+        """
+        _ = any(self[frame] is not None for frame in range(len(self)))
+        self._read.check()
+
+    def _image(self, file: Path) -> UInt8[np.ndarray, "H W 3"]:
+        return check_size(read_rgb(file, self._range), self._size_hw)
+
+    def _name(self, file: Path) -> str:
+        return os.path.relpath(file, self._folder)
+
+    def _value_range(self, name: str) -> tuple[float, float] | None:
+        """Return the range of grey values of a camera with more than 8 bits, and note it; None for others."""
+        files = [file for file in self._files if file is not None]
+        rows = np.unique(np.linspace(0, len(files) - 1, _RANGE_IMAGES).round().astype(int))
+        read = PartReader(name, "images")
+        values = []
+        for file in [files[row] for row in rows]:
+            pixels = read(self._name(file), lambda file=file: decoded(file))  # type: ignore[misc]
+            if pixels is not None and pixels.ndim == 3:
+                return None
+            values += [] if pixels is None else [pixels.reshape(-1)]
+        if not values:
+            return None
+        low, high = np.percentile(np.concatenate(values), _RANGE_PERCENT)
+        note(name, f"images of more than 8 bits; {low:g} became 0 and {high:g} became 255")
+        return float(low), float(high)
 
 
-def _frame(folder: Path, shared: dict[str, Any], entry: Any, where: str) -> _Frame:
+def _frames_of(cameras: list[RigCamera]) -> tuple[Int64[np.ndarray, "T"], Float64[np.ndarray, "T 4 4"]]:
+    """Return times and poses of the frames: those of the first camera, and of other images between them."""
+    base = cameras[0]
+    half_us = _half_period_us(base.t_us)
+    others = np.unique(np.concatenate([camera.t_us for camera in cameras]))
+    off_us = np.abs(others[:, None] - base.t_us[None]).min(axis=1)
+    inside = (others > base.t_us[0]) & (others < base.t_us[-1])
+    t_us = np.union1d(base.t_us, others[inside & (off_us > half_us)])
+    if len(base.t_us) == 1:
+        return t_us, base.T_world_cam
+    return t_us, interpolated_poses(base.t_us, base.T_world_cam, t_us.astype(np.float64))
+
+
+def _beside(
+    camera: RigCamera, t_us: Int64[np.ndarray, "T"]
+) -> tuple[list[Path | None], Int64[np.ndarray, "T"]]:
+    """Return the image of a camera beside each frame, and its time; that of the frame where there is none."""
+    nearest = np.abs(camera.t_us[None] - t_us[:, None]).argmin(axis=1)
+    near = np.abs(camera.t_us[nearest] - t_us) <= _half_period_us(t_us)
+    files = [
+        camera.files[k] if exists else None for k, exists in zip(nearest.tolist(), near.tolist(), strict=True)
+    ]
+    for file in sorted(set(camera.files) - {file for file in files if file is not None}):
+        note(camera.name, "images without a frame beside them, left out", file.name)
+    return files, np.where(near, camera.t_us[nearest], t_us)
+
+
+def _half_period_us(t_us: Int64[np.ndarray, "T"]) -> float:
+    return 0.5 * float(np.median(np.diff(t_us))) if len(t_us) > 1 else 0.0
+
+
+def _camera(name: str, lens: tuple[float, ...], T_ego_cam: Float64[np.ndarray, "4 4"]) -> CameraSpec:
+    width, height, fx, fy, cx, cy, *dist = lens
+    K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+    return CameraSpec(name, K, T_ego_cam, (int(height), int(width)), dist=np.array(dist))
+
+
+def _frame(folder: Path, shared: dict[str, Any], entry: Any, where: str) -> PosedImage:
     if not isinstance(entry, dict):
         raise InputError(f"{where}: not an object of entries")
-    found = shared | entry
-    model = found.get("camera_model", "OPENCV")
-    if model not in _PINHOLE:
-        raise InputError(f"{where}: cameras of the model {model!r} are not read; undistort the images first")
+    merged = shared | entry
+    _check_lens(merged, where)
     for key in ("file_path", "transform_matrix", *_INTRINSICS):
-        if key not in found:
+        if key not in merged:
             raise InputError(f"{where}: {key} is missing")
-    values = [_number(found.get(key, 0.0), key, where) for key in (*_INTRINSICS, *_DISTORTION)]
+    values = [_number(merged.get(key, 0.0), key, where) for key in (*_INTRINSICS, *_DISTORTION)]
     if min(values[:4]) <= 0:
         raise InputError(f"{where}: sizes and focal lengths must be above 0")
-    if found.get("k4"):
-        raise InputError(f"{where}: k4 is not read; undistort the images first")
-    t_s = next((_number(found[key], key, where) for key in ("timestamp", "time") if key in found), None)
-    return _Frame(_inside(folder, found["file_path"], where), _pose(found, where), t_s, tuple(values))
+    t_s = next((_number(merged[key], key, where) for key in ("timestamp", "time") if key in merged), None)
+    camera = next((str(entry[key]) for key in _CAMERA_KEYS if isinstance(entry.get(key), str | int)), None)
+    file = _inside(folder, merged["file_path"], where)
+    path = os.path.relpath(file, folder)
+    return PosedImage(file, path, _pose(merged, where), t_s, tuple(values), camera)
+
+
+def _check_lens(merged: dict[str, Any], where: str) -> None:
+    """Check that a lens is a pinhole with OpenCV's five coefficients, in the words of any program.
+
+    Raises:
+        InputError: it is another one.
+    """
+    model = str(merged.get("camera_model", "OPENCV"))
+    flags = [key for key, value in merged.items() if _OTHER_LENS.search(key) and value]
+    if model.upper() not in _PINHOLE or flags:
+        what = flags[0] if flags else f"the model {model!r}"
+        raise InputError(f"{where}: cameras of {what} are not read; undistort the images first")
+    for key in ("k4", "k5", "k6"):
+        if merged.get(key):
+            raise InputError(f"{where}: {key} is not read; undistort the images first")
 
 
 def _number(value: Any, key: str, where: str) -> float:
