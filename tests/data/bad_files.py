@@ -5,6 +5,7 @@ import io
 import json
 import os
 import pickle
+import re
 import struct
 from collections.abc import Callable
 from pathlib import Path
@@ -86,6 +87,15 @@ JSON: dict[str, Damage] = TEXT | {
     "texts for numbers": _json(_texts),
     "a huge integer": lambda good: b"9" * 5000,
 }
+
+
+def _laughing(good: bytes) -> bytes:
+    """Give every entry of a YAML file 2^40 values, of which each alias repeats the one before twice."""
+    lists = b", ".join([b"&z0 [x, x]", *(b"&z%d [*z%d, *z%d]" % (k + 1, k, k) for k in range(40))])
+    first, *others = re.findall(rb"^[\w-]+(?=:)", good, flags=re.MULTILINE)
+    return b"%s: &all [%s]\n" % (first, lists) + b"".join(b"%s: *all\n" % name for name in others)
+
+
 YAML: dict[str, Damage] = TEXT | {
     "an object of Python": lambda good: b"!!python/object/apply:os.system ['exit 7']",
     "deep lists": lambda good: b"[" * 20_000,
@@ -93,6 +103,17 @@ YAML: dict[str, Damage] = TEXT | {
     "a list": lambda good: b"- 1\n- 2\n",
     "an unknown entry": lambda good: b"wheels_of_fire: 7\n" + good,
     "an alias without anchor": lambda good: b"a: *nowhere\n",
+    "an alias of itself": lambda good: good + b"more: &a [*a]\n",
+    "laughs in known entries": _laughing,
+    "laughs in merged keys": lambda good: (
+        b"a0: &a0 {x: 1}\n"
+        + b"".join(b"a%d: &a%d {<<: [*a%d, *a%d]}\n" % (k + 1, k + 1, k, k) for k in range(40))
+        + good
+    ),
+    "a date that is none": lambda good: good + b"more: 2001-13-45\n",
+    "a huge integer": lambda good: good + b"more: " + b"9" * 5000 + b"\n",
+    "an entry twice": lambda good: good + re.findall(rb"^[\w-]+:", good, flags=re.MULTILINE)[0] + b" 7\n",
+    "longer than any": lambda good: good + b"#" * 2**21,
     "a billion laughs": lambda good: (
         b"a: &a [x]\n"
         + b"".join(b"%c: &%c [%s]\n" % (98 + k, 98 + k, b",".join([b"*%c" % (97 + k)] * 9)) for k in range(9))

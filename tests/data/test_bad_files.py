@@ -106,6 +106,12 @@ def ros2(root: Path) -> None:
     propose_topics(root / "raw" / "drive.mcap", topics_file(root / "raw" / "drive.mcap"))
 
 
+def ros2_folder(root: Path) -> None:
+    (root / "raw").mkdir()
+    made_bags.write_ros2(root / "raw" / "drive", made_bags.StoragePlugin.MCAP)
+    propose_topics(root / "raw" / "drive", topics_file(root / "raw" / "drive"))
+
+
 def converted(dataset: str) -> Callable[[Path], Any]:
     return lambda root: convert(root / "raw", dataset, root / "out")
 
@@ -253,6 +259,7 @@ READERS: dict[str, Reader] = {
     "nerfstudio": Reader(nerfstudio, converted("nerfstudio"), ("raw/transforms.json", "raw/images/a.png")),
     "ros1": Reader(ros1, converted("rosbag"), ("raw/drive.bag", "raw/drive.bag.topics.yaml")),
     "ros2": Reader(ros2, converted("rosbag"), ("raw/drive.mcap",)),
+    "ros2 folder": Reader(ros2_folder, converted("rosbag"), ("raw/drive/metadata.yaml",)),
     "av2": Reader(
         write_partial_av2,
         converted("av2"),
@@ -329,7 +336,18 @@ HARMLESS = {
     ("kitti360", f"{raw_kitti360.DRIVE}.xml", "another root"),  # without any object
     ("av2", "log_map_archive_raw____PIT_city_1.json", "not a number"),  # an empty map has no numbers
     ("av2", "log_map_archive_raw____PIT_city_1.json", "texts for numbers"),
-    ("scenarios", "0101.yaml", "an unknown entry"),  # neuro-ncap's files may say more than is read
+    *(
+        ("scenarios", "0101.yaml", damage)  # neuro-ncap's files may say more than is read, and all as text
+        for damage in ("an unknown entry", "a date that is none", "a huge integer")
+    ),
+    *(
+        ("kitti360", "image_02.yaml", damage)  # read by py123d, which copies nothing of it
+        for damage in ("an alias of itself", "an entry twice", "longer than any")
+    ),
+    *(
+        ("ros2 folder", "metadata.yaml", damage)  # read by rosbags, which copies nothing of it
+        for damage in ("an unknown entry", "an alias of itself", "longer than any")
+    ),
     ("scores", "scores.json", "empty"),  # no frame is scored
     ("scores", "scores.json", "not a number"),  # scores may be infinite or unknown
     *((name, file, damage) for name, file in WITHOUT_NUMBERS for damage in OF_NUMBERS),

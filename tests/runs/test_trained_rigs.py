@@ -86,7 +86,7 @@ def test_another_rig_is_refused_by_name(rig: RigPlan, message: str, rigs: Traine
 
 def test_a_damaged_file_is_one_line(tmp_path: Path) -> None:
     (tmp_path / "rigs.yaml").write_text("usual: 3\n")
-    with pytest.raises(InputError, match=r"rigs\.yaml: cannot be read as camera rigs"):
+    with pytest.raises(InputError, match=r"rigs\.yaml: not camera rigs"):
         read_rigs(tmp_path)
 
 

@@ -13,6 +13,7 @@ from foredrive.data import ClipConfig
 from foredrive.errors import InputError
 from foredrive.files import atomic_path
 from foredrive.models.planner import PlannerConfig
+from foredrive.plain_yaml import parse_yaml, read_yaml
 from foredrive.recipes.old_formats import upgraded
 from foredrive.recipes.world_models import WORLD_MODELS
 from foredrive.training import EgoMLPFit, PathFit
@@ -148,12 +149,7 @@ def read_values(path: Path) -> Any:
     Raises:
         InputError: the file cannot be read or is not YAML.
     """
-    try:
-        return yaml.safe_load(path.read_text())
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
-    except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
-        raise InputError(f"{path}: not a recipe: {str(error).splitlines()[0]}") from error
+    return read_yaml(path, "a recipe")
 
 
 def validated(kind: Any, written: Any, source: str) -> Any:
@@ -195,9 +191,9 @@ def overridden(written: Mapping[str, Any], settings: Sequence[str]) -> dict[str,
             if depth < len(parents):
                 place = place[key]
         try:
-            place[last] = yaml.safe_load(text)
-        except yaml.YAMLError as error:
-            raise InputError(f"--set {setting}: {text!r} is no value") from error
+            place[last] = parse_yaml(text)
+        except InputError as error:
+            raise InputError(f"--set {name}: {text[:100]!r} is no value: {error}") from error
     return values
 
 

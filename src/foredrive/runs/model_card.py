@@ -6,9 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-import yaml
-
 from foredrive.errors import InputError
+from foredrive.plain_yaml import read_yaml
 from foredrive.runs.shipped import CARD, CONFIG, EMBEDDED, MODELS, shipped_models
 from foredrive.search.embedded import CARD as TOWER_CARD
 from foredrive.search.embedded import SHIPPED as TOWERS
@@ -92,7 +91,7 @@ def shipped_weights() -> list[ShippedWeights]:
     """
     found = []
     for name in shipped_models():
-        card, config = read_card(MODELS / name / CARD), yaml.safe_load((MODELS / name / CONFIG).read_text())
+        card, config = read_card(MODELS / name / CARD), read_yaml(MODELS / name / CONFIG)
         kind = f"{config['model']['kind']} world model, planner"
         kind += ", task heads" if config.get("tasks") else ""
         size = _size(MODELS / name)

@@ -1,6 +1,7 @@
 """Camera rigs: known ones by name, and others from YAML files."""
 
 import math
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -12,6 +13,7 @@ from pydantic import TypeAdapter, ValidationError
 from torch import Tensor
 
 from foredrive.errors import InputError
+from foredrive.plain_yaml import read_yaml
 from foredrive.scene import CameraRig
 
 _EGO_FROM_CAM_AXES = torch.tensor([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
@@ -100,12 +102,9 @@ def find_rig(name: str) -> RigPlan:
     if name in RIGS:
         return RIGS[name]
     path = Path(name)
-    try:
-        written = yaml.safe_load(path.read_text())
-    except OSError:
-        raise InputError(f"no rig {name!r}: {', '.join(RIGS)}, or a YAML file") from None
-    except (UnicodeDecodeError, yaml.YAMLError, RecursionError) as error:
-        raise InputError(f"{path}: not YAML: {str(error).splitlines()[0]}") from error
+    if not os.path.exists(path):
+        raise InputError(f"no rig {name[:200]!r}: {', '.join(RIGS)}, or a YAML file")
+    written = read_yaml(path)
     try:
         return TypeAdapter(RigPlan).validate_python(written, extra="forbid")
     except ValidationError as error:

@@ -33,6 +33,7 @@ from foredrive.data.raw.bag_messages import (
 from foredrive.data.raw.frame_tree import FrameTree
 from foredrive.errors import InputError
 from foredrive.files import atomic_path
+from foredrive.plain_yaml import read_yaml
 
 T = TypeVar("T")
 _EGO_NAMES = ("base_link", "base_footprint", "ego", "ego_vehicle", "vehicle", "imu_link", "imu")
@@ -138,11 +139,7 @@ def read_topics(file: Path) -> BagTopics:
         InputError: the file cannot be read, or an entry is missing, unknown or of another type.
     """
     try:
-        return TypeAdapter(BagTopics).validate_python(yaml.safe_load(file.read_text()))
-    except OSError as error:
-        raise InputError(f"{file}: cannot be read: {error.strerror or error}") from error
-    except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
-        raise InputError(f"{file}: not YAML: {(str(error).splitlines() or [''])[0]}") from error
+        return TypeAdapter(BagTopics).validate_python(read_yaml(file))
     except ValidationError as error:
         first = error.errors()[0]
         place = ".".join(str(part) for part in first["loc"])

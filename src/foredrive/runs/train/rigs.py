@@ -14,6 +14,7 @@ from foredrive.data.log_paths import LogPath
 from foredrive.data.logs import Log
 from foredrive.errors import InputError
 from foredrive.files import atomic_path
+from foredrive.plain_yaml import read_yaml
 from foredrive.sensors.rigs import Mount, RigPlan
 
 RIGS = "rigs.yaml"
@@ -70,16 +71,9 @@ def read_rigs(folder: Path) -> TrainedRigs | None:
     if not path.is_file():
         return None
     try:
-        return TypeAdapter(TrainedRigs).validate_python(yaml.safe_load(path.read_text()), extra="forbid")
-    except (
-        OSError,
-        UnicodeDecodeError,
-        yaml.YAMLError,
-        ValidationError,
-        RecursionError,
-        InputError,
-    ) as error:
-        raise InputError(f"{path}: cannot be read as camera rigs: {' '.join(str(error).split())}") from error
+        return TypeAdapter(TrainedRigs).validate_python(read_yaml(path, "camera rigs"), extra="forbid")
+    except ValidationError as error:
+        raise InputError(f"{path}: not camera rigs: {' '.join(str(error).split())}") from error
 
 
 def check_rig(rigs: TrainedRigs, rig: RigPlan, run: str) -> None:

@@ -15,6 +15,7 @@ from pydantic import TypeAdapter, ValidationError
 
 from foredrive.errors import InputError
 from foredrive.files import atomic_path
+from foredrive.plain_yaml import read_yaml
 from foredrive.simulation.ncap.scenario import Jitter, Point, Polyline, SafetyScenario, ScenarioActor
 from foredrive.simulation.observation import FRAME_DT_S
 from foredrive.simulation.threats import Threat
@@ -51,12 +52,7 @@ def save_scenarios(scenarios: Sequence[SafetyScenario], path: Path) -> None:
 
 
 def _read(file: Path) -> list[SafetyScenario]:
-    try:
-        written = yaml.load(file.read_text(), Loader=yaml.BaseLoader)
-    except OSError as error:
-        raise InputError(f"{file}: cannot be read: {error.strerror or error}") from error
-    except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
-        raise InputError(f"{file}: not YAML: {str(error).splitlines()[0]}") from error
+    written = read_yaml(file, as_text=True)
     if not isinstance(written, Mapping):
         raise InputError(f"{file}: not a file of scenarios")
     if "general" in written:
