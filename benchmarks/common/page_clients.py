@@ -113,7 +113,8 @@ class SearchClients(Clients):
 
     def _get(self, path: str, body: bytes | None = None, **asked: object) -> bytes:
         url = f"http://127.0.0.1:{self.port}{path}?{urllib.parse.urlencode(asked)}"
-        with urllib.request.urlopen(urllib.request.Request(url, body), timeout=ANSWER_S) as answer:
+        headers = {"Content-Type": "application/json"}
+        with urllib.request.urlopen(urllib.request.Request(url, body, headers), timeout=ANSWER_S) as answer:
             read: bytes = answer.read()
         self.count("requests")
         return read

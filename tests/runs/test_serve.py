@@ -19,12 +19,13 @@ from PIL import Image
 from foredrive.cli.main import main
 from foredrive.errors import InputError
 from foredrive.evaluation.summary import read_summary
+from foredrive.json_server import Address, JsonServer
 from foredrive.runs.drive.in_ncap import SafetyTests
 from foredrive.runs.drive.in_rebuilt import opened_rebuilt
 from foredrive.runs.drive.suite import DriveSuite, drive_suite
 from foredrive.runs.serve import alpasim_server_of, planner_of, renderer_of
 from foredrive.simulation.ncap.outcome import Outcome
-from foredrive.simulation.remote.json_http import Address, JsonServer, ask
+from foredrive.simulation.remote.json_http import ask
 
 
 def suite(agent: str, rebuilt: Path, scenarios: Path, runs: int = 1) -> DriveSuite:

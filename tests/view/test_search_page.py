@@ -4,7 +4,6 @@ import http.client
 import json
 import shutil
 import subprocess
-import threading
 import urllib.error
 import urllib.parse
 import urllib.request
@@ -28,6 +27,7 @@ from foredrive.search.rows import FACTS, IndexRow
 from foredrive.view.search_page import SearchPage, query_of
 from foredrive.view.search_sheet import write_search_sheet
 
+JSON = {"Content-Type": "application/json"}
 MOMENTS = 3
 """Half a second apart, each with its whole and two views."""
 
@@ -38,18 +38,15 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[SearchPage]:
     log = write_log(root, frames=11)
     index_logs([log], str(root / "index"), str(save_clip(root / "clip")), 0.5, 1)
     served = SearchPage(FrameIndex(str(root / "index")), None, "localhost", 0)
-    thread = threading.Thread(target=served.serve)
-    thread.start()
-    yield served
-    served.close()
-    thread.join()
+    with served.in_background():
+        yield served
 
 
 def fetch(page: SearchPage, path: str, body: object = None, **asked: object) -> Any:
     url = f"{page.url}{path}?{urllib.parse.urlencode(asked)}"
     data = None if body is None else json.dumps(body).encode()
     try:
-        with urllib.request.urlopen(urllib.request.Request(url, data)) as answer:
+        with urllib.request.urlopen(urllib.request.Request(url, data, JSON)) as answer:
             read = answer.read()
             return json.loads(read) if answer.headers["Content-Type"] == "application/json" else read
     except urllib.error.HTTPError as error:
@@ -70,13 +67,36 @@ def test_a_text_has_hits_with_pictures(page: SearchPage) -> None:
     [
         ({}, "an empty query"),
         ({"where": "speed >>"}, "cannot be understood"),
-        ({"text": "car", "modality": "radar"}, "radar"),
-        ({"text": "car", "top": "many"}, "many"),
+        ({"text": "car", "modality": "radar"}, "modality: Input should be 'image', 'lidar'"),
+        ({"text": "car", "top": "many"}, "top: Input should be a valid integer"),
+        ({"text": "car", "top": str(10**30)}, "at most 1000 hits"),
+        ({"text": "car", "gap_s": "nan"}, "gap at least 0 s"),
     ],
 )
 def test_what_cannot_be_asked_is_said(page: SearchPage, asked: dict[str, str], why: str) -> None:
-    assert why in fetch(page, "/find", **asked)["error"]
-    assert "error" in fetch(page, "/nowhere")
+    assert why in fetch(page, "/find", **asked)["detail"]
+    assert "no GET /nowhere" in fetch(page, "/nowhere")["detail"]
+
+
+@pytest.mark.parametrize(
+    ("path", "body", "why"),
+    [
+        ("/moments", {"keys": []}, "nothing is selected"),
+        ("/moments", {"keys": [7]}, "keys.0: Input should be a valid string"),
+        ("/moments", {"keys": {"a": "b"}}, "keys: Input should be a valid list"),
+        ("/moments", {"keys": ["nowhere|all"]}, "no scene 'nowhere|all'"),
+        ("/moments", ["keys"], "dictionary"),
+        ("/tag", {"tag": " ", "keys": []}, "a tag has a name"),
+        ("/tag", {"tag": "late"}, "keys: Field required"),
+        ("/clips", {"keys": ["a|all"], "before": "soon", "after": 1}, "before"),
+        ("/clips", {"keys": ["a|all"], "before": -1, "after": 1}, "0 s or more"),
+        ("/queries", {"name": 7, "asked": {}}, "name: Input should be a valid string"),
+        ("/queries", {"name": "x", "asked": {"text": ["car"]}}, "asked.text"),
+    ],
+)
+def test_what_is_no_message_of_the_page_is_said(page: SearchPage, path: str, body: object, why: str) -> None:
+    assert why in fetch(page, path, body)["detail"]
+    assert "no scene 'nowhere'" in fetch(page, "/picture", key="nowhere")["detail"]
 
 
 @pytest.mark.parametrize(
@@ -86,11 +106,13 @@ def test_what_cannot_be_asked_is_said(page: SearchPage, asked: dict[str, str], w
         ({"Origin": "http://evil.example"}, None, 403),
         ({"Origin": "http://evil.example"}, b'{"name": "x", "asked": {"text": "car"}}', 403),
         ({"Origin": "null"}, b'{"name": "x", "asked": {"text": "car"}}', 403),
-        ({"Content-Length": "-1"}, b"{}", 413),
-        ({"Content-Length": str(2**40)}, b"{}", 413),
-        ({"Content-Length": "many"}, b"{}", 413),
-        ({}, b"[" * 100_000, 400),
-        ({}, b"{", 400),
+        ({"Content-Type": "text/plain"}, b'{"name": "x", "asked": {"text": "car"}}', 422),
+        ({"Content-Length": "-1"}, b"{}", 422),
+        ({"Content-Length": str(2**40)}, b"{}", 422),
+        ({"Content-Length": "9" * 5000}, b"{}", 422),
+        ({"Content-Length": "many"}, b"{}", 422),
+        ({}, b"[" * 100_000, 422),
+        ({}, b"{", 422),
     ],
 )
 def test_other_sites_and_long_or_broken_requests_are_refused(
@@ -98,10 +120,10 @@ def test_other_sites_and_long_or_broken_requests_are_refused(
 ) -> None:
     before = fetch(page, "/queries")
     connection = http.client.HTTPConnection(urllib.parse.urlsplit(page.url).netloc, timeout=20)
-    connection.request("GET" if body is None else "POST", "/queries", body, headers)
+    connection.request("GET" if body is None else "POST", "/queries", body, JSON | headers)
     answer = connection.getresponse()
     assert answer.status == status
-    assert json.loads(answer.read())["error"]
+    assert json.loads(answer.read())["detail"]
     connection.close()
     assert fetch(page, "/queries") == before
 
@@ -122,11 +144,9 @@ def test_scenes_in_a_lasso_are_shown_tagged_and_listed(page: SearchPage, tmp_pat
     assert [hit["key"] for hit in fetch(page, "/moments", {"keys": keys})["hits"]] == keys
     assert fetch(page, "/tag", {"tag": "late", "keys": keys})["message"] == "2 moments are tagged late"
     assert len(fetch(page, "/find", tag="late", gap_s=0, view="all")["hits"]) == 2
-    assert "error" in fetch(page, "/tag", {"tag": " ", "keys": keys})
     listed = tmp_path / "clips.json"
     listed.write_text(json.dumps(fetch(page, "/clips", {"keys": keys, "before": 0.25, "after": 1})))
     assert [clip.start_s for clip in read_clip_list(listed)] == pytest.approx([0.25, 0.75])
-    assert "error" in fetch(page, "/moments", {"keys": []})
 
 
 def test_queries_are_kept_and_come_back(page: SearchPage) -> None:

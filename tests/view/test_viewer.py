@@ -1,5 +1,6 @@
 """The page that shows a log and a run: served, stepped through, stopped."""
 
+import contextlib
 import socket
 import time
 import urllib.request
@@ -92,6 +93,30 @@ def test_pages_of_other_sites_are_refused(
         connection.sendall(("\r\n".join(lines) + "\r\n\r\n").encode())
         answer = connection.recv(1000).split(b"\r\n")[0].decode()
     assert answer.split(" ")[1] == str(status or 101)
+
+
+@pytest.mark.parametrize("sent", [b"", b"G", b"GET / HTTP/1.1\r\nHost: "])
+def test_the_page_is_served_beside_two_hundred_bad_clients(
+    viewer: Viewer, sent: bytes, capfd: pytest.CaptureFixture[str]
+) -> None:
+    with contextlib.ExitStack() as stack:
+        clients = []
+        for _ in range(200):
+            clients.append(
+                stack.enter_context(socket.create_connection(("localhost", viewer.server.get_port()), 20))
+            )
+            with contextlib.suppress(OSError):  # closed for the next ones
+                client.sendall(sent)
+        began_s = time.monotonic()
+        with urllib.request.urlopen(viewer.url, timeout=20) as page:
+            assert page.status == 200
+        assert time.monotonic() - began_s < 1.0
+        with contextlib.suppress(ConnectionResetError):
+            assert clients[0].recv(1) == b""
+    with socket.create_connection(("localhost", viewer.server.get_port()), 20) as mad:
+        mad.sendall(b"\x16\x03\x01" + bytes(200) + b"\r\n\r\n")
+        mad.recv(1000)
+    assert capfd.readouterr() == ("", "")
 
 
 def test_a_frame_that_is_asked_for_too_late_is_not_drawn(log: LogPath) -> None:

@@ -31,8 +31,8 @@ def serve(
     """
     check_number("--port", port, low=0, high=65535)
     with importing():
+        from foredrive.json_server import JsonServer
         from foredrive.runs.serve import alpasim_server_of, is_reconstruction, planner_of, renderer_of
-        from foredrive.simulation.remote.json_http import JsonServer
 
     folder = Path(run)
     renders = is_reconstruction(folder)

@@ -8,10 +8,10 @@ from typing import Any
 from foredrive.data.boxes import read_track_ids
 from foredrive.data.logs import Log
 from foredrive.errors import InputError
+from foredrive.json_server import Answer
 from foredrive.runs.drive.agents import inputs_of, make_agent, require_alpasim
 from foredrive.runs.folder import CONFIG, LOG
 from foredrive.runs.rebuild.rebuilt_run import open_rebuilt, open_run_log
-from foredrive.simulation.remote.json_http import Answer
 from foredrive.simulation.remote.planner_server import PlannerNeeds, PlannerService
 from foredrive.simulation.remote.render_server import RenderService
 

@@ -76,7 +76,7 @@ class Query:
         for name, kinds in (("modality", Modality), ("rule", Rule)):
             if (value := getattr(self, name)) not in get_args(kinds):
                 raise InputError(f"{name} is one of {', '.join(get_args(kinds))}, not {value!r}")
-        if self.top < 1 or self.gap_s < 0 or not 0 <= self.mix <= 1:
+        if self.top < 1 or not self.gap_s >= 0 or not 0 <= self.mix <= 1:
             raise InputError("top is at least 1, gap at least 0 s, and mix lies between 0 and 1")
         if self.by is not None and self.by not in NUMBERS:
             raise InputError(f"there is no column of numbers {self.by}; there are {', '.join(NUMBERS)}")

@@ -1,22 +1,26 @@
 """A viser page in the browser: its port, and an empty scene."""
 
+import asyncio
 import contextlib
 import errno
 import io
+import logging
 import socket
 from collections.abc import Callable, Iterator
 from typing import Any
 
 import viser
 import websockets.asyncio.server
-from websockets import Headers, Request, Response
+from websockets import Request, Response, State
 from websockets.asyncio.server import ServerConnection
 
+from foredrive.bounded_server import MAX_CONNECTIONS, REQUEST_S, refusal
 from foredrive.errors import InputError
 
 PORTS, PORTS_TRIED = 65536, 100
-LOOPBACK = ("localhost", "127.0.0.1", "[::1]")
 AMBIENT_LIGHT = 0.7
+_log = logging.getLogger(__name__)
+_log.addFilter(lambda record: record.msg != "opening handshake failed")  # a client's fault, not worth a line
 START_EYE_M, START_TARGET_M = (-20.0, 8.0, 15.0), (6.0, 0.0, 0.0)
 
 
@@ -39,12 +43,22 @@ def free_port(host: str, port: int) -> int:
     raise InputError(f"cannot serve a page at {host}: ports {port} to {candidates[-1]} are taken")
 
 
-@contextlib.contextmanager
-def _refusing_other_sites() -> Iterator[None]:
-    """Make the servers that viser starts in the block refuse what pages of other sites ask them.
+class _BoundedConnection(ServerConnection):
+    """A connection that gives way to new ones if its client does not finish its request."""
 
-    viser has no option for it. Browsers let any page open a WebSocket to this machine, through which it would
-    see the log and move the controls.
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        super().connection_made(transport)
+        waited_for = [one for one in self.server.handlers if one.state is State.CONNECTING]
+        if len(waited_for) > MAX_CONNECTIONS:
+            waited_for[0].transport.abort()
+
+
+@contextlib.contextmanager
+def _bounded() -> Iterator[None]:
+    """Make the servers that viser starts in the block refuse what pages of other sites ask, and bound them.
+
+    viser has no option for either. Browsers let any page open a WebSocket to this machine, through which it
+    would see the log and move the controls. Of the bounds, `websockets` has that of the time for a request.
     """
     serve = websockets.asyncio.server.serve
 
@@ -52,10 +66,16 @@ def _refusing_other_sites() -> Iterator[None]:
         handler: Any, host: str, port: int, *, process_request: Callable[..., Response | None], **options: Any
     ) -> Any:
         def checked(connection: ServerConnection, request: Request) -> Response | None:
-            why = _refusal(request.headers, is_local=host in LOOPBACK)
-            return process_request(connection, request) if why is None else connection.respond(403, why)
+            why = refusal(request.headers, host)
+            if why is not None:
+                return connection.respond(403, f"{why}\n")
+            viewers = sum(one.state is State.OPEN for one in connection.server.handlers)
+            if viewers >= MAX_CONNECTIONS:
+                return connection.respond(503, "too many viewers\n")
+            return process_request(connection, request)
 
-        return serve(handler, host, port, process_request=checked, **options)
+        bounds = {"create_connection": _BoundedConnection, "logger": _log, "open_timeout": REQUEST_S}
+        return serve(handler, host, port, process_request=checked, **options, **bounds)
 
     websockets.asyncio.server.serve = checking  # type: ignore[assignment, misc]
     try:
@@ -64,24 +84,10 @@ def _refusing_other_sites() -> Iterator[None]:
         websockets.asyncio.server.serve = serve  # type: ignore[misc]
 
 
-def _refusal(headers: Headers, *, is_local: bool) -> str | None:
-    """Return why a request is refused, or None.
-
-    A page of another site has its own name in Origin. A name that its owner points to this machine (DNS
-    rebinding) stands in Host.
-    """
-    host, origin = headers.get("Host", ""), headers.get("Origin")
-    if is_local and host.rpartition(":")[0] not in LOOPBACK:
-        return f"this page is not at {host}\n"
-    if origin is not None and origin.partition("://")[2] != host:
-        return f"{origin} may not use this page\n"
-    return None
-
-
 def _open_server(label: str, host: str, port: int) -> viser.ViserServer:
     """Serve an empty dark page, seen from behind and above the ego vehicle; it has its own threads."""
     port = free_port(host, port)  # viser would wait for a host that does not exist
-    with contextlib.redirect_stdout(io.StringIO()), _refusing_other_sites():  # viser prints a greeting
+    with contextlib.redirect_stdout(io.StringIO()), _bounded():  # viser prints a greeting
         server = viser.ViserServer(host=host, port=port, label=label, verbose=False)
     server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
     server.scene.configure_environment_map(hdri=None)  # lights without a download

@@ -2,18 +2,15 @@
 
 import functools
 import io
-import json
 import threading
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
-from http import HTTPStatus
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from typing import Any
-from urllib.parse import parse_qs, urlsplit
+from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, fields
 
 from PIL import Image
 
 from foredrive.errors import InputError
+from foredrive.json_server import Answer, JsonServer, Raw, validated
 from foredrive.runs.search.searching import ask, listed_clips
 from foredrive.search.find import Hit
 from foredrive.search.index import FrameIndex
@@ -28,10 +25,9 @@ from foredrive.view.html import render_page
 JPEG_QUALITY = 85
 MAX_SHOWN = 60
 """Maximum number of scenes shown from a lasso."""
+MAX_TOP = 1000
+"""Maximum number of hits of a query."""
 MAX_BODY_BYTES = 2**20
-LOOPBACK = ("127.0.0.1", "localhost", "[::1]")
-Key = tuple[str, str]
-"""A moment's key and a view; together they identify a row."""
 
 
 @dataclass(frozen=True)
@@ -96,95 +92,83 @@ class StatusMessage:
     message: str
 
 
+@dataclass(frozen=True)
+class SentScenes:
+    """Scenes that the page shows or selects, as JSON."""
+
+    keys: list[str]
+
+
+@dataclass(frozen=True)
+class SentTag:
+    """A tag for scenes, as JSON."""
+
+    keys: list[str]
+    tag: str
+
+
+@dataclass(frozen=True)
+class SentClips:
+    """Scenes that are to become clips, as JSON."""
+
+    keys: list[str]
+    before: float
+    after: float
+    """Time of a clip before and after the scene, s."""
+
+    def __post_init__(self) -> None:
+        for seconds in (self.before, self.after):
+            if not 0 <= seconds < float("inf"):
+                raise InputError(f"the times before and after must be numbers of 0 s or more, got {seconds}")
+
+
+@dataclass(frozen=True)
+class SentQuery:
+    """A query that is to be saved, as JSON."""
+
+    name: str
+    asked: dict[str, str]
+
+
 class SearchPage:
     """Serves the page until it is closed.
 
     Args:
         towers: folder or name of the towers that made the index; by default as noted in the index.
         port: 0 takes any free port.
+
+    Raises:
+        InputError: the page cannot be served there.
     """
 
     def __init__(self, index: FrameIndex, towers: str | None, host: str, port: int) -> None:
         self._index, self._towers = index, towers
         self._one_at_a_time = threading.Lock()  # one query uses all cores
-        page = self
-
-        class Handler(BaseHTTPRequestHandler):
-            def do_GET(self) -> None:
-                if page._is_allowed(self):
-                    page._answer(self, None)
-
-            def do_POST(self) -> None:
-                if page._is_allowed(self):
-                    page._answer(self, self.rfile.read(int(self.headers["Content-Length"])))
-
-            def log_message(self, format: str, *args: object) -> None:
-                """Print nothing."""
-
-        try:
-            self._server = ThreadingHTTPServer((host, port), Handler)
-        except OSError as error:
-            raise InputError(f"{host}:{port}: no page can be served there: {error.strerror}") from error
-        self.url = f"http://{host}:{self._server.server_address[1]}"
+        answers: dict[tuple[str, str], Answer] = {
+            ("GET", "/"): lambda _: Raw(page_html().encode(), "text/html; charset=utf-8"),
+            ("GET", "/picture"): self._picture,
+            ("GET", "/find"): self._find,
+            ("GET", "/map"): lambda _: self._map(),
+            ("GET", "/queries"): lambda _: saved_queries(self._index.uri),
+            ("POST", "/moments"): self._moments,
+            ("POST", "/tag"): self._tag,
+            ("POST", "/clips"): self._clips,
+            ("POST", "/queries"): self._save,
+        }
+        self._server = JsonServer(answers, host, port, MAX_BODY_BYTES, one_at_a_time=False)
+        self.url = f"http://{host}:{self._server.address.port}"
 
     def serve(self) -> None:
-        """Answer requests in this thread until `close`."""
-        self._server.serve_forever()
+        """Answer requests in this thread until it is interrupted."""
+        self._server.serve()
+
+    def in_background(self) -> AbstractContextManager[object]:
+        """Answer requests in a thread while the context lasts."""
+        return self._server.in_background()
 
     def close(self) -> None:
-        """Stop serving."""
-        self._server.shutdown()
-        self._server.server_close()
-
-    def _is_allowed(self, request: BaseHTTPRequestHandler) -> bool:
-        """Refuse requests that pages of other sites make through the user's browser, and long bodies.
-
-        A page of another site has its own name in Origin. A name that its owner points to this machine (DNS
-        rebinding) stands in Host.
-        """
-        host, origin = request.headers.get("Host", ""), request.headers.get("Origin")
-        served = self._server.server_address[0]
-        if served == "127.0.0.1" and host.rpartition(":")[0] not in LOOPBACK:
-            _send_json(request, {"error": f"this page is not at {host}"}, HTTPStatus.FORBIDDEN)
-        elif origin is not None and origin != f"http://{host}":
-            _send_json(request, {"error": f"{origin} may not ask this page"}, HTTPStatus.FORBIDDEN)
-        elif request.command == "GET":
-            return True
-        else:
-            length = request.headers.get("Content-Length", "")
-            if length.isascii() and length.isdigit() and int(length) <= MAX_BODY_BYTES:
-                return True
-            told = f"a request needs a Content-Length of at most {MAX_BODY_BYTES} bytes"
-            request.close_connection = True  # its body is not read
-            _send_json(request, {"error": told}, HTTPStatus.REQUEST_ENTITY_TOO_LARGE)
-        return False
-
-    def _answer(self, request: BaseHTTPRequestHandler, body: bytes | None) -> None:
-        url = urlsplit(request.path)
-        asked = {name: values[-1] for name, values in parse_qs(url.query).items()}
-        get: dict[str, Callable[[Mapping[str, str]], Any]] = {
-            "/find": self._find,
-            "/map": self._map,
-            "/queries": lambda _: saved_queries(self._index.uri),
-        }
-        post: dict[str, Callable[[Any], Any]] = {
-            "/moments": self._moments,
-            "/tag": self._tag,
-            "/clips": self._clips,
-            "/queries": self._save,
-        }
-        try:
-            if body is None and url.path == "/":
-                return _send(request, "text/html; charset=utf-8", page_html().encode())
-            if body is None and url.path == "/picture":
-                return _send(request, "image/jpeg", self._picture(asked))
-            if body is None and url.path in get:
-                return _send_json(request, get[url.path](asked))
-            if body is not None and url.path in post:
-                return _send_json(request, post[url.path](json.loads(body)))
-            _send_json(request, {"error": f"{url.path}: no such page"}, HTTPStatus.NOT_FOUND)
-        except (InputError, ValueError, LookupError, TypeError, RecursionError) as error:
-            _send_json(request, {"error": " ".join(str(error).split())}, HTTPStatus.BAD_REQUEST)
+        """Give up the port."""
+        self._server.close()
 
     def _find(self, asked: Mapping[str, str]) -> ShownHits:
         query = query_of(asked)
@@ -193,55 +177,66 @@ class SearchPage:
         how = "all compared" if found.exact else f"{found.compared} compared"
         return ShownHits([*map(ShownHit.of, found.hits)], f"{len(found.hits)} hits, {how}")
 
-    def _map(self, _: Mapping[str, str]) -> SceneMap:
+    def _map(self) -> SceneMap:
         plane = project_scenes(self._index)
         scenes = zip(plane.xy.tolist(), plane.rows, strict=True)
         return SceneMap([MapPoint.of(xy, row) for xy, row in scenes], plane.share, plane.total)
 
-    def _picture(self, asked: Mapping[str, str]) -> bytes:
-        (hit,) = self._rows([_parse_key(asked["key"])])
+    def _picture(self, asked: Mapping[str, str]) -> Raw:
+        (hit,) = self._rows([asked.get("key", "")])
         buffer = io.BytesIO()
         Image.fromarray(hit_picture(hit)).save(buffer, format="jpeg", quality=JPEG_QUALITY)
-        return buffer.getvalue()
+        return Raw(buffer.getvalue(), "image/jpeg")
 
-    def _moments(self, body: Mapping[str, Any]) -> ShownHits:
-        hits = self._rows([_parse_key(key) for key in body["keys"][:MAX_SHOWN]])
-        return ShownHits([*map(ShownHit.of, hits)], f"{len(body['keys'])} scenes, {len(hits)} shown")
+    def _moments(self, body: object) -> ShownHits:
+        sent: SentScenes = validated(SentScenes, body, "/moments")
+        hits = self._rows(sent.keys[:MAX_SHOWN])
+        return ShownHits([*map(ShownHit.of, hits)], f"{len(sent.keys)} scenes, {len(hits)} shown")
 
-    def _tag(self, body: Mapping[str, Any]) -> StatusMessage:
-        name = str(body["tag"]).strip()
+    def _tag(self, body: object) -> StatusMessage:
+        sent: SentTag = validated(SentTag, body, "/tag")
+        name = sent.tag.strip()
         if not name:
             raise InputError("a tag has a name")
-        add_tag(self._index.uri, name, [_parse_key(key)[0] for key in body["keys"]])
-        return StatusMessage(f"{len(body['keys'])} moments are tagged {name}")
+        add_tag(self._index.uri, name, [_parse_key(key)[0] for key in sent.keys])
+        return StatusMessage(f"{len(sent.keys)} moments are tagged {name}")
 
-    def _clips(self, body: Mapping[str, Any]) -> Mapping[str, object]:
-        hits = self._rows([_parse_key(key) for key in body["keys"]])
-        return listed_clips(hits, float(body["before"]), float(body["after"]))
+    def _clips(self, body: object) -> Mapping[str, object]:
+        sent: SentClips = validated(SentClips, body, "/clips")
+        return listed_clips(self._rows(sent.keys), sent.before, sent.after)
 
-    def _save(self, body: Mapping[str, Any]) -> StatusMessage:
-        save_query(self._index.uri, str(body["name"]), query_of(body["asked"]).to_json())
-        return StatusMessage(f"saved as {body['name']}")
+    def _save(self, body: object) -> StatusMessage:
+        sent: SentQuery = validated(SentQuery, body, "/queries")
+        save_query(self._index.uri, sent.name, query_of(sent.asked).to_json())
+        return StatusMessage(f"saved as {sent.name}")
 
-    def _rows(self, keys: Sequence[Key]) -> list[Hit]:
-        """Return the rows of some keys, in their order, as hits without scores."""
+    def _rows(self, keys: Sequence[str]) -> list[Hit]:
+        """Return the rows of some scenes, in their order, as hits without scores.
+
+        Raises:
+            InputError: none is named, or one is not in the index.
+        """
         if not keys:
             raise InputError("nothing is selected")
-        where = f"key IN ({quoted_list({moment for moment, _ in keys})})"
+        where = f"key IN ({quoted_list({_parse_key(key)[0] for key in keys})})"
         rows = {_key(row): row for row in IndexRow.all_of(self._index.select(where, FACTS.names))}
-        return [Hit(rows["|".join(key)], 0.0, {}) for key in keys]
+        if missing := [key for key in keys if key not in rows]:
+            raise InputError(f"no scene {missing[0][:200]!r} in the index")
+        return [Hit(rows[key], 0.0, {}) for key in keys]
 
 
-def query_of(asked: Mapping[str, Any]) -> Query:
+def query_of(asked: Mapping[str, str]) -> Query:
     """Return the query of the page's fields; empty fields are left out.
 
     Raises:
         InputError: the fields make no valid query.
     """
-    kinds: dict[str, Callable[[Any], Any]] = {"top": int, "gap_s": float, "mix": float}
     known = {field.name for field in fields(Query)}
-    given = {name: value for name, value in asked.items() if name in known and str(value).strip()}
-    return Query(**{name: kinds.get(name, str)(value) for name, value in given.items()})
+    given = {name: value for name, value in asked.items() if name in known and value.strip()}
+    query: Query = validated(Query, given, "the query")
+    if query.top > MAX_TOP:
+        raise InputError(f"the page shows at most {MAX_TOP} hits")
+    return query
 
 
 @functools.cache
@@ -254,21 +249,7 @@ def _key(row: IndexRow) -> str:
     return f"{row.key}|{row.view}"
 
 
-def _parse_key(key: str) -> Key:
+def _parse_key(key: str) -> tuple[str, str]:
+    """Return a moment's key and a view; together they identify a row."""
     moment, _, view = key.rpartition("|")
     return moment, view
-
-
-def _send_json(request: BaseHTTPRequestHandler, content: object, status: HTTPStatus = HTTPStatus.OK) -> None:
-    _send(request, "application/json", json.dumps(content, default=asdict).encode(), status)
-
-
-def _send(
-    request: BaseHTTPRequestHandler, kind: str, body: bytes, status: HTTPStatus = HTTPStatus.OK
-) -> None:
-    request.send_response(status)
-    request.send_header("Content-Type", kind)
-    request.send_header("Content-Length", str(len(body)))
-    request.send_header("X-Content-Type-Options", "nosniff")
-    request.end_headers()
-    request.wfile.write(body)

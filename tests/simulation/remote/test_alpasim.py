@@ -20,10 +20,10 @@ from test_planner_protocol import observation
 
 from foredrive.data.batches import stack_records
 from foredrive.errors import InputError
+from foredrive.json_server import Address
 from foredrive.scene import Clip, Command, Trajectory
 from foredrive.simulation.remote.alpasim_client import GrpcDriver, check_driver, points_of
 from foredrive.simulation.remote.alpasim_server import AlpasimDriver, route_of, serve_alpasim
-from foredrive.simulation.remote.json_http import Address
 from foredrive.simulation.remote.planner_server import PlannerNeeds
 from foredrive.simulation.simple_agents import StraightAgent, plan_of
 

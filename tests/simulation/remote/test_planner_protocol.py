@@ -16,10 +16,10 @@ from foredrive.data.batches import stack_records
 from foredrive.data.boxes import no_boxes
 from foredrive.data.lidar import empty_sweep
 from foredrive.errors import InputError
+from foredrive.json_server import Address, JsonServer
 from foredrive.scene import CameraRig, Clip, Command, LidarSweep, Trajectory
 from foredrive.simulation.observation import KeyFrame, make_clip
 from foredrive.simulation.plans import waypoints_of
-from foredrive.simulation.remote.json_http import Address, JsonServer
 from foredrive.simulation.remote.planner_client import HttpPlanner, check_planner
 from foredrive.simulation.remote.planner_messages import PlannerInput, T_ego_lidar, canbus, planner_input
 from foredrive.simulation.remote.planner_server import PlannerNeeds, PlannerService

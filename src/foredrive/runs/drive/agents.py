@@ -10,6 +10,7 @@ from typing import Literal
 import torch
 
 from foredrive.errors import InputError
+from foredrive.json_server import Address
 from foredrive.models.ego_mlp import EgoMLP
 from foredrive.runs.drive.seeing_agents import SeeingAgent, following
 from foredrive.runs.shipped import run_folder
@@ -22,7 +23,7 @@ from foredrive.sensors.rigs import SURROUND, RigPlan
 from foredrive.simulation.demonstrations import AlternatingStudent, DisturbedExpert
 from foredrive.simulation.idm_agent import IdmAgent
 from foredrive.simulation.observation import FRAME_DT_S
-from foredrive.simulation.remote.json_http import Address, read_address
+from foredrive.simulation.remote.json_http import read_address
 from foredrive.simulation.remote.planner_client import ALIVE_S, HttpPlanner, check_planner
 from foredrive.simulation.restarts import RestartingAgent
 from foredrive.simulation.simple_agents import StraightAgent

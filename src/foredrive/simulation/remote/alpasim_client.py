@@ -25,9 +25,9 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from foredrive.errors import InputError
+from foredrive.json_server import Address
 from foredrive.scene import CameraRig, Clip, Command, Trajectory
 from foredrive.simulation.observation import FRAME_DT_S, HORIZON_STEPS
-from foredrive.simulation.remote.json_http import Address
 from foredrive.simulation.remote.planner_client import FIRST_US
 from foredrive.simulation.simple_agents import plan_of
 

@@ -5,8 +5,9 @@ import time
 from collections.abc import Callable
 
 from foredrive.errors import InputError
+from foredrive.json_server import Address, validated
 from foredrive.scene import Clip, Trajectory
-from foredrive.simulation.remote.json_http import Address, ask, validated
+from foredrive.simulation.remote.json_http import ask
 from foredrive.simulation.remote.planner_messages import PlannerOutput, planner_input, waypoints
 from foredrive.simulation.simple_agents import plan_of
 

@@ -12,10 +12,10 @@ from jaxtyping import Float64
 from foredrive.data.batches import stack_records
 from foredrive.data.boxes import no_boxes
 from foredrive.errors import InputError
+from foredrive.json_server import Answer, validated
 from foredrive.scene import Agent, CameraRig, Clip, Command, Trajectory
 from foredrive.simulation.observation import KeyFrame, make_clip, no_images
 from foredrive.simulation.plans import waypoints_of
-from foredrive.simulation.remote.json_http import Answer, validated
 from foredrive.simulation.remote.planner_messages import COMMANDS, PlannerInput, nuscenes_name
 from foredrive.simulation.remote.sent_matrices import read_matrix
 from foredrive.simulation.remote.sent_tensors import decode_image

@@ -19,6 +19,7 @@ from torch import Tensor
 
 from foredrive.errors import InputError
 from foredrive.geometry.se3 import inverse_se3, transform_points
+from foredrive.json_server import Answer, Raw, validated
 from foredrive.rendering.edits import Edit, Remove, apply_edits
 from foredrive.rendering.novel_views import novel_camera_view
 from foredrive.rendering.rebuilt import RebuiltScene
@@ -28,7 +29,6 @@ from foredrive.rendering.tracks import poses_at
 from foredrive.rendering.vehicle import EgoState, LoggedVehicle
 from foredrive.sensors import SpinningLidar
 from foredrive.sensors.vehicle import LIDARS
-from foredrive.simulation.remote.json_http import Answer, Raw, validated
 from foredrive.simulation.remote.planner_messages import nuscenes_name
 from foredrive.simulation.remote.sent_matrices import read_pose
 from foredrive.simulation.remote.sent_tensors import encode_tensors
