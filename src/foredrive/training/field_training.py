@@ -5,7 +5,7 @@ from collections import defaultdict
 from dataclasses import dataclass, field
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.optim import Optimizer
 
@@ -232,13 +232,16 @@ class FieldTraining:
     def _image_losses(self, patches: list["_Patch"], feature: Float[Tensor, "R D"]) -> dict[str, Tensor]:
         """Return the mean squared error over all pixels of the patches, and the perceptual loss."""
         parts = feature.split([len(patch.rays.t_s) for patch in patches])
-        groups: dict[tuple[int, tuple[int, int]], list[tuple[Tensor, Tensor]]] = defaultdict(list)
+        groups: dict[tuple[int, int], list[tuple[Tensor, _Patch]]] = defaultdict(list)
         for patch, part in zip(patches, parts, strict=True):
-            groups[patch.camera, patch.size_hw].append((part.view(*patch.size_hw, -1), patch.rgb))
+            groups[patch.size_hw].append((part.view(*patch.size_hw, -1), patch))
         squares, likeness, count = feature.new_zeros(()), feature.new_zeros(()), 0
-        for (camera, _), alike in groups.items():  # patches of one camera are decoded together
-            rgb = self._decoded(torch.stack([part for part, _ in alike]), camera)
-            real = torch.stack([real for _, real in alike]).to(rgb)
+        for alike in groups.values():
+            rgb = self._decoded(
+                torch.stack([part for part, _ in alike]),
+                torch.tensor([patch.camera for _, patch in alike], device=feature.device),
+            )
+            real = torch.stack([patch.rgb for _, patch in alike]).to(rgb)
             squares, count = squares + ((rgb - real) ** 2).sum(), count + rgb.numel()
             if self._vgg is not None:
                 with torch.no_grad():
@@ -248,8 +251,13 @@ class FieldTraining:
         found = {"rgb": squares / count}
         return found if self._vgg is None else found | {"perceptual": likeness}
 
-    def _decoded(self, feature: Float[Tensor, "n H W D"], camera: int) -> Float[Tensor, "n 3 H3 W3"]:
-        """Decode patches. Batch normalisation counts its statistics here alone, never when a view is seen."""
+    def _decoded(
+        self, feature: Float[Tensor, "n H W D"], camera: Int[Tensor, "n"]
+    ) -> Float[Tensor, "n 3 H3 W3"]:
+        """Decode the patches of all cameras in one call, as rendering uses one set of statistics for all.
+
+        Batch normalisation counts its statistics here alone, never when a view is seen.
+        """
         decoder = self.scene.camera_decoder.train()
         rgb: Tensor = decoder(feature, camera)
         decoder.eval()

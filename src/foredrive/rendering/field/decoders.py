@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 UPSAMPLING = 3
@@ -53,9 +53,17 @@ class PatchDecoder(nn.Module):
         self.fine = nn.Sequential(*(_Block(fine, config) for _ in range(config.fine_blocks)))
         self.last = nn.Conv2d(fine, 3, 1)
 
-    def forward(self, feature: Float[Tensor, "n H W D"], camera: int) -> Float[Tensor, "n 3 H3 W3"]:
-        """Return patches of an image, RGB from 0 to 1."""
-        code = self.appearance[camera].expand(*feature.shape[:3], -1)
+    def forward(
+        self, feature: Float[Tensor, "n H W D"], camera: Int[Tensor, "n"]
+    ) -> Float[Tensor, "n 3 H3 W3"]:
+        """Return patches of images, RGB from 0 to 1.
+
+        Args:
+            feature: features of the patches' rays.
+            camera: index of each patch's camera. In training, batch normalisation takes its statistics over
+                all patches of a call, of whichever cameras they are.
+        """
+        code = self.appearance.index_select(0, camera)[:, None, None].expand(*feature.shape[:3], -1)
         seen = torch.cat([feature, code], dim=-1).permute(0, 3, 1, 2)
         coarse = self.coarse(F.relu(self.first(seen)))
         fine = F.pixel_shuffle(self.enlarge(coarse), UPSAMPLING)

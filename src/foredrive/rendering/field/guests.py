@@ -129,7 +129,7 @@ def with_guests_in_image(
         share = part.share.view(high, wide)
         feature = _filled(part.feature.view(high, wide, -1), share)
         code = camera if camera < len(guest.parts.camera.appearance) else 0
-        own = guest.parts.camera(feature[None], code)[0]
+        own = guest.parts.camera(feature[None], torch.tensor([code], device=feature.device))[0]
         alpha = F.interpolate(share[None, None], scale_factor=UPSAMPLING, mode="bilinear")[0]
         rest, mixed = rest - alpha, mixed + alpha * own
     return rest.clamp_min(0) * rgb + mixed

@@ -152,7 +152,7 @@ class FieldScene(RebuiltScene):
         rays = self.rays_of_pixels(view, corner_uv, size)
         seen, guests = self._in_parts(graph, rays)
         feature = seen["feature"].view(1, high, wide, -1)
-        rgb = self.camera_decoder(feature, view.sensor)[0]
+        rgb = self.camera_decoder(feature, torch.tensor([view.sensor], device=feature.device))[0]
         if guests:
             rgb = with_guests_in_image(rgb, *guests, view.sensor)
         rgb = rgb[:, : view.size_hw[0], : view.size_hw[1]]
