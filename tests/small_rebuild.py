@@ -1,4 +1,4 @@
-"""A log rebuilt in seconds: hardly any Gaussians, hardly trained."""
+"""A log rebuilt in seconds: hardly any Gaussians, hardly trained. What stands is an actor too."""
 
 from foredrive.recipes.gaussians import GaussianRecipe
 from foredrive.recipes.rebuilding import RebuildRecipe
@@ -10,6 +10,7 @@ from foredrive.training.gaussian_training import GaussianSchedule
 SMALLEST = RebuildRecipe(
     name="smallest",
     image_hw=(24, 48),
+    moves_m=0.0,
     representation=GaussianRecipe(
         initial=InitialGaussians(
             lidar_points=1100,

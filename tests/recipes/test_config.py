@@ -129,7 +129,8 @@ def test_a_reconstruction_in_an_earlier_format_opens_as_the_same_recipe() -> Non
     files = sorted((WRITTEN_BEFORE / "reconstructions").glob("*.yaml"))
     assert len(files) == 2
     for file in files:
-        assert load_rebuild_recipe(file) == find_rebuild_recipe(load_rebuild_recipe(file).name)
+        recipe = find_rebuild_recipe(load_rebuild_recipe(file).name)  # written when all tracks were actors
+        assert load_rebuild_recipe(file) == dataclasses.replace(recipe, moves_m=0.0, nonrigid=True)
 
 
 def test_a_recipe_may_be_a_file_and_entries_may_be_set(tmp_path: Path) -> None:

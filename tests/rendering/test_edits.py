@@ -1,5 +1,6 @@
 """Edits by hand, and from their file."""
 
+import dataclasses
 import math
 from pathlib import Path
 
@@ -19,6 +20,7 @@ from foredrive.rendering.edits import (
     apply_edits,
     load_edits,
     save_edits,
+    unused_id,
 )
 from foredrive.rendering.gaussians.content import gaussians_of
 from foredrive.rendering.gaussians.placing import place_gaussians
@@ -107,6 +109,22 @@ def test_edits_from_a_file_do_the_same(tmp_path: Path) -> None:
 def test_what_cannot_be_done_is_told(edit: Edit, told: str) -> None:
     with pytest.raises(InputError, match=told):
         apply_edits(scene(), [edit])
+
+
+def test_what_stands_is_in_the_way_and_no_part_to_be_edited() -> None:
+    """11 belongs to the static part: its box stays, and its number stays taken."""
+    tracks = two_actors()
+    own, stands = tracks.only(torch.tensor([True, False])), tracks.only(torch.tensor([False, True]))
+    graph = dataclasses.replace(graph_of([[5.0, 5, 5], [1.0, 0, 0]], [STATIC, 0], own), obstacles=stands)
+    for edit in (Remove(11), Move(11), Duplicate(11, copy=12), Insert("other", 7, 12, follows=11)):
+        with pytest.raises(InputError, match=r"11 is no actor of its own.*--set moves_m=0"):
+            apply_edits(graph, [edit], lambda run: graph)
+    with pytest.raises(InputError, match="there is an actor 11 already"):
+        apply_edits(graph, [Duplicate(7, copy=11)])
+    assert unused_id(graph) == 12
+    edited = apply_edits(graph, [Duplicate(7, copy=12), Remove(7)]).graph
+    assert edited.tracks.track_id.tolist() == [12]
+    assert edited.all_tracks.track_id.tolist() == [12, 11]
 
 
 def test_a_file_of_something_else_is_told(tmp_path: Path) -> None:

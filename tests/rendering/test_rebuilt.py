@@ -15,7 +15,6 @@ from foredrive.rendering.gaussians.scene_config import GaussianSceneConfig
 from foredrive.rendering.scene_graph import STATIC, SceneGraph
 from foredrive.rendering.tracks import ActorTracks
 from foredrive.rendering.views import CameraView, SweepView
-from foredrive.runs.rebuild.reconstruct import tracks_without_actors
 from foredrive.scene import LidarSweep
 
 FORWARD = torch.tensor([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
@@ -49,7 +48,7 @@ def nobody() -> ActorTracks:
         torch.eye(4).repeat(1, 2, 1, 1),
         torch.ones(1, 2, dtype=torch.bool),
     )
-    return tracks_without_actors(one)
+    return one.only(torch.tensor([False]))
 
 
 def view(twist_cam: list[float], readout_s: float) -> CameraView:

@@ -11,7 +11,6 @@ from test_scene_graph import two_actors
 from foredrive.geometry.se3 import exp_se3
 from foredrive.rendering.gaussians import Gaussians
 from foredrive.rendering.gaussians.unseen_ground import WITHIN_M, add_unseen_ground, extrapolated_ground
-from foredrive.runs.rebuild.reconstruct import tracks_without_actors
 
 WAY = torch.eye(4).repeat(21, 1, 1)
 WAY[:, 0, 3] = torch.arange(21.0)
@@ -92,7 +91,7 @@ def test_what_a_camera_sees_is_not_made_up() -> None:
     ground = torch.stack([x, y, torch.zeros_like(x)], -1)[~holes]
     across, up = torch.meshgrid(torch.arange(0, 7, 0.15), torch.arange(0, 4, 0.15), indexing="ij")
     wall = torch.stack([torch.full_like(across, 6.0), across, up], -1).flatten(0, 1)
-    scene = scene_of(torch.cat([ground, wall]), tracks_without_actors(two_actors()))
+    scene = scene_of(torch.cat([ground, wall]), two_actors().only(torch.tensor([False, False])))
     raised = FORWARD.clone()
     raised[2, 3] = 4.0
     camera = dataclasses.replace(view([0.0] * 6, readout_s=0.0), T_scene_cam=raised)

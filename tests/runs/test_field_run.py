@@ -3,9 +3,11 @@
 import dataclasses
 from pathlib import Path
 
+import numpy as np
 import pytest
 import synthetic_log as world
 import torch
+import torch.nn.functional as F
 from safetensors.torch import save_file
 from torch import Tensor
 
@@ -18,6 +20,7 @@ from foredrive.rendering.edits import Duplicate, Insert, Move, Remove, apply_edi
 from foredrive.rendering.field.config import FieldConfig, GridConfig, GridsConfig
 from foredrive.rendering.field.content import field_of
 from foredrive.rendering.field.decoders import PatchDecoderConfig
+from foredrive.rendering.field.rays import FieldRays
 from foredrive.rendering.field.scene import FieldScene, FieldSceneConfig
 from foredrive.rendering.gaussians.content import GaussianContent
 from foredrive.rendering.scene_graph import STATIC, SceneGraph
@@ -42,6 +45,7 @@ def recipe(steps: int = STEPS) -> RebuildRecipe[FieldRecipe]:
     return RebuildRecipe(
         name="small_field",
         image_hw=(48, 96),
+        moves_m=0.0,
         representation=FieldRecipe(
             schedule=dataclasses.replace(schedule, rates=rates),
             scene=FieldSceneConfig(
@@ -141,6 +145,19 @@ def test_beams_that_end_in_the_sky_do_not_return_from_the_sensor(
     assert bool(seen.range_m.isfinite().all())
     if log_opacity == -20:
         assert seen.range_m.min() > 5  # not at the sensor
+
+
+def test_what_stands_belongs_to_the_static_grid(log: LogPath, tmp_path: Path) -> None:
+    """A ray to the box that stands crosses no box; one to the box that moves crosses its own."""
+    rebuilt = reconstruct(dataclasses.replace(recipe(steps=1), moves_m=0.5), log, tmp_path / "run")
+    scene = open_rebuilt(rebuilt.folder).scene
+    assert isinstance(scene, FieldScene)
+    assert scene.graph.tracks.track_id.tolist() == [11]
+    assert scene.graph.all_tracks.track_id.tolist() == [11, 7]
+    targets = torch.from_numpy(np.stack([box["centre"] for box in (world.PARKED, world.MOVING)])).float()
+    rays = FieldRays(torch.zeros(2, 3), F.normalize(targets, dim=-1), torch.zeros(2), torch.ones(2))
+    crossings = scene.field.crossings(rays, scene.graph.tracks)
+    assert (crossings.ray.tolist(), crossings.box.tolist()) == ([1], [0])
 
 
 def test_edits_move_places_and_never_weights(run: Reconstruction) -> None:

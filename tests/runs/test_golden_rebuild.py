@@ -101,7 +101,7 @@ GAUSSIANS = {"tiny": small, "published": published}
 
 
 def recipe(name: str) -> RebuildRecipe[GaussianRecipe]:
-    return RebuildRecipe("golden", image_hw=(24, 48), representation=GAUSSIANS[name]())
+    return RebuildRecipe("golden", image_hw=(24, 48), representation=GAUSSIANS[name](), moves_m=0.0)
 
 
 @pytest.fixture(scope="module")

@@ -183,7 +183,7 @@ class BoxRecipe:
         return 0.01
 
 
-RECIPE = RebuildRecipe("boxes", image_hw=(48, 96), representation=BoxRecipe(BoxSchedule()))
+RECIPE = RebuildRecipe("boxes", image_hw=(48, 96), representation=BoxRecipe(BoxSchedule()), moves_m=0.0)
 
 
 @pytest.fixture(autouse=True)

@@ -12,10 +12,12 @@ from small_rebuild import SMALLEST
 from foredrive.data import find_logs
 from foredrive.errors import InputError
 from foredrive.geometry.se3 import matrix_from_yaw
-from foredrive.rendering.edits import Insert, Remove
+from foredrive.rendering.edits import Insert, Remove, apply_edits
 from foredrive.rendering.novel_views import novel_camera_view, novel_sweep_view, rendered_sweep
+from foredrive.rendering.scene_graph import STATIC
 from foredrive.runs.rebuild.rebuilt_run import edited_scene, open_rebuilt
 from foredrive.runs.rebuild.reconstruct import Reconstruction, reconstruct
+from foredrive.runs.rebuild.render import plan_frames, render_frame
 
 ONE_CAMERA = dataclasses.replace(SMALLEST, cameras=("ahead",))
 
@@ -86,6 +88,29 @@ def test_nothing_beyond_a_lidars_reach_returns(run: Reconstruction) -> None:
     assert float(near.returned[lost].float().mean()) < 0.05
     kept = far.hit_range_m < 5
     assert torch.equal(near.returned[kept], far.returned[kept])
+
+
+def test_what_stands_belongs_to_the_static_part_and_is_an_obstacle(tmp_path: Path) -> None:
+    """The box 7 stands and 11 moves. Static Gaussians begin on the faces of the one, not of the other."""
+    (log,) = find_logs(world.write(tmp_path, frames=7))
+    run = reconstruct(dataclasses.replace(ONE_CAMERA, moves_m=0.5), log, tmp_path / "run")
+    assert (run.summary["actors"], run.summary["obstacles"]) == (1, 1)
+    opened = open_rebuilt(run.folder)
+    graph = opened.scene.graph
+    assert graph.tracks.track_id.tolist() == [11]
+    assert graph.all_tracks.track_id.tolist() == [11, 7]
+    assert run.scene.graph.all_tracks.track_id.tolist() == [11, 7]
+    static_m = graph.content.preview(STATIC).mean_m
+    for box, fewest, most in ((world.PARKED, 20, math.inf), (world.MOVING, 0, 5)):
+        # a decimetre of each face, without the ground below
+        apart_m = (static_m - torch.from_numpy(box["centre"])).abs() - torch.from_numpy(box["size"] / 2)
+        on_it = (apart_m.amax(-1).abs() < 0.1) & (static_m[:, 2] > 0.3)
+        assert fewest <= int(on_it.sum()) <= most
+    (film,) = (plan_frames(opened.vehicle, (), None, start_s=0.2, seconds=0.0),)
+    frame = render_frame(opened.scene, opened.vehicle, apply_edits(graph, []), film, 0)
+    assert frame.boxes.track_id.tolist() == [11, 7]
+    with pytest.raises(InputError, match="7 is no actor of its own"):
+        edited_scene(opened.scene, [Remove(7)])
 
 
 @torch.no_grad()

@@ -26,7 +26,8 @@ def _stage(written: Any) -> Any:
 def upgraded_reconstruction(written: Any) -> Any:
     """Return the values of a reconstruction's recipe in today's format, as `upgraded` does.
 
-    Until November 2026 all rates of learning fell to the same fraction, and the scene had no config.
+    Until November 2026 all rates of learning fell to the same fraction, the scene had no config, and all
+    tracks were actors.
     """
     written = _renamed(written, "schedule", most_gaussians="max_gaussians")
     written = _renamed(written, "initial", actor_points_most="max_actor_points")
@@ -38,7 +39,10 @@ def upgraded_reconstruction(written: Any) -> Any:
         decoder = {"width": written.get("decoder_width", 32)}
         kept = {key: value for key, value in written.items() if key not in ("decoder_width", "rolling")}
         written = {**kept, "scene": {"decoder": decoder, "rolling": written.get("rolling", True)}}
-    return _with_representation(written)
+    written = _with_representation(written)
+    if isinstance(written, Mapping) and "representation" in written and "moves_m" not in written:
+        written = {**written, "moves_m": 0.0, "nonrigid": True}
+    return written
 
 
 def _with_representation(written: Any) -> Any:

@@ -17,6 +17,8 @@ from foredrive.recipes.gaussians import (
 from foredrive.recipes.known import nearest_name
 from foredrive.recipes.old_formats import upgraded_reconstruction
 from foredrive.recipes.representation import Representation
+from foredrive.rendering.tracks import MOVES_M
+from foredrive.training.ranges import check_at_least
 
 R = TypeVar("R", bound=Representation)
 
@@ -40,11 +42,20 @@ class RebuildRecipe(Generic[R]):
     hold_out_every: int = 2
     """The last frame of every group of this size is held out for evaluation; 0 holds out none."""
     actors: bool = True
-    """Moving actors are parts of their own. If False, everything is static."""
+    """What moves is a part of its own: an actor. If False, everything is static."""
+    moves_m: float = MOVES_M
+    """Standard deviation of the position of what moves, m. Tracks that move less belong to the static part.
+    0: all tracks are actors, so that parked vehicles can be removed and moved too."""
+    nonrigid: bool = True
+    """Pedestrians and animals that move are actors. If False, they belong to the static part."""
     drop: bool = True
     """Beams may fail to return. If False, all return."""
     about: str = field(default="", compare=False)
     """One line for lists of recipes."""
+
+    def __post_init__(self) -> None:
+        """Check the numbers' ranges."""
+        check_at_least(self, moves_m=0)
 
 
 def gaussians_tiny() -> RebuildRecipe[GaussianRecipe]:
@@ -77,6 +88,7 @@ def gaussians_published() -> RebuildRecipe[GaussianRecipe]:
         about="SplatAD with the choices of its reference implementation, for a GPU",
         image_hw=(1080, 1920),
         representation=published_gaussians(),
+        nonrigid=False,
     )
 
 
@@ -97,6 +109,7 @@ def field_base() -> RebuildRecipe[FieldRecipe]:
         about="NeuRAD in the sizes of its reference implementation, for a GPU",
         image_hw=(1080, 1920),
         representation=base_field(),
+        nonrigid=False,
     )
 
 

@@ -120,16 +120,17 @@ def apply_edits(
         open_run: opens the scene of another run's folder, for `Insert`.
 
     Raises:
-        InputError: an actor does not exist (the message names those that do), or the id of a copy is taken.
+        InputError: an actor does not exist (the message names those that do) or belongs to the static part,
+            or the id of a copy is taken.
     """
     T_ego_shifted = torch.eye(4).to(graph.tracks.T_scene_actor)
     for edit in edits:
         if isinstance(edit, ShiftEgo):
             T_ego_shifted = T_ego_shifted @ _offset(edit.offset_m, edit.yaw_rad).to(T_ego_shifted)
         elif isinstance(edit, Remove):
-            graph = _without(graph, graph.tracks.index_of(edit.actor))
+            graph = _without(graph, graph.actor_row(edit.actor))
         elif isinstance(edit, Move):
-            row = graph.tracks.index_of(edit.actor)
+            row = graph.actor_row(edit.actor)
             graph = dataclasses.replace(graph, tracks=_moved(graph.tracks, row, edit.offset_m, edit.yaw_rad))
         elif isinstance(edit, Duplicate):
             graph = _with_copy(graph, graph, edit.actor, edit.actor, edit.copy, edit.offset_m, edit.yaw_rad)
@@ -157,8 +158,8 @@ def move_between(
 
 
 def unused_id(graph: SceneGraph) -> int:
-    """Return an id that no actor has, for a copy."""
-    return max(graph.tracks.track_id.tolist(), default=0) + 1
+    """Return an id that no actor and no obstacle has, for a copy."""
+    return max(graph.all_tracks.track_id.tolist(), default=0) + 1
 
 
 def save_edits(edits: Sequence[Edit], path: Path) -> None:
@@ -203,12 +204,8 @@ def _moved(tracks: ActorTracks, row: int, offset_m: Offset, yaw_rad: float) -> A
 
 
 def _without(graph: SceneGraph, row: int) -> SceneGraph:
-    tracks, others = graph.tracks, torch.arange(len(graph.tracks)) != row
-    names = ("track_id", "category", "size_lwh", "T_scene_actor", "present")
-    return SceneGraph(
-        tracks=dataclasses.replace(tracks, **{name: getattr(tracks, name)[others] for name in names}),
-        content=graph.content.without(row),
-    )
+    others = torch.arange(len(graph.tracks)) != row
+    return dataclasses.replace(graph, tracks=graph.tracks.only(others), content=graph.content.without(row))
 
 
 def _with_copy(
@@ -221,8 +218,8 @@ def _with_copy(
     yaw_rad: float,
 ) -> SceneGraph:
     """Add an actor of `source` as `copy`, on the path of an actor of this scene and at its ground height."""
-    row, way = source.tracks.index_of(actor), graph.tracks.index_of(follows)
-    if copy in graph.tracks.track_id.tolist():
+    row, way = source.actor_row(actor), graph.actor_row(follows)
+    if copy in graph.all_tracks.track_id.tolist():
         raise InputError(f"there is an actor {copy} already: a copy needs an id of its own")
     tracks = graph.tracks
     try:
@@ -234,7 +231,8 @@ def _with_copy(
     pose = tracks.T_scene_actor[way] @ _offset((forward_m, left_m, up_m + lift_m), yaw_rad).to(
         tracks.size_lwh
     )
-    return SceneGraph(
+    return dataclasses.replace(
+        graph,
         tracks=ActorTracks(
             track_id=torch.cat([tracks.track_id, tracks.track_id.new_tensor([copy])]),
             category=torch.cat([tracks.category, source.tracks.category[row : row + 1]]),

@@ -7,14 +7,17 @@ from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float
+from safetensors import safe_open
 from torch import Tensor, nn
 
 from foredrive.geometry.se3 import exp_se3
 from foredrive.rendering.rendered import RenderedImage, RenderedSweep
 from foredrive.rendering.scene_graph import Content, SceneGraph
-from foredrive.rendering.tracks import ActorTracks
+from foredrive.rendering.tracks import PER_TRACK, ActorTracks
 from foredrive.rendering.views import CameraView, SweepView
 
+OBSTACLE = "obstacle_"
+"""Beginning of the names of the obstacles' buffers."""
 _FIRST_VELOCITY_MPS, _FIRST_TURN_RADPS = 0.05, 5e-5
 """Bounds of the initial corrections of the frames' velocities."""
 
@@ -57,9 +60,10 @@ class RebuiltScene(nn.Module, ABC):
     ) -> None:
         super().__init__()
         self.reach_m = reach_m
-        for name in ("track_id", "category", "size_lwh", "T_scene_actor", "present"):
+        for name in PER_TRACK:
             self.register_buffer(name, getattr(tracks, name))
         self.register_buffer("key_t_s", tracks.t_s)
+        self.keep_obstacles(tracks.only(torch.zeros_like(tracks.present[:, 0])))
         self.actor_offset = nn.Parameter(torch.zeros(*tracks.present.shape, 6))
         """Offsets of key poses, in the actors' own axes: m, rad."""
         self.camera_offset = nn.Parameter(torch.zeros(cameras, 6))
@@ -131,10 +135,28 @@ class RebuiltScene(nn.Module, ABC):
         )
         return logged.moved(self.actor_offset)
 
+    def keep_obstacles(self, tracks: ActorTracks) -> None:
+        """Take over the tracks of what belongs to the static part. Nothing of it is learned."""
+        for name in PER_TRACK:
+            self.register_buffer(OBSTACLE + name, getattr(tracks, name), persistent=len(tracks) > 0)
+
+    def restore_obstacles(self, file: Path) -> None:
+        """Take over the obstacles in saved weights, which are to be loaded afterwards."""
+        with safe_open(file, "pt") as saved:
+            names = [OBSTACLE + name for name in PER_TRACK if OBSTACLE + name in saved.keys()]  # noqa: SIM118
+            if names:
+                entries = {name: saved.get_tensor(name) for name in (*names, "key_t_s")}
+                self.keep_obstacles(saved_tracks(entries, OBSTACLE))
+
+    @property
+    def obstacles(self) -> ActorTracks:
+        """The tracks of what belongs to the static part."""
+        return ActorTracks(t_s=self.key_t_s, **{name: getattr(self, OBSTACLE + name) for name in PER_TRACK})
+
     @property
     def graph(self) -> SceneGraph:
         """The scene with its current parameters."""
-        return SceneGraph(self.tracks, self.content)
+        return SceneGraph(self.tracks, self.content, self.obstacles)
 
     def frame_twist(self, frame: int | None) -> Float[Tensor, "6"]:
         """Return the learned correction of a training frame's twist; 0 for None, and if there are none."""
@@ -156,17 +178,14 @@ class RebuiltScene(nn.Module, ABC):
         return SensorMotion(T_scene_cam, twist, view.t_s + late_s)
 
 
-def saved_tracks(saved: Mapping[str, Tensor]) -> ActorTracks:
+def saved_tracks(saved: Mapping[str, Tensor], prefix: str = "") -> ActorTracks:
     """Return the tracks in the saved weights of a scene, without learned offsets.
+
+    Args:
+        saved: the weights.
+        prefix: "" for the actors, `OBSTACLE` for what belongs to the static part.
 
     Raises:
         KeyError: an entry is missing.
     """
-    return ActorTracks(
-        saved["track_id"],
-        saved["category"],
-        saved["size_lwh"],
-        saved["key_t_s"],
-        saved["T_scene_actor"],
-        saved["present"],
-    )
+    return ActorTracks(t_s=saved["key_t_s"], **{name: saved[prefix + name] for name in PER_TRACK})

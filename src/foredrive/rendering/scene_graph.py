@@ -1,4 +1,4 @@
-"""A scene graph: the tracks of actors, and what the static part and each actor look like.
+"""A scene graph: the tracks of actors, what the static part and each actor look like, and obstacles.
 
 What they look like is the matter of a representation: `rendering.gaussians` keeps Gaussians. Everything else
 (edits, threats, films, drives, evaluation) knows `Content` alone.
@@ -9,8 +9,9 @@ from typing import Protocol, runtime_checkable
 
 import torch
 
+from foredrive.errors import InputError
 from foredrive.rendering.gaussians.gaussians import Gaussians
-from foredrive.rendering.tracks import ActorTracks
+from foredrive.rendering.tracks import ActorTracks, joined_tracks
 from foredrive.scene.record import Record
 
 STATIC = -1
@@ -56,3 +57,24 @@ class SceneGraph(Record):
 
     tracks: ActorTracks
     content: Content
+    obstacles: ActorTracks | None = None
+    """Tracks whose looks belong to the static part, such as those of parked vehicles. They are in the way all
+    the same. Key times are those of `tracks`."""
+
+    @property
+    def all_tracks(self) -> ActorTracks:
+        """Return the tracks of all road users: those of the actors, then those of the obstacles."""
+        return self.tracks if self.obstacles is None else joined_tracks(self.tracks, self.obstacles)
+
+    def actor_row(self, track_id: int) -> int:
+        """Return the row of an actor.
+
+        Raises:
+            InputError: there is no actor with this id, or its looks belong to the static part.
+        """
+        if self.obstacles is not None and track_id in self.obstacles.track_id.tolist():
+            raise InputError(
+                f"{track_id} is no actor of its own: it stands in the log, or is not rigid, and so belongs "
+                "to the static part, which edits do not change; rebuild with --set moves_m=0 nonrigid=true"
+            )
+        return self.tracks.index_of(track_id)

@@ -1,4 +1,4 @@
-"""ActorTracks of actors: key poses, learnable offsets, and motion between key poses."""
+"""Tracks of actors: key poses, learnable offsets, and motion between key poses."""
 
 import dataclasses
 import math
@@ -26,6 +26,12 @@ SYMMETRIC_CATEGORIES = (
     *(Category.CONSTRUCTION_VEHICLE, Category.MOTORCYCLE, Category.BICYCLE),
 )
 """Categories that are left-right symmetric."""
+PER_TRACK = ("track_id", "category", "size_lwh", "T_scene_actor", "present")
+"""Entries of `ActorTracks` with one row per track."""
+NONRIGID_CATEGORIES = (Category.PEDESTRIAN, Category.ANIMAL)
+"""Categories that change their shape while they move."""
+MOVES_M = 0.5
+"""Standard deviation of the position of what moves, m: that of NeuRAD's reference implementation."""
 MAX_HOLD_S = 0.5
 """Time before and after its key time for which an actor with a single key time is present, s."""
 
@@ -64,6 +70,10 @@ class ActorTracks(Record):
             known = ", ".join(str(i) for i in self.track_id.tolist()) or "none"
             raise InputError(f"no actor {track_id}; there are: {known}")
         return int(rows[0])
+
+    def only(self, rows: Bool[Tensor, "A"] | Int[Tensor, "n"]) -> "ActorTracks":
+        """Return some of the tracks, with the same key times."""
+        return dataclasses.replace(self, **{name: getattr(self, name)[rows] for name in PER_TRACK})
 
     def moved(self, offset: Float[Tensor, "A K 6"]) -> "ActorTracks":
         """Return tracks with every key pose changed in the actor's frame by exp(offset): m, then rad."""
@@ -149,6 +159,42 @@ def boxes_at(
         valid=torch.ones_like(tracks.track_id[near], dtype=torch.bool),
         **unlabelled(int(near.sum()), device=near.device),
     )
+
+
+def joined_tracks(tracks: ActorTracks, others: ActorTracks) -> ActorTracks:
+    """Return the tracks of both, which have the same key times."""
+    pairs = {name: (getattr(tracks, name), getattr(others, name)) for name in PER_TRACK}
+    return dataclasses.replace(tracks, **{name: torch.cat([a, b.to(a)]) for name, (a, b) in pairs.items()})
+
+
+def move_at_least(tracks: ActorTracks, std_m: float) -> Bool[Tensor, "A"]:
+    """Return which tracks move: in some direction the standard deviation of their position is greater.
+
+    NeuRAD's reference implementation finds the moving objects of nuScenes so, along the axes of the map. It
+    takes PandaSet's own marks of what stands; the cuboids that are marked keep their place exactly.
+    """
+    present = tracks.present[..., None]
+    xy_m = tracks.T_scene_actor[..., :2, 3].detach().double() * present
+    count = present.sum(1)
+    spread_m = (xy_m - (xy_m.sum(1) / count.clamp_min(1))[:, None]) * present
+    covariance = spread_m.mT @ spread_m / (count - 1).clamp_min(1)[..., None]
+    return torch.linalg.eigvalsh(covariance)[:, -1] > std_m**2
+
+
+def split_tracks(
+    tracks: ActorTracks, moves_m: float = MOVES_M, nonrigid: bool = True
+) -> tuple[ActorTracks, ActorTracks]:
+    """Return the tracks of the actors, parts of their own, and those of what belongs to the static part.
+
+    Args:
+        tracks: all tracks of a log.
+        moves_m: an actor's least standard deviation of its position (`move_at_least`), m; 0: all are actors.
+        nonrigid: whether pedestrians and animals are actors.
+    """
+    actors = move_at_least(tracks, moves_m) if moves_m else torch.ones_like(tracks.present[:, 0])
+    if not nonrigid:
+        actors &= ~torch.isin(tracks.category, torch.tensor(NONRIGID_CATEGORIES, device=actors.device))
+    return tracks.only(actors), tracks.only(~actors)
 
 
 def read_tracks(clip: Clip, T_world_scene: Float64[Tensor, "4 4"]) -> ActorTracks:

@@ -161,7 +161,7 @@ class PseudoSimulation:
         yaw, xyz = torch.tensor(offset.yaw_rad), torch.tensor([offset.ahead_m, offset.left_m, 0.0])
         drive = LoggedDrive(self._place.vehicle, matrix_from_yaw(yaw, xyz))
         graph = self._place.graph
-        simulator = RebuiltSimulator(self._place.renderer(graph), graph.tracks, drive, self._place.lanes)
+        simulator = RebuiltSimulator(self._place.renderer(graph), graph.all_tracks, drive, self._place.lanes)
         clip = simulator.reset(RebuiltScenario(start_s, self._sensors, self._past_frames))
         state, seen = drive.state_at(start_s), stack_records([clip])
         plan = self._agent_in(simulator).act(seen)
@@ -194,7 +194,7 @@ class PseudoSimulation:
 
     def _others(self, start_s: float) -> Surroundings:
         """Return the road users of the log from a time on."""
-        tracks, T = self._place.graph.tracks, self._place.vehicle.T_world_scene
+        tracks, T = self._place.graph.all_tracks, self._place.vehicle.T_world_scene
         moments = [users_at(tracks, T, start_s + STEP_S * step) for step in range(STEPS)]
         return Surroundings(
             centre_m=np.stack([users.foot_m[:, :2] for users in moments]),

@@ -13,7 +13,7 @@ import torch
 
 from foredrive.errors import InputError
 from foredrive.geometry.se3 import inverse_se3
-from foredrive.rendering.edits import DriveStraight, Offset
+from foredrive.rendering.edits import DriveStraight, Offset, unused_id
 from foredrive.rendering.scene_graph import SceneGraph
 from foredrive.scene import Category
 from foredrive.simulation.dynamics import EGO
@@ -63,17 +63,12 @@ def send_threat(threat: Threat, graph: SceneGraph, drive: LoggedDrive, start_s: 
     speed_mps = 0.0 if threat is Threat.STATIONARY else THREAT_MPS
     return DriveStraight(
         actor=int(tracks.track_id[row]),
-        copy=threat_id(graph),
+        copy=unused_id(graph),
         at_m=_offset(T_scene_ego[:3, :3] @ [ahead_m, 0.0, 0.5 * height_m] + T_scene_ego[:3, 3]),
         at_s=at_s,
         velocity_mps=_offset(speed_mps * way),
         yaw_rad=float(np.arctan2(way[1], way[0])),
     )
-
-
-def threat_id(graph: SceneGraph) -> int:
-    """Return an id that no actor of the scene has."""
-    return int(graph.tracks.track_id.max()) + 1 if len(graph.tracks) else 1
 
 
 def reference_mps(threat: Threat, drive: LoggedDrive, start_s: float) -> float:
@@ -90,7 +85,7 @@ def _most_observed_car(graph: SceneGraph) -> int:
     """Return the row of the car that was observed most."""
     rows = (graph.tracks.category == Category.CAR).nonzero()[:, 0].tolist()
     if not rows:
-        raise InputError("the scene has no car that could serve as the threat")
+        raise InputError("the scene has no car as an actor of its own that could serve as the threat")
     return max(rows, key=graph.content.evidence)
 
 

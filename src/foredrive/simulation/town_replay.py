@@ -4,7 +4,6 @@ The road users replay the recorded drive, as those of a rebuilt log do. So a tes
 this renderer differ in what the sensors show, and in nothing else.
 """
 
-import dataclasses
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -49,15 +48,8 @@ class TownReplayRenderer:
     ) -> None:
         self._world, self._sensors, self._moments = world, sensors, moments
         self._T_world_scene = T_world_scene
-        rows = [tracks.index_of(number) for number in copied]
-        self._added = tracks.map_tensors(lambda tensor: tensor.detach().cpu())
-        self._added = dataclasses.replace(
-            self._added,
-            **{
-                name: getattr(self._added, name)[rows]
-                for name in ("track_id", "category", "size_lwh", "T_scene_actor", "present")
-            },
-        )
+        rows = torch.tensor([tracks.index_of(number) for number in copied], dtype=torch.int64)
+        self._added = tracks.map_tensors(lambda tensor: tensor.detach().cpu()).only(rows)
         known = {actor.track_id: actor for moment in moments for actor in moment.actors}
         known |= {actor.track_id: actor for actor in world.parked}
         if missing := [number for number in copied.values() if number not in known]:

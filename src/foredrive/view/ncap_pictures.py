@@ -43,10 +43,10 @@ def write_scenario_picture(path: Path, place: Place, scenario: SafetyScenario) -
     renderer = place.renderer(graph)
     twist = torch.tensor([ego.speed_mps, 0.0, 0.0, 0.0, 0.0, yaw_rate_radps(ego)])
     seen = renderer.render(T_world_ego, twist, at_s)
-    tracks = graph.tracks.map_tensors(lambda tensor: tensor.detach().cpu())
+    tracks = graph.all_tracks.map_tensors(lambda tensor: tensor.detach().cpu())
     T_scene_ego = inverse_se3(place.vehicle.T_world_scene) @ T_world_ego
     boxes = boxes_at(tracks, T_scene_ego, at_s)
-    added = torch.isin(boxes.track_id, place.graph.tracks.track_id.cpu(), invert=True)
+    added = torch.isin(boxes.track_id, place.graph.all_tracks.track_id.cpu(), invert=True)
     camera = facing(renderer.rig, boxes.centre[added][0].numpy() if bool(added.any()) else np.zeros(3))
     width_px = 0
     picture = None

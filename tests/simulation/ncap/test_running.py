@@ -220,7 +220,7 @@ def test_proposals_read_boxes_that_the_reconstruction_has_refined() -> None:
 
 def test_nothing_is_proposed_where_something_stands_in_the_way() -> None:
     assert propose(place(parked_m=(45.0, 0.0)), "log") == []
-    with pytest.raises(InputError, match="no car of the log was seen"):
+    with pytest.raises(InputError, match="no car that is an actor of its own was seen"):
         propose(place(), "log")
 
 

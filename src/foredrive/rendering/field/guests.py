@@ -5,7 +5,6 @@ put together by its share: the probability that a ray ends in the one or the oth
 nothing else stops a ray, as in the box of an actor of the scene's own.
 """
 
-import dataclasses
 from typing import NamedTuple
 
 import torch
@@ -70,10 +69,10 @@ def split_guests(tracks: ActorTracks, content: FieldContent) -> tuple[FieldActor
     if not guests:
         return FieldActors(tracks, content.slot), []
     own = content.owner == 0
-    return FieldActors(_chosen(tracks, own.nonzero()[:, 0]), content.slot[own]), [
+    return FieldActors(tracks.only(own), content.slot[own]), [
         Guest(
             content.fields[int(content.owner[row])],
-            _chosen(tracks, torch.tensor([row], device=tracks.t_s.device)),
+            tracks.only(torch.tensor([row], device=tracks.t_s.device)),
             content.slot[row : row + 1],
         )
         for row in guests
@@ -241,8 +240,3 @@ def _filled(feature: Float[Tensor, "H W D"], share: Float[Tensor, "H W"]) -> Flo
     rows, columns = distance_transform_edt(nowhere, return_distances=False, return_indices=True)
     device = feature.device
     return feature[torch.from_numpy(rows).to(device).long(), torch.from_numpy(columns).to(device).long()]
-
-
-def _chosen(tracks: ActorTracks, rows: Int[Tensor, "n"]) -> ActorTracks:
-    names = (field.name for field in dataclasses.fields(tracks) if field.name != "t_s")
-    return dataclasses.replace(tracks, **{name: getattr(tracks, name)[rows] for name in names})

@@ -219,7 +219,7 @@ def _tested(source: SafetyTests) -> SelfTest:
 def place_in(folder: str) -> Place:
     """Return a reconstruction as a place of tests."""
     opened = opened_rebuilt(folder)
-    ids = {str(track_id): track_id for track_id in opened.scene.graph.tracks.track_id.tolist()}
+    ids = {str(track_id): track_id for track_id in opened.scene.graph.all_tracks.track_id.tolist()}
     with contextlib.suppress(InputError):  # without its log, actors are known by their numbers alone
         of_log = read_track_ids(Log(open_run_log(Path(folder))[1]))
         ids |= {token: track_id for token, track_id in of_log.items() if track_id in set(ids.values())}

@@ -88,7 +88,7 @@ class RebuiltRoutes:
             graph = edited_scene(opened.scene, [*edits, sent]).graph
         renderer = RebuiltRenderer(opened.scene, graph, opened.vehicle)
         lanes = lanes_of(opened.folder)
-        simulator = RebuiltSimulator(renderer, graph.tracks, drive, lanes)
+        simulator = RebuiltSimulator(renderer, graph.all_tracks, drive, lanes)
         sensors = renders_for(suite)
         agent = agent_in(suite.agent, simulator)
         route_xyz = drive.route_from(start_s)

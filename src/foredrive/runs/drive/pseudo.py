@@ -52,7 +52,9 @@ def pseudo_simulate(
         check_lidar_of(agent, None, place.vehicle, run)
         drive = LoggedDrive(place.vehicle, torch.eye(4))
         # an agent that cannot be made here is an error of the caller, and no failed start
-        agent_in(agent, RebuiltSimulator(place.renderer(place.graph), place.graph.tracks, drive, place.lanes))
+        agent_in(
+            agent, RebuiltSimulator(place.renderer(place.graph), place.graph.all_tracks, drive, place.lanes)
+        )
         simulation = PseudoSimulation(
             place,
             roads_of(run),

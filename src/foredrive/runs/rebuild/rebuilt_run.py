@@ -41,6 +41,7 @@ def open_rebuilt(folder: Path) -> OpenedReconstruction:
         raise InputError(f"{folder}: made by an earlier version (no {VEHICLE}); reconstruct the log again")
     vehicle = load_vehicle(folder / VEHICLE)
     scene = recipe.representation.open(folder / WEIGHTS, vehicle.reach_m)
+    scene.restore_obstacles(folder / WEIGHTS)
     load_weights(scene, folder / WEIGHTS)
     return OpenedReconstruction(folder, scene, vehicle)
 

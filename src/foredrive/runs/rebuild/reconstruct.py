@@ -1,6 +1,5 @@
 """Reconstruct a log as a scene that can be rendered: a folder with recipe, weights, metrics and pictures."""
 
-import dataclasses
 import json
 import logging
 import os
@@ -27,7 +26,7 @@ from foredrive.recipes.representation import Representation
 from foredrive.rendering.ply import write_ply
 from foredrive.rendering.rebuilt import RebuiltScene
 from foredrive.rendering.scene_graph import STATIC
-from foredrive.rendering.tracks import ActorTracks, read_tracks
+from foredrive.rendering.tracks import ActorTracks, joined_tracks, read_tracks, split_tracks
 from foredrive.rendering.vehicle import LoggedVehicle, read_vehicle, save_vehicle
 from foredrive.rendering.views import CameraView, SweepView, camera_views, sweep_views
 from foredrive.runs.folder import CONFIG, LOG, SUMMARY, WEIGHTS, RunFolder
@@ -56,6 +55,9 @@ class ReconstructionData:
     train: SensorViews
     held_out: SensorViews
     tracks: ActorTracks
+    """The actors."""
+    obstacles: ActorTracks
+    """What belongs to the static part."""
     vehicle: LoggedVehicle
 
 
@@ -117,7 +119,8 @@ def _rebuild(
     weights = folder / WEIGHTS
     if not weights.is_file():
         train, names = data.train, data.vehicle.rig.names
-        for finding in calibration_findings(names, train.cameras, train.sweeps, data.tracks):
+        tracks = joined_tracks(data.tracks, data.obstacles)
+        for finding in calibration_findings(names, train.cameras, train.sweeps, tracks):
             _log.warning("%s: the calibration may be wrong: %s", path.folder, finding)
         rebuild(representation.training(scene, data.train), folder)
         representation.complete(scene, data.vehicle.T_scene_ego, data.train)
@@ -157,13 +160,15 @@ def read_reconstruction_data(
     ):
         if lacking:
             _log.warning("%s: %s", path.folder, what)
+    actors, obstacles = split_tracks(tracks, recipe.moves_m, recipe.nonrigid)
     if not recipe.actors:
-        tracks = tracks_without_actors(tracks)
+        actors, obstacles = tracks.only(torch.zeros_like(tracks.present[:, 0])), tracks
     train = _sensor_views(known, T_world_scene)
     return ReconstructionData(
         train=train,
         held_out=_sensor_views(drive.frames(frames[held].tolist()), T_world_scene),
-        tracks=tracks,
+        tracks=actors,
+        obstacles=obstacles,
         vehicle=_vehicle(Log(path), drive, train.sweeps),
     )
 
@@ -171,17 +176,11 @@ def read_reconstruction_data(
 def initial_model(recipe: RebuildRecipe[Any], data: ReconstructionData) -> RebuiltScene:
     """Return the scene before training."""
     vehicle = data.vehicle
-    return recipe.representation.begin(data.train, data.tracks, len(vehicle.rig.names), vehicle.reach_m)
-
-
-def tracks_without_actors(tracks: ActorTracks) -> ActorTracks:
-    """Return tracks with the same key times and no actors."""
-    empty = {
-        field.name: getattr(tracks, field.name)[:0]
-        for field in dataclasses.fields(tracks)
-        if field.name != "t_s"
-    }
-    return dataclasses.replace(tracks, **empty)
+    scene: RebuiltScene = recipe.representation.begin(
+        data.train, data.tracks, len(vehicle.rig.names), vehicle.reach_m
+    )
+    scene.keep_obstacles(data.obstacles)
+    return scene
 
 
 def check_memory(recipe: RebuildRecipe[Any], path: LogPath) -> None:
@@ -253,6 +252,7 @@ def _summary(
         "log": path.name,
         **scene.sizes,
         "actors": len(data.tracks),
+        "obstacles": len(data.obstacles),
         "minutes": sum(float(line["step_s"]) for line in steps) / 60,
         "computing_minutes": sum(float(line["computing_s"]) for line in steps) / 60,
         "peak_memory_gib": peak_rss_gib(),

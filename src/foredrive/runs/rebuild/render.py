@@ -121,7 +121,7 @@ def render_frame(
     ego, sweep = vehicle.at(t_s).shifted(edited.T_ego_shifted.cpu()), None
     if plan.lidar is not None:
         sweep = render_sweep(scene, edited.graph, plan.lidar, ego)
-    return RenderedFrame(t_s, images, sweep, boxes_at(edited.graph.tracks, ego.T_scene_ego, t_s))
+    return RenderedFrame(t_s, images, sweep, boxes_at(edited.graph.all_tracks, ego.T_scene_ego, t_s))
 
 
 def edits_from_arguments(

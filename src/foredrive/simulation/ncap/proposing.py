@@ -8,7 +8,7 @@ after it begins to drive itself, at constant speed on the logged path. A scenari
 - the actor is on a lane around the time of the impact, if the log has a map;
 - no actor hides the target from the ego vehicle 2 s before the impact;
 - the ego vehicle could stop in front of the place with comfortable braking, so that the test can be passed;
-- the copied car was seen, and from near.
+- the copied car is an actor of its own, and was seen from near.
 
 What is proposed still has to pass the self-test.
 """
@@ -61,7 +61,7 @@ def propose(place: Place, scene: str) -> list[SafetyScenario]:
         scene: name of the reconstruction in the scenarios.
 
     Raises:
-        InputError: no car of the log was seen from near.
+        InputError: no car that is an actor of its own was seen from near.
     """
     drive = LoggedDrive(place.vehicle, torch.eye(4))
     models, found = _models(place, drive), list[SafetyScenario]()
@@ -82,7 +82,7 @@ def propose(place: Place, scene: str) -> list[SafetyScenario]:
 
 
 def _models(place: Place, drive: LoggedDrive) -> tuple[str, ...]:
-    """Return the names of the cars that were seen best, from near."""
+    """Return the names of the actors that are cars and were seen best, from near."""
     tracks, token = place.graph.tracks, {number: name for name, number in place.track_ids.items()}
     rows = []
     for t_s in np.arange(drive.first_s, drive.end_s, FRAME_DT_S).tolist():
@@ -91,7 +91,7 @@ def _models(place: Place, drive: LoggedDrive) -> tuple[str, ...]:
         near = (users.track_id >= 0) & (users.category == int(Category.CAR)) & (away_m < SEEN_WITHIN_M)
         rows += np.flatnonzero(near).tolist()
     if not rows:
-        raise InputError(f"no car of the log was seen from within {SEEN_WITHIN_M:g} m")
+        raise InputError(f"no car that is an actor of its own was seen from within {SEEN_WITHIN_M:g} m")
     best = sorted(set(rows), key=lambda row: -place.graph.content.evidence(row))[:MODELS]
     return tuple(token[int(tracks.track_id[row])] for row in best)
 
@@ -183,7 +183,8 @@ def _feasible(
 
 def _others(place: Place, t_s: float) -> shapely.Geometry:
     """Return the boxes of the log's actors at a time, in the plane of the world."""
-    states, tracks = states_at(place.graph.tracks, t_s), place.graph.tracks
+    tracks = place.graph.all_tracks
+    states = states_at(tracks, t_s)
     users = users_at(tracks, place.vehicle.T_world_scene, t_s)
     boxes = []
     for row in states.present.nonzero()[:, 0].tolist():
