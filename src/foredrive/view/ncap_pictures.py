@@ -37,7 +37,7 @@ def write_scenario_picture(path: Path, place: Place, scenario: SafetyScenario) -
     The image is that of the camera that looks most directly at the target. Its box is drawn in it.
     """
     drawn, drive = draw_run(scenario, 0), LoggedDrive(place.vehicle, torch.eye(4))
-    graph = place_actors(place.graph, drawn, place.vehicle.T_world_scene, place.track_ids, others_stay=True)
+    graph = place_actors(place.graph, drawn, place.vehicle.T_world_scene, place.track_ids, moving_stay=True)
     at_s = FRAME_DT_S * (drawn.start_frame + scenario.priming_frames) + IMPACT_S - BEFORE_S
     T_world_ego, ego = torch.from_numpy(drive.pose_at(at_s)), drive.state_at(at_s)
     renderer = place.renderer(graph)

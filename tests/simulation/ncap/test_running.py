@@ -15,13 +15,13 @@ from foredrive.rendering.gaussians.content import GaussianContent
 from foredrive.rendering.gaussians.scene import GaussianScene
 from foredrive.rendering.renderer import RebuiltRenderer
 from foredrive.rendering.scene_graph import SceneGraph
-from foredrive.rendering.tracks import ActorTracks, states_at
+from foredrive.rendering.tracks import ActorTracks, joined_tracks, states_at
 from foredrive.rendering.vehicle import LoggedVehicle
 from foredrive.scene import CameraRig, Category
 from foredrive.simulation.drive import drive_route
 from foredrive.simulation.ncap.drawing import draw_run
 from foredrive.simulation.ncap.hd import hd_score_of
-from foredrive.simulation.ncap.outcome import Outcome, SafetyResult, judge
+from foredrive.simulation.ncap.outcome import Outcome, SafetyResult, first_collision, judge
 from foredrive.simulation.ncap.proposing import propose
 from foredrive.simulation.ncap.rules import OURS, PAPER, RELEASED, RULES, Rules
 from foredrive.simulation.ncap.running import Place, drive_without_action, reference_mps, set_up_run
@@ -118,7 +118,7 @@ def test_the_actor_stands_where_and_as_it_was_drawn() -> None:
     here = place()
     run = set_up_run(here, test, 0, PAPER, sensors=False, past_frames=1)
     states = states_at(run.simulator._tracks, 4.05)
-    (T_scene_actor,) = states.T_scene_actor  # the log's own car is gone
+    T_scene_actor = states.T_scene_actor[1]  # after the log's parked car
     T = here.vehicle.T_world_scene @ T_scene_actor.double()
     assert np.allclose(T[:3, 3], np.add(at(50.0), [0.0, 0.0, 0.8]), atol=1e-4)
     yaw = math.atan2(T[1, 0], T[0, 0])
@@ -131,12 +131,49 @@ def test_a_moving_actor_heads_where_it_moves() -> None:
     here = place()
     run = set_up_run(here, SIDE, 0, PAPER, sensors=False, past_frames=1)
     states = states_at(run.simulator._tracks, 6.0)
-    T = here.vehicle.T_world_scene @ states.T_scene_actor[0].double()
+    T = here.vehicle.T_world_scene @ states.T_scene_actor[1].double()
     assert np.allclose(T[:2, 3], at(45.0, 5.0)[:2], atol=1e-3)
     assert math.atan2(T[1, 0], T[0, 0]) == pytest.approx(YAW + 0.5 * math.pi, abs=1e-4)
     inverse = inverse_se3(here.vehicle.T_world_scene)
-    velocity = inverse[:3, :3].T @ states.velocity_mps[0].double()
+    velocity = inverse[:3, :3].T @ states.velocity_mps[1].double()
     assert np.allclose(velocity[:2], 5.0 * LEFT[:2], atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("rules", "present"), [(OURS, [4, 5, 6, 7]), (PAPER, [4, 6, 7]), (RELEASED, [4, 6, 7])], ids=lambda x: ""
+)
+def test_only_what_moves_vanishes_for_a_test_of_the_paper(rules: Rules, present: list[int]) -> None:
+    """In the log 4 is parked and an actor, 5 drives, and 6 is parked and an obstacle. 7 is the test's own."""
+    here = place()
+    four = here.graph.tracks
+    driving = four.T_scene_actor.clone()
+    driving[0, :, 1, 3] += 10.0 + 2.0 * four.t_s
+    five = dataclasses.replace(four, track_id=torch.tensor([5]), T_scene_actor=driving)
+    six = dataclasses.replace(four, track_id=torch.tensor([6]))
+    here = dataclasses.replace(
+        here, graph=dataclasses.replace(here.graph, tracks=joined_tracks(four, five), obstacles=six)
+    )
+    run = set_up_run(here, STANDING, 0, rules, sensors=False, past_frames=1)
+    assert sorted(run.simulator.tracks.track_id.tolist()) == present
+
+
+@pytest.mark.parametrize("rules", list(RULES.values()), ids=list(RULES))
+def test_a_parked_vehicle_is_hit_under_all_rules(rules: Rules) -> None:
+    """It stands 30 m on, 20 m in front of the test's own actor."""
+    parked = place(parked_m=(30.0, 0.0))
+    graph, nothing = parked.graph, torch.tensor([False])
+    as_obstacle = dataclasses.replace(
+        parked, graph=dataclasses.replace(graph, tracks=graph.tracks.only(nothing), obstacles=graph.tracks)
+    )
+    assert drive_without_action(parked, STANDING, 0, rules) == pytest.approx(8.0, rel=0.03)
+    run = set_up_run(parked, STANDING, 0, rules, sensors=False, past_frames=1)
+    drive = drive_route(run.simulator, run.scenario, StraightAgent(8.0), route="", pilot=run.pilot)
+    hit = first_collision(drive)
+    assert hit is not None
+    front_m = 30.0 - 2.0 - rules.vehicle.axle_to_centre_m - 0.5 * rules.vehicle.length_m
+    assert hit.t_s == pytest.approx((front_m - 16.0) / 8.0, abs=0.3)
+    with pytest.raises(InputError, match="4 is no actor of its own"):
+        set_up_run(as_obstacle, STANDING, 0, rules, sensors=False, past_frames=1)
 
 
 def test_pedestrians_count_under_our_rules_alone() -> None:

@@ -15,7 +15,7 @@ from foredrive.simulation.ncap.scenario import (
     SafetyScenario,
     ScenarioActor,
 )
-from foredrive.simulation.ncap.scenario_file import load_scenarios, save_scenarios
+from foredrive.simulation.ncap.scenario_file import load_scenarios, outside_protocol, save_scenarios
 from foredrive.simulation.threats import Threat
 
 THEIRS = """
@@ -160,6 +160,17 @@ def test_a_wrong_entry_is_named_with_its_file(theirs: Path, old: str, new: str, 
         load_scenarios(theirs)
     assert str(theirs) in str(raised.value)
     assert "\n" not in str(raised.value)
+
+
+def test_a_file_outside_of_the_protocol_is_read_by_its_name_alone(theirs: Path) -> None:
+    """neuro-ncap's folder has 21 files, one of them for nuScenes' mini set and "not for eval"."""
+    mini = theirs.with_name("0061.yaml")
+    mini.write_text(THEIRS)
+    for folder in (theirs.parent.parent, theirs.parent):
+        assert [scenario.label for scenario in load_scenarios(folder)] == ["stationary-0101"]
+        assert outside_protocol(folder) == {mini: "stationary-0061"}
+    assert [scenario.label for scenario in load_scenarios(mini)] == ["stationary-0061"]
+    assert outside_protocol(mini) == {}
 
 
 def test_a_folder_tells_the_kind_and_names_are_unique(theirs: Path, tmp_path: Path) -> None:

@@ -31,7 +31,7 @@ from foredrive.simulation.ncap.proposing import propose
 from foredrive.simulation.ncap.rules import RULES, Rules
 from foredrive.simulation.ncap.running import Place, SafetyRun, set_up_run
 from foredrive.simulation.ncap.scenario import SafetyScenario
-from foredrive.simulation.ncap.scenario_file import load_scenarios, save_scenarios
+from foredrive.simulation.ncap.scenario_file import load_scenarios, outside_protocol, save_scenarios
 from foredrive.simulation.ncap.self_test import SelfTest, run_reference, self_test
 
 
@@ -212,7 +212,13 @@ def _tested(source: SafetyTests) -> SelfTest:
             )
         return place_in(folders[scenario.scene])
 
-    return self_test(load_scenarios(Path(source.scenarios)), place_of, source.count, rules)
+    file = Path(source.scenarios)
+    tested = self_test(load_scenarios(file), place_of, source.count, rules)
+    outside = {
+        label: f"not one of the scenarios of neuro-ncap's protocol; to drive it, name its file {path}"
+        for path, label in outside_protocol(file).items()
+    }
+    return dataclasses.replace(tested, left_out={**tested.left_out, **outside})
 
 
 @functools.lru_cache(maxsize=1)  # consecutive runs share one scene

@@ -11,8 +11,9 @@ from torch import Tensor
 
 from foredrive.errors import InputError
 from foredrive.geometry.se3 import inverse_se3
-from foredrive.rendering.edits import Duplicate, Edit, Remove, apply_edits, unused_id
+from foredrive.rendering.edits import Duplicate, Remove, apply_edits, unused_id
 from foredrive.rendering.scene_graph import SceneGraph
+from foredrive.rendering.tracks import MOVES_M, move_at_least
 from foredrive.simulation.ncap.drawing import DrawnActor, DrawnRun
 from foredrive.simulation.ncap.scenario import Polyline
 from foredrive.simulation.observation import FRAME_DT_S
@@ -27,22 +28,24 @@ def place_actors(
     T_world_scene: Float64[Tensor, "4 4"],
     track_ids: Mapping[str, int],
     *,
-    others_stay: bool,
+    moving_stay: bool,
 ) -> SceneGraph:
     """Return the scene with the actors of a run.
 
     Args:
         track_ids: id of each of the log's tracks by its token.
-        others_stay: whether the log's own actors stay.
+        moving_stay: whether the log's own actors that move stay. What stands in the log stays in any case.
 
     Raises:
         InputError: the log has no track of an actor's name.
     """
-    logged = graph.tracks.track_id.tolist()
+    logged = graph.tracks
     for actor in run.actors:
         graph = _with_actor(graph, actor, T_world_scene, track_ids)
-    removed: list[Edit] = [] if others_stay else [Remove(track_id) for track_id in logged]
-    return apply_edits(graph, removed).graph
+    if moving_stay:
+        return graph
+    moving = logged.track_id[move_at_least(logged, MOVES_M)]
+    return apply_edits(graph, [Remove(track_id) for track_id in moving.tolist()]).graph
 
 
 def _with_actor(

@@ -2,8 +2,8 @@
 
 docs/safety-tests.md compares them field by field. Sources: Ljungbergh et al., "NeuroNCAP: Photorealistic
 Closed-loop Safety Testing for Autonomous Driving", ECCV 2024 (the paper), and the public repository
-atonderski/neuro-ncap at ecdcf28 (the released code). Where the paper is silent, `PAPER` takes the value of
-the code.
+atonderski/neuro-ncap at ecdcf28 (the released code). `PAPER` has the values of the code, but for three of
+which the code does something else than it sets out to do: `reference`, `pose_feedback`, `unchecked_end_s`.
 """
 
 import enum
@@ -73,8 +73,8 @@ class Rules:
     """Actors that count in collisions."""
     struck_counts: bool
     """Whether an impact counts if the actor comes from behind the ego vehicle."""
-    others_stay: bool
-    """Whether the log's actors outside the scenario are there."""
+    moving_stay: bool
+    """Whether the log's moving actors outside the scenario are there. Parked vehicles always are."""
     unchecked_end_s: float
     """Time at the end of a run in which collisions are not looked for, s."""
     left_way_score: float
@@ -103,7 +103,7 @@ RELEASED = Rules(
     latency_s=0.0,
     categories=VEHICLES,
     struck_counts=True,
-    others_stay=False,
+    moving_stay=False,
     unchecked_end_s=0.5,
     left_way_score=BEST,
 )
@@ -118,7 +118,7 @@ PAPER = Rules(
     latency_s=0.0,
     categories=VEHICLES,
     struck_counts=True,
-    others_stay=False,
+    moving_stay=False,
     unchecked_end_s=0.0,
     left_way_score=BEST,
 )
@@ -133,7 +133,7 @@ OURS = Rules(
     latency_s=0.1,
     categories=VEHICLES | {Category.PEDESTRIAN},
     struck_counts=False,
-    others_stay=True,
+    moving_stay=True,
     unchecked_end_s=0.0,
     left_way_score=LEFT_WAY_SCORE,
 )

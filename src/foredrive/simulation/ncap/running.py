@@ -78,7 +78,7 @@ def set_up_run(
             f"{scenario.label}: run {number} begins to drive at {start_s:g} s, but the agent sees "
             f"{past_frames} earlier key frames, which this log has from {first_s:.1f} s on"
         )
-    graph = place_actors(place.graph, drawn, T_world_scene, place.track_ids, others_stay=rules.others_stay)
+    graph = place_actors(place.graph, drawn, T_world_scene, place.track_ids, moving_stay=rules.moving_stay)
     simulator = RebuiltSimulator(place.renderer(graph), graph.all_tracks, drive, place.lanes)
     start = RebuiltScenario(
         start_s, sensors, past_frames, ends_on_collision=True, length_s=length_s, contact=rules.contact

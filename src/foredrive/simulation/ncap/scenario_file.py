@@ -22,24 +22,35 @@ from foredrive.simulation.threats import Threat
 
 UNREAD = ("start_pose", "start_velo", "smooth_actors", "actor_framerate")
 """Settings of neuro-ncap's files that its code does not read, or that have one value in all of its files."""
+OUTSIDE_PROTOCOL = ("stationary/0061.yaml",)
+"""Files in neuro-ncap's folder that are not among the 20 scenarios of its protocol: "do not use for eval"."""
 
 
 def load_scenarios(path: Path) -> tuple[SafetyScenario, ...]:
     """Read a file of ours, one of neuro-ncap's, or a folder of files.
 
-    The kind of a scenario of neuro-ncap is the name of its file's folder, and its scene that of the file.
+    The kind of a scenario of neuro-ncap is the name of its file's folder, and its scene that of the file. The
+    files of a folder that are `outside_protocol` are left out. Such a file is read if it is named itself.
 
     Raises:
         InputError: a file cannot be read, an entry is wrong, or two scenarios have one name.
     """
+    outside = outside_protocol(path)
     files = sorted(path.rglob("*.yaml")) if path.is_dir() else [path]
-    scenarios = tuple(each for file in files for each in _read(file))
+    scenarios = tuple(each for file in files if file not in outside for each in _read(file))
     if not scenarios:
         raise InputError(f"{path}: there are no scenarios")
     labels = [scenario.label for scenario in scenarios]
     if twice := sorted({label for label in labels if labels.count(label) > 1}):
         raise InputError(f"{path}: several scenarios have the name {twice[0]}")
     return scenarios
+
+
+def outside_protocol(path: Path) -> Mapping[Path, str]:
+    """Return the label of each file in a folder that does not belong to neuro-ncap's protocol."""
+    files = path.rglob("*.yaml") if path.is_dir() else ()
+    outside = (file for file in files if f"{file.parent.name}/{file.name}" in OUTSIDE_PROTOCOL)
+    return {file: f"{file.parent.name}-{file.stem}" for file in outside}
 
 
 def save_scenarios(scenarios: Sequence[SafetyScenario], path: Path) -> None:
