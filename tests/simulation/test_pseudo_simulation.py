@@ -8,6 +8,7 @@ import torch
 from test_agents_of_logs import YAW, logged, seen
 
 from foredrive.errors import InputError
+from foredrive.metrics.epdms.comfort import history_comfort
 from foredrive.metrics.epdms.world import Roads
 from foredrive.rendering.gaussians import Gaussians
 from foredrive.rendering.gaussians.content import GaussianContent
@@ -18,8 +19,10 @@ from foredrive.rendering.tracks import ActorTracks
 from foredrive.rendering.vehicle import LoggedVehicle
 from foredrive.scene import Category, Clip, Trajectory
 from foredrive.scene.road_map import RoadMap
+from foredrive.simulation.logged_drive import LoggedDrive
 from foredrive.simulation.ncap.running import Place
 from foredrive.simulation.pseudo_simulation import (
+    BODY,
     FOLLOW_UPS,
     PseudoSimulation,
     figures_of,
@@ -141,6 +144,23 @@ def test_the_past_is_that_of_the_log() -> None:
     assert len(past.yaw_rad) == 15
     np.testing.assert_allclose(past.speed_mps, SPEED, atol=0.02)
     np.testing.assert_allclose(past.acceleration_mps2, 0.0, atol=0.2)
+
+
+def test_a_simulated_plan_begins_with_the_acceleration_of_the_log() -> None:
+    """The log brakes by 5 m/s², more than the bound of 4.05, and the plan keeps its speed from there on."""
+    braking = long_log()
+    times = braking.t_s
+    way = SPEED * times - 0.5 * 5.0 * (times - 2.0).clamp(min=0.0, max=1.2) ** 2
+    T = torch.eye(4).repeat(len(times), 1, 1)
+    T[:, 0, 3] = way
+    drive = LoggedDrive(dataclasses.replace(braking, T_scene_ego=T), torch.eye(4))
+    state = drive.state_at(2.5)
+    assert state.acceleration_mps2 == pytest.approx(-5.0, abs=0.05)
+    past, ego = past_motion(drive, 2.5), simulated(StraightAgent(5.5).act(seen(0.0, 5.5)), state)
+    assert ego.acceleration_mps2[0] == state.acceleration_mps2
+    assert history_comfort(past, ego, BODY) == 0.0
+    calm = dataclasses.replace(ego, acceleration_mps2=0 * ego.acceleration_mps2)
+    assert history_comfort(past_motion(logged(SPEED), 2.5), calm, BODY) == 1.0
 
 
 def test_failed_starts_are_counted_and_have_no_share() -> None:

@@ -89,6 +89,25 @@ def replay(simulator: RebuiltSimulator) -> ReplayAgent:
 FAR = actor(200.0, SPEED_MPS)
 
 
+@pytest.mark.parametrize("at_s", [0.0, 0.23, 5.0, 9.9, 10.0])
+@pytest.mark.parametrize("acceleration_mps2", [-1.5, 0.0, 2.0])
+def test_the_state_of_a_log_has_its_acceleration(acceleration_mps2: float, at_s: float) -> None:
+    """20 m/s at the start, and a constant acceleration: x = 20 t + a t² / 2."""
+    t_s = torch.arange(0.0, END_S + 1e-6, PERIOD_S)
+    way = 20.0 * t_s + 0.5 * acceleration_mps2 * t_s**2
+    poses = matrix_from_yaw(0 * t_s, torch.stack([way, 0 * way, 0 * way], dim=-1))
+    drive = LoggedDrive(dataclasses.replace(vehicle(), T_scene_ego=poses), torch.eye(4))
+    state, level = drive.state_at(at_s), 1 / math.hypot(1.0, SLOPE)  # speeds are those in the plane
+    assert state.acceleration_mps2 == pytest.approx(level * acceleration_mps2, abs=0.02)
+    speed_mps = level * (20.0 + acceleration_mps2 * at_s)
+    assert state.speed_mps == pytest.approx(speed_mps, abs=0.21)  # at the ends one-sided
+
+
+def test_a_log_of_half_a_second_tells_no_acceleration() -> None:
+    short = dataclasses.replace(vehicle(), t_s=vehicle().t_s[:6], T_scene_ego=vehicle().T_scene_ego[:6])
+    assert LoggedDrive(short, torch.eye(4)).state_at(0.2).acceleration_mps2 == 0.0
+
+
 def test_who_goes_on_as_the_log_did_drives_all_of_it() -> None:
     simulator = begun(scene_with(FAR))
     drive = driven(simulator, replay(simulator))

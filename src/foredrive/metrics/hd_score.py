@@ -2,7 +2,8 @@
 
 Source: public repository hyzhou404/HUGSIM, `sim/utils/score_calculator.py`; Zhou et al., "HUGSIM", 2024.
 There collisions with the static scene are counted on its points, and DAC by ground points under four quarters
-of the vehicle. Here the drivable area is that of a map, by the middles of these quarters.
+of the vehicle. Here the drivable area is that of a map, by the middles of these quarters. There objects count
+that are named "car", and its `closed_loop.py` names all objects so. Here all vehicles and cycles count.
 """
 
 from collections.abc import Sequence

@@ -56,7 +56,11 @@ class LoggedDrive:
         return T_world_ego
 
     def state_at(self, t_s: float) -> BicycleState:
-        """Return the vehicle's state at a time. Its steering angle follows from its turn rate."""
+        """Return the vehicle's state at a time. Its steering angle follows from its turn rate.
+
+        Its acceleration is the change from the mean speed before to that after, over twice `SPEED_OVER_S`
+        each. At the log's ends it is that of the nearest time at which both are known.
+        """
         from_s, to_s = max(t_s - SPEED_OVER_S, self.first_s), min(t_s + SPEED_OVER_S, self.end_s)
         before, now, after = (self.pose_at(at) for at in (from_s, t_s, to_s))
         speed = float(np.hypot(*(after - before)[:2, 3])) / (to_s - from_s)
@@ -64,7 +68,20 @@ class LoggedDrive:
         curvature = turned / (to_s - from_s) / speed if speed > STEERS_FROM_MPS else 0.0
         max_rad = EGO.max_steering_rad
         steering = np.clip(np.arctan(EGO.wheelbase_m * curvature), -max_rad, max_rad)
-        return BicycleState(float(now[0, 3]), float(now[1, 3]), _yaw(now), speed, float(steering))
+        x_m, y_m = float(now[0, 3]), float(now[1, 3])
+        return BicycleState(x_m, y_m, _yaw(now), speed, float(steering), self._acceleration_mps2(t_s))
+
+    def _acceleration_mps2(self, t_s: float) -> float:
+        """Return the acceleration at a time; 0 if the log is too short to tell."""
+        over_s = 2 * SPEED_OVER_S
+        first_s, last_s = self.first_s + over_s, self.end_s - over_s
+        if first_s > last_s:
+            return 0.0
+        middle_s = min(max(t_s, first_s), last_s)
+        before, now, after = (
+            self.pose_at(at)[:2, 3] for at in (middle_s - over_s, middle_s, middle_s + over_s)
+        )
+        return float(np.hypot(*(after - now)) - np.hypot(*(now - before))) / over_s**2
 
     def route_from(self, t_s: float) -> Float64[np.ndarray, "M 3"]:
         """Return the route from the vehicle's position at a time to the end of the log, m, world frame.

@@ -232,9 +232,7 @@ def simulated(plan: Trajectory, state: BicycleState) -> EgoMotion:
 def past_motion(drive: LoggedDrive, start_s: float) -> EgoMotion:
     """Return the logged vehicle until one step before a time."""
     times = start_s - STEP_S * np.arange(round(PAST_S / STEP_S), 0, -1)
-    states = [drive.state_at(t_s) for t_s in times.tolist()]
-    speed = np.array([state.speed_mps for state in states])
-    return dataclasses.replace(motion_of(states), acceleration_mps2=np.gradient(speed, STEP_S))
+    return motion_of([drive.state_at(t_s) for t_s in times.tolist()])
 
 
 def motion_of(states: list[BicycleState]) -> EgoMotion:

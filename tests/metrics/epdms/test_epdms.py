@@ -248,6 +248,14 @@ def test_what_the_human_does_too_is_forgiven() -> None:
     assert forgiven.epdms == pytest.approx(0.5 * 14 / 16)
 
 
+def test_progress_and_comfort_are_not_forgiven() -> None:
+    """The human stands, jerks, hits somebody and does not come near: 1 · (5 · 0 + 5 · 1 + 2 + 2 · 0) / 14."""
+    human = DriverScores(nc=0.0, dac=0.0, ddc=0.0, tlc=0.0, ep=0.0, ttc=0.0, lk=0.0, hc=0.0, ec=0.0)
+    forgiven = dataclasses.replace(human, ec=None).forgiven(human)
+    assert forgiven == DriverScores(nc=1.0, dac=1.0, ddc=1.0, tlc=1.0, ep=0.0, ttc=1.0, lk=1.0, hc=0.0)
+    assert forgiven.epdms == pytest.approx(7 / 14)
+
+
 def test_follow_up_scenes_count_by_their_distance() -> None:
     """exp(-d² / 0.2): one at 0 and one at 0.5 m have weights of 1 and exp(-1.25)."""
     starts = np.array([[10.0, 0.0], [10.5, 0.0]])

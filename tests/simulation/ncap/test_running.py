@@ -283,6 +283,26 @@ def test_the_hd_score_of_a_drive_tells_who_plans_through_others() -> None:
     assert on.hd_score < 0.7 * beside.hd_score
 
 
+@pytest.mark.parametrize(
+    ("category", "nc"),
+    [(Category.CAR, 0.5), (Category.TRUCK, 0.5), (Category.BICYCLE, 0.5), (Category.PEDESTRIAN, 1.0)],
+)
+def test_all_vehicles_count_in_the_hd_score(category: Category, nc: float) -> None:
+    """One plan ends 20 m on, another one 32 m on and so in what stands 36 m on: its rear is at 34 m.
+
+    The middle is 1.65 m in front of the rear axle, and half of the vehicle's length 2.45 m.
+    """
+    here = place(category, parked_m=(16.0 + 36.0, 0.0))
+    run = set_up_run(here, FRONTAL, 0, OURS, sensors=False, past_frames=0)
+    drive = drive_route(run.simulator, run.scenario, StraightAgent(SPEED_MPS), route="r", pilot=run.pilot)
+    ahead_m = np.linspace(0.0, 1.0, 7)[1:, None] * np.array([[1.0, 0.0]])
+    both = dataclasses.replace(drive, plans=((0, 20.0 * ahead_m), (0, 32.0 * ahead_m)))
+    street = shapely.Polygon([at(*corner)[:2] for corner in ((-20, -9), (150, -9), (150, 9), (-20, 9))])
+    found = hd_score_of(both, here.graph.tracks, here.vehicle.T_world_scene, run.scenario.start_s, street)
+    assert found is not None
+    assert found.nc == nc
+
+
 def test_a_plan_that_stops_in_a_curve_keeps_its_heading() -> None:
     """It turns by 0.4 rad/s and brakes by 3.2 m/s². To turn back within one step would be uncomfortable."""
     here = place()

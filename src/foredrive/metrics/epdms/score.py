@@ -14,6 +14,8 @@ from foredrive.metrics.epdms.world import EgoBody, EgoMotion, Roads, Surrounding
 
 MULTIPLIERS = ("nc", "dac", "ddc", "tlc")
 WEIGHTS = {"ep": 5.0, "ttc": 5.0, "lk": 2.0, "hc": 2.0, "ec": 2.0}
+FORGIVEN = (*MULTIPLIERS, "ttc", "lk")
+"""Sub-scores in which a plan may be as bad as the human driver."""
 SIGMA2_M2 = 0.1
 """Variance of the kernel by which a follow-up scene counts, m²."""
 
@@ -54,12 +56,12 @@ class DriverScores:
         return self.multiplied * mean
 
     def forgiven(self, human: "DriverScores") -> "DriverScores":
-        """Return the scores with 1 where the human driver has 0: whom no rule can be asked of."""
-        changed = {
-            field.name: 1.0
-            for field in dataclasses.fields(self)
-            if getattr(human, field.name) == 0.0 and getattr(self, field.name) is not None
-        }
+        """Return the scores with 1 where the human driver has 0: whom no rule can be asked of.
+
+        EP and HC stay. The devkit scores the human driver without a reference and without a past, so that
+        there both are always 1. EC is not among the scores that it compares.
+        """
+        changed = {name: 1.0 for name in FORGIVEN if getattr(human, name) == 0.0}
         return dataclasses.replace(self, **changed)
 
 
