@@ -15,16 +15,25 @@ from typing import TYPE_CHECKING
 import pytest
 import torch
 from hypothesis import settings
+from jaxtyping import Float64
 
 import shape_checks  # isort: skip
 
 shape_checks.install()  # before anything of the package is imported
 
-from foredrive.geometry.se3 import matrix_from_yaw  # noqa: E402
+from foredrive.geometry.se3 import (  # noqa: E402
+    exp_se3,
+    inverse_se3,
+    matrix_from_yaw,
+    rotate_vectors,
+    transform_points,
+    yaw_from_matrix,
+)
 from foredrive.scene import (  # noqa: E402
     Boxes,
     CameraRig,
     Clip,
+    Command,
     Example,
     LidarSweep,
     Trajectory,
@@ -67,13 +76,35 @@ def pytest_runtest_setup() -> None:
     shape_checks.begin_test()
 
 
+def driven_arc(
+    speed_mps: torch.Tensor, turn_radps: torch.Tensor, t_s: torch.Tensor
+) -> Float64[torch.Tensor, "b T 4 4"]:
+    """T_now_ego of vehicles that drive arcs, [b] speeds and yaw rates at [b, T] times."""
+    twist = torch.zeros(*t_s.shape, 6, dtype=torch.float64)
+    twist[..., 0], twist[..., 5] = speed_mps[:, None] * t_s, turn_radps[:, None] * t_s
+    return exp_se3(twist)
+
+
 def synthetic_example(
     *, batch: int = 2, past: int = 1, future: int = 2, cameras: int = 2, spec: VoxelSpec, seed: int = 0
 ) -> Example:
-    """A batch of well-formed but arbitrary examples: what networks and loops are tried on."""
+    """A batch of well-formed but arbitrary examples: what networks and loops are tried on.
+
+    Item i drives an arc at 4 + i m/s and 0.2 - 0.3 i rad/s at a place of its own. Poses, speed, command,
+    target point and future agree with that, and boxes drive straight on over ground.
+    """
     rng = torch.Generator().manual_seed(seed)
     frames, height, width, boxes, steps = past + 1 + future, 32, 64, 3, 6
     shape = (batch, frames)
+    item = torch.arange(batch)
+    speed_mps, turn_radps = 4.0 + item, 0.2 - 0.3 * item
+    t_s = ((torch.arange(frames) - past) * 0.5).expand(shape)
+    T_now_ego = driven_arc(speed_mps, turn_radps, t_s)
+    T_world_now = matrix_from_yaw(
+        0.7 + 1.3 * item.double(),
+        torch.stack([300.0 + 40 * item, -120.0 - 25 * item, 12.0 + item], -1).double(),
+    )
+    T_now_step = driven_arc(speed_mps, turn_radps, 0.5 * torch.arange(1, steps + 1).expand(batch, steps))
     K = torch.tensor([[40.0, 0.0, 32.0], [0.0, 40.0, 16.0], [0.0, 0.0, 1.0]]).expand(*shape, cameras, 3, 3)
     yaw = torch.arange(cameras) * (2 * math.pi / cameras)
     looking_forward = torch.tensor([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
@@ -99,11 +130,14 @@ def synthetic_example(
         valid=no_beams.bool(),
     )
     yes = torch.ones(*shape, dtype=torch.bool)
-    speed_mps = torch.full(shape, 4.0)
-    t_s = ((torch.arange(frames) - past) * 0.5).expand(shape)
+    T_ego_now = inverse_se3(T_now_ego).float()
+    over_ground = torch.tensor([5.0, 5.0, 0.0])
+    centre_now, velocity_now = torch.randn(2, batch, 1, boxes, 3, generator=rng) * over_ground
+    centre_now = centre_now + velocity_now * t_s[:, :, None, None]
+    velocity_ego = rotate_vectors(T_ego_now, velocity_now.expand_as(centre_now))
     clip = Clip(
         t_s=t_s,
-        T_world_ego=torch.eye(4, dtype=torch.float64).expand(*shape, 4, 4),
+        T_world_ego=T_world_now[:, None] @ T_now_ego,
         images=torch.randint(0, 256, (*shape, cameras, 3, height, width), generator=rng, dtype=torch.uint8),
         image_valid=torch.ones(*shape, cameras, dtype=torch.bool),
         rig=rig,
@@ -111,27 +145,25 @@ def synthetic_example(
         sweep_valid=~yes,
         misses_known=~yes,
         boxes=Boxes(
-            centre=torch.randn(*shape, boxes, 3, generator=rng) * 5,
+            centre=transform_points(T_ego_now, centre_now),
             size_lwh=torch.tensor([4.0, 2.0, 1.5]).expand(*shape, boxes, 3),
-            yaw=torch.zeros(*shape, boxes),
-            velocity=torch.zeros(*shape, boxes, 2),
+            yaw=torch.atan2(velocity_ego[..., 1], velocity_ego[..., 0]),
+            velocity=velocity_ego[..., :2],
             track_id=torch.arange(boxes).expand(*shape, boxes),
             category=torch.zeros(*shape, boxes, dtype=torch.long),
             valid=torch.ones(*shape, boxes, dtype=torch.bool),
             **unlabelled(*shape, boxes),
         ),
         boxes_valid=yes,
-        ego_speed_mps=speed_mps,
+        ego_speed_mps=speed_mps[:, None].expand(shape),
         ego_speed_valid=yes,
-        command=torch.full((batch,), 2),
+        command=torch.where(turn_radps > 0, Command.LEFT, Command.RIGHT),
         command_valid=torch.ones(batch, dtype=torch.bool),
-        target_xy=torch.tensor([20.0, 0.5]).expand(batch, 2),
+        target_xy=torch.stack([20.0 + item, 6.0 - 9.0 * item], -1),
         target_valid=torch.ones(batch, dtype=torch.bool),
         future=Trajectory(
-            xy=torch.stack([torch.arange(1, steps + 1) * 2.0, torch.zeros(steps)], -1).expand(
-                batch, 1, -1, -1
-            ),
-            yaw=torch.zeros(batch, 1, steps),
+            xy=T_now_step[:, None, :, :2, 3].float(),
+            yaw=yaw_from_matrix(T_now_step)[:, None].float(),
             valid=torch.ones(batch, 1, steps, dtype=torch.bool),
             log_prob=torch.zeros(batch, 1),
             dt_s=0.5,
@@ -139,10 +171,11 @@ def synthetic_example(
     )
     occupied = (torch.rand(*shape, 1, *spec.shape_zyx, generator=rng) > 0.9).float()
     known = torch.rand(*shape, *spec.shape_zyx, generator=rng) > 0.5
+    flow_mps = torch.randn(*shape, 3, *spec.shape_zyx, generator=rng)
     return Example(
         clip=clip,
         occupancy=VoxelGrid(spec, occupied, known),
-        flow=VoxelGrid(spec, torch.zeros(*shape, 3, *spec.shape_zyx), torch.zeros_like(known)),
+        flow=VoxelGrid(spec, flow_mps * known[:, :, None], known),
         key=tuple(f"log_{i}@0.0s" for i in range(batch)),
     )
 

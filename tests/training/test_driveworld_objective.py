@@ -72,6 +72,7 @@ def test_what_is_not_known_counts_for_nothing(example: Example) -> None:
     nothing = dataclasses.replace(
         example,
         occupancy=dataclasses.replace(example.occupancy, known=torch.zeros_like(example.occupancy.known)),
+        flow=dataclasses.replace(example.flow, known=torch.zeros_like(example.flow.known)),
         clip=dataclasses.replace(example.clip, boxes_valid=torch.zeros_like(example.clip.boxes_valid)),
     )
     losses = DriveWorldObjective(agent(), PRETRAINING, steps=STEPS)(nothing, torch.Generator().manual_seed(0))

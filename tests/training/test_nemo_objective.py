@@ -158,12 +158,12 @@ def test_a_file_that_is_named_and_wrong_is_one_line(tmp_path: Path) -> None:
         assert "\n" not in str(caught.value)
 
 
-def objective_of(stage: NemoStage) -> NemoObjective:
+def objective_of(stage: NemoStage, motion_std: float = 0.05) -> NemoObjective:
     """The same weights for every stage; batch normalisation at rest, so that items do not mix."""
     torch.manual_seed(0)
     objective = build_objective(RECIPE, stage, build_agent(RECIPE)).eval()
     for parameter in objective.agent.world_model.motion.parameters():
-        torch.nn.init.normal_(parameter, std=0.05)
+        torch.nn.init.normal_(parameter, std=motion_std)
     return objective
 
 
@@ -214,7 +214,10 @@ def test_an_interrupted_training_goes_on_with_the_step_that_is_due(example: Exam
 
 def test_past_frames_without_gradients_change_no_loss(example: Example) -> None:
     stage = RECIPE.pretrain
-    whole, without = objective_of(stage), objective_of(dataclasses.replace(stage, past_gradient=False))
+    # The motion is large enough that the loss depends on the past.
+    whole, without = (
+        objective_of(dataclasses.replace(stage, past_gradient=on), motion_std=0.15) for on in (True, False)
+    )
     losses = losses_of(whole, example), losses_of(without, example)
     torch.testing.assert_close(losses[0], losses[1])
     for each in losses:
@@ -224,7 +227,7 @@ def test_past_frames_without_gradients_change_no_loss(example: Example) -> None:
     past = dataclasses.replace(example.clip, images=example.clip.images.clone())
     past.images[:, 0] = 0
     changed = losses_of(without, dataclasses.replace(example, clip=past))["loss"]
-    assert not torch.isclose(changed, losses[1]["loss"], rtol=1e-6)  # the past is read
+    assert not torch.isclose(changed, losses[1]["loss"], rtol=1e-4)  # the past is read
 
 
 def test_a_planner_that_reads_imagined_frames_needs_them_of_every_item() -> None:
