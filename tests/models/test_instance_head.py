@@ -108,7 +108,7 @@ def test_sequences_are_read_and_judged_at_their_last_frames() -> None:
     heads = TaskHeads(sizes, SPEC, channels=2, instance_grid=GRID)
     now, later = torch.randn(4, 2, *SPEC.shape_zyx), torch.randn(4, STEPS, 2, *SPEC.shape_zyx)
     eye = torch.eye(4).expand(4, 4, 4)
-    volumes = {"detection": TaskVolume(now, later=later, T_now_later=torch.eye(4).expand(4, STEPS, 4, 4))}
+    volumes = {"tracking": TaskVolume(now, later=later, T_now_later=torch.eye(4).expand(4, STEPS, 4, 4))}
     sequences = heads(volumes, heads.config.steps(eye.double()))
     single = heads(volumes)
     torch.testing.assert_close(sequences.instances.pixels, single.instances.pixels[[1, 3]])

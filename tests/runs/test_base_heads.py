@@ -80,7 +80,7 @@ def test_base_heads_take_a_step_on_a_sequence() -> None:
     poses = torch.eye(4, dtype=torch.float64).expand(FRAMES, 4, 4)
     boxes, truth = truth_of(spec, heads.truth.raster, spec.shape_zyx)
     optimizer = torch.optim.AdamW(parameter_groups(module, 1e-2), 1e-4)
-    found = module(dict.fromkeys(module.config.tasks, read), module.config.steps(poses))
+    found = module(dict.fromkeys(module.config.volumes, read), module.config.steps(poses))
     valid = torch.ones(FRAMES, dtype=torch.bool)
     losses = task_losses(found, boxes, valid, truth, spec, None, heads.weights, FRAMES)
     losses["loss"].backward()

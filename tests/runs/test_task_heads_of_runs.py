@@ -1,27 +1,41 @@
 """Heads that are trained on the frozen world model of a run, and evaluated with it."""
 
+import copy
 import dataclasses
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
-from joint_heads import ALL, small_heads
+import yaml
+from joint_heads import ALL, small_heads, with_small_heads
 from miniature import miniature, miniature_driveworld, with_map
 from safetensors.torch import load_file
 
 from foredrive.data import LogPath
 from foredrive.errors import InputError
+from foredrive.models.agent import PlanningAgent
 from foredrive.models.driveworld.planes import VectorToPlaneConfig
 from foredrive.models.driveworld.task_prompt import PROMPTS, PromptConfig
 from foredrive.models.tasks.agents import CarriedConfig
-from foredrive.recipes.task_heads import base_heads, town_heads, with_settings
+from foredrive.recipes import Recipe
+from foredrive.recipes.config import load_recipe, save_recipe
+from foredrive.recipes.task_heads import (
+    base_heads,
+    load_task_heads,
+    town_heads,
+    with_joint_heads,
+    with_settings,
+)
 from foredrive.runs import Run, evaluate_run
 from foredrive.runs.build import build_agent
 from foredrive.runs.folder import WEIGHTS
 from foredrive.runs.train.run import begin_run
 from foredrive.runs.train.tasks import TASKS, load_heads, probe_run, train_heads
+from foredrive.scene import Example
 from foredrive.training import read_metrics, save_weights
+from foredrive.training.task_probe import task_volumes
 
 
 def test_heads_of_a_run_are_trained_continued_and_evaluated(
@@ -98,27 +112,51 @@ def test_a_probe_keeps_the_recipe_of_its_world_model(trained: Run, log: LogPath,
     assert trained.recipe == miniature()
 
 
-@pytest.mark.parametrize(("prompted", "volumes"), [(True, 4), (False, 1)])
-def test_heads_on_a_driveworld_read_a_volume_for_each_prompt(
-    log: LogPath, tmp_path: Path, prompted: bool, volumes: int
-) -> None:
-    """Four tasks that are read have four prompts; without prompts they share one volume."""
+def prompted_driveworld() -> Recipe:
+    """`miniature_driveworld` with a prompt for each task, whose encodings tests draw."""
     recipe = miniature_driveworld()
-    if prompted:
-        prompt = PromptConfig(
-            expand=VectorToPlaneConfig(widths=(8, 4)), encoding=16, text_encoder="", prompts=tuple(PROMPTS)
-        )
-        recipe = dataclasses.replace(recipe, model=dataclasses.replace(recipe.model, prompt=prompt))
+    prompt = PromptConfig(
+        expand=VectorToPlaneConfig(widths=(8, 4)), encoding=16, text_encoder="", prompts=tuple(PROMPTS)
+    )
+    return dataclasses.replace(recipe, model=dataclasses.replace(recipe.model, prompt=prompt))
+
+
+def agent_of(recipe: Recipe) -> PlanningAgent:
+    torch.manual_seed(0)
+    agent = build_agent(recipe, fetch=False).eval()
+    if agent.world_model.prompt is not None:
+        agent.world_model.prompt.encodings.normal_()
+    return agent
+
+
+def with_other_prompts(agent: PlanningAgent, names: Sequence[str]) -> PlanningAgent:
+    """The agent with other encodings of some prompts."""
+    other = copy.deepcopy(agent)
+    for name in names:
+        other.world_model.prompt.encodings[other.world_model.prompt.prompts.index(name)] *= -1
+    return other
+
+
+@pytest.mark.parametrize(
+    ("recipe", "volume_of", "volumes"),
+    [
+        (prompted_driveworld(), None, 4),
+        (prompted_driveworld(), "occupancy", 1),
+        (miniature_driveworld(), None, 1),
+    ],
+)
+def test_a_probe_on_a_driveworld_keeps_each_volume_once(
+    recipe: Recipe, volume_of: Any, volumes: int, log: LogPath, tmp_path: Path
+) -> None:
+    """Four tasks have four prompts, unless all heads read one volume. Without prompts they share it."""
     cache, start = tmp_path / "cache", tmp_path / "start"
     begin_run(recipe, [log], start, cache, start)
-    torch.manual_seed(0)
-    agent = build_agent(recipe, fetch=False)
-    if prompted:
-        agent.world_model.prompt.encodings.normal_()
     (start / "finetune").mkdir()
-    save_weights(agent, start / "finetune" / WEIGHTS)
+    save_weights(agent_of(recipe), start / "finetune" / WEIGHTS)
     run = probe_run(recipe, [with_map(log, tmp_path)], tmp_path / "probe", cache, start)
-    train_heads(run, small_heads((*ALL, "tracking")))
+    heads = small_heads((*ALL, "tracking"))
+    assert heads.heads.volume_of == "occupancy"
+    train_heads(run, dataclasses.replace(heads, heads=dataclasses.replace(heads.heads, volume_of=volume_of)))
     kept = [load_file(file) for file in (cache / "volumes").rglob("*.safetensors")]
     assert {len(each["volume"]) for each in kept} == {volumes}
     for each in kept[:1]:
@@ -127,6 +165,65 @@ def test_heads_on_a_driveworld_read_a_volume_for_each_prompt(
     summary = evaluate_run(run, [log], tmp_path / "evaluated", views=False).summary
     assert summary["failed"] == 0
     assert {"tracking.nuscenes.ids", "motion.uniad.car.epa"} < summary.keys()
+
+
+UNTRAINED = tuple(name for name in PROMPTS if name not in ("occupancy", "forecast"))
+"""Prompts that pre-training does not decode with."""
+
+
+@pytest.mark.parametrize("joint", [False, True])
+def test_a_probe_depends_on_no_prompt_that_pretraining_has_not_seen(
+    joint: bool, make_example: Callable[..., Example]
+) -> None:
+    recipe, heads = prompted_driveworld(), small_heads((*ALL, "tracking"))
+    agent = agent_of(recipe)
+    clip = make_example(past=recipe.clips.past_frames, future=0, spec=recipe.clips.voxels).clip
+    sizes = with_joint_heads(recipe, heads).tasks.heads if joint else heads.heads
+    with torch.no_grad():
+        read, changed = (
+            task_volumes(one.world_model, one.world_model.observe(clip), sizes.volumes).volume
+            for one in (agent, with_other_prompts(agent, UNTRAINED))
+        )
+    assert torch.equal(read, changed) != joint
+
+
+@pytest.mark.parametrize("task", ["tracking", "detection"])
+def test_agents_that_are_carried_read_the_prompt_of_their_task(
+    task: Any, make_example: Callable[..., Example]
+) -> None:
+    """Detection is that of heads from before tracking had a prompt that was read."""
+    recipe = with_small_heads(prompted_driveworld(), ("map", "tracking"))
+    sizes = recipe.tasks.heads
+    carried = dataclasses.replace(sizes.agents.carried, task=task)
+    sizes = dataclasses.replace(sizes, agents=dataclasses.replace(sizes.agents, carried=carried))
+    recipe = dataclasses.replace(recipe, tasks=dataclasses.replace(recipe.tasks, heads=sizes))
+    agent = agent_of(recipe)
+    clip = make_example(past=recipe.clips.past_frames, future=0, spec=recipe.clips.voxels).clip
+    logits = {}
+    with torch.no_grad():
+        for name in ("none", "tracking", "detection"):
+            one = agent if name == "none" else with_other_prompts(agent, (name,))
+            found = one.perceive(one.world_model.observe(clip))
+            logits[name] = found.agents[-1].boxes.logits
+    for name in ("tracking", "detection"):
+        assert torch.equal(logits[name], logits["none"]) == (name != task)
+
+
+def test_tracking_heads_from_before_they_read_its_prompt_go_on_with_that_of_detection(tmp_path: Path) -> None:
+    recipe, heads = with_small_heads(miniature(), ("tracking",)), small_heads(("tracking",))
+    for written, load, carried_of in (
+        (recipe, load_recipe, lambda opened: opened.tasks.heads.agents.carried),
+        (heads, load_task_heads, lambda opened: opened.heads.agents.carried),
+    ):
+        file = tmp_path / "config.yaml"
+        save_recipe(written, file)
+        assert load(file) == written
+        assert carried_of(written).task == "tracking"
+        values = yaml.safe_load(file.read_text())
+        values_of_heads = values.get("tasks", values)["heads"]
+        del values_of_heads["agents"]["carried"]["task"]
+        file.write_text(yaml.safe_dump(values))
+        assert carried_of(load(file)).task == "detection"
 
 
 @pytest.mark.parametrize("make", [town_heads, base_heads])
@@ -141,7 +238,8 @@ def test_tasks_choose_heads_and_truth(make: Any) -> None:
     assert both.truth.raster is None
     assert both.heads.frames == 1
     tracks = make(["tracking", "map"])
-    assert tracks.heads.tasks == ("detection", "map")
+    assert tracks.heads.tasks == ("tracking", "map")
+    assert tracks.heads.volumes == ("occupancy",)
     assert (tracks.heads.frames, tracks.now_stride_s) == (4, 0.5)
 
 

@@ -82,7 +82,7 @@ class PlanningAgent(nn.Module, Generic[W]):
         steps = None
         if sequences is not None:
             steps = self.heads.config.steps(sequences.T_world_ego[:, sequences.now])
-        read = volumes_of(self.world_model, now, self.heads.config.tasks)
+        read = volumes_of(self.world_model, now, self.heads.config.volumes)
         with full_precision(now.volume):
             cast = {id(volume): volume.map_tensors(Tensor.float) for volume in read.values()}
             volumes = {task: cast[id(volume)] for task, volume in read.items()}

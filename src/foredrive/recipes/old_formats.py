@@ -11,7 +11,21 @@ def upgraded(written: Any) -> Any:
         return written
     nested = _nested(written) if "planner_width" in model else written
     stages = {name: _stage(nested[name]) for name in ("pretrain", "finetune") if name in nested}
-    return _with_module_configs({**nested, **stages})
+    return _with_module_configs({**nested, "tasks": upgraded_heads(nested.get("tasks")), **stages})
+
+
+def upgraded_heads(written: Any) -> Any:
+    """Return the values of a recipe of task heads in today's format, as `upgraded` does.
+
+    Before carried agents had an entry for their task, they read the volume of detection.
+    """
+    heads = written.get("heads") if isinstance(written, Mapping) else None
+    agents = heads.get("agents") if isinstance(heads, Mapping) else None
+    carried = agents.get("carried") if isinstance(agents, Mapping) else None
+    if not (isinstance(heads, Mapping) and isinstance(agents, Mapping) and isinstance(carried, Mapping)):
+        return written
+    agents = {**agents, "carried": {"task": "detection", **carried}}
+    return {**written, "heads": {**heads, "agents": agents}}
 
 
 def _stage(written: Any) -> Any:

@@ -15,6 +15,7 @@ from foredrive.models.tasks.instances import InstanceHeadConfig
 from foredrive.models.tasks.maps import MapHeadConfig
 from foredrive.models.tasks.motion import MotionConfig
 from foredrive.recipes.config import Recipe, overridden, read_values, validated
+from foredrive.recipes.old_formats import upgraded_heads
 from foredrive.scene import Task
 from foredrive.training.joint_tasks import JointTasks
 from foredrive.training.loop import Schedule
@@ -100,7 +101,7 @@ def with_joint_heads(recipe: R, heads: TaskHeadsRecipe, settings: Sequence[str] 
         raise InputError(f"{recipe.name}: transfer is frozen, which keeps the heads of --start: no --tasks")
     if heads.heads.instances is not None:
         raise InputError(f"{INSTANCES} are trained on a frozen world model: use --probe")
-    joint = JointTasks(heads.heads, heads.weights)
+    joint = JointTasks(replace(heads.heads, volume_of=None), heads.weights)
     if settings:
         joint = validated(JointTasks, overridden(asdict(joint), settings), "--set")
     names = "+".join(joint.heads.tasks)
@@ -128,12 +129,12 @@ def load_task_heads(path: Path) -> TaskHeadsRecipe:
     Raises:
         InputError: an entry is wrong, missing or unknown. The message names the file and the entry.
     """
-    recipe: TaskHeadsRecipe = validated(TaskHeadsRecipe, read_values(path), str(path))
+    recipe: TaskHeadsRecipe = validated(TaskHeadsRecipe, upgraded_heads(read_values(path)), str(path))
     return recipe
 
 
 def _heads_of(tasks: Sequence[str], sizes: TaskHeadsConfig, schedule: Schedule) -> TaskHeadsRecipe:
-    """Leave out the heads of other tasks, and the truth that nobody needs."""
+    """Leave out the heads of other tasks, and the truth that nobody needs. All heads read one volume."""
     if not tasks:
         raise InputError("name at least one task")
     for task in tasks:
@@ -154,6 +155,7 @@ def _heads_of(tasks: Sequence[str], sizes: TaskHeadsConfig, schedule: Schedule) 
         voxels=sizes.voxels if "occupancy" in tasks else None,
         instances=InstanceHeadConfig() if INSTANCES in tasks else None,
         affordances=AffordanceHeadConfig() if AFFORDANCES in tasks else None,
+        volume_of="occupancy",
     )
     truth = TaskTruthConfig()
     if INSTANCES not in tasks:

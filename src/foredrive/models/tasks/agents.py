@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from typing import Literal
 
 import torch
 from jaxtyping import Float, Int
@@ -51,6 +52,8 @@ class CarriedConfig:
     """Key frames of a training sequence, at least 2."""
     dt_s: float = 0.5
     """Time between them."""
+    task: Literal["tracking", "detection"] = "tracking"
+    """Task whose volume the head reads. Heads that were saved without this entry read that of detection."""
 
 
 @dataclass(frozen=True)

@@ -45,13 +45,22 @@ class TaskHeadsConfig:
     """Needs agents, and beliefs that the world model imagines."""
     affordances: AffordanceHeadConfig | None = None
     """Reads the image features of now, which only heads within an agent have."""
+    volume_of: Task | None = None
+    """Task whose volume all heads read. None: each head reads that of its own task. A frozen world model has
+    learned no prompt but that of occupancy for the present, so probes read this one."""
+
+    @property
+    def of_agents(self) -> Task:
+        """Return the task of the head of agents: tracking if it carries them from frame to frame."""
+        carried = None if self.agents is None else self.agents.carried
+        return "detection" if carried is None else carried.task
 
     @property
     def tasks(self) -> tuple[Task, ...]:
-        """Return the tasks whose volumes the heads read."""
+        """Return the tasks of the heads."""
         found: list[Task] = []
         if self.agents is not None:
-            found += ["detection"] if self.agents.motion is None else ["detection", "motion"]
+            found += [self.of_agents] if self.agents.motion is None else [self.of_agents, "motion"]
         if self.elements is not None or self.raster is not None:
             found.append("map")
         if self.voxels is not None:
@@ -59,6 +68,15 @@ class TaskHeadsConfig:
         if self.affordances is not None:
             found.append("planning")
         return tuple(found)
+
+    def read_for(self, task: Task) -> Task:
+        """Return the task whose volume the head of a task reads."""
+        return self.volume_of or task
+
+    @property
+    def volumes(self) -> tuple[Task, ...]:
+        """Return the tasks whose volumes the heads read."""
+        return tuple(dict.fromkeys(self.read_for(task) for task in self.tasks))
 
     @property
     def frames(self) -> int:
@@ -204,43 +222,45 @@ class TaskHeads(nn.Module):
         """Return the output of every head. Tasks that share one volume share its planes.
 
         Args:
-            volumes: for each of `config.tasks`, the volume of `WorldModel.volume_for`. Without imagined ones,
-                there are no instances.
+            volumes: for each of `config.volumes`, the volume of `WorldModel.volume_for`. Without imagined
+                ones, there are no instances.
             steps: ego motion, if the items are sequences of frames, in which agents are carried on.
             carried: agents of the frame before, for items that are single frames.
         """
         made: dict[int, Planes] = {}
 
+        def volume_of(task: Task) -> TaskVolume:
+            return volumes[self.config.read_for(task)]
+
         def planes_of(task: Task) -> Planes:
-            volume = volumes[task]
+            volume = volume_of(task)
             if id(volume) not in made:
                 made[id(volume)] = self.planes(volume.now, volume.past, volume.T_past_now)
             return made[id(volume)]
 
+        of_agents = self.config.of_agents
         agents = centres = elements = raster = voxels = lineage = None
         if self.agents is not None:
             motion = None if self.agents.motion is None else planes_of("motion")
-            centres, agents, lineage = self._follow(
-                self.agents, planes_of("detection"), motion, steps, carried
-            )
+            centres, agents, lineage = self._follow(self.agents, planes_of(of_agents), motion, steps, carried)
         if self.elements is not None:
             elements = self.elements(planes_of("map"))
         if self.raster is not None:
             raster = self.raster(planes_of("map"))
         if self.voxels is not None:
-            voxels = self.voxels(volumes["occupancy"].now, planes_of("occupancy"))
+            voxels = self.voxels(volume_of("occupancy").now, planes_of("occupancy"))
         instances = None
-        if self.instances is not None and agents is not None and volumes["detection"].later is not None:
+        if self.instances is not None and agents is not None and volume_of(of_agents).later is not None:
             last = _last_frames(steps)
             instances = self._imagined(
                 self.instances,
                 agents[-1][last],
-                volumes["detection"][last],
-                planes_of("detection").fine[last],
+                volume_of(of_agents)[last],
+                planes_of(of_agents).fine[last],
             )
         affordances = None
         if self.affordances is not None:
-            affordances = self.affordances(volumes["planning"].images, planes_of("planning").fine)
+            affordances = self.affordances(volume_of("planning").images, planes_of("planning").fine)
         return HeadOutput(agents, centres, elements, raster, voxels, lineage, instances, affordances)
 
     def _imagined(self, head: InstanceHead, agents: AgentSet, volume: TaskVolume, now: Plane) -> InstanceSet:

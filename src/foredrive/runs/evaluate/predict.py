@@ -94,7 +94,7 @@ class AgentPredictor:
         heads, follower = self.heads, self._follower
         if heads is None:
             return None, None
-        volumes = volumes_of(self.agent.world_model, now, heads.config.tasks, heads.config.later)
+        volumes = volumes_of(self.agent.world_model, now, heads.config.volumes, heads.config.later)
         if follower is None:
             return heads(volumes), None
         found = []

@@ -51,8 +51,7 @@ def check_truth(heads: TaskHeadsConfig, logs: Sequence[LogPath]) -> None:
     Raises:
         InputError: none has. The message names the task and the reason.
     """
-    asked = (*heads.tasks, "tracking") if heads.frames > 1 else heads.tasks
-    missing: dict[str, str] = dict.fromkeys(asked, "")
+    missing: dict[str, str] = dict.fromkeys(heads.tasks, "")
     for log in logs:
         if not missing:
             return

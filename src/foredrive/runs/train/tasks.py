@@ -88,7 +88,7 @@ def train_heads(run: Run, heads: TaskHeadsRecipe) -> TrainedHeads:
         agent = load_agent(run)
         clips = dataclasses.replace(run.recipe.clips, tasks=heads.truth, now_stride_s=heads.now_stride_s)
         sizes = heads.heads
-        dataset = KeptVolumes(agent, run.logs, clips, sizes.tasks, run.cache_dir, sizes.later)
+        dataset = KeptVolumes(agent, run.logs, clips, sizes.volumes, run.cache_dir, sizes.later)
         if not (folder / CONFIG).is_file():
             save_recipe(heads, folder / CONFIG)
         torch.manual_seed(heads.schedule.seed)
