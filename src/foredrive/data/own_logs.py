@@ -18,6 +18,7 @@ from py123d.datatypes import EgoStateSE3Metadata
 from py123d.geometry import PoseSE3
 
 from foredrive.data.camera_streams import CameraSpec
+from foredrive.data.category_names import category_named
 from foredrive.data.ego_path import interpolated_poses
 from foredrive.data.log_paths import LogPath
 from foredrive.data.log_writer import Frame, LogWriter
@@ -66,7 +67,7 @@ class Box:
     """One labelled object."""
 
     category: str
-    """A name of `foredrive.scene.Category`, in any case."""
+    """A name of `foredrive.scene.Category`, or a usual name of public data sets such as vehicle.car."""
     track_id: int
     """Constant for one object within the log."""
     centre_m: tuple[float, float, float]
@@ -332,7 +333,7 @@ def _boxes(labels: Sequence[Box], where: str) -> Boxes:
         numbers = (*box.centre_m, *box.size_lwh_m, box.yaw_rad, *(box.velocity_mps or ()))
         if not np.isfinite(numbers).all() or min(box.size_lwh_m) <= 0:
             raise InputError(f"{where}: box {box.track_id} is not finite or has no size")
-        if box.category.upper() not in Category.__members__:
+        if category_named(box.category) is None:
             known = ", ".join(category.name.lower() for category in Category)
             raise InputError(f"{where}: unknown category {box.category!r}; there are: {known}")
     if len({box.track_id for box in labels}) < len(labels):
@@ -344,7 +345,7 @@ def _boxes(labels: Sequence[Box], where: str) -> Boxes:
         yaw=torch.tensor([float(box.yaw_rad) for box in labels]),
         velocity=torch.tensor([box.velocity_mps or unknown for box in labels]).reshape(-1, 2),
         track_id=torch.tensor([box.track_id for box in labels], dtype=torch.long),
-        category=torch.tensor([int(Category[box.category.upper()]) for box in labels], dtype=torch.long),
+        category=torch.tensor([category_named(box.category) for box in labels], dtype=torch.long),
         valid=torch.ones(len(labels), dtype=torch.bool),
         **unlabelled(len(labels)),
     )
