@@ -105,7 +105,7 @@ def test_points_of_a_moving_vehicle_are_brought_to_the_time_of_the_frame(frame: 
 
 
 def test_boxes_where_the_log_is_labelled(tmp_path: Path) -> None:
-    car = Box("car", 7, (12.0, 3.0, 0.8), (4.0, 1.8, 1.5), 0.3, velocity_mps=(2.0, 0.5))
+    car = Box("vehicle.car", 7, (12.0, 3.0, 0.8), (4.0, 1.8, 1.5), 0.3, velocity_mps=(2.0, 0.5))
     walker = Box("Pedestrian", 9, (5.0, -4.0, 0.9), (0.6, 0.6, 1.8), -1.0)
     log = write(tmp_path, boxes=[[car, walker], None, [], [walker]])
     found = read_boxes(log, 0)

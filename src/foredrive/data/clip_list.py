@@ -55,7 +55,7 @@ def read_clip_list(path: Path) -> list[ListedClip]:
         InputError: the file is not a clip list, or it has no clips.
     """
     try:
-        written = json.loads(path.read_text())
+        written = json.loads(path.read_bytes())
         if written["format"] != FORMAT:
             raise InputError(f"{path}: not a list of clips ({FORMAT}), but {written['format']!r}")
         clips = [
