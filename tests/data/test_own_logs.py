@@ -202,3 +202,15 @@ def test_the_example_of_the_documentation(tmp_path: Path, monkeypatch: pytest.Mo
     found = read_sweep(log, 3)
     assert found is not None
     assert len(found[0].valid) == 13
+
+
+def test_ten_minutes_of_poses_at_400_hz_keep_their_order(tmp_path: Path) -> None:
+    """Doubles of seconds since 1970 are 0.24 µs apart; poses that are 1 µs beside a frame are other times."""
+    t_us = np.int64(1_763_000_000_123_456) + 2500 * np.arange(240_000)
+    frames_us = t_us[[40_001, 120_000, 239_998]] + 1
+    path_us = np.union1d(t_us, frames_us)
+    poses = np.tile(np.eye(4), (len(path_us), 1, 1))
+    poses[:, 0, 3] = (path_us - t_us[0]) * 1e-5
+    at_frames = poses[np.searchsorted(path_us, frames_us)]
+    log = Log(write_log(tmp_path, "long", frames_us * 1e-6, at_frames, path=(path_us * 1e-6, poses)))
+    assert log.t_us.tolist() == frames_us.tolist()
