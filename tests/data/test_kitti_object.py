@@ -44,6 +44,8 @@ def made(tmp_path: Path) -> Path:
     points.tofile(folder / "velodyne" / "000007.bin")
     (folder / "calib" / "000007.txt").write_text(CALIBRATION)
     (folder / "label_2" / "000007.txt").write_text(LABELS)
+    for junk in ("._000007.png", "Thumbs.db", ".DS_Store"):  # as file browsers leave them
+        (folder / "image_2" / junk).write_bytes(b"junk")
     return folder.parent
 
 

@@ -57,6 +57,8 @@ def made(tmp_path: Path) -> Path:
         if frame < 3:
             SEEN.tofile(day / DRIVE / "velodyne_points" / "data" / f"{data}.bin")
         Image.new("RGB", (32, 16), (10, 200, 30)).save(day / DRIVE / "image_02" / "data" / f"{data}.png")
+    for junk in (".DS_Store", "._0000000001.png", "Thumbs.db"):  # as file browsers leave them
+        (day / DRIVE / "image_02" / "data" / junk).write_bytes(b"junk")
     return tmp_path / "raw"
 
 

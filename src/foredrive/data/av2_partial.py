@@ -70,7 +70,7 @@ class Av2PartialParser(BaseLogParser):
         lidars = self._lidars()
         empty = np.zeros(0, np.int64)
         annotated_ns = empty if annotations is None else annotations["timestamp_ns"].to_numpy()
-        sweeps = {int(sweep.stem): sweep for sweep in self._folder.glob("sensors/lidar/*.feather")}
+        sweeps = {int(sweep.stem): sweep for sweep in self._folder.glob("sensors/lidar/[0-9]*.feather")}
         if sweeps and not lidars:
             note("lidar", "left out; calibration/egovehicle_SE3_sensor.feather is missing")
             sweeps = {}

@@ -40,7 +40,7 @@ from foredrive.data.logs import imu_from_ego
 from foredrive.data.modalities import attributes_modality
 from foredrive.data.notices import note
 from foredrive.data.raw.guard import PartReader
-from foredrive.data.raw.images import read_rgb
+from foredrive.data.raw.images import is_image, read_rgb
 from foredrive.data.raw.point_files import KITTI, IntensityScale, read_points
 from foredrive.data.written_boxes import LABEL_OF_CATEGORY
 from foredrive.errors import InputError
@@ -87,7 +87,8 @@ class KittiObjectParser(BaseLogParser):
         if self._file("velodyne", "bin").is_file():
             modalities.append(self._lidar(calibration))
         for kind in _CAMERAS:
-            image = next(iter(sorted((self._folder / kind).glob(f"{self._frame}.*"))), None)
+            files = sorted((self._folder / kind).glob(f"{self._frame}.*"))
+            image = next((file for file in files if is_image(file)), None)
             if image is not None:
                 modalities.append(self._camera(kind, image, calibration))
         if self._file("label_2", "txt").is_file():

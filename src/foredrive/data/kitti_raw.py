@@ -38,7 +38,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from foredrive.data.notices import note
 from foredrive.data.raw.guard import PartReader
-from foredrive.data.raw.images import read_rgb
+from foredrive.data.raw.images import is_image, read_rgb
 from foredrive.data.raw.point_files import KITTI, IntensityScale, read_points
 from foredrive.errors import InputError
 
@@ -106,8 +106,9 @@ class KittiRawParser(BaseLogParser):
         """Return the files of each frame by stream."""
         files: dict[int, dict[str, Path]] = {}
         for name in (_LIDAR, *_CAMERAS):
-            for file in sorted((self._folder / name / "data").glob("*.bin" if name == _LIDAR else "*.*")):
-                files.setdefault(int(file.stem), {})[name] = file
+            for file in sorted((self._folder / name / "data").glob("[0-9]*")):
+                if is_image(file) or (name == _LIDAR and file.suffix == ".bin"):
+                    files.setdefault(int(file.stem), {})[name] = file
         return dict(sorted(files.items()))
 
     def _lidar(
@@ -191,7 +192,7 @@ class _Path:
         """
         t_us = _times_us(folder / "timestamps.txt")
         read, records = PartReader("oxts", "records"), dict[int, list[float]]()
-        for file in sorted((folder / "data").glob("*.txt")):
+        for file in sorted((folder / "data").glob("[0-9]*.txt")):
             record = read(file.name, functools.partial(_record, file, _time_of(t_us, int(file.stem))))
             if record is not None:
                 records[int(file.stem)] = record

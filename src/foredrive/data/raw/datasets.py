@@ -15,6 +15,7 @@ from foredrive.data.nuscenes_keyframe import NuScenesKeyframeParser
 from foredrive.data.pandaset import PandasetParser
 from foredrive.data.raw import py123d_datasets
 from foredrive.data.raw.bag_log import find_bags
+from foredrive.data.raw.images import is_image
 from foredrive.data.raw.nerfstudio import find_nerfstudio
 from foredrive.data.raw.raw_log import RawLog, folders_with
 
@@ -56,8 +57,9 @@ def _nuscenes_keyframe(source: Path) -> Iterator[RawLog]:
 def _kitti_object(source: Path) -> Iterator[RawLog]:
     for folder in folders_with(source, "calib"):
         split = "kitti_test" if folder.name == "testing" else "kitti_train"
-        sensed = [*folder.glob("velodyne/*.bin"), *folder.glob("image_2/*.*")]
-        for frame in sorted({file.stem for file in sensed}):
+        sensed = {file.stem for file in folder.glob("velodyne/*.bin")}
+        sensed |= {file.stem for file in folder.glob("image_2/*") if is_image(file)}
+        for frame in sorted(name for name in sensed if not name.startswith(".")):
             yield RawLog(folder, KittiObjectParser(folder, frame, split))
 
 

@@ -9,8 +9,14 @@ from PIL import Image, UnidentifiedImageError
 
 from foredrive.errors import InputError
 
+_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 _DEEP_MODES = ("I;16", "I;16B", "I;16L", "I;16N", "I", "F")
 """Pillow's modes of grey images with more than 8 bits. Its conversion to RGB would clip them to white."""
+
+
+def is_image(file: Path) -> bool:
+    """Return whether a file has the name of an image; file browsers leave others beside images."""
+    return file.suffix.lower() in _SUFFIXES and not file.name.startswith(".")
 
 
 def decoded(image: Path | str | bytes) -> Shaped[np.ndarray, "H W *channels"]:
