@@ -333,6 +333,19 @@ def test_each_camera_has_the_calibration_of_its_namespace(tmp_path: Path) -> Non
     assert "/left/image_raw/compressed: sensor_msgs/msg/CompressedImage, 4 messages; left out" in text
 
 
+def test_a_fisheye_is_not_proposed(tmp_path: Path) -> None:
+    def change(made: made_bags.Messages, recording: made_bags.Recording) -> made_bags.Recording:
+        for topic, _, message in recording:
+            if topic == "/front/camera_info":
+                message.distortion_model = "equidistant"
+        return recording
+
+    made_bags.write_ros2(tmp_path / "drive", change=change)
+    text = propose_topics(tmp_path / "drive", topics_file(tmp_path / "drive"))
+    assert read_topics(topics_file(tmp_path / "drive")).cameras == {}
+    assert "4 messages; left out: lenses of the model 'equidistant' are not read" in text
+
+
 STAMP_S, PERIOD_S = 1_700_000_000.25, 0.1
 
 

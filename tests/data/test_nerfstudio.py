@@ -180,6 +180,16 @@ def test_cameras_that_are_exposed_one_after_the_other(tmp_path: Path) -> None:
     assert sorted(late) == pytest.approx([0.0, 0.02, 0.04])
 
 
+@pytest.mark.parametrize(
+    ("scale", "start_s"), [(1.0, 2.5), (1.0, 1.7e9), (1e3, 1.7e9), (1e6, 1.7e9), (1e9, 1.7e9)]
+)
+def test_stamps_since_1970_may_have_finer_units(scale: float, start_s: float, tmp_path: Path) -> None:
+    stamps = [(start_s + 0.5 * k) * scale for k in range(3)]
+    frames = [frame(str(k), float(k), timestamp=stamp) for k, stamp in enumerate(stamps)]
+    (path,) = convert(write(tmp_path / "one", frames), "nerfstudio", tmp_path / "out")
+    assert Log(path).t_us.tolist() == [round(start_s * 1e6) + 500_000 * k for k in range(3)]
+
+
 def test_images_that_make_no_rig_are_refused(tmp_path: Path) -> None:
     """Equal numbers in three folders, whose cameras move against each other."""
     frames = rig_frames("images/{camera}/{k}.png", timed=False)

@@ -168,9 +168,12 @@ class NuScenesTablesParser(BaseLogParser):
         specs, channels = [], {}
         for channel, rows in readings.items():
             calibration = self._tables.calibration(rows[0])
-            if len(calibration["camera_intrinsic"]) == 0:
-                if channel != LIDAR and not channel.startswith("RADAR"):
-                    note(channel, f"left out; the only lidar that is read is {LIDAR}")
+            modality = self._tables.rows["sensor"][calibration["sensor_token"]]["modality"]
+            if modality != "camera" or not calibration["camera_intrinsic"]:
+                if channel != LIDAR and modality != "radar":
+                    lidar = f"the lidar that is read is {LIDAR}"
+                    reason = "it has no intrinsics" if modality == "camera" else lidar
+                    note(channel, f"left out; {reason}")
                 continue
             named = camera_of_channel(channel)
             name = channel if named is None else named.name

@@ -24,6 +24,7 @@ from foredrive.data.raw.bag_files import Bag, Topic, open_bag
 from foredrive.data.raw.bag_messages import (
     Placed,
     frame_of,
+    read_calibration,
     read_cloud,
     read_pixels,
     read_placed,
@@ -269,6 +270,7 @@ class _Proposal:
                 continue
             frame = [frame_of(content) for content in first]
             info = _calibration_of(topic.name, frame, frames)
+            lens = self._lens_fault(info)
             name = _camera_name(topic.name, names)
             if info is None:
                 self._left_out[topic.name] = "it has no CameraInfo"
@@ -277,12 +279,23 @@ class _Proposal:
                     "# cameras:",
                     f"#   {name}: {{images: {topic.name}, intrinsics: {{fx: , fy: , cx: , cy: }}}}",
                 ]
+            elif lens is not None:
+                self._left_out[topic.name] = lens
             elif info in used:
                 self._left_out[topic.name] = f"the same camera as {used[info]}"
             else:
                 used[info] = topic.name
                 names.add(name)
                 yield name, CameraTopics(images=topic.name, info=info, value_range=self._range(topic.name))
+
+    def _lens_fault(self, info: str | None) -> str | None:
+        """Return why the lens of a CameraInfo cannot be read, or None if it can."""
+        try:
+            for content in [] if info is None else self._first(info):
+                read_calibration(content)
+        except InputError as error:
+            return str(error)
+        return None
 
     def _range(self, topic: str) -> tuple[float, float] | None:
         """Return the smallest and the largest value of some images of 16 bits, or None for others."""

@@ -44,6 +44,7 @@ class PosedImage:
     """Of the file, in the folder of the data set."""
     T_world_cam: Float64[np.ndarray, "4 4"]
     t_s: float | None
+    """As the data set has it: s, or ms, µs or ns since 1970."""
     lens: tuple[float, ...]
     """Width, height, focal lengths and centre in px, then distortion."""
     camera: str | None = None
@@ -159,7 +160,8 @@ def _by_order(images: Sequence[PosedImage]) -> list[str]:
 def _times_us(images: Sequence[PosedImage], grouping: _Grouping) -> list[int] | None:
     """Return the times of images, or None if two of one camera would have the same."""
     if all(image.t_s is not None for image in images):
-        times = [round(float(image.t_s or 0.0) * 1e6) for image in images]
+        stamps = [float(image.t_s or 0.0) for image in images]
+        times = [round(stamp * _scale_us(max(map(abs, stamps)))) for stamp in stamps]
     else:
         ranks = {number: rank for rank, number in enumerate(sorted(set(grouping.numbers), key=_natural))}
         times = [round(PERIOD_S * 1e6) * ranks[number] for number in grouping.numbers]
@@ -167,6 +169,11 @@ def _times_us(images: Sequence[PosedImage], grouping: _Grouping) -> list[int] | 
         if len(set(grouping.cameras)) > 1 and min(Counter(grouping.cameras).values()) < 2:
             return None
     return times if len(set(zip(grouping.cameras, times, strict=True))) == len(times) else None
+
+
+def _scale_us(largest: float) -> float:
+    """Return how many µs are one unit of stamps: seconds since 1970 stay below 1e11, ms below 1e14."""
+    return 1e6 if largest < 1e11 else 1e3 if largest < 1e14 else 1.0 if largest < 1e17 else 1e-3
 
 
 def _natural(text: str) -> list[tuple[int, str]]:
