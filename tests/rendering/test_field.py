@@ -22,7 +22,13 @@ from foredrive.rendering.field.config import GridsConfig
 from foredrive.rendering.field.contraction import contract
 from foredrive.rendering.field.decoders import BeamDecoder, PatchDecoder, PatchDecoderConfig
 from foredrive.rendering.field.network import ActorSamples, harmonics, opacity_of_density
-from foredrive.rendering.field.sampling import first_borders, resampled_borders, to_distance, to_position
+from foredrive.rendering.field.sampling import (
+    Resampling,
+    first_borders,
+    resampled_borders,
+    to_distance,
+    to_position,
+)
 from foredrive.rendering.rebuilt import SensorMotion
 from foredrive.rendering.tracks import ActorTracks
 from foredrive.rendering.views import CameraView, SweepView
@@ -68,6 +74,30 @@ def test_samples_are_drawn_where_the_weight_lies(seed: int | None) -> None:
     assert bool((found[:, 0] == 0).all() and (found[:, -1] == 1).all())
     inside = (found >= border[:, 4:5]) & (found <= border[:, 5:6])
     assert bool((inside.sum(-1) >= 18).all())
+
+
+def test_padded_samples_are_the_middles_of_quantiles() -> None:
+    """With 0.01 each, the weights are 0.8, 0.1, 0.1, 0.01 of 1.01. The five borders are at (k + 1/2) / 5."""
+    border = torch.tensor([[0.0, 0.2, 0.4, 0.5, 1.0]])
+    weight = torch.tensor([[0.79, 0.09, 0.09, 0.0]])
+    found = resampled_borders(border, weight, 4, None, "padded")
+    first = [0.2 * 1.01 * u / 0.8 for u in (0.1, 0.3, 0.5, 0.7)]
+    expected = [*first, 0.4 + 0.1 * (1.01 * 0.9 - 0.9) / 0.1]
+    torch.testing.assert_close(found, torch.tensor([expected]))
+
+
+@pytest.mark.parametrize(("how", "share"), [("greedy", 0.98), ("padded", 1.01 / 2.28)])
+@pytest.mark.parametrize("seed", [None, 0])
+def test_padded_samples_look_elsewhere_too(how: Resampling, share: float, seed: int | None) -> None:
+    """128 intervals of which one has all weight: 1.01 of 1 + 1.28 with 0.01 added to each."""
+    rng = None if seed is None else torch.Generator().manual_seed(seed)
+    border, weight = torch.linspace(0, 1, 129).expand(50, -1), torch.zeros(50, 128)
+    weight[:, 40] = 1.0
+    found = resampled_borders(border, weight, 64, rng, how)
+    middle = 0.5 * (found[:, 1:] + found[:, :-1])
+    inside = (middle > border[:, 40:41]) & (middle < border[:, 41:42])
+    assert float(inside.float().mean()) == pytest.approx(share, abs=0.03)
+    assert bool((found.diff(dim=-1) > 0).all())
 
 
 def camera(twist: list[float], readout_s: float) -> CameraView:

@@ -14,7 +14,7 @@ from torch import Tensor
 from foredrive.cli.main import main
 from foredrive.data import LogPath, find_logs
 from foredrive.errors import InputError
-from foredrive.recipes.field import FieldRecipe, tiny_field
+from foredrive.recipes.field import FieldRecipe, padded_scale_m, tiny_field
 from foredrive.recipes.rebuilding import RebuildRecipe, field_base, field_tiny, rescheduled_recipe
 from foredrive.rendering.edits import Duplicate, Insert, Move, Remove, apply_edits
 from foredrive.rendering.field.config import FieldConfig, GridConfig, GridsConfig
@@ -23,6 +23,7 @@ from foredrive.rendering.field.decoders import PatchDecoderConfig
 from foredrive.rendering.field.rays import FieldRays
 from foredrive.rendering.field.scene import FieldScene, FieldSceneConfig
 from foredrive.rendering.gaussians.content import GaussianContent
+from foredrive.rendering.gaussians.initial import AHEAD_LEFT_UP
 from foredrive.rendering.scene_graph import STATIC, SceneGraph
 from foredrive.runs.rebuild.rebuilt_run import open_rebuilt
 from foredrive.runs.rebuild.reconstruct import Reconstruction, reconstruct
@@ -302,6 +303,55 @@ def test_a_page_says_that_the_browser_draws_lidar_points(run: Reconstruction, tm
         assert page.pictures.images[0].image.max() > 0
     finally:
         page.close()
+
+
+def test_the_choices_of_the_reference_are_trained_and_open_as_they_were(log: LogPath, tmp_path: Path) -> None:
+    """Ranges that are not divided by alpha, no biases, bounds from the path, padded proposals."""
+    small, published = recipe(steps=3), field_base().representation.scene
+    network = dataclasses.replace(
+        small.representation.scene.network,
+        **{name: getattr(published.network, name) for name in ("resampling", "scale_m", "biases", "surface")},
+    )
+    scene_config = dataclasses.replace(small.representation.scene, network=network, whole_ranges=False)
+    representation = dataclasses.replace(small.representation, scene=scene_config)
+    rebuilt = reconstruct(dataclasses.replace(small, representation=representation), log, tmp_path / "run")
+    scene, opened = rebuilt.scene, open_rebuilt(rebuilt.folder).scene
+    assert isinstance(scene, FieldScene)
+    assert isinstance(opened, FieldScene)
+    assert [name for name, _ in scene.field.named_parameters() if "bias" in name] == []
+    # The first frame is 1.5 m behind the middle of the 3 m, cameras and lidar are 0.8 m further on average.
+    assert float(opened.field.scale_m) == pytest.approx(80 + 1.5 + 0.8, abs=0.01)
+    assert opened.field.grids.scale_m == pytest.approx(float(scene.field.scale_m))
+    assert torch.equal(image(opened, opened.graph, rebuilt), image(scene, scene.graph, rebuilt))
+    view = rebuilt.held_out.sweeps[0]
+    with torch.no_grad():
+        plain = scene.sweep(scene.graph, scene.prepare_sweep(view), view.t_s)
+        scene.config = dataclasses.replace(scene.config, whole_ranges=True)
+        whole = scene.sweep(scene.graph, scene.prepare_sweep(view), view.t_s)
+    assert bool((plain.alpha < 0.999).all())  # with no biases, each sample stops about half
+    torch.testing.assert_close(plain.range_m, whole.range_m * plain.alpha)
+
+
+def test_bounds_hold_the_surroundings_of_all_poses(run: Reconstruction) -> None:
+    """One sweep at the origin looks along x, one at x = 100 m along y: from x = -80 m to 160 m."""
+    turned = torch.eye(4)
+    turned[:2, :2], turned[0, 3] = torch.tensor([[0.0, -1], [1, 0]]), 100.0
+    sweeps = [dataclasses.replace(run.train.sweeps[0], T_scene_ego=T) for T in (torch.eye(4), turned)]
+    found_m = padded_scale_m(SensorViews([], sweeps), torch.tensor([50.0, 0, 0]))
+    assert found_m == pytest.approx(130.0)  # behind the first; 110 m beside the second
+    camera = dataclasses.replace(run.train.cameras[0], T_scene_cam=turned @ AHEAD_LEFT_UP.inverse())
+    assert padded_scale_m(SensorViews([camera], []), torch.zeros(3)) == pytest.approx(160.0)
+
+
+def test_appearance_codes_learn_as_fast_as_layers(run: Reconstruction) -> None:
+    assert isinstance(run.scene, FieldScene)
+    training = FieldTraining(run.scene, run.train, recipe().representation.schedule)
+    groups = {group.name: {id(p) for p in group.parameters} for group in training.parameter_groups()}
+    decoder = run.scene.camera_decoder
+    assert {id(decoder.appearance), id(run.scene.lidar_decoder.appearance)} <= groups["layers"]
+    assert groups["decoder"] == {id(p) for p in decoder.parameters()} - {id(decoder.appearance)}
+    every = [id(p) for group in training.parameter_groups() for p in group.parameters]
+    assert sorted(every) == sorted(id(p) for p in run.scene.parameters())
 
 
 def test_the_sizes_of_neurad() -> None:

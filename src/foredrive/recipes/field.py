@@ -8,11 +8,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from foredrive.geometry.se3 import transform_points
 from foredrive.rendering.field.config import FieldConfig, GridConfig, GridsConfig
 from foredrive.rendering.field.decoders import PatchDecoderConfig
 from foredrive.rendering.field.scene import FieldScene, FieldSceneConfig, saved_field
 from foredrive.rendering.gaussians.content import gaussians_of
-from foredrive.rendering.gaussians.initial import InitialGaussians, initial_scene
+from foredrive.rendering.gaussians.initial import AHEAD_LEFT_UP, InitialGaussians, initial_scene
 from foredrive.rendering.tracks import ActorTracks
 from foredrive.training.field_training import FieldRates, FieldSchedule, FieldTraining, FieldWeights
 from foredrive.training.learning_rates import Rate
@@ -49,8 +50,9 @@ class FieldRecipe:
         places = [view.T_scene_cam[:3, 3] for view in views.cameras]
         places += [view.T_scene_ego[:3, 3] for view in views.sweeps]
         middle_m = torch.stack(places).mean(0) if places else torch.zeros(3)
+        scale_m = padded_scale_m(views, middle_m) if self.scene.network.scale_m is None else None
         torch.manual_seed(self.schedule.seed)  # the weights
-        return FieldScene(tracks, gaussians_of(graph), cameras, self.scene, reach_m, middle_m)
+        return FieldScene(tracks, gaussians_of(graph), cameras, self.scene, reach_m, middle_m, scale_m)
 
     def open(self, weights: Path, reach_m: float) -> FieldScene:
         """Return a scene of the sizes of saved weights, which are to be loaded into it."""
@@ -74,6 +76,20 @@ class FieldRecipe:
         samples = rays * (sizes.samples + sum(sizes.proposal_samples) / 4)
         of_patches = 9 * schedule.patches * schedule.patch**2 * _OF_A_PIXEL
         return 4 * (entries * _COPIES + samples * _OF_A_SAMPLE + of_patches) / 1024**3
+
+
+def padded_scale_m(views: SensorViews, middle_m: Float[Tensor, "3"]) -> float:
+    """Return the half side of the cube about `middle_m` that holds the surroundings of all poses, m.
+
+    The surroundings are 80 m ahead and behind and 60 m to the sides, as in NeuRAD's reference implementation,
+    and 30 m up. Cameras stand in where there are no sweeps.
+    """
+    poses = [view.T_scene_ego for view in views.sweeps] or [
+        view.T_scene_cam @ AHEAD_LEFT_UP for view in views.cameras
+    ]
+    around = torch.tensor([[80.0, 0, 0], [-80, 0, 0], [0, 60, 0], [0, -60, 0]])
+    places = [transform_points(T, around.to(T)) - middle_m.to(T) for T in poses]
+    return max([30.0, *(float(place[:, :2].abs().max()) for place in places)])
 
 
 def tiny_field() -> FieldRecipe:
@@ -124,5 +140,10 @@ def tiny_field() -> FieldRecipe:
 
 
 def base_field() -> FieldRecipe:
-    """Return NeuRAD in the sizes of its reference implementation."""
-    return FieldRecipe(schedule=FieldSchedule(steps=20_001, free_m=150.0))
+    """Return NeuRAD in the sizes and with the choices of its reference implementation."""
+    return FieldRecipe(
+        schedule=FieldSchedule(steps=20_001, free_m=150.0),
+        scene=FieldSceneConfig(
+            network=FieldConfig(resampling="padded", scale_m=None, biases=False), whole_ranges=False
+        ),
+    )

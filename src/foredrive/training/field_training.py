@@ -61,7 +61,7 @@ class FieldRates:
     grids: Rate = field(default_factory=lambda: Rate(1e-2, warmup_steps=500))
     layers: Rate = field(default_factory=lambda: Rate(1e-2, warmup_steps=500))
     decoder: Rate = field(default_factory=lambda: Rate(1e-3, warmup_steps=2_500))
-    """The CNN for images."""
+    """The CNN for images; appearance codes are among the layers, as in the reference implementation."""
     actor_offset: Rate = field(default_factory=lambda: Rate(1e-3, warmup_steps=2_500))
     camera_offset: Rate = field(default_factory=lambda: Rate(0.0))
     camera_twist: Rate = field(default_factory=lambda: Rate(0.0))
@@ -148,8 +148,8 @@ class FieldTraining:
         layers = [p for p in scene.field.parameters() if id(p) not in of_table]
         found = {
             "grids": tables,
-            "layers": [*layers, *scene.lidar_decoder.parameters()],
-            "decoder": list(scene.camera_decoder.parameters()),
+            "layers": [*layers, *scene.lidar_decoder.parameters(), scene.camera_decoder.appearance],
+            "decoder": [p for n, p in scene.camera_decoder.named_parameters() if n != "appearance"],
         }
         for rate in dataclasses.fields(self.schedule.rates):
             parameters = found.get(rate.name) or [getattr(scene, rate.name)]

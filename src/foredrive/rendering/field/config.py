@@ -3,6 +3,8 @@
 from dataclasses import dataclass, field
 from typing import Literal
 
+from foredrive.rendering.field.sampling import Resampling
+
 
 @dataclass(frozen=True)
 class GridConfig:
@@ -55,12 +57,15 @@ class FieldConfig:
     """Samples on a ray in each round of proposals."""
     samples: int = 32
     """Samples on a ray at which the field is evaluated."""
+    resampling: Resampling = "greedy"
+    """How samples are drawn from the weights of a proposal."""
     spacing_m: float = 20.0
     """The first samples are uniform in t / (t + spacing): the power spacing of Zip-NeRF with λ = -1."""
     sky_m: float = 20_000.0
     """End of every ray. What the ray has left there is given to its last sample."""
-    scale_m: float = 50.0
-    """Half side of the cube about the path's middle that is not contracted."""
+    scale_m: float | None = 50.0
+    """Half side of the cube about the path's middle that is not contracted. None: it holds all places up to
+    80 m ahead of and behind the path and 60 m beside it, as in the reference implementation."""
     actor_scale_m: float = 10.0
     """The same for the boxes of actors, about the box' centre."""
     actor_margin_m: tuple[float, float, float] = (0.25, 0.25, 0.1)
@@ -71,6 +76,8 @@ class FieldConfig:
     """Where directions enter: at each sample, as in the paper, or once a ray, after its samples' sum."""
     beta: float = 20.0
     """Initial slope β of the opacity."""
+    biases: bool = True
+    """Whether the field's layers have biases. Those of tiny-cuda-nn have none."""
     width: int = 32
     """Channels of hidden layers and of the field's features."""
     geometry_layers: int = 2

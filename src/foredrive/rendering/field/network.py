@@ -22,7 +22,7 @@ _MAX_LOG_DENSITY = 15.0
 _FIRST_LOG_DENSITY = math.log(0.02)
 """Initial logarithm of a density, 1/m: a ray passes through tens of metres."""
 _FIRST_DISTANCE = 0.1
-"""Initial signed distance: with β = 20, a sample stops an eighth of the light."""
+"""Initial signed distance: with β = 20, a sample stops an eighth of the light. About 0 without biases."""
 HARMONICS = 16
 """Number of spherical harmonics up to degree 3."""
 
@@ -62,9 +62,9 @@ class HashGrid(nn.Module):
 class Grids(nn.Module):
     """The grid of what stands, and a grid that all actors share, as in NeuRAD."""
 
-    def __init__(self, config: GridsConfig, field: FieldConfig, actors: int) -> None:
+    def __init__(self, config: GridsConfig, field: FieldConfig, actors: int, scale_m: float) -> None:
         super().__init__()
-        self.scale_m, self.actor_scale_m = field.scale_m, field.actor_scale_m
+        self.scale_m, self.actor_scale_m = scale_m, field.actor_scale_m
         self.static = HashGrid(config.static)
         self.actors = HashGrid(config.actors, actors)
         self.features = config.static.levels * config.static.features
@@ -97,9 +97,9 @@ class Grids(nn.Module):
 class Layers(nn.Module):
     """A perceptron for values with the samples last: ReLU between the layers."""
 
-    def __init__(self, *sizes: int) -> None:
+    def __init__(self, *sizes: int, bias: bool = True) -> None:
         super().__init__()
-        self.linear = nn.ModuleList(nn.Linear(a, b) for a, b in pairwise(sizes))
+        self.linear = nn.ModuleList(nn.Linear(a, b, bias=bias) for a, b in pairwise(sizes))
 
     def forward(self, x: Float[Tensor, "C N"]) -> Float[Tensor, "D N"]:
         """Return the last layer's output."""
@@ -111,7 +111,7 @@ class Layers(nn.Module):
 def affine(layer: nn.Module, x: Float[Tensor, "C N"]) -> Float[Tensor, "D N"]:
     """Apply a linear layer from the left."""
     assert isinstance(layer, nn.Linear)
-    return torch.addmm(layer.bias[:, None], layer.weight, x)
+    return layer.weight @ x if layer.bias is None else torch.addmm(layer.bias[:, None], layer.weight, x)
 
 
 class FieldLayers(nn.Module):
@@ -119,17 +119,18 @@ class FieldLayers(nn.Module):
 
     def __init__(self, config: FieldConfig, features: int) -> None:
         super().__init__()
-        width, self.shading = config.width, config.shading
-        self.geometry = Layers(features, *[width] * (config.geometry_layers - 1), width + 1)
-        self.first = nn.Linear(width, width)
+        width, bias, self.shading = config.width, config.biases, config.shading
+        self.geometry = Layers(features, *[width] * (config.geometry_layers - 1), width + 1, bias=bias)
+        self.first = nn.Linear(width, width, bias=bias)
         self.first_direction = nn.Linear(HARMONICS, width, bias=False)
-        self.rest = Layers(*[width] * config.feature_layers)
+        self.rest = Layers(*[width] * config.feature_layers, bias=bias)
         self.beta = nn.Parameter(torch.tensor(config.beta)) if config.surface == "sdf" else None
         with torch.no_grad():
             last = self.geometry.linear[-1]
             assert isinstance(last, nn.Linear)
             last.weight[0] *= _FIRST_DISTANCE
-            last.bias[0] = _FIRST_DISTANCE if self.beta is not None else 0.0
+            if bias:
+                last.bias[0] = _FIRST_DISTANCE if self.beta is not None else 0.0
 
     def surface(
         self, grid: Float[Tensor, "C N"], length_m: Float[Tensor, "R S"]
@@ -207,9 +208,9 @@ def opacity_of_density(
 class ProposalDensity(nn.Module):
     """A density from a small grid, which only says where to sample the field."""
 
-    def __init__(self, config: GridsConfig, field: FieldConfig, actors: int) -> None:
+    def __init__(self, config: GridsConfig, field: FieldConfig, actors: int, scale_m: float) -> None:
         super().__init__()
-        self.grids = Grids(config, field, actors)
+        self.grids = Grids(config, field, actors, scale_m)
         self.decoder = nn.Linear(self.grids.features, 1, bias=False)
 
     def forward(

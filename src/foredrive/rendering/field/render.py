@@ -67,17 +67,29 @@ class NeuralField(nn.Module):
         config: parts of the field.
         actors: number of places in the grid of actors.
         middle_m: the middle of the part of the scene that is not contracted.
+        scale_m: half side of that part; None: that of `config`.
+
+    Raises:
+        ValueError: neither gives the half side.
     """
 
     middle_m: Tensor
 
-    def __init__(self, config: FieldConfig, actors: int, middle_m: Float[Tensor, "3"]) -> None:
+    def __init__(
+        self, config: FieldConfig, actors: int, middle_m: Float[Tensor, "3"], scale_m: float | None = None
+    ) -> None:
         super().__init__()
+        scale_m = config.scale_m if scale_m is None else scale_m
+        if scale_m is None:
+            raise ValueError("a field whose scale_m follows from the path has to be given it")
         self.config = config
         self.register_buffer("middle_m", middle_m)
-        self.grids = Grids(config.grids, config, actors)
+        self.register_buffer("scale_m", torch.tensor(scale_m), persistent=config.scale_m is None)
+        self.grids = Grids(config.grids, config, actors, scale_m)
         self.layers = FieldLayers(config, self.grids.features)
-        self.proposals = nn.ModuleList(ProposalDensity(grids, config, actors) for grids in config.proposals)
+        self.proposals = nn.ModuleList(
+            ProposalDensity(grids, config, actors, scale_m) for grids in config.proposals
+        )
 
     def forward(
         self,
@@ -110,7 +122,9 @@ class NeuralField(nn.Module):
             proposals.append(Intervals(border, border_m, weight))
             last = i + 1 == len(self.proposals)
             count = config.samples if last else config.proposal_samples[i + 1]
-            border = resampled_borders(border, weight, count, generator)
+            border = resampled_borders(border, weight, count, generator, config.resampling)
+        # The last interval is the sky.
+        border = torch.cat([border[:, :-1], torch.ones_like(border[:, :1])], dim=-1)
         border_m = to_distance(border, config.spacing_m, config.sky_m)
         points, footprint, moving = self._samples(rays, border_m, crossings, actors, learn_poses=True)
         grid = self.grids(points, footprint, moving)

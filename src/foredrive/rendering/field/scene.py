@@ -46,6 +46,9 @@ class FieldSceneConfig:
 
     network: FieldConfig = field(default_factory=FieldConfig)
     decoder: PatchDecoderConfig = field(default_factory=PatchDecoderConfig)
+    whole_ranges: bool = True
+    """Ranges are the mean distances of what stops a ray. If False, they are not divided by the probability
+    that something stops it, as in the reference implementation."""
     rolling: bool = True
     """Rows of an image and beams of a sweep have their own times. If False, all are simultaneous."""
 
@@ -60,6 +63,7 @@ class FieldScene(RebuiltScene):
         config: parts of the scene.
         reach_m: nothing beyond stops a beam.
         middle_m: middle of the part of the scene that is not contracted.
+        scale_m: half side of that part; None: that of `config`.
     """
 
     preview_name = "coloured lidar points"
@@ -76,11 +80,12 @@ class FieldScene(RebuiltScene):
         config: FieldSceneConfig,
         reach_m: float,
         middle_m: Float[Tensor, "3"],
+        scale_m: float | None = None,
     ) -> None:
         super().__init__(tracks, cameras, reach_m, frames=0)
         self.config = config
         sizes = config.network
-        self.field = NeuralField(sizes, len(tracks), middle_m)
+        self.field = NeuralField(sizes, len(tracks), middle_m, scale_m)
         self.camera_decoder = PatchDecoder(sizes.width, cameras, sizes.appearance, config.decoder)
         self.camera_decoder.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.lidar_decoder = BeamDecoder(sizes.width, sizes.appearance)
@@ -159,7 +164,7 @@ class FieldScene(RebuiltScene):
         # The camera's axis is that of the row's own time: it turns during the read-out.
         along = pixels_to_rays(_pixels_of_rays(corner_uv, size).to(view.K), view.K, view.dist)[:, 2]
         alpha = seen["alpha"].view(high, wide)
-        range_m = seen["depth_m"].view(high, wide) / alpha.clamp_min(_TINY) * along.view(high, wide)
+        range_m = self._ranges(seen).view(high, wide) * along.view(high, wide)
         return RenderedImage(rgb, _enlarged(range_m, view.size_hw), _enlarged(alpha, view.size_hw))
 
     def prepare_sweep(self, view: SweepView) -> FieldRays:
@@ -176,12 +181,17 @@ class FieldScene(RebuiltScene):
         intensity, drop_logit = self.lidar_decoder(seen["feature"])
         if guests:
             intensity, drop_logit = with_guests_in_sweep(intensity, drop_logit, *guests)
-        range_m = seen["depth_m"] / seen["alpha"].clamp_min(_TINY)
+        range_m = self._ranges(seen)
         median_m = seen["median_m"]
         beyond = torch.where(median_m.isfinite(), median_m, range_m) > self.reach_m
         nothing = seen["alpha"] < _LEAST_ALPHA
         drop_logit = torch.where(beyond | nothing, drop_logit.abs() + 1, drop_logit)
         return RenderedSweep(range_m, median_m, intensity, drop_logit, seen["alpha"], None)
+
+    def _ranges(self, seen: Mapping[str, Tensor]) -> Float[Tensor, "R"]:
+        """Return the ranges of rays from their expected distances."""
+        depth_m, alpha = seen["depth_m"], seen["alpha"]
+        return depth_m / alpha.clamp_min(_TINY) if self.config.whole_ranges else depth_m
 
     def _in_parts(
         self, graph: SceneGraph, rays: FieldRays
@@ -238,8 +248,10 @@ def saved_field(weights: Path, config: FieldSceneConfig, reach_m: float) -> Fiel
             saved["shown_rgb"],
         )
         shown, cameras = GaussianContent(points, saved["shown_actor"]), len(saved["camera_late_s"])
-        middle_m = saved["field.middle_m"]
-        return FieldScene(saved_tracks(saved), shown, cameras, config, reach_m, middle_m)
+        middle_m, scale_m = saved["field.middle_m"], None
+        if config.network.scale_m is None:
+            scale_m = float(saved["field.scale_m"])
+        return FieldScene(saved_tracks(saved), shown, cameras, config, reach_m, middle_m, scale_m)
     except (OSError, SafetensorError, KeyError) as error:
         raise InputError(f"{weights}: not the weights of a field: {error}") from error
 

@@ -32,7 +32,7 @@ from foredrive.rendering.tracks import ActorTracks
 from foredrive.rendering.views import CameraView, SweepView
 
 _LEAST_SCALE_M, _GREATEST_SCALE_M = 0.01, 2.0
-_AHEAD_LEFT_UP = torch.tensor([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
+AHEAD_LEFT_UP = torch.tensor([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
 """Transform from axes ahead, left, up to those of a camera."""
 _PATCH = 8
 """Number of neighbours that set the shape of a Gaussian where no camera looks."""
@@ -120,7 +120,7 @@ def initial_scene(
     ]
     if size.random_far_points or size.random_near_points:
         poses = [view.T_scene_ego for view in sweeps] or [
-            view.T_scene_cam @ _AHEAD_LEFT_UP for view in cameras
+            view.T_scene_cam @ AHEAD_LEFT_UP for view in cameras
         ]
         bounds, counts = drive_bounds(torch.stack(poses)), (size.random_far_points, size.random_near_points)
         around = random_points(bounds, *counts, size.scale, generator)
