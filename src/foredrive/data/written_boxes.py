@@ -6,6 +6,7 @@ from py123d.datatypes import BoxDetectionAttributes, BoxDetectionSE3, BoxDetecti
 from py123d.datatypes.detections.box_detections_metadata import BoxDetectionsSE3Metadata
 from py123d.datatypes.modalities.base_modality import BaseModality
 from py123d.geometry import BoundingBoxSE3, PoseSE3, Vector3D
+from py123d.geometry.utils.rotation_utils import get_quaternion_array_from_rotation_matrices
 from py123d.parser.registry import NuScenesBoxDetectionLabel as Label
 
 from foredrive.data.modalities import attributes_modality
@@ -43,8 +44,11 @@ def box_modalities(boxes: Boxes, T_world_ego: Float64[np.ndarray, "4 4"], t_us: 
     points = [None if count == UNKNOWN else count for count in boxes.num_points.tolist()]
     T_ego_box = matrix_from_yaw(boxes.yaw.double(), boxes.centre.double()).numpy()
     detections = []
-    for T, size, velocity, track, category, hits in zip(
-        T_world_ego @ T_ego_box,
+    T_world_box = T_world_ego @ T_ego_box
+    # py123d's conversion of one matrix at a time would take most of the time of writing a log.
+    quaternions = get_quaternion_array_from_rotation_matrices(T_world_box[:, :3, :3])
+    for pose, size, velocity, track, category, hits in zip(
+        np.concatenate([T_world_box[:, :3, 3], quaternions], axis=1),
         boxes.size_lwh.tolist(),
         boxes.velocity.double().numpy(),
         boxes.track_id.tolist(),
@@ -56,9 +60,7 @@ def box_modalities(boxes: Boxes, T_world_ego: Float64[np.ndarray, "4 4"], t_us: 
         over_ground = Vector3D.from_array(R_world_ego @ [*velocity, 0.0]) if known else None
         attributes = BoxDetectionAttributes(LABEL_OF_CATEGORY[Category(category)], str(track), hits)
         detections.append(
-            BoxDetectionSE3(
-                attributes, BoundingBoxSE3(PoseSE3.from_transformation_matrix(T), *size), over_ground
-            )
+            BoxDetectionSE3(attributes, BoundingBoxSE3(PoseSE3.from_array(pose), *size), over_ground)
         )
     when, attribute = Timestamp.from_us(t_us), boxes.attribute.tolist()
     written: list[BaseModality] = [BoxDetectionsSE3(detections, when, BoxDetectionsSE3Metadata(Label))]

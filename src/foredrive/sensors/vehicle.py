@@ -27,7 +27,8 @@ class VehicleSensors:
 
     rig: CameraRig
     """Cameras, without leading dimensions."""
-    lidar: SpinningLidar
+    lidar: SpinningLidar | None
+    """None: there is none, and nothing is spent on it."""
 
 
 def roof_lidar(channels: int = 32, azimuth_steps: int = 720, rate_hz: float = 10.0) -> SpinningLidar:

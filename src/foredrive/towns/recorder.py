@@ -224,7 +224,8 @@ def _frame(
     snapshot, frame, seed = sensed
     actors = [*snapshot.actors, *world.parked]
     near = in_box_range(actors, snapshot.T_world_ego)
-    returned = frame.beam_ids[frame.sweep.returned.numpy()]
+    returned = None if frame.sweep is None else frame.beam_ids[frame.sweep.returned.numpy()]
+    boxes = boxes_in_ego_frame(near, snapshot.T_world_ego)
     visibility, setting, text = None, None, None
     if labels.visibility or labels.captions:
         visibility = world.visibility(near, sensors, snapshot.T_world_ego, frame)
@@ -242,10 +243,7 @@ def _frame(
         acceleration_ego_mps2=snapshot.acceleration_ego_mps2,
         images=frame.images,
         sweep=frame.sweep,
-        boxes=replace(
-            boxes_in_ego_frame(near, snapshot.T_world_ego),
-            num_points=_count(np.array([a.track_id for a in near], dtype=np.int64), returned),
-        ),
+        boxes=boxes if returned is None else replace(boxes, num_points=_count(near, returned)),
         occupancy=None if spec is None else world.occupancy(snapshot.actors, snapshot.T_world_ego, spec),
         visibility=visibility if labels.visibility else None,
         setting=setting,
@@ -271,18 +269,20 @@ def _ray_labels(
             name: camera_labels(frame.pixel_surface[name], categories[frame.pixel_ids[name]])
             for name in names
         }
-        out["beam_semantic"] = lidar_labels(frame.beam_surface, categories[frame.beam_ids])
+        if frame.sweep is not None:
+            out["beam_semantic"] = lidar_labels(frame.beam_surface, categories[frame.beam_ids])
     if labels.instance:
         out["instance"] = {name: instance_labels(frame.pixel_ids[name]) for name in names}
-        out["beam_instance"] = instance_labels(frame.beam_ids)
+        if frame.sweep is not None:
+            out["beam_instance"] = instance_labels(frame.beam_ids)
     return out
 
 
-def _count(track_ids: Int[np.ndarray, "M"], hit_ids: Int[np.ndarray, "N"]) -> Int[Tensor, "M"]:
-    """Return how often each track was hit."""
+def _count(actors: list[ActorState], hit_ids: Int[np.ndarray, "N"]) -> Int[Tensor, "M"]:
+    """Return how often each actor was hit."""
     hit, count = np.unique(hit_ids, return_counts=True)
     counts = dict(zip(hit.tolist(), count.tolist(), strict=True))
-    return torch.tensor([counts.get(i, 0) for i in track_ids.tolist()], dtype=torch.int64)
+    return torch.tensor([counts.get(actor.track_id, 0) for actor in actors], dtype=torch.int64)
 
 
 def camera_specs(rig: CameraRig) -> list[CameraSpec]:

@@ -50,7 +50,7 @@ from foredrive.towns.sensing import capture, lens, raycast, shading
 from foredrive.towns.sensing.actor_shapes import SLOTS, ShapeLibrary, make_shape_library, unit_to_world
 from foredrive.towns.sensing.capture import SensorSuite
 from foredrive.towns.sensing.columns import make_columns
-from foredrive.towns.sensing.hit_buffer import HitBuffer, surface_ids, track_ids
+from foredrive.towns.sensing.hit_buffer import HitBuffer, empty_hit_buffer, surface_ids, track_ids
 from foredrive.towns.sensing.lamps import gather_lamps
 from foredrive.towns.sensing.light import Rgb, headlights_on, make_light, street_lamps_on
 
@@ -76,9 +76,9 @@ class SensorFrame:
     """`Surface`, -1 for the sky."""
     pixel_range_m: dict[str, Float32[np.ndarray, "H W"]]
     """Distance along the pixel's ray, m; infinite for the sky."""
-    sweep: LidarSweep
-    """Lidar sweep, unbatched, in the ego frame at the frame's time. A beam without a return is free up to the
-    surface that it hit."""
+    sweep: LidarSweep | None
+    """Lidar sweep, unbatched, in the ego frame at the frame's time; None without a lidar. A beam without a
+    return is free up to the surface that it hit."""
     beam_ids: Int[np.ndarray, "N"]
     """Track ids of all beams, including those without a return."""
     beam_surface: Int[np.ndarray, "N"]
@@ -198,7 +198,10 @@ class World:
         ego = capture.EgoMotion(T_world_ego, twist_ego)
         images, buffer = capture.render_images(tracer, sensors, ego, np.random.default_rng((noise_seed, 1)))
         images = self._through_air_and_lens(images, sensors, noise_seed)
-        sweep, met = capture.simulate_sweep(tracer, sensors.lidar, ego, np.random.default_rng(noise_seed))
+        sweep, met = None, empty_hit_buffer(0)
+        if sensors.lidar is not None:
+            noise = np.random.default_rng(noise_seed)
+            sweep, met = capture.simulate_sweep(tracer, sensors.lidar, ego, noise)
         names = sensors.rig.names
         shape = (len(names), *sensors.rig.size_hw)
         return SensorFrame(

@@ -180,9 +180,10 @@ class CarlaSimulator:
                 pose = CarlaPose(*(spec[key] for key in ("x", "y", "z", "roll", "pitch", "yaw")))
                 attributes = carla_sensors.camera_attributes(spec)
                 cameras.append(mount(carla_sensors.CAMERA, spec["id"], pose, attributes))
-            pose = carla_sensors.lidar_pose(suite.lidar, T_actor_ego)
-            attributes = carla_sensors.lidar_attributes(suite.lidar)
-            lidar = mount(carla_sensors.LIDAR, "lidar", pose, attributes)
+            if suite.lidar is not None:
+                pose = carla_sensors.lidar_pose(suite.lidar, T_actor_ego)
+                attributes = carla_sensors.lidar_attributes(suite.lidar)
+                lidar = mount(carla_sensors.LIDAR, "lidar", pose, attributes)
         collisions = mount("sensor.other.collision", "collisions", CarlaPose(0.0, 0.0, 0.0), {})
         return _Ego(vehicle, T_actor_ego, cameras, lidar, collisions)
 
@@ -235,8 +236,9 @@ class CarlaSimulator:
     def _with_frame(self, session: CarlaSession, state: CarlaState, frame: int) -> tuple[KeyFrame, ...]:
         """Append the current key frame and return the latest frames, as many as an observation has."""
         suite, images, sweep = self._scenario.sensors, no_images(), None
-        if suite is not None and self._ego.lidar is not None:
+        if suite is not None:
             images = self._images(frame)
+        if suite is not None and suite.lidar is not None and self._ego.lidar is not None:
             sweep = _sweep(self._ego.lidar.at(frame, self._timeout_s), suite.lidar)
         boxes = self._boxes(session, state.T_world_ego)
         now = KeyFrame(state.t_s, state.T_world_ego, state.ego.speed_mps, images, sweep, boxes)

@@ -110,7 +110,7 @@ class ExpertDrive:
         """Return the poses of all vehicles of `state`, with the steering disturbance applied to the ego
         vehicle."""
         poses, ego = self._traffic.poses(self.state), self._ego
-        T_world_ego = _axle_pose(poses) @ _T_path_ego(self._deviation)
+        T_world_ego = poses.axle_frame() @ T_path_ego(self._deviation)
         to_centre_ego = [float(ego.axle_to_centre_m[0]), 0.0, 0.5 * ego.size_lwh[0, 2], 1.0]
         poses.axle_xyz[0], poses.forward[0] = T_world_ego[:3, 3], T_world_ego[:3, 0]
         poses.centre_m[0] = T_world_ego[:3] @ to_centre_ego
@@ -141,8 +141,8 @@ class ExpertDrive:
 
     def _snapshot(self, t_s: float) -> DriveSnapshot:
         ego = self._ego
-        T_world_ego = _axle_pose(vehicle_poses(self._traffic.lanes, ego)) @ _T_path_ego(self._deviation)
-        twist = self._twist(T_world_ego)
+        T_world_ego = vehicle_poses(self._traffic.lanes, ego).axle_frame() @ T_path_ego(self._deviation)
+        twist = ego_twist(self._traffic.lanes, ego, T_world_ego, self._deviation)
         return DriveSnapshot(
             t_s=t_s,
             T_world_ego=T_world_ego,
@@ -152,16 +152,26 @@ class ExpertDrive:
             lights=self._traffic.zone_lights(self.state.time_s),
         )
 
-    def _twist(self, T_world_ego: Float64[np.ndarray, "4 4"]) -> Float64[np.ndarray, "6"]:
-        """Return the motion of the ego frame, exactly 0 while it stands."""
-        half_m = 0.5 * MOTION_S * float(self._ego.speed_mps[0])
-        if half_m == 0:
-            return np.zeros(6)
-        paths = zip(motion(self._traffic.lanes, self._ego), (-half_m, half_m), strict=True)
-        before, after = (_axle_pose(poses) @ _T_path_ego(self._deviation.moved(d)) for poses, d in paths)
-        moved_ego = T_world_ego[:3, :3].T @ (after[:3, 3] - before[:3, 3])
-        turned = Rotation.from_matrix(before[:3, :3].T @ after[:3, :3]).as_rotvec()
-        return np.concatenate([moved_ego, turned]) / MOTION_S
+
+def ego_twist(
+    lanes: LaneGraph, ego: Vehicles, T_world_ego: Float64[np.ndarray, "4 4"], deviation: PathDeviation
+) -> Float64[np.ndarray, "6"]:
+    """Return the motion of a vehicle's ego frame in its own axes: m/s, then rad/s. It is 0 while it stands.
+
+    Args:
+        lanes: the town's lanes.
+        ego: one vehicle.
+        T_world_ego: pose of its ego frame.
+        deviation: of the ego frame from the vehicle's path.
+    """
+    half_m = 0.5 * MOTION_S * float(ego.speed_mps[0])
+    if half_m == 0:
+        return np.zeros(6)
+    paths = zip(motion(lanes, ego), (-half_m, half_m), strict=True)
+    before, after = (poses.axle_frame() @ T_path_ego(deviation.moved(moved_m)) for poses, moved_m in paths)
+    moved_ego = T_world_ego[:3, :3].T @ (after[:3, 3] - before[:3, 3])
+    turned = Rotation.from_matrix(before[:3, :3].T @ after[:3, :3]).as_rotvec()
+    return np.concatenate([moved_ego, turned]) / MOTION_S
 
 
 def plan_route(lanes: LaneGraph, starts: StartPoints, seed: int, seconds: float) -> Route:
@@ -171,18 +181,8 @@ def plan_route(lanes: LaneGraph, starts: StartPoints, seed: int, seconds: float)
     return draw_route(lanes, starts, rng, max_length_m, SETTLE_S, SETTLE_S + seconds)
 
 
-def _T_path_ego(deviation: PathDeviation) -> Float64[np.ndarray, "4 4"]:
+def T_path_ego(deviation: PathDeviation) -> Float64[np.ndarray, "4 4"]:
     """Return the pose of the ego frame in the frame of the path."""
     T, cos, sin = np.eye(4), np.cos(deviation.yaw_rad), np.sin(deviation.yaw_rad)
     T[:2, :2], T[1, 3] = [[cos, -sin], [sin, cos]], deviation.lateral_m
-    return T
-
-
-def _axle_pose(poses: Poses) -> Float64[np.ndarray, "4 4"]:
-    """Return the pose of the ego frame: on the road below the rear axle, x forward along the slope."""
-    forward = poses.forward[0]
-    left = np.array([-forward[1], forward[0], 0.0]) / np.hypot(forward[0], forward[1])
-    T = np.eye(4)
-    T[:3, :3] = np.stack([forward, left, np.cross(forward, left)], axis=1)
-    T[:3, 3] = poses.axle_xyz[0]
     return T

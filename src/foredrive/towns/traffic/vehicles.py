@@ -138,6 +138,15 @@ class Poses:
         """Return the pitch about the left axis, rad, positive with the nose down."""
         return -np.arcsin(np.clip(self.forward[:, 2], -1, 1))
 
+    def axle_frame(self, row: int = 0) -> Float64[np.ndarray, "4 4"]:
+        """Return the pose of a body's ego frame: on the road below its rear axle, x along the slope."""
+        forward = self.forward[row]
+        left = np.array([-forward[1], forward[0], 0.0]) / np.hypot(forward[0], forward[1])
+        T = np.eye(4)
+        T[:3, :3] = np.stack([forward, left, np.cross(forward, left)], axis=1)
+        T[:3, 3] = self.axle_xyz[row]
+        return T
+
 
 def empty_slots(count: int) -> Vehicles:
     """Return `count` empty slots."""

@@ -1,0 +1,105 @@
+"""Short logs from virtual egos: what is in them, and that equal seeds give equal bytes."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from file_digests import digests
+
+from foredrive.data.affordances import read_affordances
+from foredrive.data.boxes import read_boxes
+from foredrive.data.cameras import pinhole_cameras, read_camera
+from foredrive.data.commands import route_at
+from foredrive.data.log_paths import LogPath
+from foredrive.data.logs import Log
+from foredrive.scene import Category
+from foredrive.sensors.rigs import camera_rig
+from foredrive.towns import virtual_egos
+from foredrive.towns.sensing.capture import SensorSuite
+from foredrive.towns.virtual_egos import IMAGES, LATER, record_virtual_egos
+from foredrive.towns.world import World
+
+SMALL = SensorSuite(camera_rig((24, 40)), None)
+COUNT = 18
+"""More than come from one window of the traffic."""
+
+
+@pytest.fixture(scope="module")
+def logs(world02: World, tmp_path_factory: pytest.TempPathFactory) -> list[LogPath]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(virtual_egos, "World", lambda town, seed, conditions: world02)
+        return record_virtual_egos("Town02", 3, COUNT, tmp_path_factory.mktemp("egos"), SMALL)
+
+
+def test_each_log_has_images_first_and_then_its_future(logs: list[LogPath]) -> None:
+    assert [path.name for path in logs[:2]] == [f"town-egos_train/Town02_seed3_ego{k:04d}" for k in range(2)]
+    log = Log(logs[5])
+    assert np.diff(log.t_us).tolist() == [500_000] * (IMAGES + LATER - 1)
+    cameras = pinhole_cameras(log)
+    assert len(cameras) == 6
+    for camera in cameras.values():
+        frames, _ = log.rows(camera.modality_key)
+        assert frames.tolist() == list(range(IMAGES))
+    shown = read_camera(log, IMAGES - 1, cameras["PCAM_F0"], (24, 40), with_image=True)
+    assert shown.image is not None
+    assert float(shown.image.float().std()) > 5.0
+
+
+def test_the_ego_is_no_box_and_drives_along_its_route(logs: list[LogPath]) -> None:
+    """Its own car would stand over the rear axle. Lateral offsets are those that were drawn, below 1.5 m."""
+    moved_m = []
+    for path in logs:
+        log = Log(path)
+        for frame in (0, IMAGES + LATER - 1):
+            boxes = read_boxes(log, frame)
+            assert boxes is not None
+            middle_m = boxes.centre[:, :2] - boxes.centre.new_tensor([1.4, 0.0])
+            vehicles = boxes.category != int(Category.PEDESTRIAN)
+            assert float(middle_m[vehicles].norm(dim=-1).min()) > 1.5
+            arc_m, xyz, progress_m = route_at(log, frame) or pytest.fail("no route")
+            beside = np.array([np.interp(progress_m, arc_m, xyz[:, axis]) for axis in range(2)])
+            assert np.linalg.norm(beside - log.T_world_ego[frame, :2, 3]) < 1.5
+        moved_m.append(np.linalg.norm(log.T_world_ego[-1, :3, 3] - log.T_world_ego[0, :3, 3]))
+        speed_mps = np.linalg.norm(np.diff(log.T_world_ego[:, :3, 3], axis=0), axis=-1) / 0.5
+        assert np.abs(speed_mps - 0.5 * (log.speed_mps[1:] + log.speed_mps[:-1])).max() < 0.8
+    assert np.median(moved_m) > 5.0
+
+
+def test_the_labels_of_the_last_image_are_known(logs: list[LogPath]) -> None:
+    """They need 4 s of boxes after it, and lights on the route."""
+    lights, crossers = 0, 0
+    for path in logs:
+        seen = read_affordances(Log(path), IMAGES - 1)
+        assert bool(seen.crossing_known)
+        assert bool(seen.lead_known)
+        assert bool(seen.light_known)
+        lights += int(seen.light) > 0
+        crossers += len(seen.crossing_xy)
+    assert lights >= COUNT // 4
+    assert crossers >= 1
+
+
+def test_cyclists_wait_and_then_cross(logs: list[LogPath]) -> None:
+    """A cyclist who is added stands, or rides on at one speed of 3.5 to 6 m/s."""
+    speeds = []
+    for path in logs:
+        log = Log(path)
+        tracks = [read_boxes(log, frame) for frame in range(len(log))]
+        for boxes in tracks:
+            assert boxes is not None
+            inserted = (boxes.category == int(Category.BICYCLE)) & (boxes.size_lwh[:, 2] - 1.7).abs().lt(1e-4)
+            speeds += boxes.velocity[inserted].norm(dim=-1).tolist()
+    moving = [speed for speed in speeds if speed > 0.1]
+    assert moving
+    assert len(moving) < len(speeds)
+    assert min(moving) > 3.4
+    assert max(moving) < 6.1
+
+
+def test_equal_seeds_give_equal_bytes(
+    logs: list[LogPath], world02: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(virtual_egos, "World", lambda town, seed, conditions: world02)
+    again = record_virtual_egos("Town02", 3, 2, tmp_path, SMALL)
+    for first, second in zip(logs, again, strict=False):
+        assert digests(first.folder) == digests(second.folder)
