@@ -1,8 +1,8 @@
 # %% [markdown]
 # # Rebuild a log and put a car in the way
 #
-# A recorded drive becomes a scene of 3-D Gaussians: a static part, and one part for each road user. The scene
-# renders cameras and lidar from places where nobody drove. So a planner can be tested there on something that
+# A recorded drive becomes a scene of 3-D Gaussians: a static part, and one for each road user that moves. The
+# scene renders cameras and lidar from places where nobody drove. So a planner can be tested there on what
 # never happened: here, a car that stands in the lane.
 #
 # ## A drive
@@ -70,8 +70,8 @@ Image(film)
 # %% [markdown]
 # ## Look around
 #
-# `foredrive view rebuilt` opens the scene in the browser: move the camera and the time, drag road users,
-# remove and add some. `rebuilt/static.ply` opens in other viewers of 3-D Gaussians.
+# `foredrive view rebuilt` opens the scene in the browser: move the camera and the time, drag road users that
+# moved, remove and add some. `rebuilt/static.ply` opens in other viewers of 3-D Gaussians.
 #
 # ## Then
 #

@@ -61,8 +61,8 @@ STEPS = (
     Step(
         "Rebuild",
         "rebuilding a drive, and putting a car in the way",
-        "A drive becomes 3-D Gaussians: a static part, and one for each road user. Cameras and lidar are "
-        "rendered from where nobody drove, and a car stands where there was none. Every second frame was "
+        "A drive becomes 3-D Gaussians: a static part, and one for each moving road user. Cameras and lidar "
+        "are rendered from where nobody drove, and a car stands where there was none. Every second frame was "
         "held out of the training.",
         (
             "foredrive reconstruct data/logs/town_test/Town05_seed7 --out runs/rebuilt",
