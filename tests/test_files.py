@@ -9,7 +9,7 @@ import pytest
 
 from foredrive import files
 from foredrive.errors import InputError
-from foredrive.files import atomic_path, remove_abandoned
+from foredrive.files import atomic_path, latest, remove_abandoned, sole_writer, together
 
 KILLED = """
 import os, sys
@@ -102,3 +102,94 @@ def test_abandoned_scratch_is_found_in_all_folders_below(tmp_path: Path) -> None
     assert not deep.exists()
     assert deep.parent.is_dir()
     remove_abandoned(tmp_path / "nowhere")
+
+
+def write(path: Path, text: str) -> None:
+    with atomic_path(path) as temporary:
+        temporary.write_text(text)
+
+
+def test_files_of_one_folder_appear_together(tmp_path: Path) -> None:
+    first, second, elsewhere = tmp_path / "a" / "1", tmp_path / "a" / "2", tmp_path / "a" / "cache" / "3"
+    with together(tmp_path / "a"):
+        write(first, "half")
+        write(first, "whole")
+        write(elsewhere, "at once")
+        assert latest(second) == second
+        write(second, "whole")
+        assert not first.exists()
+        assert not second.exists()
+        assert elsewhere.read_text() == "at once"
+        assert latest(first).read_text() == "whole"
+    assert first.read_text() == second.read_text() == "whole"
+    assert sorted(path.name for path in first.parent.iterdir()) == ["1", "2", "cache"]
+    assert latest(first) == first
+
+
+def test_files_of_one_folder_stay_away_together(tmp_path: Path) -> None:
+    write(tmp_path / "1", "before")
+
+    def spoil() -> None:
+        with together(tmp_path):
+            write(tmp_path / "1", "after")
+            with atomic_path(tmp_path / "2") as temporary:
+                temporary.write_text("half")
+                raise OSError("full")
+
+    with pytest.raises(OSError, match="full"):
+        spoil()
+    assert [path.name for path in tmp_path.iterdir()] == ["1"]
+    (tmp_path / "2").mkdir()
+
+    def replace_a_folder() -> None:
+        with together(tmp_path):
+            write(tmp_path / "1", "after")
+            write(tmp_path / "2", "after")
+
+    with pytest.raises(IsADirectoryError):
+        replace_a_folder()
+    assert (tmp_path / "1").read_text() == "before"
+
+
+def test_what_is_written_is_on_the_disk_before_it_has_its_name(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """The order of the calls that a power cut may come between: the content, the name, the folder."""
+    calls = []
+
+    def sync(opened: int) -> None:
+        calls.append(Path(os.readlink(f"/proc/self/fd/{opened}")))
+
+    def replace(source: Path, final: Path) -> None:
+        calls.append("rename")
+        os.rename(source, final)
+
+    monkeypatch.setattr(files.os, "fsync", sync)
+    monkeypatch.setattr(files.os, "replace", replace)
+    with atomic_path(tmp_path / "log") as log:
+        (log / "inner").mkdir(parents=True)
+        (log / "inner" / "a.arrow").write_text("a")
+    assert calls == [log, log / "inner" / "a.arrow", log / "inner", "rename", tmp_path]
+    calls.clear()
+    with atomic_path(tmp_path / "cached", durable=False) as entry:
+        entry.write_text("a")
+    assert calls == ["rename"]
+
+
+def test_a_path_has_one_writer_at_a_time_who_may_leave_it(tmp_path: Path) -> None:
+    final = tmp_path / "logs" / "a"
+    waiting = WAITING.replace("atomic_path(Path(sys.argv[1]), alone=True)", "sole_writer(Path(sys.argv[1]))")
+    other = subprocess.Popen(
+        [sys.executable, "-c", waiting.replace("import atomic_path", "import sole_writer"), str(final)],
+        stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    assert other.stdout is not None
+    assert other.stdout.readline() == "writing\n"
+    with pytest.raises(InputError, match=rf"{final}: another process \({other.pid}\)"), sole_writer(final):
+        pass
+    with sole_writer(tmp_path / "logs" / "b"):
+        pass
+    other.communicate()
+    with sole_writer(final), atomic_path(final, alone=True) as temporary:
+        temporary.write_text("whole")
+    assert [path.name for path in final.parent.iterdir()] == ["a"]

@@ -1,6 +1,7 @@
 """Atomic writing: a file under its final name is always complete."""
 
 import contextlib
+import errno
 import fcntl
 import os
 import re
@@ -8,6 +9,8 @@ import shutil
 import socket
 import tempfile
 from collections.abc import Iterator
+from contextvars import ContextVar
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from foredrive.errors import InputError
@@ -19,6 +22,8 @@ WHILE_WRITING = "while writing "
 _HOST = re.sub(r"\W", "_", socket.gethostname())
 _SCRATCH = re.compile(rf"\.(?P<final>.+)\.{_HOST}-(?P<process>\d+)-[^.]*\.part")
 """Name of a scratch folder of this machine: what is written, and the process that writes it."""
+_TOGETHER, _CLAIMED = "together", " (claimed)"
+"""Name of the scratch folder of files that appear together, and end of the name of one that is a claim."""
 _REPLACED = "replaced"
 """Name that a folder gets in the scratch folder of the one that replaces it."""
 _tidied: set[Path] = set()
@@ -52,34 +57,148 @@ def make_folder(folder: Path) -> None:
 
 
 @contextlib.contextmanager
-def atomic_path(final: Path, *, alone: bool = False) -> Iterator[Path]:
+def atomic_path(final: Path, *, alone: bool = False, durable: bool = True) -> Iterator[Path]:
     """Yield a temporary path beside `final`, and rename it to `final` if the block succeeds.
 
     The block may create a file or a folder at the temporary path. An existing file or folder at `final` is
     replaced. If the block raises (a full disk, Ctrl-C), everything written is removed and `final` is
-    unchanged. What a killed process left is removed when the next one writes to the same folder.
+    unchanged. What a killed process left is removed when the next one writes to the same folder. In a block
+    of `together`, `final` appears at the end of that block.
 
     Args:
         final: path of the file or folder.
         alone: whether to refuse if another process of this machine is writing the same path. It is for what
             takes long to write; of small files the last one written stays.
+        durable: whether `final` is whole after a power cut too, once the block has ended. Entries of caches
+            need not be: they are many, and what is damaged is made anew.
 
     Raises:
         InputError: the parent folder cannot be created, or another process is writing `final`.
     """
     final = Path(final)
+    held_back = _held_back.get()
     with naming(final):
+        if held_back is not None and final.parent.absolute() == held_back.folder:
+            with held_back.written(final.name) as temporary:
+                yield temporary
+            return
         make_folder(final.parent)
         scratch, lock = _new_scratch(final, alone)
         temporary = scratch / final.name
         try:
             yield temporary
+            if durable:
+                _flush(temporary)
             if temporary.is_dir() and final.is_dir():
                 final.rename(scratch / _REPLACED)
             os.replace(temporary, final)
+            if durable:
+                _flush_entry(final.parent)
         finally:
             shutil.rmtree(scratch, ignore_errors=True)
             _unlock(lock)
+
+
+@contextlib.contextmanager
+def together(folder: Path) -> Iterator[None]:
+    """Let the files that the block writes directly into a folder appear together, at its end.
+
+    If the block raises, none of them appears. Within the block `latest` says where such a file can be read.
+    Threads and processes that are started in the block write at once.
+
+    Raises:
+        InputError: the folder cannot be created.
+    """
+    make_folder(folder)
+    scratch, lock = _new_scratch(folder / _TOGETHER, alone=False)
+    held_back = _HeldBack(folder.absolute(), scratch)
+    before = _held_back.set(held_back)
+    try:
+        yield
+        for final in held_back.names:
+            if (folder / final).is_dir():
+                raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(folder / final))
+        for name in held_back.names:
+            os.replace(scratch / name, folder / name)
+        _flush_entry(folder)
+    finally:
+        _held_back.reset(before)
+        shutil.rmtree(scratch, ignore_errors=True)
+        _unlock(lock)
+
+
+def latest(final: Path) -> Path:
+    """Return where the newest version of a file can be read; in a block of `together` it is not in place."""
+    held_back = _held_back.get()
+    if held_back is not None and final.parent.absolute() == held_back.folder:
+        return held_back.scratch / final.name if final.name in held_back.names else final
+    return final
+
+
+@dataclass
+class _HeldBack:
+    """Files that will appear in a folder together."""
+
+    folder: Path
+    scratch: Path
+    names: list[str] = field(default_factory=list)
+    """Names of the files that are whole, in the order in which they were written first."""
+
+    @contextlib.contextmanager
+    def written(self, name: str) -> Iterator[Path]:
+        """Yield a path for a file, which is held back if the block succeeds."""
+        half = Path(tempfile.mkdtemp(dir=self.scratch))
+        try:
+            yield half / name
+            _flush(half / name)
+            os.replace(half / name, self.scratch / name)
+            if name not in self.names:
+                self.names.append(name)
+        finally:
+            shutil.rmtree(half, ignore_errors=True)
+
+
+_held_back: ContextVar[_HeldBack | None] = ContextVar("held_back", default=None)
+
+
+@contextlib.contextmanager
+def sole_writer(final: Path) -> Iterator[None]:
+    """Keep other processes of this machine out of such a block for the same path.
+
+    Unlike `atomic_path(final, alone=True)`, the block can look whether `final` is there, and leave it.
+
+    Raises:
+        InputError: another process is in such a block, or the parent folder cannot be created.
+    """
+    make_folder(final.parent)
+    scratch, lock = _new_scratch(final.with_name(f"{final.name}{_CLAIMED}"), alone=True)
+    try:
+        yield
+    finally:
+        shutil.rmtree(scratch, ignore_errors=True)
+        _unlock(lock)
+
+
+def _flush(path: Path) -> None:
+    """Wait until a file, or a folder with all that it holds, is on the disk and not in memory alone."""
+    for folder, _, names in os.walk(path):
+        for name in names:
+            _flush_entry(Path(folder, name))
+        _flush_entry(Path(folder))
+    if path.is_file():
+        _flush_entry(path)
+
+
+def _flush_entry(path: Path) -> None:
+    """Flush one file, or the names in one folder."""
+    opened = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
+    try:
+        os.fsync(opened)
+    except OSError as error:
+        if error.errno not in (errno.EINVAL, errno.ENOTSUP):  # the file system or device cannot
+            raise
+    finally:
+        os.close(opened)
 
 
 def remove_abandoned(folder: Path, *, below: bool = False) -> None:
@@ -118,8 +237,9 @@ def _new_scratch(final: Path, alone: bool) -> tuple[Path, int | None]:
         _remove_abandoned(final.parent, again=alone)
         for _, name in _scratch_folders(final.parent) if alone else ():
             if name["final"] == final.name:
+                written = str(final).removesuffix(_CLAIMED)
                 raise InputError(
-                    f"{final}: another process ({name['process']}) is writing it; wait for it or end it"
+                    f"{written}: another process ({name['process']}) is writing it; wait for it or end it"
                 )
         prefix = f".{final.name}.{_HOST}-{os.getpid()}-"
         scratch = Path(tempfile.mkdtemp(prefix=prefix, suffix=".part", dir=final.parent))

@@ -147,8 +147,8 @@ def test_evaluate(programs: Programs, log: LogPath, tmp_path: Path) -> None:
     arguments = ("evaluate", run, "--out", out)
     programs.interrupt(there(run / "cache", "*.labels"), *arguments)
     assert not out.exists()
-    programs.interrupt(there(out, "summary.json"), *arguments)
-    assert all_files(out) == {"summary.json"}
+    programs.interrupt(there(out, "*together*.part/summary.json"), *arguments)
+    assert not out.exists()
     assert without_cache(run) == before
     assert no_scratch(tmp_path)
 

@@ -1,6 +1,7 @@
 """Conversion of many logs: finished logs are kept, a bad one stops no other, names stay in the data root."""
 
 import json
+import os
 import shutil
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from foredrive.cli.main import main
 from foredrive.data.convert import convert, log_path
 from foredrive.data.raw.guard import check_names
 from foredrive.errors import InputError
+from foredrive.files import sole_writer
 from foredrive.runs.convert import convert_all
 
 
@@ -51,6 +53,18 @@ def test_finished_logs_are_kept_and_damaged_ones_are_not(raw: Path, tmp_path: Pa
     assert done == {"001": True, "002": False, "003": False}
     assert (logs / "001" / "sync.arrow").stat().st_mtime_ns == before
     assert not any(one.kept for one in convert_all(raw, "pandaset", out, 1, overwrite=True))
+
+
+def test_two_conversions_into_one_data_root_share_the_logs(raw: Path, tmp_path: Path) -> None:
+    """The second begins when the first has converted one log, and the first goes on when it has ended."""
+    out, logs = tmp_path / "out", tmp_path / "out" / "logs" / "pandaset_train"
+    first = convert_all(raw, "pandaset", out, 1)
+    assert next(first).kept is False
+    with sole_writer(logs / "003"):
+        second = {one.name[-3:]: (one.kept, one.failure) for one in convert_all(raw, "pandaset", out, 1)}
+    busy = f"{logs / '003'}: another process ({os.getpid()}) is writing it; wait for it or end it"
+    assert second == {"001": (True, None), "002": (False, None), "003": (False, busy)}
+    assert {one.name[-3:]: one.kept for one in first} == {"002": True, "003": False}
 
 
 def test_workers_write_the_same_logs(raw: Path, tmp_path: Path) -> None:

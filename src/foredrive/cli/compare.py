@@ -36,7 +36,7 @@ def compare(
         from foredrive.evaluation.summary import write_summary
         from foredrive.runs.drive.compare import compare as compare_agents
         from foredrive.runs.drive.compare import figures_of, read_agent
-        from foredrive.runs.folder import SUMMARY
+        from foredrive.runs.folder import SUMMARY, held_for_results
         from foredrive.view.compare_report import (
             REPORT,
             means_table,
@@ -46,8 +46,9 @@ def compare(
         from foredrive.view.table import print_table
 
     comparison = compare_agents([read_agent(given) for given in runs])
-    write_summary(out / SUMMARY, figures_of(comparison) | collect_provenance())
-    write_compare_report(out / REPORT, comparison)
+    with held_for_results(out):
+        write_summary(out / SUMMARY, figures_of(comparison) | collect_provenance())
+        write_compare_report(out / REPORT, comparison)
     console = Console()
     print_table(means_table(comparison), console)
     if shown:

@@ -60,13 +60,18 @@ def drive(
     suite = DriveSuite(name, source, planning.sensors, planning.period, planning.latency, faults)
     workers = towns.workers or len(os.sched_getaffinity(0))
     with DrivesProgress(len(suite.jobs())) as progress:
-        driven = drive_suite(suite, out, workers, on_ray=towns.ray, tick=progress.tick)
+        driven = drive_suite(
+            suite, out, workers, on_ray=towns.ray, tick=progress.tick, report=lambda _: _write_report(out)
+        )
     check_driven(driven)
     _tell(driven)
+    print(f"report: {out / 'report.html'}")
 
-    from foredrive.view.drive_report import write_drive_report
 
-    print(f"report: {write_drive_report(out)}")
+def _write_report(out: Path) -> None:
+    from foredrive.view.drive_report import write_drive_report  # it brings Matplotlib along
+
+    write_drive_report(out)
 
 
 def check_driven(driven: "SuiteResult") -> None:

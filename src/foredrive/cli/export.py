@@ -33,10 +33,12 @@ def export(
     with importing():
         from foredrive.runs import open_run
         from foredrive.runs.export import export_run
+        from foredrive.runs.folder import held_for_results
 
     trained = open_run(run)
     folder = out or run / "export"
-    facts = export_run(trained, named or trained.logs, folder, clips)
+    with held_for_results(folder):
+        facts = export_run(trained, named or trained.logs, folder, clips)
     for name, latency in facts["latency_ms"].items():
         print(f"{name}: {latency['median']:.1f} ms a clip (90 % below {latency['p90']:.1f} ms)")
         for output, difference in facts["largest_difference"].get(name, {}).items():

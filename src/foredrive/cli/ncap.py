@@ -71,23 +71,33 @@ def ncap(
 
         from foredrive.runs.drive.in_ncap import SafetyTests
         from foredrive.runs.drive.records import tested_runs
-        from foredrive.runs.drive.suite import DriveSuite, drive_suite
+        from foredrive.runs.drive.suite import DriveSuite, SuiteResult, drive_suite
         from foredrive.simulation.ncap.rules import RULES
-        from foredrive.view.drive_report import write_drive_report
+        from foredrive.view.drive_report import REPORT, write_drive_report
         from foredrive.view.ncap_tables import safety_table
-        from foredrive.view.table import print_table
+        from foredrive.view.table import Table, print_table
 
     name = str(Path(agent).absolute()) if Path(agent).is_dir() else agent
     source = SafetyTests(
         folders, str(scenarios.absolute()), rules, runs, spread=ray or workers > 1, sees=sees
     )
     suite = DriveSuite(name, source, sensors, latency_s=RULES[rules].latency_s)
+
+    def table(driven: SuiteResult) -> Table:
+        return safety_table(tested_runs(list(driven.drives.values())), source.tested().left_out)
+
     with DrivesProgress(len(suite.jobs())) as progress:
-        driven = drive_suite(suite, out, workers, on_ray=ray, tick=progress.tick)
+        driven = drive_suite(
+            suite,
+            out,
+            workers,
+            on_ray=ray,
+            tick=progress.tick,
+            report=lambda driven: write_drive_report(out, films, table(driven)),
+        )
     check_driven(driven)
-    table = safety_table(tested_runs(list(driven.drives.values())), source.tested().left_out)
-    print_table(table, Console())
-    print(f"report: {write_drive_report(out, films, table)}")
+    print_table(table(driven), Console())
+    print(f"report: {out / REPORT}")
 
 
 def _propose(folders: tuple[str, ...], file: Path, rules: str, runs: int) -> None:

@@ -114,20 +114,22 @@ def rebuild_log(
     import torch
 
     from foredrive.evaluation.perceptual import PerceptualMetrics, PerceptualWeights
-    from foredrive.runs.rebuild.reconstruct import reconstruct
+    from foredrive.runs.rebuild.reconstruct import Reconstruction, reconstruct
+    from foredrive.view.rebuilt_sheet import write_rebuilt_sheet
 
     if threads is not None:
         torch.set_num_threads(threads)
     log, out = job
     perceptual = None if weights == PerceptualWeights() else PerceptualMetrics(weights)
-    run = reconstruct(recipe, log, out, cache, perceptual)
-    lines = [f"rebuilt {log.name} by {recipe.representation.kind}: {out}"]
-    if run.held_out.cameras:
-        from foredrive.view.rebuilt_sheet import write_rebuilt_sheet
 
-        title = f"{log.name}, frames that were held out"
-        write_rebuilt_sheet(out / "held_out.png", run.scene, run.held_out.cameras, title)
-    elif not run.held_out.sweeps:
+    def draw(run: Reconstruction) -> None:
+        if run.held_out.cameras:
+            title = f"{log.name}, frames that were held out"
+            write_rebuilt_sheet(out / "held_out.png", run.scene, run.held_out.cameras, title)
+
+    run = reconstruct(recipe, log, out, cache, perceptual, draw)
+    lines = [f"rebuilt {log.name} by {recipe.representation.kind}: {out}"]
+    if not run.held_out.cameras and not run.held_out.sweeps:
         lines.insert(0, f"{log.name} is too short: no frame was held out, so the scene is not evaluated")
     known = {
         name: value for name in (*run.scene.sizes, *FIGURES) if (value := run.summary.get(name)) is not None

@@ -82,7 +82,7 @@ class FrameStore:
         kept = self._read_entry(file)
         if kept is None:
             kept = self._read(log, frame, cameras, with_images)
-            with atomic_path(file) as temporary:
+            with atomic_path(file, durable=False) as temporary:
                 safetensors.torch.save_file(_flat(kept), temporary)
         return kept
 

@@ -54,7 +54,7 @@ class LabelStore:
         if file is None:
             return labels
         entry = _encode(labels)
-        with atomic_path(file) as temporary:
+        with atomic_path(file, durable=False) as temporary:
             temporary.write_bytes(entry)
         return _decode(entry, self._spec)  # velocities are rounded here as in later reads
 

@@ -92,7 +92,7 @@ class TaskTruthStore:
         if truth is None:
             truth = self._make(log, frame, there)
             if file is not None:
-                with atomic_path(file) as temporary:
+                with atomic_path(file, durable=False) as temporary:
                     temporary.write_bytes(_encode(truth))
         futures = read_futures(log, frame, self.config.future_steps, self.config.future_dt_s)
         rays = read_rays(log, frame, self.voxels) if self.config.rays else None

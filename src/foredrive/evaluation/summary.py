@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from foredrive.errors import InputError
-from foredrive.files import atomic_path
+from foredrive.files import atomic_path, latest
 
 Value = float | int | str | None
 Summary = Mapping[str, Value]
@@ -29,7 +29,7 @@ def write_summary(path: Path, summary: Summary) -> None:
 def read_summary(path: Path) -> Figures:
     """Read what `write_summary` wrote."""
     try:
-        summary = json.loads(path.read_text())
+        summary = json.loads(latest(path).read_text())
     except (OSError, ValueError, RecursionError) as error:
         raise InputError(f"{path}: not a summary that can be read") from error
     if not isinstance(summary, dict):

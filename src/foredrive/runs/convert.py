@@ -14,7 +14,7 @@ from foredrive.data.log_paths import LogPath
 from foredrive.data.raw.guard import reading_raw
 from foredrive.data.raw.raw_log import RawLog
 from foredrive.errors import InputError
-from foredrive.files import remove_abandoned
+from foredrive.files import remove_abandoned, sole_writer
 from foredrive.runs.fan_out import fan_out, reason
 
 
@@ -59,7 +59,7 @@ def convert_all(
         InputError: the data set is unknown, or there is no log of it.
         OSError: the disk is full, so that no other log could be written.
     """
-    todo, names = [], dict[int, str]()
+    todo, paths = [], dict[int, LogPath]()
     for raw in find_raw_logs(source, dataset, topics):
         with reading_raw(raw.source):
             path = log_path(raw.log.get_log_metadata(), out)
@@ -67,34 +67,48 @@ def convert_all(
         if not overwrite and _is_whole(path.folder):
             yield Conversion(path.name, path, kept=True)
         else:
-            names[id(raw)] = path.name
+            paths[id(raw)] = path
             todo.append(raw)
-    for raw, result in _converted(todo, out, workers, on_ray, tick):
-        name = names[id(raw)]
+    for raw, result in _converted(todo, out, workers, on_ray, overwrite, tick):
+        path = paths[id(raw)]
         if isinstance(result, BaseException):
-            yield Conversion(name, None, reason(name, result))
+            yield Conversion(path.name, None, reason(path.name, result))
         else:
-            yield Conversion(name, result)
+            yield Conversion(path.name, path, kept=result is None)
 
 
 def _converted(
-    todo: list[RawLog], out: Path, workers: int, on_ray: bool, tick: Callable[[], None]
-) -> Iterator[tuple[RawLog, LogPath | BaseException]]:
+    todo: list[RawLog], out: Path, workers: int, on_ray: bool, overwrite: bool, tick: Callable[[], None]
+) -> Iterator[tuple[RawLog, LogPath | BaseException | None]]:
     if (workers > 1 and len(todo) > 1) or on_ray:
-        work = functools.partial(_convert_here, out=out)
+        work = functools.partial(_convert_here, out=out, overwrite=overwrite)
         with contextlib.closing(fan_out(todo, work, workers, on_ray=on_ray)) as results:
             yield from results
         return
     for raw in todo:
         try:
-            yield raw, convert_log(raw, out, tick)
+            yield raw, _convert_unless_there(raw, out, overwrite, tick)
         except InputError as error:
             yield raw, error
 
 
-def _convert_here(raw: RawLog, out: Path) -> LogPath:
+def _convert_here(raw: RawLog, out: Path, overwrite: bool) -> LogPath | None:
     torch.set_num_threads(1)
-    return convert_log(raw, out)
+    return _convert_unless_there(raw, out, overwrite)
+
+
+def _convert_unless_there(
+    raw: RawLog, out: Path, overwrite: bool, tick: Callable[[], None] = lambda: None
+) -> LogPath | None:
+    """Convert a log; return None if another process has done it since this one began.
+
+    Raises:
+        InputError: as `convert_log`, or another process is converting the log.
+    """
+    with reading_raw(raw.source):
+        path = log_path(raw.log.get_log_metadata(), out)
+    with sole_writer(path.folder):
+        return None if not overwrite and _is_whole(path.folder) else convert_log(raw, out, tick)
 
 
 def _is_whole(folder: Path) -> bool:

@@ -18,7 +18,7 @@ from foredrive.data import ClipDataset, LogPath, collate
 from foredrive.errors import InputError
 from foredrive.evaluation.provenance import collect_provenance
 from foredrive.export.graph import MEANING, AgentGraph, GraphInputs, GraphOutputs
-from foredrive.files import atomic_path
+from foredrive.files import atomic_path, latest
 from foredrive.models.agent import PlanningAgent
 from foredrive.runs.open_clips import open_clips
 from foredrive.runs.train.run import Run, load_agent
@@ -75,7 +75,7 @@ def export_run(run: Run, logs: Sequence[LogPath], out: Path, clips: int = 8) -> 
         write_onnx(program, temporary, GraphInputs._fields, GraphOutputs._fields)
 
     truth = [GraphOutputs.from_agent(agent(sample.observed, steps)) for sample in samples]
-    runtimes = {PROGRAM: _program(out / PROGRAM), MODEL: _session(out / MODEL)}
+    runtimes = {PROGRAM: _program(latest(out / PROGRAM)), MODEL: _session(latest(out / MODEL))}
     outputs = {name: [infer(sample.inputs) for sample in samples] for name, infer in runtimes.items()}
     report = {
         "recipe": run.recipe.name,

@@ -11,7 +11,7 @@ from filelock import FileLock, Timeout
 
 from foredrive.errors import InputError
 from foredrive.evaluation.provenance import COMMIT
-from foredrive.files import atomic_path, make_folder, remove_abandoned
+from foredrive.files import atomic_path, make_folder, remove_abandoned, together
 
 CONFIG, LOGS, LOG, WEIGHTS, SUMMARY = (
     "config.yaml",
@@ -117,6 +117,8 @@ def held(folder: Path) -> Iterator[None]:
 def held_for_results(folder: Path) -> Iterator[None]:
     """Keep other processes from writing results to a folder. Nothing but the results stays in it.
 
+    The files directly in the folder appear together at the end of the block, or none of them.
+
     Raises:
         InputError: another process writes results to it.
     """
@@ -131,7 +133,8 @@ def held_for_results(folder: Path) -> Iterator[None]:
         ) from None
     try:
         remove_abandoned(folder)
-        yield
+        with together(folder):
+            yield
     finally:
         (folder / RESULTS_LOCK).unlink(missing_ok=True)
         lock.release()

@@ -10,6 +10,7 @@ from markupsafe import Markup
 from foredrive.data.log_paths import LogPath
 from foredrive.errors import InputError
 from foredrive.evaluation.summary import Summary, read_summary
+from foredrive.files import latest
 from foredrive.runs.drive.records import read_drive, suite_title
 from foredrive.runs.folder import DRIVES, SUMMARY
 from foredrive.simulation.drive_record import DriveRecord
@@ -103,7 +104,7 @@ def write_drive_report(out: Path, shown: int | None = None, safety: Table | None
     Raises:
         InputError: the folder holds no suite whose drives are all complete.
     """
-    if not (out / SUMMARY).is_file():
+    if not latest(out / SUMMARY).is_file():
         raise InputError(f"{out}: not a suite of drives (no {SUMMARY})")
     title = suite_title(out)
     drives = {path.stem: read_drive(path) for path in sorted((out / DRIVES).glob("*.json"), key=_order)}

@@ -16,7 +16,7 @@ from foredrive.data.cameras import rig_of_log
 from foredrive.data.log_paths import LogPath
 from foredrive.data.logs import Log
 from foredrive.errors import InputError
-from foredrive.files import remove_abandoned
+from foredrive.files import remove_abandoned, sole_writer
 from foredrive.runs.fan_out import fan_out, reason
 from foredrive.scene.conditions import BackgroundTraffic, find_conditions
 from foredrive.sensors.rigs import RigPlan, camera_rig, same_rig
@@ -86,17 +86,21 @@ def record_plan(plan: DrivePlan, out: Path, rig: RigPlan, threads: int | None = 
     """Record one drive with this number of threads; None keeps the number."""
     if threads is not None:
         torch.set_num_threads(threads)
-    return record(
-        plan.town,
-        plan.seconds,
-        plan.seed,
-        out,
-        plan.rate_hz,
-        SensorSuite(camera_rig(plan=rig), roof_lidar()),
-        BackgroundTraffic(plan.vehicles, plan.people),
-        conditions=None if plan.conditions is None else find_conditions(plan.conditions),
-        log_name=plan.log_name,
-    )
+    path = log_of(plan, out)
+    with sole_writer(path.folder):
+        if is_recorded(plan, out, rig):  # by another process since this one began
+            return path
+        return record(
+            plan.town,
+            plan.seconds,
+            plan.seed,
+            out,
+            plan.rate_hz,
+            SensorSuite(camera_rig(plan=rig), roof_lidar()),
+            BackgroundTraffic(plan.vehicles, plan.people),
+            conditions=None if plan.conditions is None else find_conditions(plan.conditions),
+            log_name=plan.log_name,
+        )
 
 
 def log_of(plan: DrivePlan, out: Path) -> LogPath:

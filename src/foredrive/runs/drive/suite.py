@@ -22,7 +22,7 @@ from jaxtyping import Float64
 from foredrive.data.log_writer import Frame, LogWriter
 from foredrive.errors import InputError
 from foredrive.evaluation.summary import write_summary
-from foredrive.files import atomic_path
+from foredrive.files import atomic_path, together
 from foredrive.runs.drive.agents import check_ready
 from foredrive.runs.drive.records import read_drive, read_suite, summarise, write_drive
 from foredrive.runs.fan_out import fan_out, reason
@@ -152,6 +152,7 @@ def drive_suite(
     *,
     on_ray: bool = False,
     tick: Callable[[DriveJob, DriveRecord | None], None] = lambda job, drive: None,
+    report: Callable[[SuiteResult], object] = lambda driven: None,
 ) -> SuiteResult:
     """Drive all jobs that have no record in the folder yet; write the summary when every job has one.
 
@@ -159,6 +160,7 @@ def drive_suite(
         workers: number of drives at a time, if the source allows more than one; on Ray as for
             `fan_out.fan_out`.
         tick: called after each drive with its record, or None if the drive broke.
+        report: writes the report of a whole suite, which appears together with its summary.
 
     Raises:
         InputError: there is no such agent, it is in another process and not alive, or there are no drives;
@@ -192,7 +194,9 @@ def drive_suite(
                     tick(job, result)
         driven = SuiteResult({job: drives[job] for job in jobs if job in drives}, skipped, broken)
         if not broken:  # a mean over only some of the drives would mislead
-            write_summary(out / SUMMARY, summarise(list(driven.drives.values())))
+            with together(out):
+                write_summary(out / SUMMARY, summarise(list(driven.drives.values())))
+                report(driven)
     return driven
 
 

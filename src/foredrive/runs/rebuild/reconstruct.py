@@ -3,7 +3,7 @@
 import json
 import logging
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,7 @@ from foredrive.evaluation.perceptual import PerceptualMetrics
 from foredrive.evaluation.provenance import collect_provenance, peak_rss_gib
 from foredrive.evaluation.rendering import evaluate_cameras, evaluate_sweeps
 from foredrive.evaluation.summary import read_summary, write_summary
-from foredrive.files import atomic_path
+from foredrive.files import atomic_path, together
 from foredrive.recipes.config import save_recipe
 from foredrive.recipes.rebuilding import RebuildRecipe, load_rebuild_recipe
 from foredrive.recipes.representation import Representation
@@ -80,6 +80,7 @@ def reconstruct(
     folder: Path,
     cache_dir: Path | None = None,
     perceptual: PerceptualMetrics | None = None,
+    report: Callable[[Reconstruction], None] = lambda run: None,
 ) -> Reconstruction:
     """Reconstruct a log, and evaluate the scene on held-out frames.
 
@@ -91,6 +92,7 @@ def reconstruct(
         folder: folder of the run.
         cache_dir: folder for shrunk images; by default in `folder`.
         perceptual: further metrics of held-out images; they are added to a finished run too.
+        report: draws pictures of the scene into `folder`, which appear together with the summary.
 
     Raises:
         InputError: `folder` holds a run of another recipe or log, or another process writes to it; the log
@@ -101,7 +103,7 @@ def reconstruct(
     check_memory(recipe, path)
     data = read_reconstruction_data(recipe, path, (cache_dir or folder / "cache").absolute())
     with claim.claimed():
-        return _rebuild(recipe, path, folder, data, perceptual)
+        return _rebuild(recipe, path, folder, data, perceptual, report)
 
 
 def _rebuild(
@@ -110,6 +112,7 @@ def _rebuild(
     folder: Path,
     data: ReconstructionData,
     perceptual: PerceptualMetrics | None,
+    report: Callable[[Reconstruction], None],
 ) -> Reconstruction:
     """Do the steps of a reconstruction that are not done yet."""
     save_vehicle(data.vehicle, folder / VEHICLE)
@@ -128,14 +131,18 @@ def _rebuild(
             save_weights(scene, temporary)
     scene.resize(weights)
     load_weights(scene, weights)
-    if not (folder / SUMMARY).is_file():
-        write_summary(folder / SUMMARY, _summary(recipe, path, folder, scene, data))
-    if perceptual is not None:
-        more = perceptual.evaluate(scene, data.held_out.cameras)
-        write_summary(folder / SUMMARY, read_summary(folder / SUMMARY) | more)
-    if not (folder / STATIC_PART).is_file():
-        write_ply(scene.content.preview(STATIC), folder / STATIC_PART)
-    return Reconstruction(folder, recipe, read_summary(folder / SUMMARY), scene, data.train, data.held_out)
+    with together(folder):
+        if not (folder / SUMMARY).is_file():
+            write_summary(folder / SUMMARY, _summary(recipe, path, folder, scene, data))
+        if perceptual is not None:
+            more = perceptual.evaluate(scene, data.held_out.cameras)
+            write_summary(folder / SUMMARY, read_summary(folder / SUMMARY) | more)
+        if not (folder / STATIC_PART).is_file():
+            write_ply(scene.content.preview(STATIC), folder / STATIC_PART)
+        figures = read_summary(folder / SUMMARY)
+        run = Reconstruction(folder, recipe, figures, scene, data.train, data.held_out)
+        report(run)
+    return run
 
 
 def read_reconstruction_data(

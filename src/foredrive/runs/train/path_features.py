@@ -40,7 +40,7 @@ def sample_paths(
         cached = load_file(file)
     except (OSError, SafetensorError):
         cached = _sample(agent, logs, dataclasses.replace(clips, now_stride_s=stride_s), cache_dir)
-        with atomic_path(file) as temporary:
+        with atomic_path(file, durable=False) as temporary:
             save_file(cached, temporary)
     return PathDemonstrations(**cached)
 
