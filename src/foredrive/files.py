@@ -26,6 +26,8 @@ _TOGETHER, _CLAIMED = "together", " (claimed)"
 """Name of the scratch folder of files that appear together, and end of the name of one that is a claim."""
 _REPLACED = "replaced"
 """Name that a folder gets in the scratch folder of the one that replaces it."""
+_writing: set[Path] = set()
+"""Scratch folders of this process."""
 _tidied: set[Path] = set()
 """Folders in which this process has looked for scratch folders of killed processes."""
 
@@ -95,8 +97,7 @@ def atomic_path(final: Path, *, alone: bool = False, durable: bool = True) -> It
             if durable:
                 _flush_entry(final.parent)
         finally:
-            shutil.rmtree(scratch, ignore_errors=True)
-            _unlock(lock)
+            _remove_scratch(scratch, lock)
 
 
 @contextlib.contextmanager
@@ -123,8 +124,7 @@ def together(folder: Path) -> Iterator[None]:
         _flush_entry(folder)
     finally:
         _held_back.reset(before)
-        shutil.rmtree(scratch, ignore_errors=True)
-        _unlock(lock)
+        _remove_scratch(scratch, lock)
 
 
 def latest(final: Path) -> Path:
@@ -175,8 +175,18 @@ def sole_writer(final: Path) -> Iterator[None]:
     try:
         yield
     finally:
-        shutil.rmtree(scratch, ignore_errors=True)
-        _unlock(lock)
+        _remove_scratch(scratch, lock)
+
+
+def writes_files() -> bool:
+    """Return whether this process is writing something that is not under its final name yet."""
+    return bool(_writing)
+
+
+def _remove_scratch(scratch: Path, lock: int | None) -> None:
+    shutil.rmtree(scratch, ignore_errors=True)
+    _writing.discard(scratch)
+    _unlock(lock)
 
 
 def _flush(path: Path) -> None:
@@ -243,6 +253,7 @@ def _new_scratch(final: Path, alone: bool) -> tuple[Path, int | None]:
                 )
         prefix = f".{final.name}.{_HOST}-{os.getpid()}-"
         scratch = Path(tempfile.mkdtemp(prefix=prefix, suffix=".part", dir=final.parent))
+        _writing.add(scratch)
         return scratch, _lock(scratch)
     finally:
         _unlock(among)

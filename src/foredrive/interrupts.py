@@ -1,4 +1,4 @@
-"""Ctrl-C handling that is not lost in code that drops exceptions."""
+"""Ctrl-C and SIGTERM, which act alike, and are not lost in code that drops exceptions."""
 
 import _thread
 import signal
@@ -10,64 +10,69 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from types import FrameType
 
+STOPPING = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: signal.SIG_DFL}
+"""Signals that interrupt a program, with Python's own handlers. Containers and schedulers send SIGTERM."""
 PATIENCE_S = 0.2
 """Time after which an interruption without effect is raised again."""
 
 
 class LastingInterrupt:
-    """A handler of SIGINT that raises KeyboardInterrupt, and raises it again if it was lost.
+    """A handler of signals that raises KeyboardInterrupt, and raises it again if it was lost.
 
     Some code drops exceptions from signal handlers. Python does so in destructors and in callbacks from C.
     NumPy does so when it looks up attributes of operands, which runs Python code for enumeration members.
     While an exception is being handled (e.g. cleaning up half-written files), it is not raised again.
 
-    As a context manager it is the SIGINT handler inside the block, if Python's own handler is active outside.
+    As a context manager it handles, inside the block, those of `STOPPING` that have Python's own handler.
 
     Args:
         wanted: returns whether there is something to interrupt.
+        once: whether a second signal does not interrupt the cleaning up either.
     """
 
-    def __init__(self, wanted: Callable[[], bool] = lambda: True) -> None:
+    def __init__(self, wanted: Callable[[], bool] = lambda: True, *, once: bool = False) -> None:
         self.pressed = False
-        self._wanted = wanted
+        self._wanted, self._once = wanted, once
         self._over = threading.Event()
         self._asks_again = False
-        self._installed = False
+        self._installed = list[signal.Signals]()
 
     def __call__(self, number: int, frame: "FrameType | None") -> None:
-        """Handle SIGINT."""
+        """Handle a signal."""
         again, self._asks_again = self._asks_again, False
-        if again and sys.exc_info()[1] is not None:
+        if (again or (self._once and self.pressed)) and sys.exc_info()[1] is not None:
             return
         if not self.pressed:
-            self.pressed, self._main = True, threading.get_ident()
+            self.pressed, self._number, self._main = True, number, threading.get_ident()
             threading.Thread(target=self._ask_again, daemon=True).start()
         if self._wanted():
             raise KeyboardInterrupt
 
     def _ask_again(self) -> None:
-        is_blocked = signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, ())  # as in the main thread
+        is_blocked = self._number in signal.pthread_sigmask(signal.SIG_BLOCK, ())  # as in the main thread
         while not self._over.wait(PATIENCE_S):
             self._asks_again = True
             if is_blocked:
-                _thread.interrupt_main()
+                _thread.interrupt_main(self._number)
             else:  # also wakes a sleeping main thread
-                signal.pthread_kill(self._main, signal.SIGINT)
+                signal.pthread_kill(self._main, self._number)
 
     def __enter__(self) -> "LastingInterrupt":
         self._hook = sys.unraisablehook
-        in_main_thread = threading.current_thread() is threading.main_thread()
-        if in_main_thread and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
-            signal.signal(signal.SIGINT, self)
+        if threading.current_thread() is threading.main_thread():
+            self._installed = [
+                number for number, usual in STOPPING.items() if signal.getsignal(number) is usual
+            ]
+        for number in self._installed:
+            signal.signal(number, self)
             sys.unraisablehook = self._ignored
-            self._installed = True
         return self
 
     def __exit__(self, *_: object) -> None:
         self._over.set()
-        if self._installed:
+        for number in self._installed:
             sys.unraisablehook = self._hook
-            signal.signal(signal.SIGINT, signal.default_int_handler)
+            signal.signal(number, STOPPING[number])
 
     def _ignored(self, unraisable: "sys.UnraisableHookArgs") -> None:
         """Report exceptions that Python ignores, except KeyboardInterrupt, which will be raised again."""
@@ -75,8 +80,13 @@ class LastingInterrupt:
             self._hook(unraisable)
 
 
-def raises_interrupts() -> bool:
-    """Return whether Ctrl-C raises KeyboardInterrupt here: in the main thread, without a foreign handler."""
-    handler = signal.getsignal(signal.SIGINT)
-    in_main_thread = threading.current_thread() is threading.main_thread()
-    return in_main_thread and (handler is signal.default_int_handler or isinstance(handler, LastingInterrupt))
+def interrupting_signals() -> list[signal.Signals]:
+    """Return the signals that raise KeyboardInterrupt here: in the main thread, without a foreign handler."""
+    if threading.current_thread() is not threading.main_thread():
+        return []
+    handlers = {number: signal.getsignal(number) for number in STOPPING}
+    return [
+        number
+        for number, handler in handlers.items()
+        if handler is signal.default_int_handler or isinstance(handler, LastingInterrupt)
+    ]

@@ -342,8 +342,9 @@ def test_it_runs_as_a_module_and_passes_its_exit_code_on(tmp_path: Path) -> None
     assert done.stderr == f"foredrive: {tmp_path}: no 123D log here (a log is a folder with a sync.arrow)\n"
 
 
-def test_a_real_interrupt_reaches_the_verb() -> None:
-    """Ctrl-C, as the terminal sends it, to a process in the middle of a verb."""
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_real_interrupt_reaches_the_verb(number: signal.Signals) -> None:
+    """Ctrl-C, as the terminal sends it, or SIGTERM to a process in the middle of a verb."""
     code = (
         "import sys, time\n"
         "from foredrive.cli import main as program\n"
@@ -355,7 +356,7 @@ def test_a_real_interrupt_reaches_the_verb() -> None:
     assert process.stdout is not None
     assert process.stdout.readline() == "waiting\n"
     time.sleep(0.05)
-    process.send_signal(2)
+    process.send_signal(number)
     _, err = process.communicate(timeout=30)
     assert process.returncode == 130
     assert err == "foredrive: interrupted\n"

@@ -3,6 +3,7 @@
 `foredrive bench faults` kills more verbs more often.
 """
 
+import contextlib
 import json
 import os
 import shutil
@@ -29,14 +30,26 @@ from foredrive.recipes import RECIPES
 RECIPES["miniature"] = miniature()
 """
 FANNED_OUT = """
-import sys, time
+import contextlib, sys, time
+from pathlib import Path
+from foredrive.cli import main as program
+from foredrive.files import atomic_path
 from foredrive.runs.fan_out import fan_out
 def work(seconds):
-    time.sleep(seconds)
+    with atomic_path(Path("out", str(seconds))) as temporary:
+        temporary.write_text("half")
+        print("working", flush=True)
+        time.sleep(seconds)
+def fan():
+    with contextlib.closing(fan_out([600.0, 601.0], work, 2)) as results:
+        for job, _ in results:
+            pass
 if __name__ == "__main__":
-    for job, _ in fan_out([0.0, 600.0], work, 2):
-        print(job, flush=True)
+    program.VERBS = {"fan": fan, "other": fan}
+    sys.exit(program.main(["fan"]))
 """
+GONE_S = 5.0
+"""Time in which workers end; they take a fifth of a second, but the machine may be busy."""
 
 
 @pytest.fixture(scope="module")
@@ -68,17 +81,68 @@ def test_a_difference_is_found(trained: Run, tmp_path: Path) -> None:
         assert (contents(run) == found) is same
 
 
-def test_workers_end_with_a_killed_parent(tmp_path: Path) -> None:
-    """Those that wait for work too: nobody else ends them."""
-    program = tmp_path / "fanned_out.py"
-    program.write_text(FANNED_OUT)
-    parent = subprocess.Popen([sys.executable, program], stdout=subprocess.PIPE, start_new_session=True)
-    assert parent.stdout is not None
-    assert parent.stdout.readline() == b"0.0\n"
-    assert len(in_session(parent.pid)) > 3
-    os.kill(parent.pid, signal.SIGKILL)
-    parent.communicate()
-    until_s = time.monotonic() + 60.0
-    while in_session(parent.pid) and time.monotonic() < until_s:
-        time.sleep(0.1)
-    assert not in_session(parent.pid)
+@contextlib.contextmanager
+def fanned_out(folder: Path) -> Iterator["subprocess.Popen[str]"]:
+    """A program with two workers."""
+    (folder / "program.py").write_text(FANNED_OUT)
+    (folder / "tmp").mkdir()
+    program = subprocess.Popen(
+        [sys.executable, folder / "program.py"],
+        cwd=folder,
+        env=os.environ | {"TMPDIR": str(folder / "tmp")},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    yield program
+    for pid in in_session(program.pid):
+        os.kill(pid, signal.SIGKILL)
+    program.communicate()
+
+
+def wait_for_the_end(program: "subprocess.Popen[str]") -> str:
+    """What it said, once it and all of its workers have ended."""
+    _, said = program.communicate(timeout=60)
+    until_s = time.monotonic() + GONE_S
+    while in_session(program.pid) and time.monotonic() < until_s:
+        time.sleep(0.05)
+    assert not in_session(program.pid)
+    return said
+
+
+def left(folder: Path) -> list[str]:
+    return [path.name for part in ("tmp", "out") for path in (folder / part).glob("*")]
+
+
+@pytest.mark.parametrize("to_all", [False, True])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
+def test_workers_end_at_once_with_their_parent(number: signal.Signals, to_all: bool, tmp_path: Path) -> None:
+    """With their unfinished files, and with the folder of the sockets; a worker that is killed cannot."""
+    with fanned_out(tmp_path) as program:
+        assert program.stdout is not None
+        assert [program.stdout.readline() for _ in range(2)] == ["working\n"] * 2
+        (os.killpg if to_all else os.kill)(program.pid, number)
+        said = wait_for_the_end(program)
+    if number == signal.SIGKILL:
+        assert program.returncode == -signal.SIGKILL
+        assert "Traceback" not in said
+        assert to_all or left(tmp_path) == []
+    else:
+        assert (program.returncode, said) == (130, "foredrive: interrupted\n")
+        assert left(tmp_path) == []
+
+
+def test_an_interruption_while_workers_start_is_one_line(tmp_path: Path) -> None:
+    for number, after_s in enumerate((0.0, 0.1, 0.3, 0.6)):
+        folder = tmp_path / str(number)
+        folder.mkdir()
+        with fanned_out(folder) as program:
+            until_s = time.monotonic() + 60
+            while not list((folder / "tmp").glob("pymp-*")) and time.monotonic() < until_s:
+                time.sleep(0.01)
+            time.sleep(after_s)
+            os.killpg(program.pid, signal.SIGINT)
+            said = wait_for_the_end(program)
+        assert (program.returncode, said) == (130, "foredrive: interrupted\n"), after_s
+        assert left(folder) == []

@@ -10,7 +10,6 @@ Local work runs on the standard library's process pool. Ray would start a cluste
 workers. loky kills its workers, so that unfinished files would stay. Ray serves clusters.
 """
 
-import _thread
 import contextlib
 import logging
 import multiprocessing
@@ -22,14 +21,18 @@ from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from multiprocessing.connection import Connection
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import rich
 
 from foredrive.errors import InputError
 from foredrive.interrupts import LastingInterrupt
-from foredrive.training.interrupts import end_with_parent, start_fork_server
+from foredrive.training.interrupts import end_with_parent, hold_interrupts, start_fork_server
 
+if TYPE_CHECKING:
+    from types import FrameType
+
+EXIT_TERMINATED = 143
 LAST_WORDS_S = 60.0
 """Maximum time for Ray's tasks to remove their unfinished files, s."""
 
@@ -99,12 +102,13 @@ def _on_processes(work: Callable[[J], R], workers: int) -> Iterator[tuple[Callab
 
     def submit(job: J) -> Future[R]:
         nonlocal pool
-        if pool is not None:
-            with contextlib.suppress(BrokenProcessPool):
-                return pool.submit(_unless_stopped, work, job)
-            pool.shutdown()
-        pool = ProcessPoolExecutor(workers, context, _start_worker, (stop,))
-        return pool.submit(_unless_stopped, work, job)
+        with hold_interrupts():  # a worker that is interrupted while it starts would print a traceback
+            if pool is not None:
+                with contextlib.suppress(BrokenProcessPool):
+                    return pool.submit(_unless_stopped, work, job)
+                pool.shutdown()
+            pool = ProcessPoolExecutor(workers, context, _start_worker, (stop,))
+            return pool.submit(_unless_stopped, work, job)
 
     try:
         yield submit, workers
@@ -118,23 +122,32 @@ def _on_processes(work: Callable[[J], R], workers: int) -> Iterator[tuple[Callab
 class _Worker:
     """The state of a worker process."""
 
-    is_busy = False
-    interrupt = LastingInterrupt(lambda: _Worker.is_busy)
+    is_busy = is_terminated = False
+    interrupt = LastingInterrupt(lambda: _Worker.is_busy, once=True)
 
 
 def _start_worker(stop: Connection) -> None:
-    """Set up a worker: stop when the parent closes its end of the pipe, not by Ctrl-C.
+    """Set up a worker: stop when the parent closes its end of the pipe, and by Ctrl-C and SIGTERM.
 
     The worker removes its unfinished files when it stops. The pool ends the workers, unless the parent was
     killed: then a worker ends by itself.
     """
     rich.get_console().quiet = True  # the parent shows the progress
+    main = threading.get_ident()
 
     def watch() -> None:
         stop.poll(None)
-        _thread.interrupt_main()
+        signal.pthread_kill(main, signal.SIGINT)  # wakes a thread that sleeps or waits, too
+
+    def terminate(number: int, frame: "FrameType | None") -> None:
+        if not _Worker.is_busy:
+            os._exit(EXIT_TERMINATED)
+        _Worker.is_terminated = True
+        _Worker.interrupt(number, frame)
 
     signal.signal(signal.SIGINT, _Worker.interrupt)
+    signal.signal(signal.SIGTERM, terminate)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     threading.Thread(target=watch, daemon=True).start()
     end_with_parent(0)
 
@@ -147,6 +160,8 @@ def _unless_stopped(work: Callable[[J], R], job: J) -> R:
         return work(job)
     finally:
         _Worker.is_busy = False
+        if _Worker.is_terminated:
+            os._exit(EXIT_TERMINATED)
 
 
 @contextlib.contextmanager

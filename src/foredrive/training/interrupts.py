@@ -3,6 +3,7 @@
 import _thread
 import contextlib
 import multiprocessing
+import multiprocessing.util
 import os
 import signal
 import threading
@@ -10,15 +11,17 @@ import time
 from collections.abc import Callable, Iterator
 from multiprocessing import forkserver, resource_tracker
 
-from foredrive.interrupts import raises_interrupts
+from foredrive.files import writes_files
+from foredrive.interrupts import PATIENCE_S, interrupting_signals
+from foredrive.training.frozen import SOCKETS
 
 CLEANUP_S = 10.0
-"""Time for a worker without a parent to remove its unfinished files."""
+"""Longest time for a worker without a parent to remove its unfinished files. It ends when there are none."""
 
 
 @contextlib.contextmanager
 def hold_interrupts() -> Iterator[Callable[[], bool]]:
-    """Record a first Ctrl-C and raise it as KeyboardInterrupt only at the end of the block.
+    """Record a first Ctrl-C or SIGTERM and raise it as KeyboardInterrupt only at the end of the block.
 
     A step interrupted halfway has already changed some weights or statistics, so a checkpoint then would
     belong to no step. A second Ctrl-C is raised at once. Where Ctrl-C does not raise KeyboardInterrupt
@@ -27,10 +30,7 @@ def hold_interrupts() -> Iterator[Callable[[], bool]]:
     Yields:
         a function that returns whether Ctrl-C was pressed, so that the block can end.
     """
-    if not raises_interrupts():
-        yield lambda: False
-        return
-    before, pressed = signal.getsignal(signal.SIGINT), False
+    before, pressed = {number: signal.getsignal(number) for number in interrupting_signals()}, False
 
     def note(signum: int, frame: object) -> None:
         nonlocal pressed
@@ -38,11 +38,13 @@ def hold_interrupts() -> Iterator[Callable[[], bool]]:
             raise KeyboardInterrupt
         pressed = True
 
-    signal.signal(signal.SIGINT, note)
+    for number in before:
+        signal.signal(number, note)
     try:
         yield lambda: pressed
     finally:
-        signal.signal(signal.SIGINT, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)
     if pressed:
         raise KeyboardInterrupt
 
@@ -58,11 +60,13 @@ def start_fork_server(preload: str) -> None:
     """
     multiprocessing.set_forkserver_preload([preload, "foredrive.training.frozen"])
     resource_tracker.ensure_running()  # the fork server would start it, which unblocks SIGINT
+    os.environ[SOCKETS] = multiprocessing.util.get_temp_dir()
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         forkserver.ensure_running()
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        del os.environ[SOCKETS]
 
 
 def end_with_parent(worker_id: int) -> None:
@@ -73,11 +77,18 @@ def end_with_parent(worker_id: int) -> None:
     """
     parent = multiprocessing.parent_process()
     assert parent is not None
+    main = threading.get_ident()
 
     def watch() -> None:
         parent.join()
-        _thread.interrupt_main()
-        time.sleep(CLEANUP_S)
+        if callable(signal.getsignal(signal.SIGTERM)):
+            signal.pthread_kill(main, signal.SIGTERM)  # wakes a thread that sleeps or waits, too
+        else:
+            _thread.interrupt_main()
+        until_s = time.monotonic() + CLEANUP_S
+        time.sleep(PATIENCE_S)
+        while writes_files() and time.monotonic() < until_s:
+            time.sleep(PATIENCE_S)
         os._exit(1)
 
     threading.Thread(target=watch, daemon=True).start()
