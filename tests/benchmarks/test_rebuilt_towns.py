@@ -100,7 +100,7 @@ def test_who_is_removed_or_moved_is_not_where_it_was() -> None:
 
 
 def findings(cameras: list[CameraView], sweeps: list[SweepView]) -> list[str]:
-    return calibration_findings(DRIVE.cameras, cameras, sweeps, NOBODY)
+    return [finding.text for finding in calibration_findings(DRIVE.cameras, cameras, sweeps, NOBODY)]
 
 
 def test_a_right_calibration_gives_no_finding(driven: list[TrueViews]) -> None:
@@ -109,15 +109,53 @@ def test_a_right_calibration_gives_no_finding(driven: list[TrueViews]) -> None:
     assert findings(cameras, []) == []
 
 
-def test_a_camera_that_is_turned_is_told(driven: list[TrueViews]) -> None:
-    turned = exp_se3(torch.tensor([0.0, 0.0, 0.0, 0.0, math.radians(2.0), 0.0]))
+def moved(driven: list[TrueViews], sensor: int, offset: list[float]) -> list[CameraView]:
+    """All views, those of one camera with a pose that is wrong by a translation (m) and a rotation (rad)."""
+    T_cam_moved = exp_se3(torch.tensor(offset))
+    cameras = [camera for seen in driven for camera in seen.cameras]
+    return [
+        dataclasses.replace(camera, T_scene_cam=camera.T_scene_cam @ T_cam_moved)
+        if camera.sensor == sensor
+        else camera
+        for camera in cameras
+    ]
+
+
+@pytest.mark.parametrize("sensor", [0, 1])
+@pytest.mark.parametrize(("degrees", "side"), [(0.5, "left"), (-0.5, "right"), (2.0, "left")])
+def test_a_camera_that_is_turned_is_told(
+    sensor: int, degrees: float, side: str, driven: list[TrueViews]
+) -> None:
+    cameras = moved(driven, sensor, [0.0, 0.0, 0.0, 0.0, math.radians(degrees), 0.0])
+    (said,) = findings(cameras, [seen.sweep for seen in driven])
+    assert said.startswith(f"camera {DRIVE.cameras[sensor]} fits the lidar better if it is turned")
+    around = [abs(degrees) + step for step in (-0.25, 0.0, 0.25)]
+    assert any(f"{degrees:.2f}° to the {side}" in said for degrees in around)
+
+
+@pytest.mark.parametrize("left_m", [0.2, -0.2])
+def test_a_lidar_that_is_moved_is_told(left_m: float, driven: list[TrueViews]) -> None:
+    T_ego_moved = exp_se3(torch.tensor([0.0, left_m, 0.0, 0.0, 0.0, 0.0]))
+    sweeps = [
+        dataclasses.replace(seen.sweep, T_scene_ego=seen.sweep.T_scene_ego @ T_ego_moved) for seen in driven
+    ]
+    (said,) = findings([camera for seen in driven for camera in seen.cameras], sweeps)
+    assert said.startswith("the lidar fits the images better if it is moved 0.00 m forward")
+    assert f"0.20 m to the {'right' if left_m > 0 else 'left'}" in said
+
+
+@pytest.mark.parametrize("sensor", [0, 1])
+def test_a_camera_whose_clock_is_wrong_is_told(sensor: int, driven: list[TrueViews]) -> None:
     cameras = [
-        dataclasses.replace(seen.cameras[1], T_scene_cam=seen.cameras[1].T_scene_cam @ turned)
+        dataclasses.replace(camera, T_scene_cam=camera.T_scene_cam @ exp_se3(0.05 * camera.twist_cam))
+        if camera.sensor == sensor
+        else camera
         for seen in driven
+        for camera in seen.cameras
     ]
     (said,) = findings(cameras, [seen.sweep for seen in driven])
-    assert said.startswith("camera PCAM_R0 fits the lidar better if it is turned")
-    assert any(f"{degrees:.2f}° to the left" in said for degrees in (1.75, 2.0, 2.25))
+    assert said.startswith(f"camera {DRIVE.cameras[sensor]} fits the lidar better if its images are from")
+    assert any(f"{delay_s:.2f} s earlier" in said for delay_s in (0.04, 0.05, 0.06))
 
 
 def test_cameras_that_are_exchanged_are_told(driven: list[TrueViews]) -> None:

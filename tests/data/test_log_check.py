@@ -98,7 +98,7 @@ FAST = [[Box("car", 3, (11.0, 2.0, 0.75), (4.0, 2.0, 1.5), 0.0, (90.0, 0.0))]] *
         (
             {"sweeps": without(DRIVE["sweeps"], range(5, 9))},
             "lidar.lidar_top",
-            r"1 gaps; .* 0\.50 s, from 0\.40 s",
+            r"1 gap; it lasts 0\.50 s, from 0\.40 s",
         ),
         ({"sweeps": [Points(np.zeros((0, 3)))] * FRAMES}, "lidar", "12 of 12 sampled sweeps are empty"),
         ({"sweeps": [Points(DRIVE["sweeps"][0].xyz_m)] * FRAMES}, "lidar", "no times of their own"),
@@ -122,6 +122,16 @@ def test_a_fault_is_found(changed: dict[str, Any], subject: str, text: str, tmp_
     findings = checked(tmp_path, **changed).findings
     told = [finding.text for finding in findings if finding.subject == subject]
     assert any(re.search(text, each) for each in told), findings
+
+
+def test_a_gap_of_several_streams_is_one_finding(tmp_path: Path) -> None:
+    gone = range(5, 9)
+    images = {"front": without(DRIVE["images"]["front"], gone)}
+    findings = checked(tmp_path, images=images, sweeps=without(DRIVE["sweeps"], gone)).findings
+    (gap,) = [finding for finding in findings if "gap" in finding.text]
+    assert gap.subject == "2 streams"
+    assert "(usually 0.100 s): " in gap.text
+    assert all(name in gap.text for name in ("camera.pcam_f0", "lidar.lidar_top"))
 
 
 def test_a_sweep_that_cannot_be_read_is_told_once_and_the_rest_is_checked(tmp_path: Path) -> None:

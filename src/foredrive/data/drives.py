@@ -1,6 +1,6 @@
-"""A whole log as one clip, with all frames at the log's own rate."""
+"""A log as one clip, with its frames at the log's own rate."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -35,11 +35,11 @@ def read_drive(
     image_hw: tuple[int, int],
     cameras: tuple[str, ...] | None = None,
     cache_dir: Path | None = None,
-    max_frames: int | None = None,
+    frames: Sequence[int] | None = None,
+    derived: bool = True,
 ) -> Clip:
-    """Read all frames of a log with sweeps and boxes. Now is the first frame, so all times are >= 0.
+    """Read frames of a log with sweeps and boxes. Now is the first of them, so all times are >= 0.
 
-    Beams that did not return are reconstructed where the lidar's pattern is known (`sensors.missed_beams`).
     The clip has no command, no target and no future.
 
     Args:
@@ -47,7 +47,9 @@ def read_drive(
         image_hw: height and width of the resized images, px.
         cameras: camera names, the log's own or 123D's, in this order. None selects all.
         cache_dir: folder for resized images. None disables the cache.
-        max_frames: number of frames to read, from the middle of the log. None reads all.
+        frames: frames of the log, in order. None reads all.
+        derived: add what the log does not tell itself: the lidar points in boxes, and the beams that did not
+            return where the lidar's pattern is known (`sensors.missed_beams`).
 
     Raises:
         InputError: the log cannot be read, or it lacks a requested camera.
@@ -59,13 +61,12 @@ def read_drive(
     for name, camera in zip(names, chosen, strict=True):
         if camera is None:
             raise InputError(f"{path.folder}: no camera {name!r}; there are: {told_cameras(there.values())}")
-    count = len(log) if max_frames is None else min(len(log), max_frames)
-    first = (len(log) - count) // 2
-    frames = list(range(first, first + count))
+    frames = range(len(log)) if frames is None else frames
     store = FrameStore(cache_dir, image_hw, names)
-    seen = [store.read(log, frame, chosen) for frame in frames]
-    sweeps = [_read_beams(log, frame) for frame in frames]
-    return assemble_clip(log, frames, 0, seen, sweeps, log.driven_future(first, 0, log.period_s))
+    seen = [store.read(log, frame, chosen, with_points=derived) for frame in frames]
+    read = _read_beams if derived else read_sweep
+    sweeps = [read(log, frame) for frame in frames]
+    return assemble_clip(log, frames, frames[0], seen, sweeps, log.driven_future(frames[0], 0, log.period_s))
 
 
 def _read_beams(log: Log, frame: int) -> tuple[LidarSweep, bool] | None:

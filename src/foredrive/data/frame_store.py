@@ -67,8 +67,16 @@ class FrameStore:
         frame: int,
         cameras: Sequence[PinholeCameraMetadata | None],
         with_images: bool = True,
+        with_points: bool = True,
     ) -> FrameData:
-        """Read one frame. `cameras` are the log's own, in the order of `names`; None for a missing one.
+        """Read one frame.
+
+        Args:
+            log: the log.
+            frame: its frame.
+            cameras: the log's own cameras, in the order of `names`; None for a missing one.
+            with_images: read the images.
+            with_points: count the lidar points in boxes where the log does not have the numbers.
 
         Raises:
             InputError: an image, a pose or the boxes cannot be read.
@@ -76,18 +84,23 @@ class FrameStore:
         there = [camera for camera in cameras if camera is not None]
         small = self.image_hw[0] * self.image_hw[1]
         shrinks = any(camera.width * camera.height > small for camera in there)
-        if self._folder is None or not with_images or not shrinks:
-            return self._read(log, frame, cameras, with_images)
+        if self._folder is None or not (with_images and with_points and shrinks):
+            return self._read(log, frame, cameras, with_images, with_points)
         file = self._file(self._folder, log, frame, there)
         kept = self._read_entry(file)
         if kept is None:
-            kept = self._read(log, frame, cameras, with_images)
+            kept = self._read(log, frame, cameras, with_images, with_points)
             with atomic_path(file, durable=False) as temporary:
                 safetensors.torch.save_file(_flat(kept), temporary)
         return kept
 
     def _read(
-        self, log: Log, frame: int, cameras: Sequence[PinholeCameraMetadata | None], with_images: bool
+        self,
+        log: Log,
+        frame: int,
+        cameras: Sequence[PinholeCameraMetadata | None],
+        with_images: bool,
+        with_points: bool,
     ) -> FrameData:
         count = len(self.names)
         images = torch.zeros(count, 3, *self.image_hw, dtype=torch.uint8)
@@ -103,7 +116,7 @@ class FrameStore:
             if camera.image is not None:
                 images[c], image_valid[c] = camera.image, True
         rig = CameraRig(K, T_ego_cam, dist, readout_s, self.names, self.image_hw, exposed_dt_s)
-        boxes = _counted_boxes(log, frame)
+        boxes = _counted_boxes(log, frame) if with_points else read_boxes(log, frame)
         annotated = torch.tensor(boxes is not None)
         return FrameData(images, image_valid, rig, no_boxes() if boxes is None else boxes, annotated)
 

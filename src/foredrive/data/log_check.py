@@ -10,12 +10,12 @@ from jaxtyping import Float, Float64
 
 from foredrive.data.boxes import read_boxes, read_tracks, with_counted_points
 from foredrive.data.cameras import pinhole_cameras, read_camera
-from foredrive.data.lidar import read_sweep
+from foredrive.data.lidar import frames_with_lidar, read_sweep
 from foredrive.data.log_paths import LogPath
 from foredrive.data.logs import Log
 from foredrive.data.notices import read_notices
 from foredrive.errors import InputError
-from foredrive.scene import Boxes
+from foredrive.scene import LidarSweep
 
 Level = Literal["problem", "note"]
 SAMPLES = 12
@@ -78,7 +78,7 @@ def check_log(path: LogPath) -> LogCheck:
     """
     log = Log(path)
     streams = list(_streams(log))
-    checks: tuple[Callable[[Log], Iterator[Finding]], ...] = (_poses, _images, _sweeps, _boxes)
+    checks: tuple[Callable[[Log], Iterator[Finding]], ...] = (_poses, _images, _sweeps, _tracks)
     findings = [Finding("note", "conversion", notice) for notice in read_notices(path.folder)]
     findings += _gaps(log, streams)
     for check in checks:
@@ -104,11 +104,12 @@ def _period_s(log: Log, frames: np.ndarray) -> float | None:
 
 
 def _gaps(log: Log, streams: Sequence[Stream]) -> Iterator[Finding]:
-    """Find times without poses or sensors, beyond the usual period of each."""
+    """Find times without poses or sensors, beyond the usual period. Streams with equal gaps are one."""
+    streams_of: dict[str, list[str]] = {}
     for stream in streams:
         frames, _ = log.rows(stream.name)
         if not len(frames):
-            yield Finding("note", stream.name, "declared, but no frame has it")
+            streams_of.setdefault("declared, but no frame has it", []).append(stream.name)
             continue
         if stream.period_s is None:
             continue
@@ -116,13 +117,19 @@ def _gaps(log: Log, streams: Sequence[Stream]) -> Iterator[Finding]:
         gaps = np.flatnonzero(since_s > GAP * stream.period_s)
         if len(gaps):
             longest = int(gaps[since_s[gaps].argmax()])
-            at_s = float(log.t_us[frames[longest]] - log.t_us[0]) * 1e-6
-            yield Finding(
-                "note",
-                stream.name,
-                f"{len(gaps)} gaps; the longest lasts {since_s[longest]:.2f} s, from {at_s:.2f} s "
-                f"(usually {stream.period_s:.3f} s)",
+            start_s = float(log.t_us[frames[longest]] - log.t_us[0]) * 1e-6
+            count = "1 gap; it" if len(gaps) == 1 else f"{len(gaps)} gaps; the longest"
+            text = (
+                f"{count} lasts {since_s[longest]:.2f} s, from {start_s:.2f} s "
+                f"(usually {stream.period_s:.3f} s)"
             )
+            streams_of.setdefault(text, []).append(stream.name)
+    for text, names in streams_of.items():
+        yield Finding("note", names[0] if len(names) == 1 else f"{len(names)} streams", _named(text, names))
+
+
+def _named(text: str, names: Sequence[str]) -> str:
+    return text if len(names) == 1 else f"{text}: {', '.join(names)}"
 
 
 def _poses(log: Log) -> Iterator[Finding]:
@@ -204,27 +211,27 @@ def _clock(name: str, offset_s: Float[np.ndarray, "N"], period_s: float) -> Iter
 
 
 def _sweeps(log: Log) -> Iterator[Finding]:
-    """Find empty sweeps, missing point times, and a ground that is not where the ego frame says."""
+    """Find empty sweeps and boxes, missing point times, and a ground that is not where the ego frame says."""
     ground_m, empty, untimed, read = [], 0, 0, 0
-    for frame in _sampled(np.arange(len(log))):
+    near, bare = 0, 0
+    for frame in _sampled(frames_with_lidar(log)):
         try:
-            found = read_sweep(log, int(frame))
+            loaded = read_sweep(log, int(frame))
         except InputError as error:
             yield Finding("problem", "lidar", str(error))
             continue
-        if found is None:
+        if loaded is None:
             continue
         read += 1
-        sweep = found[0][found[0].returned & found[0].valid]
+        sweep = loaded[0][loaded[0].returned & loaded[0].valid]
         if not len(sweep.range_m):
             empty += 1
             continue
         untimed += not bool(sweep.dt_s.any())
-        points = sweep.points_ego.numpy()
-        distance_m = np.hypot(points[:, 0], points[:, 1])
-        near = points[(distance_m > NEAR_GROUND_M[0]) & (distance_m < NEAR_GROUND_M[1])]
-        if len(near) > MIN_GROUND_POINTS:
-            ground_m.append(_ground_level(near))
+        level_m = _ground_level(sweep.points_ego.numpy())
+        ground_m += [] if level_m is None else [level_m]
+        close, without = _boxes_without_points(log, int(frame), loaded[0])
+        near, bare = near + close, bare + without
     if empty:
         yield Finding("problem", "lidar", f"{empty} of {read} sampled sweeps are empty")
     if untimed:
@@ -233,19 +240,44 @@ def _sweeps(log: Log) -> Iterator[Finding]:
     if ground_m and abs(np.median(ground_m)) > MAX_GROUND_M:
         text = f"the ground is at z = {np.median(ground_m):.2f} m in the ego frame, which should stand on it"
         yield Finding("problem", "lidar", text)
+    if near and bare / near > MAX_EMPTY_SHARE:
+        text = f"{bare} of {near} sampled boxes within {NEAR_BOX_M:.0f} m have no lidar point in them"
+        yield Finding("problem", "boxes", text)
 
 
-def _ground_level(points_m: Float[np.ndarray, "N 3"]) -> float:
-    """Return the height at which most columns of 1 m have their lowest point: roads are flat."""
-    _, column = np.unique(np.floor(points_m[:, :2]), axis=0, return_inverse=True)
-    lowest_m = np.full(column.max() + 1, np.inf)
-    np.minimum.at(lowest_m, column.reshape(-1), points_m[:, 2])
+def _ground_level(points_m: Float[np.ndarray, "N 3"]) -> float | None:
+    """Return the height at which most columns of 1 m nearby have their lowest point: roads are flat.
+
+    Return None if there are too few points.
+    """
+    distance_m = np.hypot(points_m[:, 0], points_m[:, 1])
+    near_m = points_m[(distance_m > NEAR_GROUND_M[0]) & (distance_m < NEAR_GROUND_M[1])]
+    if len(near_m) <= MIN_GROUND_POINTS:
+        return None
+    side = 2 * int(NEAR_GROUND_M[1]) + 2
+    cell = np.floor(near_m[:, :2]).astype(np.int64) + side // 2
+    lowest_m = np.full(side * side, np.inf)
+    np.minimum.at(lowest_m, cell[:, 0] * side + cell[:, 1], near_m[:, 2])
+    lowest_m = lowest_m[np.isfinite(lowest_m)]
     count, edges = np.histogram(lowest_m, bins=np.arange(lowest_m.min(), lowest_m.max() + 0.4, 0.2))
     return float(edges[count.argmax()]) + 0.1
 
 
-def _boxes(log: Log) -> Iterator[Finding]:
-    """Find boxes without points, with impossible speeds, and tracks that stand twice in a frame."""
+def _boxes_without_points(log: Log, frame: int, sweep: LidarSweep) -> tuple[int, int]:
+    """Return the number of near boxes of a frame, and how many of them have no lidar point."""
+    try:
+        boxes = read_boxes(log, frame)
+    except InputError:
+        return 0, 0  # `_tracks` names it
+    if boxes is None:
+        return 0, 0
+    close = boxes[boxes.valid & (boxes.centre.norm(dim=-1) < NEAR_BOX_M)]
+    counted = with_counted_points(close, sweep)
+    return len(counted.num_points), int((counted.num_points == 0).sum())
+
+
+def _tracks(log: Log) -> Iterator[Finding]:
+    """Find boxes with impossible speeds, and tracks that stand twice in a frame."""
     try:
         tracks = read_tracks(log)
     except InputError as error:
@@ -262,20 +294,6 @@ def _boxes(log: Log) -> Iterator[Finding]:
     twice = len(rows) - len(np.unique(np.stack([rows, tracks.track_id]), axis=1).T)
     if twice:
         yield Finding("problem", "boxes", f"{twice} boxes have the track of another box of their frame")
-    near, bare = 0, 0
-    for frame in _sampled(np.arange(len(log))):
-        try:
-            boxes, found = read_boxes(log, int(frame)), read_sweep(log, int(frame))
-        except InputError:
-            continue  # told with the sweeps, and by `read_tracks`
-        if boxes is None or found is None:
-            continue
-        counted: Boxes = with_counted_points(boxes, found[0])
-        close = counted.centre.norm(dim=-1) < NEAR_BOX_M
-        near, bare = near + int(close.sum()), bare + int((close & (counted.num_points == 0)).sum())
-    if near and bare / near > MAX_EMPTY_SHARE:
-        text = f"{bare} of {near} sampled boxes within {NEAR_BOX_M:.0f} m have no lidar point in them"
-        yield Finding("problem", "boxes", text)
 
 
 def _sampled(frames: np.ndarray) -> np.ndarray:

@@ -1,10 +1,11 @@
 """A check of camera calibration: images against lidar.
 
-A camera is tested in two ways. Lidar points should look the same from the vehicle's position some metres
-later; this holds if depth, poses and camera fit together. And where lidar sees one object in front of
-another, the image should have an edge (Levinson & Thrun, "Automatic online calibration of cameras and
-lasers", RSS 2013). Both scores are highest at the true calibration. They are lower at an error of half a
-degree or a decimetre.
+Where lidar sees one object in front of another, the image should have an edge (Levinson & Thrun, "Automatic
+online calibration of cameras and lasers", RSS 2013). A step of range between two beams of one channel is an
+edge with a change of brightness from left to right, a step between two channels one from top to bottom. The
+strength of image edges is measured against that of their surroundings: otherwise an offset that moves all
+points into a part of the image with much texture would seem to fit better. The score is highest at the true
+calibration, and lower at an error of half a degree or a decimetre.
 """
 
 import dataclasses
@@ -12,56 +13,85 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-import numpy as np
 import torch
 import torch.nn.functional as F
 from jaxtyping import Bool, Float
-from scipy.ndimage import gaussian_filter, gaussian_gradient_magnitude
 from torch import Tensor
 
 from foredrive.geometry.projection import project
 from foredrive.geometry.se3 import exp_se3, inverse_se3, transform_points
+from foredrive.rendering.scene_graph import STATIC
 from foredrive.rendering.seed_points import actor_rows
 from foredrive.rendering.tracks import ActorTracks, states_at
 from foredrive.rendering.views import CameraView, SweepView
 from foredrive.scene import LidarSweep
 
-_ROTATION_RAD, _TRANSLATION_M = math.radians(0.5), 0.1
-_ROTATION_STEPS = (((0, 1), 4.0), ((0, 1), 2.0), ((0, 1), 1.0), ((0, 1, 2), 1.0), ((0, 1, 2), 0.5))
-_TRANSLATION_STEPS = (((0, 1, 2), 2.0), ((0, 1, 2), 1.0), ((0, 1, 2), 0.5))
-"""Steps of the search: axes (of rotation or translation) and step size in the units above."""
-_MAX_STEPS = 8.0
-"""Bound of the search, in the units above."""
-_VIEWS, _MIN_VIEWS = 12, 4
-_BASELINE_M = 3.0
-"""Driven distance between two compared images, m."""
-_MAX_POINTS, _MIN_POINTS = 4000, 50
-"""Maximum points used of a sweep and minimum points in an image."""
-_WIDTH_PX, _FINE_PX, _COARSE_PX = 480, 1.5, 12.0
-"""Maximum image width, its blur, and the scale over which brightness and contrast are normalised."""
-_MIN_CONTRAST = 0.02
-_SATURATION = 0.95
-"""Quantile of the gradient from which on all edges count equally."""
-_JUMP_M, _JUMP_SHARE, _NEXT_RAD = 0.5, 0.1, math.radians(0.8)
-"""An edge needs a range jump of this many metres plus this share of the range, between beams this close."""
+ROTATION_STEPS_RAD = tuple(
+    (axes, math.radians(step)) for axes, step in ((2, 1.0), (2, 0.5), (3, 0.5), (3, 0.25))
+)
+TRANSLATION_STEPS_M = ((3, 0.5), (3, 0.2), (3, 0.1), (3, 0.05))
+DELAY_STEPS_S = ((1, 0.02), (1, 0.01))
+"""Steps of the searches, from coarse to fine: the number of axes that are searched, and the size of the step.
+The first are tried on a grid, the others climb.
+"""
+MAX_ROTATION_RAD, MAX_TRANSLATION_M, MAX_DELAY_S = math.radians(4.0), 0.8, 0.12
+"""Bounds of the searches. An optimum at a bound is none."""
+_VIEWS, _MIN_VIEWS = 10, 4
+_MIN_EDGES, _MAX_EDGES = 30, 800
+"""Minimum number of points in an image (and of each kind by which a sum is divided), and maximum number."""
+_WIDTH_PX = 480
+"""Maximum image width."""
+_SURROUNDINGS_RAD = math.radians(4.0)
+"""Size of the surroundings against which the strength of an image edge is measured."""
+_MIN_CHANGE, _MAX_STRENGTH = 0.002, 4.0
+"""Mean change of brightness below which surroundings are flat, and largest strength in units of the mean."""
+_JUMP_M, _JUMP_SHARE = 0.5, 0.1
+"""An edge needs a range jump of this many metres plus this share of the range."""
+_BESIDE_RAD, _ABOVE_RAD = math.radians(0.8), math.radians(0.6)
+"""Maximum angle to the next beam of a channel and to the next channel."""
+_COLUMN_RAD, _ROW_RAD = math.radians(0.2), math.radians(0.1)
+"""Width of a column of beams, and height of a row that stands for the channel where a log has none."""
 _MAX_STATIC_MPS = 0.3
+_GOOD_SCORE, _FAR_GAIN = 0.35, 0.15
+"""Score from which the nearest optimum is taken, since repeated structures look alike, and the gain by which
+another must be better if the nearest scores less.
+"""
+_TYPICAL_RANGE_M = 10.0
 _MIN_FOCAL = 150.0
 """Minimum focal length, px/rad: coarser images cannot show half a degree."""
 
 
 @dataclass(frozen=True)
-class CalibrationView:
-    """An image, a later image of the same place, and the static lidar points in view."""
+class SweepEdges:
+    """Points of a sweep next to which a beam hit something farther, on static surfaces."""
 
-    view: CameraView
-    later: CameraView | None
-    appearance: Float[Tensor, "1 1 H W"]
-    later_appearance: Float[Tensor, "1 1 H W"] | None
-    edge: Float[Tensor, "1 1 H W"]
+    t_s: float
     T_scene_ego: Float[Tensor, "4 4"]
-    """Pose of the sweep's ego frame."""
     points_ego: Float[Tensor, "N 3"]
-    edges_ego: Float[Tensor, "E 3"]
+    horizontal: Bool[Tensor, "N"]
+    """True where the farther beam is above or below, False where it is left or right."""
+
+
+@dataclass(frozen=True)
+class CalibrationViews:
+    """V images of one camera, each with the N points of lidar edges near its field of view."""
+
+    K: Float[Tensor, "V 3 3"]
+    dist: Float[Tensor, "V 5"]
+    size_hw: tuple[int, int]
+    twist_cam: Float[Tensor, "V 6"]
+    R_cam_ego: Float[Tensor, "V 3 3"]
+    """Rotation from the sweep's ego axes to the camera's."""
+    strength: Sequence[Float[Tensor, "V 2 _H _W"]]
+    """Strength of image edges that brightness crosses along u and along v; 0 is that of the surroundings.
+    A pyramid: its cells are 1, 2, 4, … pixels.
+    """
+    points_cam: Float[Tensor, "V N 3"]
+    horizontal: Bool[Tensor, "V N"]
+    points_valid: Bool[Tensor, "V N"]
+
+    def __len__(self) -> int:
+        return len(self.K)
 
 
 @dataclass(frozen=True)
@@ -69,73 +99,125 @@ class OffsetFit:
     """Agreement of the sensors as calibrated and after the best offset."""
 
     score_before: float
-    """Score as calibrated: the sum of both tests, typically 0.6 to 1.2; 0 is chance."""
+    """Score as calibrated, typically 0.3 to 1; 0 is chance."""
     score_after: float
     """Score with `offset`."""
-    offset: Float[Tensor, "3"]
+    offset: Float[Tensor, "D"]
     improved_share: float
     """Share of the views that fit better with `offset`."""
+    bounded: bool
+    """True if the search ended at its bound, so that `offset` is no optimum."""
+
+    @property
+    def gain(self) -> float:
+        """Return the increase of agreement."""
+        return self.score_after - self.score_before
 
 
-def calibration_views(
-    cameras: Sequence[CameraView], sweeps: Sequence[SweepView], tracks: ActorTracks
-) -> list[CalibrationView]:
-    """Pick views of one camera, evenly spaced along the driven path, or in time if the path is short.
+def spread_along_path(position_m: Float[Tensor, "F 3"], count: int = _VIEWS) -> list[int]:
+    """Return up to `count` indices, evenly along the path, or in time where the path is short."""
+    frames = len(position_m)
+    if frames <= count:
+        return list(range(frames))
+    path_m = F.pad((position_m[1:] - position_m[:-1]).norm(dim=-1).cumsum(0), (1, 0))
+    if float(path_m[-1]) < count:
+        return torch.linspace(0, frames - 1, count).round().long().unique().tolist()
+    even_m = torch.linspace(0, float(path_m[-1]), count, dtype=path_m.dtype)
+    return torch.searchsorted(path_m, even_m).clamp_max(frames - 1).unique().tolist()
+
+
+def sweep_edges(sweeps: Sequence[SweepView], tracks: ActorTracks) -> list[SweepEdges]:
+    """Return the edges of sweeps that are spread over the driven path, without those of moving actors."""
+    if not sweeps:
+        return []
+    position_m = torch.stack([sweep.T_scene_ego[:3, 3] for sweep in sweeps])
+    return [_sweep_edges(sweeps[index], tracks) for index in spread_along_path(position_m)]
+
+
+def calibration_views(cameras: Sequence[CameraView], edges: Sequence[SweepEdges]) -> CalibrationViews | None:
+    """Pair the images of one camera with the sweeps nearest in time.
 
     Args:
-        cameras: views in order of time, with images.
-        sweeps: sweeps of the same drive.
-        tracks: moving actors, which are left out.
+        cameras: views with images of one camera.
+        edges: lidar edges of the same drive.
+
+    Returns:
+        The views, or None if fewer than four images show lidar edges, or if they are too coarse.
     """
-    if not cameras or not sweeps or float(_downsampled(cameras[0]).K[0, 0]) < _MIN_FOCAL:
-        return []
-    position_m = torch.stack([view.T_scene_cam[:3, 3] for view in cameras])
-    path_m = F.pad((position_m[1:] - position_m[:-1]).norm(dim=-1).cumsum(0), (1, 0))
-    last_m = float(path_m[-1]) - _BASELINE_M
-    if last_m > 0:
-        starts = torch.searchsorted(path_m, torch.linspace(0, last_m, _VIEWS))
-    else:
-        starts = torch.linspace(0, len(cameras) - 1, _VIEWS).round().long()
-    found = []
-    for start in starts.unique().tolist():
-        end = int(torch.searchsorted(path_m, path_m[start] + _BASELINE_M))
-        view, later = cameras[start], cameras[end] if end < len(cameras) else None
-        sweep = min(sweeps, key=lambda other: abs(other.t_s - view.t_s))
-        pair = _calibration_view(view, later, sweep, tracks)
-        if len(pair.points_ego) >= _MIN_POINTS:
-            found.append(pair)
-    return found
-
-
-def agreement(views: Sequence[CalibrationView]) -> float | None:
-    """Return the score as calibrated (see `OffsetFit.score_before`), or None if there are too few views."""
-    if len(views) < _MIN_VIEWS:
+    if not cameras or float(_downsampled(cameras[0]).K[0, 0]) < _MIN_FOCAL:
         return None
-    return float(_scores(views, torch.zeros(6), torch.zeros(3)).mean())
+    pairs = []
+    for sweep in edges:
+        view = _downsampled(min(cameras, key=lambda other: abs(other.t_s - sweep.t_s)))
+        T_cam_ego = inverse_se3(view.T_scene_cam) @ sweep.T_scene_ego
+        points_cam = transform_points(T_cam_ego, sweep.points_ego)
+        if int(project(points_cam, view.K, view.dist, view.size_hw)[2].sum()) >= _MIN_EDGES:
+            near = _near_view(points_cam, view).nonzero()[:, 0]
+            near = near[:: math.ceil(len(near) / _MAX_EDGES)]
+            pairs.append((view, T_cam_ego, points_cam[near], sweep.horizontal[near]))
+    if len(pairs) < _MIN_VIEWS:
+        return None
+    views, T_cam_ego, points_cam, horizontal = zip(*pairs, strict=True)
+    counts = torch.tensor([len(points) for points in points_cam])
+    pad = torch.nn.utils.rnn.pad_sequence
+    return CalibrationViews(
+        K=torch.stack([view.K for view in views]),
+        dist=torch.stack([view.dist for view in views]),
+        size_hw=views[0].size_hw,
+        twist_cam=torch.stack([view.twist_cam for view in views]),
+        R_cam_ego=torch.stack(T_cam_ego)[:, :3, :3],
+        strength=_pyramid(_edge_strength(views)),
+        points_cam=pad(points_cam, batch_first=True),
+        horizontal=pad(horizontal, batch_first=True),
+        points_valid=torch.arange(int(counts.max())) < counts[:, None],
+    )
 
 
-def best_camera_rotation(views: Sequence[CalibrationView]) -> OffsetFit | None:
-    """Find the rotation of a camera that fits best: up, to its right, clockwise, rad.
+def agreement(views: CalibrationViews) -> float:
+    """Return the score as calibrated (see `OffsetFit.score_before`)."""
+    return float(_scores(views, torch.eye(4).expand(len(views), 4, 4), 0.0).mean())
 
-    Return None if there are too few views.
-    """
-    if len(views) < _MIN_VIEWS:
+
+def best_camera_rotation(views: CalibrationViews) -> OffsetFit:
+    """Find the rotation of a camera that fits best: up, to its right, clockwise, rad."""
+
+    def scores(offset: Tensor, step: float) -> Tensor:
+        T_moved_cam = inverse_se3(exp_se3(F.pad(offset, (3, 0)))).expand(len(views), 4, 4)
+        return _scores(views, T_moved_cam, step)
+
+    return _search(scores, ROTATION_STEPS_RAD, MAX_ROTATION_RAD)
+
+
+def mean_shift_rad(views: CalibrationViews, turn: Float[Tensor, "3"]) -> float:
+    """Return the mean angle by which a rotation of the camera moves the edges, rad."""
+    rays = F.normalize(views.points_cam[views.points_valid], dim=-1)
+    turned = transform_points(exp_se3(F.pad(turn, (3, 0))), rays)
+    return float((turned - rays).norm(dim=-1).mean())
+
+
+def best_camera_delay(views: CalibrationViews) -> OffsetFit:
+    """Find the time by which a camera was exposed later than its images say, s."""
+
+    def scores(offset: Tensor, _: float) -> Tensor:
+        return _scores(views, inverse_se3(exp_se3(views.twist_cam * offset)), 0.0)
+
+    return _search(scores, DELAY_STEPS_S, MAX_DELAY_S)
+
+
+def best_lidar_translation(cameras: Sequence[CalibrationViews]) -> OffsetFit | None:
+    """Find the translation of the lidar that fits all cameras best: forward, left, up, m."""
+    if not cameras:
         return None
 
-    def scores(offset: Tensor) -> Tensor:
-        return _scores(views, F.pad(offset, (3, 0)), torch.zeros(3))
+    def scores(offset: Tensor, step: float) -> Tensor:
+        scored = []
+        for views in cameras:
+            T_moved_cam = torch.eye(4).repeat(len(views), 1, 1)
+            T_moved_cam[:, :3, 3] = views.R_cam_ego @ offset
+            scored.append(_scores(views, T_moved_cam, step / _TYPICAL_RANGE_M))
+        return torch.cat(scored)
 
-    return _search(scores, _ROTATION_RAD, _ROTATION_STEPS)
-
-
-def best_lidar_translation(views: Sequence[CalibrationView]) -> OffsetFit | None:
-    """Find the translation of the lidar that fits all cameras best: forward, left, up, m.
-
-    Return None if there are too few views.
-    """
-    if len(views) < _MIN_VIEWS:
-        return None
-    return _search(lambda offset: _scores(views, torch.zeros(6), offset), _TRANSLATION_M, _TRANSLATION_STEPS)
+    return _search(scores, TRANSLATION_STEPS_M, MAX_TRANSLATION_M)
 
 
 def with_images_from(cameras: Sequence[CameraView], others: Sequence[CameraView]) -> list[CameraView]:
@@ -147,124 +229,153 @@ def with_images_from(cameras: Sequence[CameraView], others: Sequence[CameraView]
 
 
 def _search(
-    scores: Callable[[Float[Tensor, "3"]], Float[Tensor, "G"]],
-    unit: float,
-    steps: Sequence[tuple[tuple[int, ...], float]],
+    scores: Callable[[Float[Tensor, "D"], float], Float[Tensor, "V"]],
+    steps: Sequence[tuple[int, float]],
+    bound: float,
 ) -> OffsetFit:
-    """Climb by steps of decreasing size, each along the axis that gains most."""
-    at, given = torch.zeros(3), scores(torch.zeros(3))
-    best = given
-    for axes, size in steps:
+    """Climb to the nearest optimum, by the finest steps and by steps of decreasing size.
+
+    If that is no good one, find another on a grid in coarse images, from where steps of decreasing size climb
+    in images of increasing resolution.
+    """
+    dims, fine = steps[-1]
+
+    def climbed(offset: Tensor, axes: int, step: float) -> Tensor:
+        best = float(scores(offset, step).mean())
         while True:
-            near = [at + sign * size * unit * F.one_hot(torch.tensor(axis), 3)
-                    for axis in axes for sign in (-1.0, 1.0)]  # fmt: skip
-            within = [offset for offset in near if float(offset.abs().max()) <= _MAX_STEPS * unit]
-            tried = [(scores(offset), offset) for offset in within]
-            score, offset = max(tried, key=lambda pair: float(pair[0].mean()))
-            if float(score.mean()) <= float(best.mean()):
-                break
-            best, at = score, offset
-    return OffsetFit(float(given.mean()), float(best.mean()), at, float((best > given).float().mean()))
+            near = [offset + sign * step * axis for axis in torch.eye(dims)[:axes] for sign in (-1.0, 1.0)]
+            within = [other for other in near if float(other.abs().max()) < bound + 0.5 * fine]
+            tried = [(float(scores(other, step).mean()), other) for other in within]
+            score, other = max(tried, key=lambda pair: pair[0])
+            if score <= best:
+                return offset
+            best, offset = score, other
 
+    def refined(offset: Tensor) -> Tensor:
+        for axes, step in steps[1:]:
+            offset = climbed(offset, axes, step)
+        return offset
 
-def _scores(
-    views: Sequence[CalibrationView], camera: Float[Tensor, "6"], lidar_m: Float[Tensor, "3"]
-) -> Tensor:
-    """Return the score of each pair with the camera (m, rad, own axes) and the lidar (ego axes) moved."""
-    T_cam_moved = exp_se3(camera)
-    return torch.tensor([_score(view, T_cam_moved, lidar_m) for view in views])
+    def mean_score(offset: Tensor) -> float:
+        return float(scores(offset, fine).mean())
 
-
-def _score(pair: CalibrationView, T_cam_moved: Float[Tensor, "4 4"], lidar_m: Float[Tensor, "3"]) -> float:
-    """Return the mean edge strength at lidar edges plus the correlation of both images at lidar points."""
-
-    def place(view: CameraView, points_ego: Float[Tensor, "N 3"]) -> tuple[Tensor, Tensor]:
-        return _project(view, T_cam_moved, transform_points(pair.T_scene_ego, points_ego + lidar_m))
-
-    uv, inside = place(pair.view, pair.edges_ego)
-    score = float(_sample(pair.edge, uv[inside]).sum()) / max(int(inside.sum()), _MIN_POINTS)
-    if pair.later is not None and pair.later_appearance is not None:
-        uv, inside = place(pair.view, pair.points_ego)
-        later_uv, later_inside = place(pair.later, pair.points_ego)
-        both = inside & later_inside
-        if int(both.sum()) >= _MIN_POINTS:
-            now, later = _sample(pair.appearance, uv[both]), _sample(pair.later_appearance, later_uv[both])
-            score += float(torch.corrcoef(torch.stack([now, later]))[0, 1].nan_to_num())
-    return score
-
-
-def _project(
-    view: CameraView, T_cam_moved: Float[Tensor, "4 4"], points_m: Float[Tensor, "N 3"]
-) -> tuple[Float[Tensor, "N 2"], Bool[Tensor, "N"]]:
-    points_cam = transform_points(inverse_se3(view.T_scene_cam @ T_cam_moved), points_m)
-    uv, _, inside = project(points_cam, view.K, view.dist, view.size_hw)
-    return uv, inside
-
-
-def _sample(image: Float[Tensor, "1 1 H W"], uv: Float[Tensor, "N 2"]) -> Float[Tensor, "N"]:
-    size_wh = torch.tensor([image.shape[-1], image.shape[-2]])
-    return F.grid_sample(image, (2 * uv / size_wh - 1)[None, None], align_corners=False)[0, 0, 0]
-
-
-def _calibration_view(
-    view: CameraView, later: CameraView | None, sweep: SweepView, tracks: ActorTracks
-) -> CalibrationView:
-    view, later = _downsampled(view), None if later is None else _downsampled(later)
-    beams = _static_beams(sweep, tracks)
-    seen = _project(view, torch.eye(4), transform_points(sweep.T_scene_ego, beams.points_ego))[1]
-    points_ego = beams.points_ego[seen]
-    appearance = _appearance(view)
-    return CalibrationView(
-        view=view,
-        later=later,
-        appearance=torch.from_numpy(appearance)[None, None],
-        later_appearance=None if later is None else torch.from_numpy(_appearance(later))[None, None],
-        edge=torch.from_numpy(_edges(appearance))[None, None],
-        T_scene_ego=sweep.T_scene_ego,
-        points_ego=points_ego[:: max(len(points_ego) // _MAX_POINTS, 1)],
-        edges_ego=_edges_ego(beams),
+    calibrated = torch.zeros(dims)
+    offset = max(climbed(calibrated, dims, fine), refined(calibrated), key=mean_score)
+    if mean_score(offset) < _GOOD_SCORE:
+        axes, step = steps[0]
+        ticks = torch.arange(-int(bound / step), int(bound / step) + 1) * step
+        grid = F.pad(torch.cartesian_prod(*[ticks] * axes).reshape(-1, axes), (0, dims - axes))
+        far = refined(max(grid, key=lambda other: float(scores(other, step).mean())))
+        offset = far if mean_score(far) > mean_score(offset) + _FAR_GAIN else offset
+    before, after = scores(calibrated, fine), scores(offset, fine)
+    return OffsetFit(
+        score_before=float(before.mean()),
+        score_after=float(after.mean()),
+        offset=offset,
+        improved_share=float((after > before).float().mean()),
+        bounded=float(offset.abs().max()) > bound - 0.5 * fine,
     )
 
 
-def _static_beams(sweep: SweepView, tracks: ActorTracks) -> LidarSweep:
-    """Return the beams that hit static surfaces."""
-    beams = sweep.beams[sweep.beams.returned]
-    states = states_at(tracks, sweep.t_s)
-    owner = actor_rows(transform_points(sweep.T_scene_ego, beams.points_ego), beams.dt_s, states, tracks)
-    moving = states.velocity_mps.norm(dim=-1) > _MAX_STATIC_MPS
-    return beams[~torch.cat([moving, moving.new_zeros(1)])[owner]]  # STATIC is -1, the last entry
+def _scores(
+    views: CalibrationViews, T_moved_cam: Float[Tensor, "V 4 4"], step_rad: float
+) -> Float[Tensor, "V"]:
+    """Return the mean edge strength at edges of each kind, summed over both kinds, with the cameras moved.
+
+    Args:
+        views: the images.
+        T_moved_cam: maps from the calibrated to the moved camera.
+        step_rad: the images are so coarse that their cells are at most this large.
+    """
+    points_cam = transform_points(T_moved_cam, views.points_cam)
+    uv, _, inside = project(points_cam, views.K, views.dist, views.size_hw)
+    step_px = max(step_rad * float(views.K[0, 0, 0]), 1.0)
+    level = min(int(math.log2(step_px)), len(views.strength) - 1)
+    strength = views.strength[level]
+    covered_wh = torch.tensor([strength.shape[-1], strength.shape[-2]]) * 2**level
+    sampled = F.grid_sample(strength, (2 * uv / covered_wh - 1)[:, None], align_corners=False)[:, :, 0]
+    score = torch.zeros(len(views))
+    for kind, belongs in enumerate((~views.horizontal, views.horizontal)):
+        weight = (inside & views.points_valid & belongs).float()
+        score += (sampled[:, kind] * weight).sum(-1) / weight.sum(-1).clamp_min(_MIN_EDGES)
+    return score
 
 
 def _downsampled(view: CameraView) -> CameraView:
     return view.shrunk(max(view.size_hw[1] // _WIDTH_PX, 1))
 
 
-def _appearance(view: CameraView) -> Float[np.ndarray, "H W"]:
-    """Return brightness, normalised by local mean and contrast."""
-    assert view.image is not None
-    grey = gaussian_filter(view.image.float().mean(0).numpy() / 255, _FINE_PX)
-    mean = gaussian_filter(grey, _COARSE_PX)
-    variance = gaussian_filter(grey * grey, _COARSE_PX) - mean * mean
-    return (grey - mean) / (np.sqrt(variance.clip(min=0.0)) + _MIN_CONTRAST)
+def _near_view(points_cam: Float[Tensor, "N 3"], view: CameraView) -> Bool[Tensor, "N"]:
+    """Return which points a camera may see that is turned or moved within the bounds of the searches."""
+    height, width = view.size_hw
+    half_rad = torch.atan2(torch.tensor([width, height]), 2 * view.K.diagonal()[:2]).norm()
+    off_axis_rad = torch.atan2(points_cam[:, :2].norm(dim=-1), points_cam[:, 2])
+    return off_axis_rad < half_rad + 2 * MAX_ROTATION_RAD
 
 
-def _edges(appearance: Float[np.ndarray, "H W"]) -> Float[np.ndarray, "H W"]:
-    """Return the gradient magnitude, at most 1, minus its mean."""
-    change = gaussian_gradient_magnitude(appearance, 0.5)
-    change = (change / max(float(np.quantile(change, _SATURATION)), 1e-6)).clip(max=1.0)
-    return change - change.mean()
+def _edge_strength(views: Sequence[CameraView]) -> Float[Tensor, "V 2 H W"]:
+    """Return the change of brightness along u and v in units of its local mean, less the mean of that."""
+    images = [view.image for view in views if view.image is not None]
+    grey = torch.stack([image.float().mean(0, keepdim=True) / 255 for image in images])
+    grey = F.avg_pool2d(grey, 3, stride=1, padding=1, count_include_pad=False)
+    along_v, along_u = torch.gradient(grey, dim=(-2, -1))
+    change = torch.cat([along_u, along_v], dim=1).abs()
+    cell_px = max(round(_SURROUNDINGS_RAD * float(views[0].K[0, 0])), 1)
+    strength = (change / (_local_mean(change, cell_px) + _MIN_CHANGE)).clamp(max=_MAX_STRENGTH)
+    return strength - _local_mean(strength, cell_px)
 
 
-def _edges_ego(beams: LidarSweep) -> Float[Tensor, "E 3"]:
-    """Return the points next to which a beam of the same channel hit something farther."""
-    beams = beams[beams.beam >= 0]
+def _pyramid(values: Float[Tensor, "V C H W"], levels: int = 4) -> list[Tensor]:
+    """Return the values, and their means over cells of 2, 4, … pixels."""
+    pyramid = [values]
+    for _ in range(levels - 1):
+        pyramid.append(F.avg_pool2d(pyramid[-1], 2, ceil_mode=True))
+    return pyramid
+
+
+def _local_mean(values: Float[Tensor, "V C H W"], cell_px: int) -> Float[Tensor, "V C H W"]:
+    """Return the means of cells, interpolated between their centres."""
+    means = F.avg_pool2d(values, cell_px, ceil_mode=True, count_include_pad=False)
+    whole_hw = (means.shape[-2] * cell_px, means.shape[-1] * cell_px)
+    grown = F.interpolate(means, whole_hw, mode="bilinear", align_corners=False)
+    return grown[..., : values.shape[-2], : values.shape[-1]]
+
+
+def _sweep_edges(sweep: SweepView, tracks: ActorTracks) -> SweepEdges:
+    beams = sweep.beams[sweep.beams.returned]
     azimuth = torch.atan2(beams.dir_ego[:, 1], beams.dir_ego[:, 0])
-    order = (beams.beam * 10.0 + azimuth).argsort()
-    beams, azimuth = beams[order], azimuth[order]
-    near = (beams.beam[1:] == beams.beam[:-1]) & ((azimuth[1:] - azimuth[:-1]).abs() < _NEXT_RAD)
-    farther_m = beams.range_m[1:] - beams.range_m[:-1]
-    min_jump_m = _JUMP_M + _JUMP_SHARE * torch.minimum(beams.range_m[1:], beams.range_m[:-1])
-    edge = torch.zeros(len(beams.range_m), dtype=torch.bool)
+    elevation = torch.asin(beams.dir_ego[:, 2].clamp(-1, 1))
+    column = (azimuth / _COLUMN_RAD).round().long()
+    elevation_row = (elevation / _ROW_RAD).round().long() - 10_000
+    channel = torch.where(beams.beam >= 0, beams.beam.long(), elevation_row)
+    rows = [
+        _rows_before_farther(beams.range_m, channel, azimuth, _BESIDE_RAD),
+        _rows_before_farther(beams.range_m, column, elevation, _ABOVE_RAD),
+    ]
+    horizontal = torch.cat([torch.full_like(row, kind, dtype=torch.bool) for kind, row in enumerate(rows)])
+    points = beams[torch.cat(rows)]
+    static = _static(points, sweep, tracks)
+    return SweepEdges(sweep.t_s, sweep.T_scene_ego, points.points_ego[static], horizontal[static])
+
+
+def _rows_before_farther(
+    range_m: Float[Tensor, "N"], line: Tensor, angle_rad: Float[Tensor, "N"], max_apart_rad: float
+) -> Tensor:
+    """Return the beams whose neighbour in angle on the same line hit something farther."""
+    order = (line.double() * 10 + angle_rad).argsort()
+    line, angle_rad, sorted_m = line[order], angle_rad[order], range_m[order]
+    near = (line[1:] == line[:-1]) & ((angle_rad[1:] - angle_rad[:-1]) < max_apart_rad)
+    farther_m = sorted_m[1:] - sorted_m[:-1]
+    min_jump_m = _JUMP_M + _JUMP_SHARE * torch.minimum(sorted_m[1:], sorted_m[:-1])
+    edge = torch.zeros(len(sorted_m), dtype=torch.bool)
     edge[:-1] |= near & (farther_m > min_jump_m)
     edge[1:] |= near & (-farther_m > min_jump_m)
-    return beams.points_ego[edge]
+    return order[edge]
+
+
+def _static(beams: LidarSweep, sweep: SweepView, tracks: ActorTracks) -> Bool[Tensor, "N"]:
+    """Return which beams hit static surfaces."""
+    states = states_at(tracks, sweep.t_s)
+    moving = states.present & (states.velocity_mps.norm(dim=-1) > _MAX_STATIC_MPS)
+    points_scene = transform_points(sweep.T_scene_ego, beams.points_ego)
+    return actor_rows(points_scene, beams.dt_s, dataclasses.replace(states, present=moving), tracks) == STATIC

@@ -58,10 +58,18 @@ class SweepView(Record):
     t_s: float
 
 
-def camera_views(clip: Clip, T_world_scene: Float64[Tensor, "4 4"]) -> list[list[CameraView]]:
-    """Return the images of an unbatched clip by camera, in order of time; some may have none."""
+def camera_views(
+    clip: Clip, T_world_scene: Float64[Tensor, "4 4"], twists: Float[Tensor, "T 6"] | None = None
+) -> list[list[CameraView]]:
+    """Return the images of an unbatched clip by camera, in order of time; some may have none.
+
+    Args:
+        clip: the key frames.
+        T_world_scene: maps from the scene's frame to the world.
+        twists: see `ego_twists`; by default those of the clip's own frames.
+    """
     T_scene_ego = _scene_poses(clip, T_world_scene)
-    twists = ego_twists(clip)
+    twists = ego_twists(clip.t_s, clip.T_world_ego) if twists is None else twists
     rig = clip.rig
     views: list[list[CameraView]] = [[] for _ in rig.names]
     for frame, camera in clip.image_valid.nonzero().tolist():
@@ -86,7 +94,7 @@ def camera_views(clip: Clip, T_world_scene: Float64[Tensor, "4 4"]) -> list[list
 def sweep_views(clip: Clip, T_world_scene: Float64[Tensor, "4 4"]) -> list[SweepView]:
     """Return the sweeps of an unbatched clip in order of time."""
     T_scene_ego = _scene_poses(clip, T_world_scene)
-    twists = ego_twists(clip)
+    twists = ego_twists(clip.t_s, clip.T_world_ego)
     return [
         SweepView(
             beams=clip.sweeps[frame][clip.sweeps.valid[frame]],
@@ -99,18 +107,18 @@ def sweep_views(clip: Clip, T_world_scene: Float64[Tensor, "4 4"]) -> list[Sweep
     ]
 
 
-def ego_twists(clip: Clip) -> Float[Tensor, "T 6"]:
+def ego_twists(t_s: Float[Tensor, "T"], T_world_ego: Float64[Tensor, "T 4 4"]) -> Float[Tensor, "T 6"]:
     """Return velocity (m/s) and turn rate (rad/s) over ground in the ego axes, by central differences."""
-    frames = len(clip.t_s)
+    frames = len(t_s)
     if frames == 1:
         return torch.zeros(1, 6)
     before = (torch.arange(frames) - 1).clamp_min(0)
     after = (torch.arange(frames) + 1).clamp_max(frames - 1)
-    span_s = (clip.t_s[after] - clip.t_s[before]).double()[:, None]
-    R_ego_world = clip.T_world_ego[:, :3, :3].transpose(-1, -2)
-    way = clip.T_world_ego[after, :3, 3] - clip.T_world_ego[before, :3, 3]
+    span_s = (t_s[after] - t_s[before]).double()[:, None]
+    R_ego_world = T_world_ego[:, :3, :3].transpose(-1, -2)
+    way = T_world_ego[after, :3, 3] - T_world_ego[before, :3, 3]
     velocity = (R_ego_world @ way[..., None])[..., 0]
-    turn = log_so3(clip.T_world_ego[before, :3, :3].transpose(-1, -2) @ clip.T_world_ego[after, :3, :3])
+    turn = log_so3(T_world_ego[before, :3, :3].transpose(-1, -2) @ T_world_ego[after, :3, :3])
     return (torch.cat([velocity, turn], dim=-1) / span_s).float()
 
 

@@ -2,17 +2,21 @@
 
 import dataclasses
 
+import numpy as np
+import torch
+
 from foredrive.data import LogPath
 from foredrive.data.drives import read_drive
+from foredrive.data.lidar import frames_with_lidar
 from foredrive.data.log_check import Finding, LogCheck, check_log
+from foredrive.data.logs import Log
 from foredrive.errors import InputError
+from foredrive.rendering.calibration import spread_along_path
 from foredrive.rendering.tracks import read_tracks
-from foredrive.rendering.views import camera_views, sweep_views
+from foredrive.rendering.views import camera_views, ego_twists, sweep_views
 from foredrive.runs.rebuild.calibration_check import calibration_findings
 
 CALIBRATION_HW = (270, 480)
-MAX_FRAMES = 150
-"""Frames whose images and sweeps are compared, from the middle of the log."""
 
 
 def check_with_calibration(path: LogPath) -> LogCheck:
@@ -21,17 +25,26 @@ def check_with_calibration(path: LogPath) -> LogCheck:
     Raises:
         InputError: the log cannot be opened, or has no ego poses.
     """
-    found = check_log(path)
-    return dataclasses.replace(found, findings=[*found.findings, *_calibration(path)])
+    check = check_log(path)
+    return dataclasses.replace(check, findings=[*check.findings, *_calibration(path)])
 
 
 def _calibration(path: LogPath) -> list[Finding]:
+    log = Log(path)
+    swept = frames_with_lidar(log)
+    if not len(swept):
+        return []
+    frames = swept[spread_along_path(torch.from_numpy(log.T_world_ego[swept, :3, 3]))].tolist()
     try:
-        drive = read_drive(path, CALIBRATION_HW, max_frames=MAX_FRAMES)
+        drive = read_drive(path, CALIBRATION_HW, frames=frames, derived=False)
     except InputError as error:
         return [Finding("problem", "calibration", f"not checked: {error}")]
+    t_s = torch.from_numpy((log.t_us - log.t_us[0]).astype(np.float32) * 1e-6)
+    twists = ego_twists(t_s, torch.from_numpy(log.T_world_ego))[frames]
     T_world_scene = drive.T_world_ego[0]
-    views = [view for camera in camera_views(drive, T_world_scene) for view in camera]
+    views = [view for camera in camera_views(drive, T_world_scene, twists) for view in camera]
     tracks, sweeps = read_tracks(drive, T_world_scene), sweep_views(drive, T_world_scene)
-    told = calibration_findings(drive.rig.names, views, sweeps, tracks)
-    return [Finding("problem", "calibration", text) for text in told]
+    return [
+        Finding("problem" if finding.large else "note", "calibration", finding.text)
+        for finding in calibration_findings(drive.rig.names, views, sweeps, tracks)
+    ]

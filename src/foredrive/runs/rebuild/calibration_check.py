@@ -2,33 +2,51 @@
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 from foredrive.rendering.calibration import (
-    CalibrationView,
+    CalibrationViews,
     OffsetFit,
+    SweepEdges,
     agreement,
+    best_camera_delay,
     best_camera_rotation,
     best_lidar_translation,
     calibration_views,
+    mean_shift_rad,
+    sweep_edges,
     with_images_from,
 )
 from foredrive.rendering.tracks import ActorTracks
 from foredrive.rendering.views import CameraView, SweepView
 
-MIN_ROTATION_RAD, MIN_TRANSLATION_M = math.radians(0.7), 0.15
-"""Minimum rotation (rad) and translation (m) that are reported."""
-_MIN_GAIN, _MIN_IMPROVED_SHARE = 0.03, 0.8
+MIN_ROTATION_RAD, MIN_TRANSLATION_M, MIN_DELAY_S = math.radians(0.4), 0.15, 0.03
+"""Minimum rotation (as it moves edges in the image), translation and delay that are reported."""
+LARGE_ROTATION_RAD = math.radians(0.7)
+"""Rotation from which a reconstruction is visibly worse."""
+_MIN_GAIN, _MIN_IMPROVED_SHARE = 0.05, 0.8
 """An offset is accepted if it raises the agreement by at least this much, in at least this share of views."""
-_MAX_OWN_AGREEMENT, _MIN_DIFFERENCE = 0.5, 0.3
+_SIMPLER = 0.85
+"""Share of the gain of rotations for which one clock or one lidar is the better explanation."""
+_MAX_OWN_AGREEMENT, _MIN_DIFFERENCE = 0.15, 0.2
 """Images are assigned to another camera if their agreement with their own camera is below the first number
 and that with the other camera is higher by more than the second.
 """
 
 
+@dataclass(frozen=True)
+class CalibrationFinding:
+    """A sensor whose pose or clock does not agree with its calibration."""
+
+    text: str
+    large: bool
+    """False for an offset that is seen but hardly matters."""
+
+
 def calibration_findings(
     names: Sequence[str], cameras: Sequence[CameraView], sweeps: Sequence[SweepView], tracks: ActorTracks
-) -> list[str]:
-    """Return a sentence for each sensor whose pose does not agree with its calibration; none if all agree.
+) -> list[CalibrationFinding]:
+    """Return a finding for each sensor whose pose does not agree with its calibration; none if all agree.
 
     Without enough evidence (no lidar, tiny images) it returns nothing.
 
@@ -38,33 +56,47 @@ def calibration_findings(
         sweeps: lidar sweeps of the same drive.
         tracks: tracks of the moving actors.
     """
+    edges = sweep_edges(sweeps, tracks)
     by_camera = {name: [v for v in cameras if v.sensor == number] for number, name in enumerate(names)}
-    pairs = {name: calibration_views(views, sweeps, tracks) for name, views in by_camera.items()}
-    exchanged = {
-        name: other for name in names if (other := _exchanged_camera(name, by_camera, pairs, sweeps, tracks))
+    paired = {
+        name: pairs
+        for name, views in by_camera.items()
+        if (pairs := calibration_views(views, edges)) is not None
     }
-    findings = [f"the images of camera {name} fit the pose of {other}" for name, other in exchanged.items()]
-    rest = {name: views for name, views in pairs.items() if name not in exchanged}
-    rotations = {name: fit for name, views in rest.items() if (fit := best_camera_rotation(views))}
-    translation = best_lidar_translation([view for views in rest.values() for view in views])
+    exchanged = {
+        name: other
+        for name, views in paired.items()
+        if (other := _exchanged_camera(name, views, by_camera, edges)) is not None
+    }
+    findings = [
+        CalibrationFinding(f"the images of camera {name} fit the pose of {other}", large=True)
+        for name, other in exchanged.items()
+    ]
+    rest = {name: views for name, views in paired.items() if name not in exchanged}
+    rotations = {name: best_camera_rotation(views) for name, views in rest.items()}
+    translation = best_lidar_translation(list(rest.values()))
     if (
         translation is not None
-        and _is_significant(translation, MIN_TRANSLATION_M)
-        and _mean_gain(translation) > _mean_gain(*rotations.values())
+        and _is_significant(translation, float(translation.offset.norm()), MIN_TRANSLATION_M)
+        and translation.gain > _SIMPLER * sum(fit.gain for fit in rotations.values()) / len(rotations)
     ):
-        forward_m, left_m, up_m = translation.offset.tolist()
-        return [
-            *findings,
-            "the lidar fits the images better if it is moved "
-            f"{_directed(forward_m, ' m', 'forward', 'back')}, "
-            f"{_directed(left_m, ' m', 'to the left', 'to the right')} and "
-            f"{_directed(up_m, ' m', 'up', 'down')} {_scores(translation)}",
-        ]
-    return findings + [
-        f"camera {name} {_rotation(fit)}"
-        for name, fit in rotations.items()
-        if _is_significant(fit, MIN_ROTATION_RAD)
-    ]
+        return [*findings, CalibrationFinding(_translation(translation), large=True)]
+    for name, views in rest.items():
+        findings += _camera_findings(name, views, rotations[name])
+    return findings
+
+
+def _camera_findings(name: str, views: CalibrationViews, rotation: OffsetFit) -> list[CalibrationFinding]:
+    """Return what explains a camera's images better than its calibration: a rotation or another clock."""
+    shift_rad = mean_shift_rad(views, rotation.offset)
+    turned = _is_significant(rotation, shift_rad, MIN_ROTATION_RAD)
+    delay = best_camera_delay(views)
+    delayed = _is_significant(delay, abs(float(delay.offset)), MIN_DELAY_S)
+    if delayed and delay.gain > _SIMPLER * rotation.gain:
+        return [CalibrationFinding(f"camera {name} {_delay(delay)}", large=True)]
+    if turned:
+        return [CalibrationFinding(f"camera {name} {_rotation(rotation)}", shift_rad >= LARGE_ROTATION_RAD)]
+    return []
 
 
 def _rotation(fit: OffsetFit) -> str:
@@ -73,6 +105,21 @@ def _rotation(fit: OffsetFit) -> str:
         f"fits the lidar better if it is turned {_directed(up, '°', 'up', 'down')}, "
         f"{_directed(right, '°', 'to the right', 'to the left')} and "
         f"{_directed(clockwise, '°', 'clockwise', 'counter-clockwise')} {_scores(fit)}"
+    )
+
+
+def _delay(fit: OffsetFit) -> str:
+    delay_s = _directed(float(fit.offset), " s", "later", "earlier")
+    return f"fits the lidar better if its images are from {delay_s} {_scores(fit)}"
+
+
+def _translation(fit: OffsetFit) -> str:
+    forward_m, left_m, up_m = fit.offset.tolist()
+    return (
+        "the lidar fits the images better if it is moved "
+        f"{_directed(forward_m, ' m', 'forward', 'back')}, "
+        f"{_directed(left_m, ' m', 'to the left', 'to the right')} and "
+        f"{_directed(up_m, ' m', 'up', 'down')} {_scores(fit)}"
     )
 
 
@@ -85,31 +132,28 @@ def _scores(fit: OffsetFit) -> str:
     return f"(agreement {fit.score_after:.2f} instead of {fit.score_before:.2f})"
 
 
-def _is_significant(fit: OffsetFit, min_offset: float) -> bool:
-    large = float(fit.offset.norm()) >= min_offset
-    return large and _mean_gain(fit) >= _MIN_GAIN and fit.improved_share >= _MIN_IMPROVED_SHARE
-
-
-def _mean_gain(*fits: OffsetFit) -> float:
-    """Return the mean increase of agreement."""
-    return sum(fit.score_after - fit.score_before for fit in fits) / max(len(fits), 1)
+def _is_significant(fit: OffsetFit, size: float, min_size: float) -> bool:
+    """Return whether an offset is an optimum, large enough, and better in nearly all views."""
+    better = fit.gain >= _MIN_GAIN and fit.improved_share >= _MIN_IMPROVED_SHARE
+    return better and size >= min_size and not fit.bounded
 
 
 def _exchanged_camera(
     name: str,
+    views: CalibrationViews,
     by_camera: Mapping[str, Sequence[CameraView]],
-    pairs: Mapping[str, Sequence[CalibrationView]],
-    sweeps: Sequence[SweepView],
-    tracks: ActorTracks,
+    edges: Sequence[SweepEdges],
 ) -> str | None:
     """Return the camera whose pose fits a camera's images clearly better; None if there is none."""
-    own = agreement(pairs[name])
-    if own is None or own >= _MAX_OWN_AGREEMENT:
+    own = agreement(views)
+    if own >= _MAX_OWN_AGREEMENT:
         return None
-    scores = {
-        other: agreement(calibration_views(with_images_from(views, by_camera[name]), sweeps, tracks)) or 0.0
-        for other, views in by_camera.items()
-        if other != name and views
-    }
+    scores = {}
+    for other, other_views in by_camera.items():
+        if other != name and other_views:
+            swapped = calibration_views(with_images_from(other_views, by_camera[name]), edges)
+            scores[other] = 0.0 if swapped is None else agreement(swapped)
     best = max(scores, key=lambda other: scores[other], default=None)
-    return best if best is not None and scores[best] > own + _MIN_DIFFERENCE else None
+    if best is None or scores[best] <= own + _MIN_DIFFERENCE:
+        return None
+    return best if scores[best] > best_camera_rotation(views).score_after else None

@@ -124,7 +124,8 @@ def _rebuild(
         train, names = data.train, data.vehicle.rig.names
         tracks = joined_tracks(data.tracks, data.obstacles)
         for finding in calibration_findings(names, train.cameras, train.sweeps, tracks):
-            _log.warning("%s: the calibration may be wrong: %s", path.folder, finding)
+            if finding.large:
+                _log.warning("%s: the calibration may be wrong: %s", path.folder, finding.text)
         rebuild(representation.training(scene, data.train), folder)
         representation.complete(scene, data.vehicle.T_scene_ego, data.train)
         with atomic_path(weights) as temporary:
