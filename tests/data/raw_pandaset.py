@@ -64,3 +64,30 @@ def write_pickle(file: Path, value: Any) -> None:
     file.parent.mkdir(parents=True, exist_ok=True)
     with gzip.open(file, "wb") as out:
         pickle.dump(value, out, protocol=4)
+
+
+def write_drive(folder: Path, frames: int, first: int = 0) -> None:
+    """Write frames at 10 Hz of a vehicle that drives 1 m in each; the files are numbered from `first`."""
+    write(folder)
+    meta, cameras = folder / "meta", [folder / "camera" / f"{name}_camera" for name in CAMERAS]
+    for file in (CUBOIDS, SEMSEG, LIDAR, *(f"camera/{camera.name}/00.jpg" for camera in cameras)):
+        whole = (folder / file).read_bytes()
+        (folder / file).unlink()
+        for frame in range(frames):
+            (folder / file.replace("00.", f"{first + frame:02d}.")).write_bytes(whole)
+    for frame in range(frames):
+        sweep = {
+            "x": [1.0, 2.0, 3.0],
+            "y": [5.0 + frame] * 3,
+            "z": [0.0] * 3,
+            "i": [7.0] * 3,
+            "t": [100.0 + 0.1 * frame] * 3,
+            "d": [0, 0, 1],
+        }
+        write_pickle(folder / f"lidar/{first + frame:02d}.pkl.gz", table(sweep))
+    (meta / "timestamps.json").write_text(json.dumps([100.1 + 0.1 * frame for frame in range(frames)]))
+    for camera in cameras:
+        (pose,) = json.loads((camera / "poses.json").read_text())
+        poses = [pose | {"position": pose["position"] | {"y": float(frame)}} for frame in range(frames)]
+        (camera / "poses.json").write_text(json.dumps(poses))
+        (camera / "timestamps.json").write_text(json.dumps([100.0 + 0.1 * frame for frame in range(frames)]))
