@@ -15,7 +15,6 @@ pytestmark = [pytest.mark.oracle, pytest.mark.filterwarnings("ignore")]
 
 @pytest.mark.parametrize("seed", [20, 21, 22])
 def test_forecasts(seed: int) -> None:
-    pytest.importorskip("av2.evaluation.forecasting.eval", exc_type=ImportError)
     agents, scene = single_agents(seed), forecasting_scene(seed)
     check_single_agents(*agents, single_agents_of_av2(*agents))
     check_forecasting(*scene, forecasting_of_av2(*scene))

@@ -24,7 +24,6 @@ def nusc(tmp_path_factory: pytest.TempPathFactory) -> Any:
 
 
 def exported(log: Log, out: Path) -> Any:
-    pytest.importorskip("nuscenes.nuscenes", exc_type=ImportError)
     from nuscenes import NuScenes
 
     assert main(["export", "nuscenes", str(log.path.folder), "--out", str(out)]) == 0
