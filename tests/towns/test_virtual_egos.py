@@ -6,13 +6,14 @@ import numpy as np
 import pytest
 from file_digests import digests
 
+from foredrive.data import ClipConfig, ClipDataset
 from foredrive.data.affordances import read_affordances
 from foredrive.data.boxes import read_boxes
 from foredrive.data.cameras import pinhole_cameras, read_camera
 from foredrive.data.commands import route_at
 from foredrive.data.log_paths import LogPath
 from foredrive.data.logs import Log
-from foredrive.scene import Category
+from foredrive.scene import Category, VoxelSpec
 from foredrive.sensors.rigs import camera_rig
 from foredrive.towns import virtual_egos
 from foredrive.towns.sensing.capture import SensorSuite
@@ -94,6 +95,18 @@ def test_cyclists_wait_and_then_cross(logs: list[LogPath]) -> None:
     assert len(moving) < len(speeds)
     assert min(moving) > 3.4
     assert max(moving) < 6.1
+
+
+def test_clips_are_those_that_see_something(logs: list[LogPath]) -> None:
+    """With two frames of history, and a grid that is not needed here, each log gives four clips."""
+    spec = VoxelSpec(lower_m=(-8.0, -8.0, -1.0), voxel_m=2.0, shape_zyx=(2, 8, 8))
+    config = ClipConfig(past_frames=2, future_frames=0, image_hw=(24, 40), voxels=spec)
+    clips = ClipDataset(logs, config, None)
+    assert len(clips) == COUNT * (IMAGES - 2)
+    clip = clips.clip(3)
+    assert bool(clip.image_valid.all())
+    assert clip.t_s.tolist() == pytest.approx([-1.0, -0.5, 0.0])
+    assert bool(clip.future.valid.all())
 
 
 def test_equal_seeds_give_equal_bytes(

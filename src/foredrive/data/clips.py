@@ -19,7 +19,7 @@ from foredrive.data.commands import command_at, count_command_sources, target_at
 from foredrive.data.frame_store import FrameStore
 from foredrive.data.label_store import LabelStore
 from foredrive.data.labels import VoxelLabels
-from foredrive.data.lidar import read_sweep
+from foredrive.data.lidar import frames_with_lidar, read_sweep
 from foredrive.data.log_paths import LogPath
 from foredrive.data.logs import Log
 from foredrive.data.maps import read_map_patch
@@ -107,7 +107,9 @@ class ClipDataset(Dataset[Example]):
         if config.occupancy_source == "recorded":
             for log in self._logs:
                 check_recorded_occupancy(log)
-        frames = [_clip_frames(log, config) for log in self._logs]
+        frames = [
+            self._sensed_now(number, _clip_frames(log, config)) for number, log in enumerate(self._logs)
+        ]
         self._clip_frames = np.concatenate(frames)
         self._clip_logs = np.repeat(np.arange(len(self._logs)), [len(of_log) for of_log in frames])
         if not len(self):
@@ -131,6 +133,19 @@ class ClipDataset(Dataset[Example]):
                 count_command_sources(log, of_log, self.config.horizon_steps, self.config.horizon_dt_s)
             )
         return dict(counts)
+
+    def _sensed_now(self, number: int, clips: Int64[np.ndarray, "N T"]) -> Int64[np.ndarray, "_ T"]:
+        """Return the clips whose now has an image or a sweep, if the log has images of the chosen cameras.
+
+        A log may go on without images, for the true future of the last ones.
+        """
+        log, cameras = self._logs[number], self._cameras[number]
+        chosen = [camera for name in self.camera_names if (camera := find_camera(cameras, name)) is not None]
+        sensed = [log.rows(camera.modality_key)[0] for camera in chosen]
+        if not any(len(frames) for frames in sensed):
+            return clips
+        sensed += [frames_with_lidar(log)] if self.config.lidar else []
+        return clips[np.isin(clips[:, self.config.past_frames], np.concatenate(sensed))]
 
     def _clip(self, index: int) -> tuple[int, list[int]]:
         """Return the number of the log of a clip, and the clip's frames."""
