@@ -31,7 +31,7 @@ def field(density: float) -> NeuralField:
     sizes = FieldConfig(
         grids, (grids,), proposal_samples=(128,), samples=128, width=4, surface="density", appearance=2
     )
-    made = NeuralField(sizes, 2, torch.zeros(3))
+    made = NeuralField(sizes, 2, torch.zeros(3), scale_m=50.0)
     geometry = made.layers.geometry.linear[-1]
     assert isinstance(geometry, torch.nn.Linear)
     with torch.no_grad():

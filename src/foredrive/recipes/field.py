@@ -143,7 +143,5 @@ def base_field() -> FieldRecipe:
     """Return NeuRAD in the sizes and with the choices of its reference implementation."""
     return FieldRecipe(
         schedule=FieldSchedule(steps=20_001, free_m=150.0),
-        scene=FieldSceneConfig(
-            network=FieldConfig(resampling="padded", scale_m=None, biases=False), whole_ranges=False
-        ),
+        scene=FieldSceneConfig(network=FieldConfig(resampling="padded", biases=False), whole_ranges=False),
     )

@@ -63,7 +63,7 @@ class FieldConfig:
     """The first samples are uniform in t / (t + spacing): the power spacing of Zip-NeRF with λ = -1."""
     sky_m: float = 20_000.0
     """End of every ray. What the ray has left there is given to its last sample."""
-    scale_m: float | None = 50.0
+    scale_m: float | None = None
     """Half side of the cube about the path's middle that is not contracted. None: it holds all places up to
     80 m ahead of and behind the path and 60 m beside it, as in the reference implementation."""
     actor_scale_m: float = 10.0
