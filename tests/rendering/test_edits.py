@@ -117,7 +117,7 @@ def test_what_stands_is_in_the_way_and_no_part_to_be_edited() -> None:
     own, stands = tracks.only(torch.tensor([True, False])), tracks.only(torch.tensor([False, True]))
     graph = dataclasses.replace(graph_of([[5.0, 5, 5], [1.0, 0, 0]], [STATIC, 0], own), obstacles=stands)
     for edit in (Remove(11), Move(11), Duplicate(11, copy=12), Insert("other", 7, 12, follows=11)):
-        with pytest.raises(InputError, match=r"11 is no actor of its own.*--set moves_m=0"):
+        with pytest.raises(InputError, match=r"11 is no actor of its own.*--set actors=true moves_m=0"):
             apply_edits(graph, [edit], lambda run: graph)
     with pytest.raises(InputError, match="there is an actor 11 already"):
         apply_edits(graph, [Duplicate(7, copy=11)])

@@ -75,6 +75,7 @@ class SceneGraph(Record):
         if self.obstacles is not None and track_id in self.obstacles.track_id.tolist():
             raise InputError(
                 f"{track_id} is no actor of its own: it stands in the log, or is not rigid, and so belongs "
-                "to the static part, which edits do not change; rebuild with --set moves_m=0 nonrigid=true"
+                "to the static part, which edits do not change; "
+                "rebuild with --set actors=true moves_m=0 nonrigid=true"
             )
         return self.tracks.index_of(track_id)
