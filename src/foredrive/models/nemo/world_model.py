@@ -48,7 +48,8 @@ class NemoConfig:
     """Initial occupancy probability of f_occ. It is small because most space is free and an opaque volume
     would hide what is behind."""
     unseen: Literal["zero", "learned"] = "zero"
-    """Feature of voxels that come into view in imagined frames. The paper does not say."""
+    """Feature of voxels that come into view in imagined frames: 0, or learned from 0 on. The paper does not
+    say which."""
     step_features: bool = False
     """Add a learned feature to all voxels of an imagined volume, one for each step. Warped features are
     smoother than observed ones; so the decoder knows. Not in the paper."""
@@ -68,6 +69,8 @@ class Nemo(nn.Module):
     """
 
     samples_futures = False
+    may_lack = ("unseen",)
+    """Parameters that weights to start from may lack: at their first value, 0, they change nothing."""
 
     def __init__(
         self,
