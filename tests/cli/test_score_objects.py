@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 
 from foredrive.cli.main import main
+from foredrive.evaluation.objects.kitti_boxes import score_kitti_boxes
 
 Box = dict[str, Any]
 Content = dict[str, list[Box]]
@@ -183,7 +184,7 @@ WRONG: list[tuple[str, str, Edit]] = [
         lambda content: content["a0"].extend(content["a0"][:1] * 499),
     ),
     ("detection", f"{FIRST} has the unknown attribute_name 'parked'", put(attribute_name="parked")),
-    ("detection", f"{FIRST} has the detection_score -0.1, which is not", put(detection_score=-0.1)),
+    ("detection", f"{FIRST}: its detection_score is not finite", put(detection_score=math.inf)),
 ]
 
 
@@ -259,7 +260,26 @@ def test_folders_of_kitti(tmp_path: Path, capsys: pytest.CaptureFixture[str]) ->
     assert figures["tracking.kitti.car.hota"] == pytest.approx(1.0)
     assert "detection.kitti.ave_mps" not in figures
     wrong = tmp_path / "detection" / "found" / "000000.txt"
-    wrong.write_text("Car 0 0 0 0 100 50 150 1.5 1.6 4 0 1.6 20 0 7\n")
+    wrong.write_text("Bus 0 0 0 0 100 50 150 1.5 1.6 4 0 1.6 20 0 7\n")
     folders = [str(wrong.parent), "--truth", str(tmp_path / "detection" / "truth")]
+    capsys.readouterr()
     assert main(["score", *folders, "--task", "detection", "--out", str(tmp_path / "out")]) == 2
-    assert capsys.readouterr().err == f"foredrive: {wrong}: line 1 has a score outside [0, 1]\n"
+    said = f"{wrong.parent}: left out of 1: 1 boxes of other classes: nothing remains to be scored"
+    assert capsys.readouterr().err == f"foredrive: {said}\n"
+
+
+@pytest.mark.parametrize("scores", [(0.9, 0.1), (7.0, -2.5)])
+def test_scores_of_detections_only_rank(scores: tuple[float, float], tmp_path: Path) -> None:
+    """A car that is found, and one that is not there, of a lower score."""
+    found, truth = tmp_path / "found", tmp_path / "truth"
+    line = "Car 0 0 0 0 100 50 150 1.5 1.6 4 0 1.6 {depth} 0"
+    for folder, lines in (
+        (truth, [line.format(depth=20), line.format(depth=40).replace("Car", "Van")]),
+        (found, [f"{line.format(depth=depth)} {s}" for depth, s in zip((20, 30), scores, strict=True)]
+         + [f"{line.format(depth=10)} 9".replace("Car", "Bus")]),
+    ):  # fmt: skip
+        folder.mkdir()
+        (folder / "000000.txt").write_text("\n".join(lines))
+    figures = score_kitti_boxes(found, truth)
+    assert figures["detection.kitti.car.ap"] > 0.99
+    assert (figures["found"], figures["boxes_of_other_classes_left_out"]) == (2, 1)

@@ -51,6 +51,20 @@ def test_sequences_are_not_joined(tmp_path: Path) -> None:
     assert (figures["scenes"], figures["scenes_without_results"]) == (2, 1)
 
 
+def test_results_in_the_folder_of_other_tools(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    truth = write(tmp_path / "truth", *(line(f, 1, 100) for f in range(4)))
+    boxes = (line(f, 1, 100, score="0.9") for f in range(4))
+    (tmp_path / "found").mkdir()
+    data = write(tmp_path / "found" / "data", *boxes, line(0, 9, 300, "Bus", score="0.9"))
+    figures = score_kitti_tracks(tmp_path / "found", truth)
+    assert figures["tracking.kitti.car.hota"] == pytest.approx(1.0)
+    assert (figures["scenes_without_results"], figures["boxes_of_other_classes_left_out"]) == (0, 1)
+    assert caplog.messages == [f"{data}: left out of 5: 1 boxes of other classes"]
+    (data / "0000.txt").rename(data / "0007.txt")
+    with pytest.raises(InputError, match=r"holds no results of the sequences in .*, such as 0000\.txt"):
+        score_kitti_tracks(tmp_path / "found", truth)
+
+
 def test_boxes_that_do_not_count(tmp_path: Path) -> None:
     """A van, a hidden and a cut car need not be found, and their boxes are not false.
 
@@ -89,6 +103,7 @@ def test_wrong_lines_are_named(wrong: str, told: str, tmp_path: Path) -> None:
 
 def test_an_unknown_sequence_is_named(tmp_path: Path) -> None:
     truth = write(tmp_path / "truth", line(0, 1, 100))
-    found = write(tmp_path / "found", line(0, 7, 100, score="1"), name="0009.txt")
+    for name in ("0000.txt", "0009.txt"):
+        found = write(tmp_path / "found", line(0, 7, 100, score="1"), name=name)
     with pytest.raises(InputError, match=r"0009\.txt: there is no such sequence in"):
         score_kitti_tracks(found, truth)

@@ -1,6 +1,7 @@
 """Files of vector maps: both formats give the same figures, and wrong entries are named."""
 
 import json
+import math
 import pickle
 from pathlib import Path
 from typing import Any
@@ -143,8 +144,14 @@ WRONG: dict[str, tuple[Any, str]] = {
         maptr({"a": [("divider", LINE, 0.9), ("divider", [[0.0, float("nan")], [1.0, 1.0]], 0.9)]}),
         "frame a, vector 1 has a point that is not finite, or beyond 10000 m",
     ),
-    "score": (maptr({"a": [("divider", LINE, 1.2)]}), "frame a, vector 0: the score 1.2 is not in [0, 1]"),
-    "no score": (maptr({"a": [("divider", LINE, 1.0)]}, truth=True)["GTs"], "the score None is not in"),
+    "score": (
+        maptr({"a": [("divider", LINE, math.inf)]}),
+        "frame a, vector 0: the score inf is not a finite number",
+    ),
+    "no score": (
+        maptr({"a": [("divider", LINE, 1.0)]}, truth=True)["GTs"],
+        "the score None is not a finite number",
+    ),
     "split": (maptr({"x": [], "y": []}), "none of its 2 frames is in "),
     "twice": (
         {"results": [{"sample_token": "a", "vectors": []}, {"sample_token": "a", "vectors": []}]},

@@ -17,7 +17,7 @@ PICKLES = (".pkl", ".pickle")
 
 
 def read_plain(path: Path, *, arrays: bool = False) -> Any:
-    """Return the content of a JSON file, or of a pickle of plain data.
+    """Return the content of a JSON file, or of a pickle of plain data. An entry that is null is as absent.
 
     Args:
         path: a pickle if it ends in .pkl or .pickle.
@@ -30,17 +30,21 @@ def read_plain(path: Path, *, arrays: bool = False) -> Any:
         content = load_pickle(path)
         return content if arrays else _as_json(content)
     try:
-        return json.loads(path.read_text())
+        return json.loads(path.read_text("utf-8-sig"), object_pairs_hook=_without_null)
     except OSError as error:
         raise InputError(f"{path}: {error.strerror or error}") from error
     except (ValueError, RecursionError) as error:
         raise InputError(f"{path}: not JSON that can be read") from error
 
 
+def _without_null(entries: list[tuple[str, Any]]) -> dict[str, Any]:
+    return {key: entry for key, entry in entries if entry is not None}
+
+
 def _as_json(value: Any) -> Any:
     """Return containers, arrays and numbers as JSON would have them."""
     if isinstance(value, dict):
-        return {str(key): _as_json(entry) for key, entry in value.items()}
+        return _without_null([(str(key), _as_json(entry)) for key, entry in value.items()])
     if isinstance(value, list | tuple):
         return [_as_json(entry) for entry in value]
     if isinstance(value, np.ndarray):

@@ -141,7 +141,7 @@ def test_wrong_boxes_are_named(tmp_path: Path, change: dict, message: str) -> No
             {"ego_translation": [1.0, math.nan, 0.0]},
             r"gt\.json: frame a, box 0: its ego_translation is not finite",
         ),
-        ({"num_pts": None}, r"gt\.json: frame a, box 0: its num_pts is not finite"),
+        ({"num_pts": math.nan}, r"gt\.json: frame a, box 0: its num_pts is not finite"),
         ({"relevance": -1.0}, r"gt\.json: frame a, box 0 has a relevance below 0"),
     ],
 )
@@ -180,11 +180,65 @@ def test_wrong_lines_are_named(tmp_path: Path) -> None:
         (f"{good} x", "line 2 has something that is not a number"),
         (f"{good} nan", "line 2 has a number that is not finite"),
         (f"{good} 3.5", "line 2 has a score outside"),
-        (good.replace("1.5 2 4", "0 2 4") + " 0.9", "line 2 has a box without size"),
     ):
         (tmp_path / "found" / "0.txt").write_text(f"{good} 0.5\n{line}\n")
         with pytest.raises(InputError, match=rf"0\.txt: {message}"):
             read_detections(tmp_path / "found", tmp_path / "gt")
+
+
+COCO_BOXES = [
+    {"image_id": 1, "category_id": 3, "bbox": [10, 10, 20, 10], "score": 0.9},
+    {"image_id": 1, "category_id": 3, "bbox": [30, 10, 20, 0.0], "score": 0.5},
+    {"image_id": 2, "category_id": 91, "bbox": [10, 10, 20, 10], "score": 0.8},
+    {"image_id": 2, "category_id": 7, "bbox": [50, 10, 20, 10], "score": 0.7, "covariance": None},
+]
+
+
+def test_other_categories_and_boxes_without_size_are_left_out(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    car = {"image_id": 1, "category_id": 3, "bbox": [10, 10, 20, 10], "relevance": None}
+    truth = write_coco_truth(tmp_path / "gt.json", [car, {**car, "bbox": [0, 0, 0, 5]}])
+    read = read_detections(write_list(tmp_path / "found.json", COCO_BOXES), truth)
+    assert [len(frame.detected.log_existence) for frame in read.frames] == [1, 1]
+    assert [len(frame.objects.label) for frame in read.frames] == [1, 0]
+    assert read.frames[0].relevance is None
+    assert read.counts["boxes_of_other_classes_left_out"] == 1
+    assert read.counts["boxes_without_size_left_out"] == 1
+    assert read.counts["true_boxes_without_size_left_out"] == 1
+    assert caplog.messages == [
+        f"{tmp_path / 'found.json'}: left out of 4: 1 boxes of other categories, 1 boxes without size",
+        f"{tmp_path / 'gt.json'}: left out of 2: 1 boxes without size",
+    ]
+
+
+def test_coco_results_with_a_mark_or_under_annotations(tmp_path: Path) -> None:
+    truth = write_coco_truth(tmp_path / "gt.json", [])
+    file = tmp_path / "found.json"
+    for text in (
+        "\ufeff" + json.dumps(COCO_BOXES[:1]).replace(", ", ",\r\n"),
+        json.dumps({"annotations": COCO_BOXES[:1]}),
+    ):
+        file.write_text(text, "utf-8")
+        assert [len(frame.detected.log_existence) for frame in read_detections(file, truth).frames] == [1, 0]
+
+
+def test_kitti_folders_as_other_tools_write_them(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """In data/, with a byte order mark, CRLF, and a line without a 3-D box."""
+    good = "Car 0 0 0 1 2 3 4 1.5 2 4 3 1.7 20 0.1"
+    (tmp_path / "gt").mkdir()
+    (tmp_path / "gt" / "0.txt").write_text(good)
+    data = tmp_path / "found" / "data"
+    data.mkdir(parents=True)
+    flat = good.replace("1.5 2 4", "-1 -1 -1")
+    (data / "0.txt").write_bytes(f"\ufeff{good} 0.5\r\n{flat} 0.9\r\n".encode())
+    read = read_detections(tmp_path / "found", tmp_path / "gt")
+    assert len(read.frames[0].detected.log_existence) == 1
+    assert read.counts["frames_without_detections"] == 0
+    assert caplog.messages == [f"{data}: left out of 2: 1 boxes without size"]
+    (data / "0.txt").rename(tmp_path / "found" / "7.txt")
+    with pytest.raises(InputError, match=r"found: holds no results of the frames in .*gt, such as 0\.txt"):
+        read_detections(tmp_path / "found", tmp_path / "gt")
 
 
 def test_wrong_files_are_named(tmp_path: Path) -> None:
@@ -213,10 +267,14 @@ def test_wrong_files_are_named(tmp_path: Path) -> None:
     coco = write_coco_truth(tmp_path / "coco.json", [])
     for record, message in (
         ({"image_id": 9, "category_id": 3}, "record 0 is of the unknown image 9"),
-        ({"image_id": 1, "category_id": 8}, "record 0 has the unknown category 8"),
+        ({"image_id": 1, "category_id": 8}, "left out of 1: 1 boxes of other categories: nothing remains"),
         (
             {"image_id": 1, "category_id": 3, "bbox": [1, 2, 0, 4], "score": 1},
-            "record 0 has a bbox of the size",
+            "left out of 1: 1 boxes without size: nothing remains",
+        ),
+        (
+            {"image_id": 1, "category_id": 3, "bbox": [1, 2, -1, 4], "score": 1},
+            "record 0 has a bbox of the size -1 x 4",
         ),
         ({"image_id": 1, "category_id": 3, "bbox": [1, 2, 3, 4]}, "record 0 has no score"),
         ({"image_id": [1], "category_id": 3}, "record 0 is of the unknown image None"),

@@ -1,6 +1,9 @@
 """2-D detections in COCO's results format, and truth in COCO's instances format.
 
 Results are a list of records with `image_id`, `category_id`, `bbox` (x, y, width, height in px) and `score`.
+Results may also be an object with this list under `annotations`. Records of other categories than the truth's
+are left out, as pycocotools does, and so are boxes without width or height.
+
 Beyond the format, a record may have `covariance` (of x1, y1, x2, y2 in px) and `class_probabilities` (by
 category name).
 """
@@ -29,6 +32,7 @@ from foredrive.evaluation.detections.frames import (
     read_number_rows,
     read_numbers,
     read_relevance,
+    tell_left_out,
 )
 from foredrive.sets import Family
 
@@ -56,8 +60,12 @@ def read_coco(
             crowds += 1
         else:
             true[_key(record, "image_id")].append((n, record))
+    others = 0
     for n, record in enumerate(results):
-        found[_key(record, "image_id")].append((n, record))
+        category = _key(record, "category_id")
+        others += category is not None and category not in label_of
+        if category is None or category in label_of:
+            found[_key(record, "image_id")].append((n, record))
     known = {image["id"] for image in images}
     for records, where in ((found, path), (true, truth_path)):
         for image_id, members in records.items():
@@ -68,10 +76,19 @@ def read_coco(
                     raise InputError(
                         f"{where}: record {n} has the unknown category {record.get('category_id')}"
                     )
+    sizeless, true_sizeless = (
+        _drop_sizeless(each, where) for each, where in ((found, path), (true, truth_path))
+    )
+    tell_left_out(path, {"boxes of other categories": others, "boxes without size": sizeless}, len(results))
+    true_boxes = sum(len(members) for members in true.values())
+    tell_left_out(truth_path, {"boxes without size": true_sizeless}, true_boxes + true_sizeless)
     counts = {
         "frames_without_detections": len(known - set(found)),
         "boxes_without_covariance": sum(record.get("covariance") is None for record in results),
         "crowds_left_out": crowds,
+        "boxes_of_other_classes_left_out": others,
+        "boxes_without_size_left_out": sizeless,
+        "true_boxes_without_size_left_out": true_sizeless,
     }
     frames = [
         _frame(image, found[image["id"]], true[image["id"]], label_of, classes, path, truth_path, family)
@@ -120,6 +137,18 @@ def _key(record: Any, name: str) -> int | str | None:
     """Return the id under `name`; None if the record has none."""
     key = record.get(name) if isinstance(record, dict) else None
     return key if isinstance(key, int | str) else None
+
+
+def _drop_sizeless(records_of: dict[Any, list[tuple[int, Record]]], path: Path) -> int:
+    """Remove the boxes whose width or height is 0, and return their number."""
+    dropped = 0
+    for image_id, members in records_of.items():
+        names = [f"{path}: record {n}" for n, _ in members]
+        size = read_number_rows([record for _, record in members], "bbox", 4, names)[:, 2:]
+        empty = (size == 0).any(1)
+        records_of[image_id] = [member for member, out in zip(members, empty, strict=True) if not out]
+        dropped += int(empty.sum())
+    return dropped
 
 
 def _corners(records: Sequence[tuple[int, Record]], path: Path) -> Float[ndarray, "n 4"]:

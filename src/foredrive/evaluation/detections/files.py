@@ -30,6 +30,8 @@ def read_detections(results: Path, truth: Path, family: Family = "gaussian") -> 
         predicted, true = read_plain(results), read_plain(truth)
         if not isinstance(true, dict):
             raise InputError(f"{truth}: neither an object of boxes by sample (nuScenes) nor of images (COCO)")
+        if isinstance(predicted, dict) and isinstance(predicted.get("annotations"), list):
+            predicted = predicted["annotations"]
         if isinstance(predicted, dict):
             read = read_nuscenes(predicted, true, results, truth, family)
         elif isinstance(predicted, list):

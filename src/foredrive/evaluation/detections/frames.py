@@ -1,7 +1,9 @@
 """Detections and truth by frame, as every file of detections is read."""
 
+import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,6 +14,7 @@ from numpy import ndarray
 from foredrive.errors import InputError
 from foredrive.sets import BoxDensity, Family, LabelledBoxes, MultiBernoulli
 
+_log = logging.getLogger(__name__)
 MIN_PROBABILITY = 1e-6
 """Probabilities in files are kept this far from 0 and 1, which are mostly rounded from such."""
 STD_M = (0.5, 0.5, 0.3)
@@ -213,6 +216,26 @@ def read_class_probabilities(
         except (TypeError, ValueError, OverflowError) as error:
             raise InputError(f"{names[n]}: class_probabilities must be numbers") from error
     return share
+
+
+def tell_left_out(path: Path, counts: Mapping[str, int], given: int) -> None:
+    """Say in one line how many records of a file are left out.
+
+    Args:
+        path: the file or folder, for the message.
+        counts: numbers of records left out, by what they are: a noun in the plural.
+        given: number of all records of the file.
+
+    Raises:
+        InputError: all are left out.
+    """
+    parts = [f"{count} {what}" for what, count in counts.items() if count]
+    if not parts:
+        return
+    text = f"{path}: left out of {given}: {', '.join(parts)}"
+    if sum(counts.values()) == given:
+        raise InputError(f"{text}: nothing remains to be scored")
+    _log.warning("%s", text)
 
 
 def order_classes(true: set[str], found: set[str]) -> tuple[list[str], int]:

@@ -23,6 +23,7 @@ from foredrive.evaluation.detections.frames import (
     make_detections,
     make_objects,
     order_classes,
+    tell_left_out,
 )
 from foredrive.evaluation.detections.nuscenes_results import DEFAULT_COVARIANCE
 from foredrive.sets import Family, MultiBernoulli
@@ -56,6 +57,34 @@ def check_type(kind: str, where: str) -> None:
         raise InputError(f"{where} has the unknown class {kind!r}; there are: {', '.join(KITTI_TYPES)}")
 
 
+def result_files(folder: Path, truth: Path, what: str) -> tuple[Path, set[str]]:
+    """Return the folder of results and the names of its text files, all of which are in the truth.
+
+    Where no file of the folder is in the truth, the results are those of its folder `data`, as TrackEval and
+    AB3DMOT write them.
+
+    Args:
+        folder, truth: folders with a text file for each frame or sequence.
+        what: a frame or a sequence, for messages.
+
+    Raises:
+        InputError: there are no text files in the truth, none of it in the results, or one that is not in it.
+    """
+    true = {path.name for path in truth.glob("*.txt")}
+    if not true:
+        raise InputError(f"{truth}: holds no text files")
+    for place in (folder, folder / "data"):
+        files = {path.name for path in place.glob("*.txt")}
+        if not files & true:
+            continue
+        if files - true:
+            raise InputError(f"{place / min(files - true)}: there is no such {what} in {truth}")
+        return place, files
+    raise InputError(
+        f"{folder}: holds no results of the {what}s in {truth}, such as {min(true)}, nor in data/"
+    )
+
+
 def read_kitti(folder: Path, truth: Path, family: Family) -> DetectionSet:
     """Return the frames of the truth, by name.
 
@@ -64,7 +93,7 @@ def read_kitti(folder: Path, truth: Path, family: Family) -> DetectionSet:
     """
     true, found, classes, true_classes = read_frames(folder, truth)
     counts = {
-        "frames_without_detections": sum(not (folder / name).exists() for name in true),
+        "frames_without_detections": len(set(true) - result_files(folder, truth, "frame")[1]),
         "boxes_without_covariance": sum(len(lines) for lines in found.values()),
     }
     frames = []
@@ -93,14 +122,15 @@ def read_frames(
     Raises:
         InputError: a file or a line is wrong. The message names the first.
     """
-    true_paths, paths = sorted(truth.glob("*.txt")), {path.name for path in folder.glob("*.txt")}
-    if not true_paths:
-        raise InputError(f"{truth}: holds no text files")
-    unknown = sorted(paths - {path.name for path in true_paths})
-    if unknown:
-        raise InputError(f"{folder / unknown[0]}: there is no such frame in {truth}")
-    true = {path.name: _lines(path, 15) for path in true_paths}
-    found = {name: _lines(folder / name, 16) if name in paths else [] for name in true}
+    folder, files = result_files(folder, truth, "frame")
+    true = {path.name: _lines(path, 15) for path in sorted(truth.glob("*.txt"))}
+    found = {name: _lines(folder / name, 16) if name in files else [] for name in true}
+    for lines_of, where in ((true, truth), (found, folder)):
+        given = sum(len(lines) for lines in lines_of.values())
+        for name, lines in lines_of.items():
+            lines_of[name] = [line for line in lines if (line.values[7:10] > 0).all()]
+        sized = sum(len(lines) for lines in lines_of.values())
+        tell_left_out(where, {"boxes without size": given - sized}, given)
     classes, true_classes = order_classes(
         *({line.kind for lines in each.values() for line in lines} for each in (true, found))
     )
@@ -124,7 +154,7 @@ def _detections(lines: Sequence[KittiLine], classes: Sequence[str], family: Fami
 def _lines(path: Path, fields: int) -> list[KittiLine]:
     """Return the lines that are not `DontCare`."""
     try:
-        text = path.read_text()
+        text = path.read_text("utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: not text that can be read") from error
     lines = []
@@ -140,8 +170,6 @@ def _lines(path: Path, fields: int) -> list[KittiLine]:
             raise InputError(f"{name} has {len(words)} fields, not {fields}")
         if not (np.abs(values) <= MAX_NUMBER).all():
             raise InputError(f"{name} has a number that is not finite, or beyond {MAX_NUMBER:g}")
-        if not (values[7:10] > 0).all():
-            raise InputError(f"{name} has a box without size")
         lines.append(KittiLine(name, words[0], values))
     return lines
 

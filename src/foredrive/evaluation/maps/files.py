@@ -12,6 +12,7 @@ a folder of 123D logs: frames are named LOG@T_US then, and coordinates are in th
 their area under `meta` as `area_m`, [60, 30] or [100, 50].
 """
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -262,8 +263,8 @@ def _points(value: Any, where: str) -> Float[ndarray, "V 2"]:
 
 
 def _score(value: Any, where: str) -> float:
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 <= value <= 1:
-        raise InputError(f"{where}: the score {value!r} is not in [0, 1]")
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
+        raise InputError(f"{where}: the score {value!r} is not a finite number")
     return float(value)
 
 

@@ -4,11 +4,12 @@ KITTI's own average precision is by overlap; this is nuScenes' matching, without
 """
 
 import dataclasses
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
-from foredrive.errors import InputError
+from foredrive.evaluation.detections.frames import tell_left_out
 from foredrive.evaluation.detections.kitti_labels import (
     KittiLine,
     box_states,
@@ -30,9 +31,11 @@ def score_kitti_boxes(folder: Path, truth: Path) -> Figures:
         InputError: a file or a line is wrong. The message names the first.
     """
     true, found, classes, true_classes = read_frames(folder, truth)
-    for lines in (*true.values(), *found.values()):
+    for lines in true.values():
         for line in lines:
             check_type(line.kind, line.name)
+    others = _drop_other_classes(found, classes[:true_classes])
+    tell_left_out(folder, {"boxes of other classes": others}, others + sum(map(len, found.values())))
     protocol = dataclasses.replace(
         DETECTION_PROTOCOLS["nuscenes"],
         title="KITTI, by distance",
@@ -48,6 +51,7 @@ def score_kitti_boxes(folder: Path, truth: Path) -> Figures:
         "frames_counted": len(true),
         "objects": len(true_rows),
         "found": len(found_rows),
+        "boxes_of_other_classes_left_out": others,
         "detection.kitti.map": scored.mean_ap,
         **{f"detection.kitti.{key}": scored.errors[key] for key in scored.errors if key not in _UNKNOWN},
     }
@@ -60,15 +64,20 @@ def score_kitti_boxes(folder: Path, truth: Path) -> Figures:
     return figures
 
 
+def _drop_other_classes(found: dict[str, list[KittiLine]], classes: Sequence[str]) -> int:
+    """Remove the lines of other classes, and return their number."""
+    given = sum(map(len, found.values()))
+    for name, lines in found.items():
+        found[name] = [line for line in lines if line.kind in classes]
+    return given - sum(map(len, found.values()))
+
+
 def _rows(frames: list[list[KittiLine]], classes: tuple[str, ...], *, scored: bool) -> ObjectRows:
     lines = [line for each in frames for line in each]
     state, yaw = box_states(lines)
     frame = np.repeat(np.arange(len(frames)), [len(each) for each in frames])
     label_of = {name: n for n, name in enumerate(classes)}
     score = np.array([line.values[14] if scored else np.nan for line in lines]).reshape(-1)
-    wrong = np.flatnonzero((score < 0) | (score > 1))
-    if len(wrong):
-        raise InputError(f"{lines[wrong[0]].name} has a score outside [0, 1]")
     return make_rows(
         frame,
         np.array([label_of.get(line.kind, -1) for line in lines], dtype=np.int64),

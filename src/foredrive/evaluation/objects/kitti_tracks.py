@@ -18,8 +18,8 @@ from numpy import ndarray
 from scipy.optimize import linear_sum_assignment
 
 from foredrive.errors import InputError
-from foredrive.evaluation.detections.frames import MAX_NUMBER
-from foredrive.evaluation.detections.kitti_labels import check_type
+from foredrive.evaluation.detections.frames import MAX_NUMBER, tell_left_out
+from foredrive.evaluation.detections.kitti_labels import KITTI_TYPES, check_type, result_files
 from foredrive.evaluation.summary import Figures
 from foredrive.metrics.detection import overlaps
 from foredrive.metrics.tracking.clear import Candidates, TrackRows, clear_mot
@@ -58,21 +58,25 @@ def score_kitti_tracks(folder: Path, truth: Path) -> Figures:
     Raises:
         InputError: a line is wrong, or a sequence has no truth. The message names the first.
     """
+    folder, files = result_files(folder, truth, "sequence")
     paths = sorted(truth.glob("*.txt"))
-    if not paths:
-        raise InputError(f"{truth}: holds no text files")
-    unknown = sorted({path.name for path in folder.glob("*.txt")} - {path.name for path in paths})
-    if unknown:
-        raise InputError(f"{folder / unknown[0]}: there is no such sequence in {truth}")
     pairs = []
     for path in paths:
-        results = folder / path.name
         true = read_sequence(path, _RESULT_FIELDS - 1)
-        pairs.append((true, read_sequence(results, _RESULT_FIELDS) if results.exists() else true[:0]))
+        for n, kind in enumerate(true.kind.tolist(), 1):
+            check_type(kind, f"{path}: box {n}")
+        pairs.append(
+            (true, read_sequence(folder / path.name, _RESULT_FIELDS) if path.name in files else true[:0])
+        )
+    given = sum(len(found) for _, found in pairs)
+    pairs = [(true, found[np.isin(found.kind, KITTI_TYPES)]) for true, found in pairs]
+    others = given - sum(len(found) for _, found in pairs)
+    tell_left_out(folder, {"boxes of other classes": others}, given)
     figures: Figures = {
         "data_set": "kitti",
         "scenes": len(paths),
-        "scenes_without_results": sum(not (folder / path.name).exists() for path in paths),
+        "scenes_without_results": len(paths) - len(files),
+        "boxes_of_other_classes_left_out": others,
     }
     for name in CLASSES:
         figures |= {f"tracking.kitti.{name}.{key}": value for key, value in _score_class(pairs, name).items()}
@@ -86,7 +90,7 @@ def read_sequence(path: Path, fields: int) -> KittiBoxes:
         InputError: a line is wrong, or a track has two boxes in a frame.
     """
     try:
-        lines = path.read_text().splitlines()
+        lines = path.read_text("utf-8-sig").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: not text that can be read") from error
     rows, kinds, known = [], [], set()
@@ -102,7 +106,6 @@ def read_sequence(path: Path, fields: int) -> KittiBoxes:
             raise InputError(f"{path}: line {n} has something that is not a number") from error
         if not all(abs(value) <= MAX_NUMBER for value in values):
             raise InputError(f"{path}: line {n} has a number that is not finite, or beyond {MAX_NUMBER:g}")
-        check_type(words[2], f"{path}: line {n}")
         kind = words[2].lower()
         if kind != "dontcare" and (kind, *values[:2]) in known:
             raise InputError(f"{path}: line {n} has the track {words[1]} a second time in frame {words[0]}")

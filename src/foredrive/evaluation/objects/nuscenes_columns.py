@@ -43,10 +43,12 @@ def read_texts(boxes: Sequence[Box], key: str, names: Sequence[str]) -> list[str
     return [str(text) for text in texts]
 
 
-def read_scores(boxes: Sequence[Box], key: str, names: Sequence[str]) -> Float[ndarray, "n"]:
-    """Return scores, all in [0, 1]."""
+def read_scores(
+    boxes: Sequence[Box], key: str, names: Sequence[str], *, only_ranks: bool
+) -> Float[ndarray, "n"]:
+    """Return scores, all in [0, 1] unless they only rank."""
     score = read_number_rows(boxes, key, 1, names)[:, 0]
-    wrong = np.flatnonzero(~((score >= 0) & (score <= 1)))
+    wrong = np.flatnonzero(~((score >= 0) & (score <= 1)) & (not only_ranks))
     if len(wrong):
         raise InputError(f"{names[int(wrong[0])]} has the {key} {score[wrong[0]]:g}, which is not in [0, 1]")
     return score

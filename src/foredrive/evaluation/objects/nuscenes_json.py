@@ -85,7 +85,7 @@ def read_results(
     label = read_labels(boxes, (f"{task}_name",), classes, (), names)
     centre, size_lwh, yaw = read_geometry(boxes, names)
     columns: dict[str, ndarray] = {
-        "score": read_scores(boxes, f"{task}_score", names),
+        "score": read_scores(boxes, f"{task}_score", names, only_ranks=task == "detection"),
         "velocity": read_velocities(boxes, names),
         "from_ego": centre[:, :2] - truth.ego[frame],
     }

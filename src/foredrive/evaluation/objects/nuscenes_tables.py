@@ -134,7 +134,7 @@ def _ego_places(folder: Path, wanted: Mapping[str, Row]) -> dict[str, np.ndarray
 def _table(folder: Path, name: str) -> dict[str, Row]:
     path = folder / f"{name}.json"
     try:
-        rows = json.loads(path.read_text())
+        rows = json.loads(path.read_text("utf-8-sig"))
         if not isinstance(rows, list):
             raise TypeError("not a list of rows")
         return {row["token"]: row for row in rows}
