@@ -16,6 +16,7 @@ from foredrive.towns.map.names import check_town
 
 if TYPE_CHECKING:
     from foredrive.runs.drive.recording import RecordingResult
+    from foredrive.sensors.rigs import RigPlan
     from foredrive.towns.campaign import DrivePlan
 
 SHEET = "contact_sheet.png"
@@ -35,6 +36,7 @@ def record(
     vehicles: Range = "30",
     people: Range = "20",
     conditions: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME [NAME ...]")] = (),
+    virtual_egos: int = 0,
     workers: int = 0,
     ray: bool = False,
 ) -> None:
@@ -58,6 +60,9 @@ def record(
         people: Number of pedestrians, where the town has walkways; from a range, drawn for each drive.
         conditions: clear, morning, overcast, dusk, night, rain, night_rain or fog: every drive under each;
             any: one for each drive, evenly; none: a bright day.
+        virtual_egos: In place of drives, this many short logs for each town and seed. In each, another car
+            of the traffic is the recording vehicle: six key frames of images without lidar, then 4 s of
+            boxes. --seconds, --rate, --vehicles and --people do not apply.
         workers: Number of drives recorded at a time; 0: one for each core.
         ray: Record on Ray: on the cluster at RAY_ADDRESS, or on a cluster that is started here.
     """
@@ -65,6 +70,7 @@ def record(
     check_number("--seed", seed, low=0)
     check_number("--rate", rate, above=0)
     check_image_size(image_size)
+    check_number("--virtual-egos", virtual_egos, low=0)
     check_number("--workers", workers, low=0)
     check_out_folder(out)
     between = _range("vehicles", vehicles), _range("people", people)
@@ -78,6 +84,9 @@ def record(
         from foredrive.runs.drive.recording import record_drives, record_plan
         from foredrive.towns.campaign import Campaign, plan_drives
 
+    if virtual_egos:
+        _record_egos(town, some_seeds, weather, virtual_egos, out, cameras, workers, ray)
+        return
     plans = plan_drives(Campaign(town, some_seeds, weather, *between, seconds=seconds, rate_hz=rate))
     if len(plans) == 1 and not ray:
         log = record_plan(plans[0], out, cameras)
@@ -88,6 +97,37 @@ def record(
     with job_progress("recording drives", len(plans)) as tick:
         done = record_drives(plans, out, cameras, workers, on_ray=ray, tick=tick)
     _tell(done, plans, out)
+
+
+def _record_egos(
+    towns: tuple[str, ...],
+    seeds: tuple[int, ...] | int,
+    conditions: tuple[str, ...],
+    count: int,
+    out: Path,
+    rig: "RigPlan",
+    workers: int,
+    ray: bool,
+) -> None:
+    """Record virtual egos of each town and seed, and print what became of them.
+
+    Raises:
+        InputError: some failed.
+    """
+    from foredrive.runs.drive.recording import EgosPlan, record_egos
+    from foredrive.scene.conditions import ANY_CONDITIONS, CONDITIONS
+
+    some = tuple(CONDITIONS) if conditions == (ANY_CONDITIONS,) else conditions
+    numbers = range(seeds) if isinstance(seeds, int) else seeds
+    plans = [EgosPlan(town, seed, count, some) for town in dict.fromkeys(towns) for seed in numbers]
+    with job_progress("recording virtual egos", len(plans)) as tick:
+        logs, failed = record_egos(
+            plans, out, rig, workers or len(os.sched_getaffinity(0)), on_ray=ray, tick=tick
+        )
+    if logs:
+        print(f"{len(logs)} logs in {logs[0].folder.parent}")
+    if failed:
+        raise InputError(f"{len(failed)} of {len(plans)} failed: {listed_failures(failed)}")
 
 
 def _tell(done: "RecordingResult", plans: "list[DrivePlan]", out: Path) -> None:

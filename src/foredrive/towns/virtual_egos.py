@@ -118,7 +118,8 @@ def record_virtual_egos(
 ) -> list[LogPath]:
     """Record `count` short logs of one town. The same arguments give the same bytes on one kind of processor.
 
-    The logs are out/logs/SPLIT/TOWN_seedN_egoNNNN with SPLIT town-egos_train or town-egos_test.
+    The logs are out/logs/SPLIT/TOWN_seedN_egoNNNN with SPLIT town-egos_train or town-egos_test. Existing ones
+    are kept.
 
     Args:
         town: one of `TOWNS`.
@@ -139,22 +140,29 @@ def record_virtual_egos(
     others = conditions[1:] if conditions else [draw_daylight(rng) for _ in range(WORLDS - 1)]
     worlds = [first, *map(first.under, others)]
     maps = write_town_map(town, out)
-    split = f"town-egos_{'test' if town in TEST_TOWNS else 'train'}"
+    split = split_of(town)
     logs: list[LogPath] = []
     for window, egos in _windows(town_map, seed, rng):
         for ego in egos[: count - len(logs)]:
-            name = f"{town}_seed{seed}_ego{len(logs):04d}"
-            world = worlds[int(rng.integers(len(worlds)))]
-            inserted = _insert(ego, rng)
-            place = (out, split, name, camera_specs(sensors.rig), maps, town, ego.route_xyz)
-            with LogWriter(*place) as writer:
-                for k in range(len(window.moments)):
-                    writer.write(_frame(world, window, ego, inserted, k, sensors, (seed, len(logs), k)))
-            logs.append(LogPath(writer.folder, maps))
+            of_log = np.random.default_rng((seed, 6, len(logs)))  # whether the logs before are there or not
+            path = LogPath(out / "logs" / split / f"{town}_seed{seed}_ego{len(logs):04d}", maps)
+            if not (path.folder / "sync.arrow").is_file():  # logs get their names when they are whole
+                world = worlds[int(of_log.integers(len(worlds)))]
+                inserted = _insert(ego, of_log)
+                place = (out, split, path.folder.name, camera_specs(sensors.rig), maps, town, ego.route_xyz)
+                with LogWriter(*place) as writer:
+                    for k in range(len(window.moments)):
+                        writer.write(_frame(world, window, ego, inserted, k, sensors, (seed, len(logs), k)))
+            logs.append(path)
             tick()
         if len(logs) == count:
             return logs
     return logs
+
+
+def split_of(town: str) -> str:
+    """Return the 123D split of a town's virtual egos."""
+    return f"town-egos_{'test' if town in TEST_TOWNS else 'train'}"
 
 
 @dataclass(frozen=True)

@@ -21,6 +21,7 @@ from foredrive.runs.fan_out import fan_out, reason
 from foredrive.scene.conditions import BackgroundTraffic, find_conditions
 from foredrive.sensors.rigs import RigPlan, camera_rig, same_rig
 from foredrive.sensors.vehicle import roof_lidar
+from foredrive.towns import virtual_egos
 from foredrive.towns.campaign import DrivePlan
 from foredrive.towns.recorder import record, split_of
 from foredrive.towns.sensing.capture import SensorSuite
@@ -119,3 +120,58 @@ def is_recorded(plan: DrivePlan, out: Path, rig: RigPlan) -> bool:
         return False
     rate_fits = plan.frames == 1 or abs(log.period_s * plan.rate_hz - 1) < 1e-3
     return len(log) == plan.frames and rate_fits and same_rig(rig_of_log(log), rig)
+
+
+@dataclass(frozen=True)
+class EgosPlan:
+    """The virtual egos of one town and seed."""
+
+    town: str
+    seed: int
+    count: int
+    conditions: tuple[str, ...]
+    """Names of `CONDITIONS`, of which one is drawn for each ego. Empty: bright daylight."""
+
+    @property
+    def name(self) -> str:
+        """Return the name for messages."""
+        return f"virtual egos of {self.town}, seed {self.seed}"
+
+
+def record_egos(
+    plans: Sequence[EgosPlan],
+    out: Path,
+    rig: RigPlan,
+    workers: int,
+    *,
+    on_ray: bool = False,
+    tick: Callable[[], None] = lambda: None,
+) -> tuple[list[LogPath], dict[str, str]]:
+    """Record virtual egos without lidar; logs that are in the data root are kept.
+
+    Args:
+        out, rig, workers, on_ray: as of `record_drives`.
+        tick: called after the egos of each town and seed.
+
+    Returns:
+        The logs, and the reason in one line for each town and seed that failed.
+    """
+    logs, failed = list[LogPath](), dict[str, str]()
+    for town in {plan.town for plan in plans}:
+        remove_abandoned(out / "logs" / virtual_egos.split_of(town))
+    work = functools.partial(_record_egos, out=out, rig=rig)
+    with contextlib.closing(fan_out(plans, work, workers, on_ray=on_ray)) as results:
+        for plan, result in results:
+            if isinstance(result, BaseException):
+                failed[plan.name] = reason(plan.name, result)
+            else:
+                logs += result
+            tick()
+    return logs, failed
+
+
+def _record_egos(plan: EgosPlan, out: Path, rig: RigPlan) -> list[LogPath]:
+    torch.set_num_threads(1)
+    sensors = SensorSuite(camera_rig(plan=rig), None)
+    conditions = [find_conditions(name) for name in plan.conditions]
+    return virtual_egos.record_virtual_egos(plan.town, plan.seed, plan.count, out, sensors, conditions)
