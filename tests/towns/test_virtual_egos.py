@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from file_digests import digests
 
 from foredrive.data import ClipConfig, ClipDataset
@@ -69,16 +70,34 @@ def test_the_ego_is_no_box_and_drives_along_its_route(logs: list[LogPath]) -> No
 
 def test_the_labels_of_the_last_image_are_known(logs: list[LogPath]) -> None:
     """They need 4 s of boxes after it, and lights on the route."""
-    lights, crossers = 0, 0
+    lights = 0
     for path in logs:
         seen = read_affordances(Log(path), IMAGES - 1)
         assert bool(seen.crossing_known)
         assert bool(seen.lead_known)
         assert bool(seen.light_known)
         lights += int(seen.light) > 0
-        crossers += len(seen.crossing_xy)
     assert lights >= COUNT // 4
-    assert crossers >= 1
+
+
+def test_people_and_cyclists_come_onto_the_route(logs: list[LogPath]) -> None:
+    """Those who are added have sizes of their own; they begin at least 3 m beside the route."""
+    onto = 0
+    for path in logs:
+        log = Log(path)
+        _, xyz, _ = route_at(log, 0) or pytest.fail("no route")
+        beside_m = []
+        for frame in range(len(log)):
+            boxes = read_boxes(log, frame)
+            assert boxes is not None
+            added = torch.isin(boxes.size_lwh[:, 1], torch.tensor([0.6, 0.55])) & (
+                boxes.size_lwh[:, 2] > 1.69
+            )
+            T = torch.from_numpy(log.T_world_ego[frame]).float()
+            for centre in boxes.centre[added] @ T[:3, :3].T + T[:3, 3]:
+                beside_m.append(np.linalg.norm(xyz[:, :2] - centre[:2].numpy(), axis=-1).min())
+        onto += bool(beside_m) and beside_m[0] > 2.5 and min(beside_m) < 1.5
+    assert onto >= COUNT // 4
 
 
 def test_cyclists_wait_and_then_cross(logs: list[LogPath]) -> None:
