@@ -147,10 +147,10 @@ def test_heads_and_tokens_of_a_planner_read_affordances() -> None:
     torch.manual_seed(0)
     heads = TaskHeads(config, SPEC, channels=FEATURES)
     volume = TaskVolume(torch.randn(2, FEATURES, *SPEC.shape_zyx), images=images([1, 3], 0))
-    tokens = SceneTokens(("affordances",), config, SPEC, width=12)(heads({"planning": volume}))
+    tokens = SceneTokens(("affordances",), config, SPEC, width=12)(heads({"occupancy": volume}))
     assert tokens.shape == (2, 1 + config.affordances.people, 12)
     with pytest.raises(InputError, match="this belief has none"):
-        heads({"planning": dataclasses.replace(volume, images=None)})
+        heads({"occupancy": dataclasses.replace(volume, images=None)})
     with pytest.raises(InputError, match=r"attends names affordances.*train with affordances"):
         SceneTokens(("affordances",), small_heads(("detection",)).heads, SPEC, width=12)
 

@@ -154,7 +154,7 @@ def test_a_drive_frame_by_frame_gives_the_agents_of_a_training_sequence() -> Non
     module, volume, T_world_ego = heads(config), frame_volumes(), poses(SEQUENCES * FRAMES)
     follower = DriveFollower(config)
     with torch.no_grad():
-        whole = module({"detection": volume, "motion": volume}, module.config.steps(T_world_ego))
+        whole = module({"tracking": volume, "motion": volume}, module.config.steps(T_world_ego))
         assert whole.agents is not None
         assert whole.lineage is not None
         ids = []
@@ -162,7 +162,7 @@ def test_a_drive_frame_by_frame_gives_the_agents_of_a_training_sequence() -> Non
             one = volume[item : item + 1]
 
             def perceive(carried: CarriedAgents | None, one: TaskVolume = one) -> HeadOutput:
-                return module({"detection": one, "motion": one}, carried=carried)
+                return module({"tracking": one, "motion": one}, carried=carried)
 
             key = f"drive_{item // FRAMES}@{500_000 * (item + 1)}"
             found, track_id = follower.step(perceive, key, T_world_ego[item])
@@ -193,7 +193,7 @@ def test_a_low_score_gets_no_identity() -> None:
     module = heads(config)
     with torch.no_grad():
         _, track_id = follower.step(
-            lambda carried: module({"detection": volume, "motion": volume}, carried=carried),
+            lambda carried: module({"tracking": volume, "motion": volume}, carried=carried),
             "a@0",
             poses(1)[0],
         )
@@ -212,11 +212,11 @@ def test_agents_that_are_not_finite_are_not_carried_on() -> None:
             one = dataclasses.replace(volume[item : item + 1], now=now)
 
             def perceive(carried: CarriedAgents | None, one: TaskVolume = one) -> HeadOutput:
-                return module({"detection": one, "motion": one}, carried=carried)
+                return module({"tracking": one, "motion": one}, carried=carried)
 
             found.append(follower.step(perceive, f"drive@{500_000 * item}", T_world_ego[item]))
         last = volume[2:3]
-        alone = module({"detection": last, "motion": last})
+        alone = module({"tracking": last, "motion": last})
     assert found[2][0].agents[-1].boxes.mean.equal(alone.agents[-1].boxes.mean)
     assert not set(found[2][1][0].tolist()) & set(found[0][1][0].tolist())
 
