@@ -85,10 +85,10 @@ def imported(folder: Path, module: str, modules: Mapping[str, Any]) -> Any:
 
 def function_of(file: Path, name: str, names: Mapping[str, Any]) -> Any:
     """A function or method of a file, compiled alone, with the global names that it uses."""
-    found = [node for node in ast.walk(ast.parse(file.read_text())) if getattr(node, "name", None) == name]
-    assert len(found) == 1, f"{file} has {len(found)} of {name}"
+    nodes = [node for node in ast.walk(ast.parse(file.read_text())) if getattr(node, "name", None) == name]
+    assert len(nodes) == 1, f"{file} has {len(nodes)} of {name}"
     scope = dict(names)
-    exec(compile(ast.Module(found, []), str(file), "exec"), scope)
+    exec(compile(ast.Module(nodes, []), str(file), "exec"), scope)
     return scope[name]
 
 
@@ -185,9 +185,9 @@ def uniad_instances(checkout: Path, scene: Arrays) -> Arrays:
         cut = (..., slice(first, end), slice(first, end))
         iou, panoptic = code.IntersectionOverUnion(2), code.PanopticMetric(n_classes=2)
         for sample in range(len(true)):
-            found, real = (side[sample : sample + 1][cut].contiguous() for side in (predicted, true))
-            iou.update((found > 0).long(), (real > 0).long())
-            panoptic.update(found, real)
+            ours, real = (side[sample : sample + 1][cut].contiguous() for side in (predicted, true))
+            iou.update((ours > 0).long(), (real > 0).long())
+            panoptic.update(ours, real)
         figures[f"iou_{name}"] = iou.compute()[1].numpy()
         figures[f"vpq_{name}"] = panoptic.compute()["pq"][1].numpy()
     return figures
@@ -201,9 +201,9 @@ def uniad_raster(checkout: Path, scene: Arrays) -> Arrays:
     total: dict[str, Any] = {}
     for true, predicted in zip(scene["true"], scene["predicted"], strict=True):
         masks = torch.from_numpy(true.astype(np.int32))
-        found = torch.from_numpy(predicted.astype(np.int32))
+        layers = torch.from_numpy(predicted.astype(np.int32))
         head = MagicMock()
-        head.get_bboxes.return_value = [{"drivable": found[3], "lane": found[:3]}]
+        head.get_bboxes.return_value = [{"drivable": layers[3], "lane": layers[:3]}]
         labels = torch.tensor([0, 1, 2, 3])
         (counted,) = forward_test(
             head, gt_lane_labels=[labels[None]], gt_lane_masks=[masks[None]], img_metas=[None]
@@ -256,21 +256,27 @@ def maptr(checkout: Path, scene: Arrays) -> Arrays:
             sides[side][lines.frame[n]]["vectors"].append(vector)
     classes = ["divider", "ped_crossing", "boundary"]
     with contextlib.redirect_stdout(io.StringIO()):
-        found = code.format_res_gt_by_classes(
+        lines_by_class = code.format_res_gt_by_classes(
             "results.json",
             sides["predicted"],
             sides["true"],
             cls_names=classes,
             eval_use_same_gt_sample_num_flag=True,
         )
-        each = [
+        results = [
             code.eval_map(
-                sides["predicted"], sides["true"], *found, threshold, classes, "silent", metric="chamfer"
+                sides["predicted"],
+                sides["true"],
+                *lines_by_class,
+                threshold,
+                classes,
+                "silent",
+                metric="chamfer",
             )
             for threshold in (0.5, 1.0, 1.5)
         ]
-    ap = np.array([[result["ap"] for result in results] for _, results in each])
-    return {"ap": ap, "mean_ap": np.array([mean for mean, _ in each])}
+    ap = np.array([[by_class["ap"] for by_class in classes_at] for _, classes_at in results])
+    return {"ap": ap, "mean_ap": np.array([mean for mean, _ in results])}
 
 
 def sparseocc_rays(checkout: Path, scene: Arrays) -> Arrays:
@@ -285,14 +291,14 @@ def sparseocc_rays(checkout: Path, scene: Arrays) -> Arrays:
         [np.ascontiguousarray(labels.transpose(2, 1, 0)) for labels in scene[side]]
         for side in ("true", "predicted")
     )
-    origins = [torch.from_numpy(each)[None] for each in scene["origins_m"]]
+    origins = [torch.from_numpy(places_m)[None] for places_m in scene["origins_m"]]
     to_device, torch.Tensor.cuda = torch.Tensor.cuda, lambda tensor: tensor  # type: ignore[method-assign, assignment]
     try:
         with contextlib.redirect_stdout(io.StringIO()):
-            found = code.main_rayiou(predicted, true, origins, OCC3D_CLASSES)
+            figures = code.main_rayiou(predicted, true, origins, OCC3D_CLASSES)
     finally:
         torch.Tensor.cuda = to_device  # type: ignore[method-assign]
-    return {key.lower().replace("@", "_"): np.array(value) for key, value in found.items()}
+    return {key.lower().replace("@", "_"): np.array(value) for key, value in figures.items()}
 
 
 METRICS = {

@@ -61,7 +61,7 @@ def test_instances_over_time_are_uniads(arrays: Arrays) -> None:
     pairs = zip(arrays["predicted"].astype(np.int64), arrays["true"].astype(np.int64), strict=True)
     counts = [count_instances(predicted, true, UNIAD_INSTANCES) for predicted, true in pairs]
     for name in ("near", "far"):
-        total = reduce(add, (each[name] for each in counts))
+        total = reduce(add, (by_range[name] for by_range in counts))
         assert total.iou == pytest.approx(arrays[f"reference.iou_{name}"].item(), abs=1e-6)
         assert total.vpq == pytest.approx(arrays[f"reference.vpq_{name}"].item(), abs=1e-6)
 

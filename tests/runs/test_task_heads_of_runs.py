@@ -203,8 +203,8 @@ def test_agents_that_are_carried_read_the_prompt_of_their_task(
     with torch.no_grad():
         for name in ("none", "tracking", "detection"):
             one = agent if name == "none" else with_other_prompts(agent, (name,))
-            found = one.perceive(one.world_model.observe(clip))
-            logits[name] = found.agents[-1].boxes.logits
+            output = one.perceive(one.world_model.observe(clip))
+            logits[name] = output.agents[-1].boxes.logits
     for name in ("tracking", "detection"):
         assert torch.equal(logits[name], logits["none"]) == (name != task)
 
