@@ -53,6 +53,23 @@ def routes(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+def test_what_a_route_file_asks_for_and_is_not_here_is_told(
+    routes: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    scenario = '<scenarios><scenario type="ParkingCutIn"/><scenario type="Accident"/></scenarios>'
+    first, second = routes.read_text().split("</route>", 1)
+    file = tmp_path / "bench.xml"
+    file.write_text(
+        f"{first}{scenario}</route>{second}".replace('id="b" town="Town02"', 'id="b" town="Town12"')
+    )
+    with pytest.raises(InputError, match=r"not here: Town12 \(1 of 2\); the towns are Town01, .*--only"):
+        TownRoutes(str(file)).jobs("stop")
+    source = TownRoutes(str(file), only=("a",))
+    assert [job.route for job in (*source.jobs("stop"), *source.jobs("stop"))] == ["a", "a"]
+    (said,) = caplog.messages
+    assert "scenarios left out: 1 Accident, 1 ParkingCutIn" in said
+
+
 def changed(suite: DriveSuite, **fields: Any) -> DriveSuite:
     """The suite over other routes, or under other circumstances."""
     return dataclasses.replace(suite, source=dataclasses.replace(suite.source, **fields))

@@ -46,6 +46,20 @@ def test_carla_s_left_handed_waypoints_are_mirrored(tmp_path: Path) -> None:
     np.testing.assert_array_equal(route.xyz_m, [[1.5, 2.5, 0.25], [11.0, -4.0, 0.0]])
 
 
+def test_routes_of_leaderboard_2_and_bench2drive(tmp_path: Path) -> None:
+    path = tmp_path / "routes.xml"
+    path.write_text(
+        """<routes><route id="24211" town="Town05">
+        <waypoints><position x="1.5" y="-2.5" z="0.25"/><position x="11.0" y="4.0" z="0"/></waypoints>
+        <scenarios><scenario name="ParkingCutIn_1" type="ParkingCutIn">
+        <trigger_point x="1.5" y="-2.5" z="0.25" yaw="90"/></scenario></scenarios>
+        <weathers><weather cloudiness="5" route_percentage="0"/></weathers></route></routes>"""
+    )
+    (route,) = read_carla_routes(path)
+    np.testing.assert_array_equal(route.xyz_m, [[1.5, 2.5, 0.25], [11.0, -4.0, 0.0]])
+    assert route.scenarios == ("ParkingCutIn",)
+
+
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [

@@ -46,7 +46,8 @@ def record(
     parallel. Complete logs are skipped, and a contact sheet shows all drives at the end.
 
     Args:
-        town: Town01 to Town07 or Town10HD; Town05 is held out for testing.
+        town: Town01 to Town07 or Town10HD; Town05 is held out for testing. Towns of other road maps (.xodr)
+            cannot be recorded.
         out: 123D data root; logs and the towns' maps are written into it.
         seconds: Length of each drive, s.
         seed: Seed of the buildings, the route, the traffic and all noise; the same seed gives the same bytes.

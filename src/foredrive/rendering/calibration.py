@@ -157,18 +157,18 @@ def calibration_views(cameras: Sequence[CameraView], edges: Sequence[SweepEdges]
             pairs.append((view, T_cam_ego, points_cam[near], sweep.horizontal[near]))
     if len(pairs) < _MIN_VIEWS:
         return None
-    views, T_cam_ego, points_cam, horizontal = zip(*pairs, strict=True)
-    counts = torch.tensor([len(points) for points in points_cam])
+    views = [view for view, *_ in pairs]
+    counts = torch.tensor([len(points) for _, _, points, _ in pairs])
     pad = torch.nn.utils.rnn.pad_sequence
     return CalibrationViews(
         K=torch.stack([view.K for view in views]),
         dist=torch.stack([view.dist for view in views]),
         size_hw=views[0].size_hw,
         twist_cam=torch.stack([view.twist_cam for view in views]),
-        R_cam_ego=torch.stack(T_cam_ego)[:, :3, :3],
+        R_cam_ego=torch.stack([T_cam_ego[:3, :3] for _, T_cam_ego, _, _ in pairs]),
         strength=_pyramid(_edge_strength(views)),
-        points_cam=pad(points_cam, batch_first=True),
-        horizontal=pad(horizontal, batch_first=True),
+        points_cam=pad([points for _, _, points, _ in pairs], batch_first=True),
+        horizontal=pad([horizontal for *_, horizontal in pairs], batch_first=True),
         points_valid=torch.arange(int(counts.max())) < counts[:, None],
     )
 

@@ -34,6 +34,8 @@ class RouteWaypoints:
     underscores."""
     town: str
     xyz_m: Float64[np.ndarray, "W 3"]
+    scenarios: tuple[str, ...] = ()
+    """Types of the scenarios that its file places on it. Drives have others, of their own."""
 
     def __post_init__(self) -> None:
         if not re.fullmatch(r"[\w-][\w.-]{0,99}", self.id):
@@ -74,9 +76,10 @@ def shipped_sets() -> dict[str, list[RouteWaypoints]]:
 
 
 def read_carla_routes(path: Path) -> list[RouteWaypoints]:
-    """Read a route file of CARLA's leaderboard 1.0.
+    """Read a route file of CARLA's leaderboards or of Bench2Drive.
 
-    The y axis is mirrored because CARLA's world is left-handed.
+    Waypoints are `waypoint` in leaderboard 1.0, and `waypoints/position` in 2.x and Bench2Drive. The y axis
+    is mirrored because CARLA's world is left-handed.
 
     Raises:
         InputError: the file is missing, is no XML or does not have that form. The error names file and route.
@@ -115,7 +118,8 @@ def _route(path: Path, number: int, element: ElementTree.Element) -> RouteWaypoi
     where = f"route {name if name is not None else f'number {number + 1}'} of {path}"
     if name is None or town is None:
         raise InputError(f"{where} has no {'id' if name is None else 'town'}")
-    waypoints = element.findall("waypoint")
+    waypoints = [*element.findall("waypoint"), *element.findall("waypoints/position")]
+    scenarios = tuple(each.get("type", "?") for each in element.findall("scenarios/scenario"))
     if len(waypoints) < 2:
         raise InputError(f"{where} has {len(waypoints)} waypoints; a route needs at least two")
     try:
@@ -125,6 +129,6 @@ def _route(path: Path, number: int, element: ElementTree.Element) -> RouteWaypoi
     if not all(map(math.isfinite, np.ravel(xyz).tolist())):
         raise InputError(f"{where} has a waypoint that is not finite")
     try:
-        return RouteWaypoints(name, town, np.array(xyz) * [1.0, -1.0, 1.0])
+        return RouteWaypoints(name, town, np.array(xyz) * [1.0, -1.0, 1.0], scenarios)
     except InputError as error:
         raise InputError(f"route number {number + 1} of {path}: {error}") from None

@@ -1,7 +1,10 @@
 """Drives over routes through towns: what every simulator with towns has in common."""
 
 import dataclasses
+import functools
+import logging
 import zlib
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -16,8 +19,11 @@ from foredrive.scene.conditions import (
     find_conditions,
 )
 from foredrive.sensors.rigs import SURROUND, RigPlan
-from foredrive.simulation.route_sets import load_route_set
+from foredrive.simulation.route_sets import RouteWaypoints, load_route_set
 from foredrive.simulation.routes import DriveRoute, snap_route
+from foredrive.towns.map.names import TOWNS
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -61,15 +67,23 @@ class RouteSource:
         return {**fields, "image_hw": self.rig.image_hw, **other}
 
     def jobs(self, agent: str) -> Sequence[DriveJob]:
-        """Return one drive for each route and repetition."""
+        """Return one drive for each route and repetition.
+
+        Raises:
+            InputError: there is no such route, a route is in a town that is not here, or the agent has
+                another rig.
+        """
         inputs_of(agent)
         if not self.other_rig:
             check_rig_of(agent, self.rig)
-        ids = [route.id for route in load_route_set(self.routes)]
+        routes = {route.id: route for route in load_route_set(self.routes)}
         for name in self.only:
-            if name not in ids:
-                raise InputError(f"{self.routes} has no route {name}; it has {', '.join(ids)}")
-        return [job_of(name, n) for n in range(self.repetitions) for name in self.only or ids]
+            if name not in routes:
+                raise InputError(f"{self.routes} has no route {name}; it has {', '.join(routes)}")
+        chosen = [routes[name] for name in self.only or routes]
+        _check_towns(self.routes, chosen)
+        _tell_scenarios(self.routes, tuple(kind for route in chosen for kind in route.scenarios))
+        return [job_of(route.id, n) for n in range(self.repetitions) for route in chosen]
 
     def route_of(self, job: DriveJob) -> DriveRoute:
         """Return the route of a drive, snapped to the lanes."""
@@ -82,6 +96,25 @@ class RouteSource:
         if self.conditions != ANY_CONDITIONS:
             return find_conditions(self.conditions)
         return list(CONDITIONS.values())[drive_hash(seed, route) % len(CONDITIONS)]
+
+
+def _check_towns(name: str, routes: Sequence[RouteWaypoints]) -> None:
+    elsewhere = Counter(route.town for route in routes if route.town not in TOWNS)
+    if elsewhere:
+        counted = ", ".join(f"{town} ({count} of {len(routes)})" for town, count in sorted(elsewhere.items()))
+        raise InputError(
+            f"{name}: routes in towns that are not here: {counted}; the towns are {', '.join(TOWNS)}. "
+            "--only ROUTE … drives some routes"
+        )
+
+
+@functools.cache
+def _tell_scenarios(name: str, types: tuple[str, ...]) -> None:
+    """Say once in a process that the scenarios of a route file are not played."""
+    if types:
+        counted = ", ".join(f"{count} {kind}" for kind, count in sorted(Counter(types).items()))
+        text = "%s: scenarios left out: %s; --scenarios has scenarios of its own"
+        _log.warning(text, name, counted)
 
 
 def job_of(route: str, repetition: int) -> DriveJob:

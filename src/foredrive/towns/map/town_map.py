@@ -282,6 +282,8 @@ _SWAPPED = {
 
 def _markings(helper: Any, marks: list[Any], swap: bool) -> tuple[Marking, ...]:
     """Convert road marks from the road's s coordinate to the strip's direction of travel."""
+    if not marks:
+        return ()
     length = float(helper.s_range[1] - helper.s_range[0])
     ends = [mark.s_offset for mark in marks[1:]] + [length]
     found = []
