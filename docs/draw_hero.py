@@ -11,7 +11,7 @@ from pathlib import Path
 from foredrive.data import find_logs
 from foredrive.runs import open_run, predict_examples
 from foredrive.runs.shipped import run_folder
-from foredrive.view.overview import write_overview
+from foredrive.view.overview import Overview, write_overview
 
 HERE = Path(__file__).parent
 COUNT = 40
@@ -23,7 +23,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         run = open_run(run_folder(Path("embedded:nemo_town"), Path(folder)))
         shown = predict_examples(run, find_logs(Path(log)), COUNT)
-        write_overview(HERE / "hero.png", shown[int(index)])
+        write_overview(HERE / "hero.png", Overview.of(shown[int(index)]))
 
 
 if __name__ == "__main__":

@@ -69,6 +69,21 @@ def test_a_camera_the_log_lacks_is_told(drive: Clip, tmp_path: Path) -> None:
         read_drive(log, (48, 96), ("behind",))
 
 
+def test_cameras_are_found_by_both_names_in_any_case(tmp_path: Path) -> None:
+    (log,) = find_logs(world.write(tmp_path, frames=2))
+    right = read_drive(log, (48, 96), ("ahead",), frames=[0]).rig.T_ego_cam
+    for name in ("AHEAD", "PCAM_F0", "pcam_f0"):
+        torch.testing.assert_close(read_drive(log, (48, 96), (name,), frames=[0]).rig.T_ego_cam, right)
+
+
+def test_chosen_frames_are_read_with_the_first_of_them_as_now(drive: Clip, tmp_path: Path) -> None:
+    (log,) = find_logs(world.write(tmp_path, frames=11))
+    part = read_drive(log, (48, 96), frames=[3, 7], derived=False)
+    assert part.now == 0
+    torch.testing.assert_close(part.t_s, drive.t_s[[3, 7]] - drive.t_s[3])
+    torch.testing.assert_close(part.T_world_ego, drive.T_world_ego[[3, 7]])
+
+
 def test_tracks_are_where_the_boxes_are(drive: Clip) -> None:
     tracks = read_tracks(drive.frames([0, 2, 4, 6, 8, 10]), drive.T_world_ego[0])
     states = states_at(tracks, 0.5)  # between frames that were read

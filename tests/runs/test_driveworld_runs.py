@@ -143,6 +143,8 @@ def test_nemo_imagines_one_future_as_far_as_it_can_and_renders_it(
     assert moment.futures.shape[:2] == (1, 3)
     assert moment.rendered.shape == (3, 2, 3, 32, 64)
     assert write_imagination_video(tmp_path / "film.webp", [moment], 0.5) == 4
+    (by_default,) = imagine_run(trained, log, samples=5, moments=1)
+    assert torch.equal(by_default.futures, moment.futures)
     with pytest.raises(InputError, match="imagines at most 1 s"):
         next(imagine_run(trained, log, seconds=4.0, samples=5, moments=1))
 

@@ -268,6 +268,8 @@ def test_threats_need_a_car_and_a_moving_log() -> None:
         send_threat(Threat.SIDE, scene_with(actor(9.0, 0.0, Category.PEDESTRIAN)), drive, 1.0)
     with pytest.raises(InputError, match="too early for an impact"):
         send_threat(Threat.SIDE, scene_with(FAR), drive, END_S - 2.0)
+    with pytest.raises(InputError, match=r"drives on for 1\.0 m after an impact at .* s, and 5 m are needed"):
+        send_threat(Threat.SIDE, scene_with(FAR), drive, END_S - 4.0 - 1.0 / SPEED_MPS)
 
 
 def test_a_shifted_ego_vehicle_drives_beside_the_log() -> None:

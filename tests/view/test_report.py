@@ -23,7 +23,7 @@ from foredrive.view.example_panel import (
 )
 from foredrive.view.html import Provenance
 from foredrive.view.loss_curves import draw_loss_curves
-from foredrive.view.overview import write_overview
+from foredrive.view.overview import Overview, write_overview
 from foredrive.view.run_report import RunReport, write_run_report
 from foredrive.view.summary_tables import (
     full_table,
@@ -296,14 +296,14 @@ def test_the_report_is_written_whole(report: RunReport, tmp_path: Path) -> None:
 
 
 def test_the_overview_needs_images(panel: ExamplePrediction, tmp_path: Path) -> None:
-    write_overview(tmp_path / "overview.png", panel)
+    write_overview(tmp_path / "overview.png", Overview.of(panel))
     with Image.open(tmp_path / "overview.png") as picture:
         assert picture.width > 1500
     clip = panel.example.clip
     dark = dataclasses.replace(clip, image_valid=torch.zeros_like(clip.image_valid))
     blind = dataclasses.replace(panel, example=dataclasses.replace(panel.example, clip=dark))
     with pytest.raises(InputError, match="no camera images"):
-        write_overview(tmp_path / "none.png", blind)
+        write_overview(tmp_path / "none.png", Overview.of(blind))
 
 
 def test_figures_of_tasks_stand_beside_their_baselines() -> None:

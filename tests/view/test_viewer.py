@@ -12,6 +12,7 @@ import pytest
 import torch
 import viser
 from miniature import miniature, write_log
+from PIL import Image
 from test_task_pictures import agents
 
 from foredrive.cli.main import main
@@ -22,6 +23,7 @@ from foredrive.scene import Trajectory, VoxelSpec
 from foredrive.scene.agents import MapLines
 from foredrive.view.log_frames import LogFrames
 from foredrive.view.model_panel import pinhole
+from foredrive.view.overview import CAPTION_PX, GAP_PX, VOXELS_WIDTH_PX, Overview, occupancy_with_paths
 from foredrive.view.page import free_port
 from foredrive.view.task_nodes import show_agents, show_lines
 from foredrive.view.viewer import Viewer
@@ -284,3 +286,32 @@ def test_what_heads_find_is_shown_and_cleared(viewer: Viewer) -> None:
     show_true_classes(scene, None, "occ3d", SPEC, 0.0)
     for name in ("/found boxes", "/found boxes/lines", "/found map", "/true voxels"):
         assert node(viewer, name) is None
+
+
+def test_the_picture_of_a_run_shows_its_occupancy_and_plan(log: LogPath, run: Run, tmp_path: Path) -> None:
+    """The right part is the drawing of what the model predicts then."""
+    frames = LogFrames(log, 640, run)
+    index = frames.nearest(None)
+    prediction = frames.prediction(index)
+    assert prediction is not None
+    arguments = ["view", str(log.folder), "--save", str(tmp_path / "x.png")]
+    assert main([*arguments, "--run", str(run.folder)]) == 0
+    picture = np.asarray(Image.open(tmp_path / "x.png").convert("RGB")).astype(int)
+    occupied, plan = prediction.occupancy_logit[0] > 0, prediction.plan
+    shown = Overview("", frames.clip(index), occupied, plan, run.recipe.clips.voxels)
+    height = picture.shape[0] - CAPTION_PX - GAP_PX
+    drawn = occupancy_with_paths(shown, (height, VOXELS_WIDTH_PX)).astype(int)
+    place = picture[CAPTION_PX : CAPTION_PX + height, -VOXELS_WIDTH_PX - GAP_PX : -GAP_PX]
+    assert np.abs(place - drawn).max() <= 1
+
+
+def test_a_picture_of_a_run_needs_enough_frames_before(
+    log: LogPath, run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    frames = LogFrames(log, 640, run)
+    assert frames.prediction(0) is None
+    path = tmp_path / "x.png"
+    told = ["view", str(log.folder), "--save", str(path), "--run", str(run.folder), "--t", "0"]
+    assert main(told) == 2
+    assert "too few frames before this one for the model" in capsys.readouterr().err
+    assert not path.exists()

@@ -14,7 +14,7 @@ def imagine(
     run: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")],
     log: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="LOG")],
     out: Path,
-    seconds: float = 4.0,
+    seconds: float | None = None,
     samples: int = 5,
     moments: int = 4,
 ) -> None:
@@ -26,7 +26,7 @@ def imagine(
         run: Folder of a trained run.
         log: Folder of a 123D log, or of a split or data root with exactly one log in it.
         out: The video: .mp4, or .webp, which browsers play as a picture.
-        seconds: Length of each future, s.
+        seconds: Length of each future, s; by default as far as the model imagines, at most 4 s.
         samples: Number of futures drawn from a stochastic model; a deterministic model gives one.
         moments: Number of times of the log from which the model imagines.
     """

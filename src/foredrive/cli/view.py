@@ -13,6 +13,7 @@ from foredrive.lazy import importing
 
 if TYPE_CHECKING:
     from foredrive.runs import Run
+    from foredrive.view.log_frames import LogFrames
 
 EDITS = "edits.json"
 
@@ -39,7 +40,7 @@ def view(
         edits: For a reconstruction: file of edits that the page loads and saves. By default the page starts
             without edits and saves them as "edits.json" in the folder of the reconstruction.
         save: Write a picture (PNG) and serve no page: every camera with lidar and boxes, and the scene from
-            above with the map.
+            above with the map. With --run: the images, the occupancy that the model predicts, and its plan.
         t: Time since the start of the log, s; by default the middle of a log, the start of a reconstruction.
         reach: Distance that the picture's view from above shows in each direction, m.
         host: Address at which the page is served; use 0.0.0.0 to make it visible to other machines.
@@ -59,8 +60,6 @@ def view(
     if edits is not None:
         raise InputError(f"{log}: --edits needs the folder of a reconstruction")
     found = find_one_log(log)
-    if save is not None and run is not None:
-        raise InputError("--save draws only the log and cannot be combined with --run")
     if run is not None:
         run = check_run(run)
 
@@ -70,11 +69,7 @@ def view(
     frames = LogFrames(found, CAMERA_WIDTH_PX, None if run is None else _opened(run))
     index = frames.nearest(t)
     if save is not None:
-        from foredrive.view.log_sheet import write_log_sheet
-
-        title = f"{frames.name}    t = {frames.t_s[index]:.2f} s"
-        write_log_sheet(save, frames.clip(index), title, reach)
-        print(f"wrote {save}")
+        _save(save, frames, index, reach)
         return
     from foredrive.view.viewer import Viewer
 
@@ -82,6 +77,25 @@ def view(
         viewer.show(index)
         print(f"{frames.name} is at {viewer.url} until you press Ctrl-C", flush=True)
         viewer.play()
+
+
+def _save(path: Path, frames: "LogFrames", index: int, reach_m: float) -> None:
+    """Write the picture of one time: of the log, or of what a run's model sees and plans."""
+    title = f"{frames.name}    t = {frames.t_s[index]:.2f} s"
+    if frames.run is None:
+        from foredrive.view.log_sheet import write_log_sheet
+
+        write_log_sheet(path, frames.clip(index), title, reach_m)
+    else:
+        from foredrive.view.overview import Overview, write_overview
+
+        prediction = frames.prediction(index)
+        if prediction is None:
+            raise InputError(f"{title}: too few frames before this one for the model; choose a later --t")
+        spec = frames.run.recipe.clips.voxels
+        occupied = prediction.occupancy_logit[0] > 0
+        write_overview(path, Overview(title, frames.clip(index), occupied, prediction.plan, spec))
+    print(f"wrote {path}")
 
 
 def _opened(run: Path) -> "Run":

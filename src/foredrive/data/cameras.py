@@ -93,9 +93,13 @@ def camera_mount(log: Log, metadata: PinholeCameraMetadata) -> Float64[np.ndarra
 
 
 def find_camera(cameras: dict[str, PinholeCameraMetadata], name: str) -> PinholeCameraMetadata | None:
-    """Find a camera by its own name ("CAM_FRONT") or by 123D's name ("pcam_f0"), common to all datasets."""
-    by_id = {metadata.camera_id.serialize(): metadata for metadata in cameras.values()}
-    return cameras.get(name) or by_id.get(name)
+    """Find a camera by its own name ("CAM_FRONT") or by 123D's name ("pcam_f0"), common to all datasets.
+
+    An upper and a lower case letter are the same.
+    """
+    by_id = {metadata.camera_id.serialize().lower(): metadata for metadata in cameras.values()}
+    by_name = {own.lower(): metadata for own, metadata in cameras.items()}
+    return by_name.get(name.lower()) or by_id.get(name.lower())
 
 
 def told_cameras(cameras: Iterable[PinholeCameraMetadata]) -> str:

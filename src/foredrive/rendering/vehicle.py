@@ -86,9 +86,10 @@ class LoggedVehicle(Record):
         Raises:
             InputError: there is no camera of this name. The message lists those that exist.
         """
-        if name not in self.rig.names:
-            raise InputError(f"no camera {name!r}; there are: {', '.join(self.rig.names) or 'none'}")
-        return self.rig.names.index(name)
+        for index, known in enumerate(self.rig.names):
+            if known.lower() == name.lower():
+                return index
+        raise InputError(f"no camera {name!r}; there are: {', '.join(self.rig.names) or 'none'}")
 
 
 def read_vehicle(

@@ -46,8 +46,13 @@ def send_threat(threat: Threat, graph: SceneGraph, drive: LoggedDrive, start_s: 
         InputError: the scene has no car, or at the time of impact the log has ended or hardly moves.
     """
     at_s = start_s + AFTER_S
-    if at_s > drive.end_s or drive.way_left_m(at_s) < ARRIVED_M:
+    if at_s > drive.end_s:
         raise InputError(f"the log ends at {drive.end_s:.1f} s, too early for an impact at {at_s:.1f} s")
+    if (left_m := drive.way_left_m(at_s)) < ARRIVED_M:
+        raise InputError(
+            f"the log drives on for {left_m:.1f} m after an impact at {at_s:.1f} s, "
+            f"and {ARRIVED_M:.0f} m are needed: the log is too short"
+        )
     if drive.state_at(at_s).speed_mps < MIN_MPS:
         raise InputError(f"the vehicle of the log hardly moves at {at_s:.1f} s, so no impact would follow")
     row, tracks = _most_observed_car(graph), graph.tracks

@@ -38,7 +38,7 @@ from foredrive.view.image_drawing import resize, to_image
 from foredrive.view.log_frames import CAMERA_WIDTH_PX, LogFrames
 from foredrive.view.log_sheet import write_log_sheet
 from foredrive.view.loss_curves import draw_loss_curves
-from foredrive.view.overview import write_overview
+from foredrive.view.overview import Overview, write_overview
 from foredrive.view.run_report import report_on_run, write_run_report
 from foredrive.view.search_sheet import query_line
 from foredrive.view.summary_tables import BASELINE_TITLES, PRIOR, planning_overview
@@ -81,7 +81,7 @@ def show_shipped(demo: Demo) -> Section:
     """Show what the shipped model sees in the held-out town."""
     judged = judge_shipped(demo)
     best = _fastest(judged.examples)
-    write_overview(demo.out / "hero.png", best)
+    write_overview(demo.out / "hero.png", Overview.of(best))
     _write_run_report(judged, demo.out / "seen" / "report.html")
     recall = number(judged.summary.get("vehicles.car_recall_20m"), 2)
     return Section(

@@ -1,16 +1,18 @@
 """One wide picture of Foredrive: cameras and lidar as input, occupancy and a plan as output."""
 
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Bool, UInt8
 from matplotlib.figure import Figure
 from PIL import Image, ImageDraw
+from torch import Tensor
 
 from foredrive.errors import InputError
 from foredrive.files import atomic_path
 from foredrive.runs import ExamplePrediction
-from foredrive.scene import Trajectory
+from foredrive.scene import Clip, Trajectory, VoxelSpec
 from foredrive.view import palette
 from foredrive.view.bev import path_points
 from foredrive.view.example_panel import example_title
@@ -26,16 +28,35 @@ PATH_WIDTH_PX, DOT_PX = 4, 5
 OUTPUT_CAPTION = "Output: predicted occupancy and plan (red; driven path: green)"
 
 
-def write_overview(path: Path, shown: ExamplePrediction) -> None:
-    """Write the picture as a PNG, about 1,900 px wide.
+@dataclass(frozen=True)
+class Overview:
+    """What a model receives at one time, and what it sees and plans. Nothing has leading dimensions."""
+
+    title: str
+    clip: Clip
+    occupied: Bool[Tensor, "Z Y X"]
+    plan: Trajectory
+    spec: VoxelSpec
+
+    @classmethod
+    def of(cls, shown: ExamplePrediction) -> "Overview":
+        """Return the overview of an example."""
+        example = shown.example
+        return cls(
+            example_title(example), example.clip, shown.occupied[0], shown.plan, example.occupancy.spec
+        )
+
+
+def write_overview(path: Path, shown: Overview) -> None:
+    """Write the picture as a PNG, about 1,900 px wide for six cameras.
 
     Raises:
-        InputError: the example has no camera images.
+        InputError: there are no camera images.
     """
-    clip = shown.example.clip
+    clip = shown.clip
     rows = camera_rows(clip.rig[clip.now])
     if not rows or not bool(clip.image_valid[clip.now].any()):
-        raise InputError(f"{example_title(shown.example)}: no camera images to make a picture of")
+        raise InputError(f"{shown.title}: no camera images to make a picture of")
     cell_h = round(CAMERA_WIDTH_PX * clip.rig.size_hw[0] / clip.rig.size_hw[1])
     columns = max(len(row) for row in rows)
     cameras_w = columns * (CAMERA_WIDTH_PX + GAP_PX) - GAP_PX
@@ -58,14 +79,14 @@ def write_overview(path: Path, shown: ExamplePrediction) -> None:
         _captioned(np.asarray(canvas), captions).savefig(scratch, dpi=DPI, format="png")
 
 
-def occupancy_with_paths(shown: ExamplePrediction, size_hw: tuple[int, int]) -> UInt8[np.ndarray, "H W 3"]:
+def occupancy_with_paths(shown: Overview, size_hw: tuple[int, int]) -> UInt8[np.ndarray, "H W 3"]:
     """Draw predicted occupancy now in perspective, with the vehicle, the driven future and the plan."""
-    viewpoint = Viewpoint.behind(shown.example.occupancy.spec, size_hw)
-    picture = draw_voxels(shown.occupied[0], shown.example.occupancy.spec, size_hw, viewpoint)
+    viewpoint = Viewpoint.behind(shown.spec, size_hw)
+    picture = draw_voxels(shown.occupied, shown.spec, size_hw, viewpoint)
     large_hw = (size_hw[0] * SUPERSAMPLING, size_hw[1] * SUPERSAMPLING)
     canvas = Image.fromarray(picture).resize(large_hw[::-1], Image.Resampling.NEAREST)
     draw = ImageDraw.Draw(canvas)
-    _draw_path(draw, viewpoint, large_hw, shown.example.clip.future, palette.EXPERT)
+    _draw_path(draw, viewpoint, large_hw, shown.clip.future, palette.EXPERT)
     _draw_path(draw, viewpoint, large_hw, shown.plan, palette.PLAN)
     _draw_ego(draw, viewpoint, large_hw)
     return np.asarray(canvas.resize(size_hw[::-1], Image.Resampling.BOX))

@@ -16,6 +16,8 @@ from foredrive.scene import Belief, Clip, Example, RayRenderer, WorldModel
 from foredrive.training import thinned_rays
 
 SEED = 0
+MAX_DEFAULT_S = 4.0
+"""Longest future that is imagined where no length is asked for, s."""
 
 
 @dataclass(frozen=True)
@@ -32,12 +34,12 @@ class ImaginedFutures:
 
 @torch.no_grad()
 def imagine_run(
-    run: Run, log: LogPath, *, seconds: float, samples: int, moments: int, ray_stride: int = 1
+    run: Run, log: LogPath, *, seconds: float | None = None, samples: int, moments: int, ray_stride: int = 1
 ) -> Iterator[ImaginedFutures]:
     """Imagine futures from times spread evenly over a log.
 
     Args:
-        seconds: length of a future, s.
+        seconds: length of a future, s; None: as far as the model imagines, at most `MAX_DEFAULT_S`.
         samples: number of futures from a stochastic world model; the seed is fixed, so they are the same in
             every call.
         moments: number of times; fewer if the log is too short for as many.
@@ -48,11 +50,13 @@ def imagine_run(
             imagine that far.
     """
     clips = run.recipe.clips
-    steps = round(seconds / clips.frame_dt_s)
+    world = load_agent(run).world_model
+    steps = round((MAX_DEFAULT_S if seconds is None else seconds) / clips.frame_dt_s)
+    if seconds is None and world.max_steps is not None:
+        steps = min(steps, world.max_steps)
     if min(steps, samples, moments) < 1:
         raise InputError(f"at least one moment, one sample and one step of {clips.frame_dt_s:g} s are needed")
-    world = load_agent(run).world_model
-    if world.max_steps is not None and steps > world.max_steps:
+    if seconds is not None and world.max_steps is not None and steps > world.max_steps:
         max_s = world.max_steps * clips.frame_dt_s
         raise InputError(f"{run.folder}: the model imagines at most {max_s:g} s, not {seconds:g} s")
     config = dataclasses.replace(clips.judged, future_frames=steps, future_images=True)
