@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from foredrive.errors import InputError
+from foredrive.towns.map import town_map
 from foredrive.towns.map.junction_heights import level_junction
 from foredrive.towns.map.town_map import MarkingKind, StopZoneKind, StripKind, TownMap, load_town_map
 
@@ -86,3 +87,24 @@ def test_crossing_roads_of_a_junction_agree_on_their_height() -> None:
     np.testing.assert_array_equal(b[[0, -1]], bumpy[0][[0, -1]])  # where they meet the roads outside
     (same, _), _ = level_junction([even, even])
     assert same is even[0]
+
+
+def test_a_lane_without_road_marks_has_no_markings(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As on roads of Town13: OpenDRIVE does not ask for marks. The painted neighbours keep theirs."""
+    painted = load_town_map("Town02")
+    collect = town_map.collect_element_helpers
+
+    def without_marks_of_road_0(*arguments: object) -> object:
+        elements = collect(*arguments)
+        for helper in elements[2].values():
+            if helper.lane_id.startswith("0_"):
+                helper.open_drive_lane.road_marks.clear()
+        return elements
+
+    monkeypatch.setattr(town_map, "collect_element_helpers", without_marks_of_road_0)
+    bare = {strip.id: strip for strip in load_town_map.__wrapped__("Town02").strips}
+    of_road_0 = [strip for strip in painted.strips if strip.id.startswith("0_")]
+    assert any(strip.right_markings for strip in of_road_0)
+    assert not any(bare[strip.id].right_markings for strip in of_road_0)
+    others = [strip for strip in painted.strips if not strip.id.startswith("0_")]
+    assert all(bare[strip.id].right_markings == strip.right_markings for strip in others)

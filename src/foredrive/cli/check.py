@@ -6,6 +6,7 @@ from typing import Annotated
 import tyro
 
 from foredrive.cli.failures import listed_failures
+from foredrive.cli.progress import job_progress
 from foredrive.errors import InputError
 from foredrive.lazy import importing
 
@@ -37,18 +38,21 @@ def check(
         from foredrive.view.check_table import check_table
         from foredrive.view.table import print_table
 
-    found, unopened = [], {}
-    for path in find_all_logs(logs):
-        try:
-            found.append(check_with_calibration(path))
-        except InputError as error:
-            unopened[path.name] = str(error)
-            found.append(LogCheck(path.name, 0, 0.0, 0.0, [], [Finding("problem", "log", str(error))]))
-        if not json:
-            print_table(check_table(found[-1]), Console())
+    checks, unopened = [], {}
+    paths = find_all_logs(logs)
+    with job_progress("checking logs", len(paths)) as tick:
+        for path in paths:
+            try:
+                checks.append(check_with_calibration(path))
+            except InputError as error:
+                unopened[path.name] = str(error)
+                checks.append(LogCheck(path.name, 0, 0.0, 0.0, [], [Finding("problem", "log", str(error))]))
+            if not json:
+                print_table(check_table(checks[-1]), Console())
+            tick()
     if json:
-        print(dumps([dataclasses.asdict(each) for each in found], indent=2))
-    if unopened and len(found) == 1:
+        print(dumps([dataclasses.asdict(check) for check in checks], indent=2))
+    if unopened and len(checks) == 1:
         raise InputError(next(iter(unopened.values())))
     if unopened:
-        raise InputError(f"{len(unopened)} of {len(found)} logs: {listed_failures(unopened)}")
+        raise InputError(f"{len(unopened)} of {len(checks)} logs: {listed_failures(unopened)}")

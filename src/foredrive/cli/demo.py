@@ -4,6 +4,7 @@ import time
 from pathlib import Path
 
 from foredrive.cli.arguments import OptionalPath, check_out_folder
+from foredrive.cli.progress import progress_lines
 from foredrive.errors import InputError
 from foredrive.lazy import importing
 
@@ -27,7 +28,15 @@ def demo(out: OptionalPath = None, quick: bool = False) -> None:
 
     started = time.perf_counter()
     folder = out or Path("runs", "demo-quick" if quick else "demo")
-    outcomes = do_steps(STEPS, Demo(quick_demo() if quick else full_demo(), folder), print)
+    step = "demo"
+
+    def tell(text: str) -> None:
+        nonlocal step
+        step = text
+        print(text, flush=True)
+
+    with progress_lines(lambda: f"still {step}"):
+        outcomes = do_steps(STEPS, Demo(quick_demo() if quick else full_demo(), folder), tell)
     report = folder / "report.html"
     write_demo_report(report, outcomes, Provenance.of(collect_provenance()))
     print(f"done in {time.perf_counter() - started:.0f} s: the report is {report}")

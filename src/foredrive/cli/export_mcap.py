@@ -7,6 +7,7 @@ from typing import Annotated
 import tyro
 
 from foredrive.cli.arguments import OptionalPath, check_run
+from foredrive.cli.progress import progress_lines
 from foredrive.errors import InputError
 from foredrive.lazy import importing
 
@@ -39,5 +40,6 @@ def export_mcap(
         from foredrive.runs import open_run
         from foredrive.view.log_mcap import write_log_mcap
 
-    topics = write_log_mcap(path, out, None if run is None else open_run(run))
+    with progress_lines(lambda: f"exporting {path.name}"):
+        topics = write_log_mcap(path, out, None if run is None else open_run(run))
     print(f"wrote {out} with {', '.join(topics)}")

@@ -6,6 +6,7 @@ from typing import Annotated
 import tyro
 
 from foredrive.cli.arguments import check_number, check_run
+from foredrive.cli.progress import counted, job_progress
 from foredrive.data.log_paths import find_one_log
 from foredrive.lazy import importing
 
@@ -46,5 +47,6 @@ def imagine(
 
     opened = open_run(run)
     seen = imagine_run(opened, found, seconds=seconds, samples=samples, moments=moments)
-    count = write_imagination_video(out, seen, opened.recipe.clips.frame_dt_s)
+    with job_progress("imagining futures", moments) as tick:
+        count = write_imagination_video(out, counted(seen, tick), opened.recipe.clips.frame_dt_s)
     print(f"wrote {out}: {count} frames of {opened.recipe.clips.frame_dt_s:g} s")
