@@ -56,6 +56,10 @@ def make_folder(folder: Path) -> None:
         folder.mkdir(parents=True, exist_ok=True)
     except FileNotFoundError:
         raise InputError(f"{folder}: no folder can be made there") from None
+    except FileExistsError:
+        if folder.is_symlink() and not folder.exists():
+            raise InputError(f"{folder}: a symbolic link that leads nowhere") from None
+        raise
 
 
 @contextlib.contextmanager

@@ -204,6 +204,43 @@ def test_each_verb_names_what_it_cannot_use(
     assert list(tmp_path.iterdir()) == []  # nothing half-written
 
 
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        *((line, "this name is too long") for line in (
+            "view {long}", "train nemo_tiny --logs {long} --out {tmp}/run", "evaluate {long}",
+            "record --town Town02 --out {long}", "score {long} --truth {long}", "compare {long}",
+            "convert pandaset {long} --out {tmp}/out", "drive --agent {long} --out {tmp}/out",
+            "search rain --index {long}", "reconstruct {long} --out {tmp}/run",
+        )),
+        ("train nemo_tiny --logs {loop} --out {tmp}/run", "{loop}: no such folder"),
+        ("record --town Town02 --out {loop}", "its symbolic links lead in a circle"),
+        ("score {log} --truth {log} --out {loop}", "{loop}: a symbolic link that leads nowhere"),
+    ],
+)  # fmt: skip
+def test_names_that_lead_nowhere_are_one_line(
+    line: str, said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    loop, other = tmp_path / "loop", tmp_path / "other"
+    loop.symlink_to(other)
+    other.symlink_to(loop)
+    (tmp_path / "log").mkdir()
+    places = {"long": tmp_path / ("a" * 300), "loop": loop, "tmp": tmp_path, "log": tmp_path / "log"}
+    assert main(line.format(**places).split()) == 2
+    err = capsys.readouterr().err
+    assert err.startswith("foredrive: ")
+    assert err.endswith(f"{said.format(**places)}\n")
+    assert err.count("\n") == 1
+
+
+def test_pictures_need_no_home(log: LogPath, tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "foredrive", "view", log.folder, "--save", tmp_path / "log.png"]
+    done = subprocess.run(
+        command, env=os.environ | {"HOME": "/proc/nowhere"}, capture_output=True, text=True, check=True
+    )
+    assert done.stderr == ""
+
+
 RECORD, RENDER = "record --town Town01 --out {tmp}/out", "render {tmp} --out {tmp}/x.webp"
 
 

@@ -1,13 +1,16 @@
 """Pickles from outside: plain data load, anything that could run does not."""
 
+import gzip
 import importlib
 import pickle
+import resource
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 
-from foredrive.data.safe_pickle import load_pickle, load_records
+from foredrive.data.safe_pickle import MAX_UNZIPPED_BYTES, load_pickle, load_records, load_table
 from foredrive.errors import InputError
 
 
@@ -59,3 +62,68 @@ def test_records_of_a_schema_load_under_their_old_name(tmp_path: Path) -> None:
     file.write_bytes(pickle.dumps(Intruder()))
     with pytest.raises(InputError, match=r"builtins\.print"):
         load_records(file, name, {"data_schema": name})
+
+
+def call(name: str, *args: bytes) -> bytes:
+    """A pickle of a call; the arguments are opcodes."""
+    return b"c" + name.replace(" ", "\n").encode() + b"\n(" + b"".join(args) + b"tR"
+
+
+def number(value: int) -> bytes:
+    return b"L%dL\n" % value
+
+
+HUGE = number(10**10)
+LONG_TYPE = call("numpy dtype", b"S'V2000000000'\n")
+RANGE = call(
+    "pandas.core.indexes.base _new_Index",
+    b"cpandas\nRangeIndex\n",
+    b"(S'start'\n" + number(0) + b"S'stop'\n" + HUGE + b"S'step'\n" + number(1) + b"d",
+)
+ENCODED = b"S'ab'\n"
+for _ in range(34):  # each hexadecimal text is twice as long
+    ENCODED = call("_codecs encode", ENCODED, b"S'hex'\n")
+
+
+@pytest.mark.parametrize(
+    "made",
+    [
+        call("numpy ndarray", b"(" + HUGE + b"t"),
+        call("numpy._core.multiarray _reconstruct", b"cnumpy\nndarray\n", b"(" + HUGE + b"t", b"S'b'\n"),
+        call("numpy._core.multiarray scalar", LONG_TYPE),
+        ENCODED,
+        RANGE,
+        call("pandas DataFrame", number(0), HUGE),
+        call("pandas Index", RANGE),
+        call("pandas.core.indexes.base _new_Index", b"cpandas\nIndex\n", b"(S'data'\n(ld"),
+    ],
+    ids=["array", "reconstructed", "scalar", "encoded", "range", "table", "index", "index of a list"],
+)
+def test_what_would_take_more_memory_than_it_has_bytes_is_refused(made: bytes, tmp_path: Path) -> None:
+    file = tmp_path / "large.pkl.gz"
+    file.write_bytes(gzip.compress(made + b"."))
+    before_kib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    with pytest.raises(InputError, match=r"large\.pkl\.gz: cannot read it"):
+        load_table(file)
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before_kib < 200_000
+
+
+def test_a_gzip_bomb_is_refused(tmp_path: Path) -> None:
+    file = tmp_path / "bomb.pkl.gz"
+    file.write_bytes(gzip.compress(b"N0" * (MAX_UNZIPPED_BYTES // 2) + b"N."))  # push and pop nothing
+    assert file.stat().st_size < 200_000
+    with pytest.raises(InputError, match=r"bomb\.pkl\.gz: .*longer than"):
+        load_table(file)
+
+
+@pytest.mark.parametrize("protocol", [4, 5])
+def test_tables_load_as_they_were(protocol: int, tmp_path: Path) -> None:
+    """Texts as objects, as pandas before 3 stores them."""
+    table = pd.DataFrame({"x": [1.5, 2.5], "n": [3, 4], "name": pd.Series(["a", "b"], dtype=object)})
+    table.columns = table.columns.astype(object)
+    for kept in (table, table.set_index(pd.Index([7, 5])), table.iloc[:0]):
+        file = tmp_path / "table.pkl.gz"
+        file.write_bytes(gzip.compress(pickle.dumps(kept, protocol=protocol)))
+        loaded = load_table(file)
+        assert type(loaded) is pd.DataFrame
+        pd.testing.assert_frame_equal(loaded, kept)

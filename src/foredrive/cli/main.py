@@ -99,6 +99,8 @@ DISK_ERRORS = {
     errno.EEXIST: "there is a file of that name",
     errno.ENOTDIR: "a part of this path is a file",
     errno.EISDIR: "there is a folder of that name",
+    errno.ENAMETOOLONG: "this name is too long",
+    errno.ELOOP: "its symbolic links lead in a circle",
 }
 ERROR_NUMBER = re.compile(r"\[Errno (\d+)\]|\(os error (\d+)\)")
 """Matches the number of an operating system's error in a message of Python or Rust."""

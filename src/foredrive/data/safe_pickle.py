@@ -1,4 +1,9 @@
-"""Reading of untrusted pickles without running their code."""
+"""Reading of untrusted pickles without running their code, in memory that their bytes account for.
+
+Some of the names that arrays and tables need can be called with other arguments than pandas and NumPy write:
+`ndarray((10**10,))`, `DataFrame(0, RangeIndex(10**9))`, or `encode` again and again on its own result. Here
+classes are stand-ins that cannot be called, and functions check their arguments.
+"""
 
 import gzip
 import importlib
@@ -9,9 +14,16 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
+from numpy._core import multiarray
 
 from foredrive.errors import InputError
+
+MAX_UNZIPPED_BYTES = 2**26
+"""Size of the largest gzipped pickle. A sweep of PandaSet has 9 MB."""
+MAX_ROWS = 10**7
+"""Number of rows of the longest table whose index is a range, which takes no bytes."""
 
 _PLAIN = {
     ("numpy", "dtype"),
@@ -50,7 +62,69 @@ class _Unpickler(pickle.Unpickler):
         module = self._moved.get(module, module)
         if (module, name) not in self._allowed:
             raise pickle.UnpicklingError(f"it asks for {module}.{name}, which plain data do not need")
+        if name in _CHECKED:
+            return _CHECKED[name]
         return getattr(importlib.import_module(module), name)
+
+
+class _StandIn:
+    """Stands for a class that a pickle names and may not call."""
+
+    def __init__(self, kind: type) -> None:
+        self.kind = kind
+
+
+_NDARRAY, _INDEX, _RANGE = _StandIn(np.ndarray), _StandIn(pd.Index), _StandIn(pd.RangeIndex)
+
+
+def _reconstruct(kind: object, shape: object, dtype: object) -> Any:
+    """Return an empty array; its shape and its bytes, whose number NumPy compares, follow."""
+    if kind is not _NDARRAY or shape != (0,):
+        raise pickle.UnpicklingError("an array is not as NumPy writes it")
+    return multiarray._reconstruct(np.ndarray, (0,), dtype)  # type: ignore[attr-defined]
+
+
+def _scalar(dtype: Any, content: object) -> Any:
+    """Return a number. Without content, it would have as many bytes as its type says."""
+    return multiarray.scalar(dtype, content)  # type: ignore[attr-defined]
+
+
+def _encode(text: str, encoding: str) -> bytes:
+    """Return bytes that protocols before 3 write as text."""
+    if not isinstance(text, str) or encoding != "latin1":
+        raise pickle.UnpicklingError(f"bytes are not as Python writes them ({encoding!r})"[:100])
+    return text.encode("latin1")
+
+
+def _new_index(kind: object, state: dict[str, Any]) -> Any:
+    """Return the index of a table, which is a range or has its values."""
+    if kind is _RANGE:
+        index = pd.RangeIndex(state["start"], state["stop"], state["step"], name=state.get("name"))
+        if len(index) <= MAX_ROWS:
+            return index
+    elif kind is _INDEX and isinstance(state["data"], np.ndarray | pd.api.extensions.ExtensionArray):
+        return pd.Index(state["data"], dtype=state["data"].dtype, name=state.get("name"))
+    raise pickle.UnpicklingError("the index of a table is not as pandas writes it")
+
+
+class _Table(pd.DataFrame):
+    """A table that is made of its unpickled state alone."""
+
+    def __init__(self, *args: object, **options: object) -> None:
+        raise pickle.UnpicklingError("a table is not as pandas writes it")
+
+
+_CHECKED: Mapping[str, Any] = {
+    "ndarray": _NDARRAY,
+    "Index": _INDEX,
+    "RangeIndex": _RANGE,
+    "DataFrame": _Table,
+    "_reconstruct": _reconstruct,
+    "scalar": _scalar,
+    "encode": _encode,
+    "_new_Index": _new_index,
+}
+"""What stands for an allowed name; others cannot take more than they are given."""
 
 
 def load_pickle(file: Path) -> Any:
@@ -71,7 +145,7 @@ def load_table(file: Path) -> "pd.DataFrame":
     table = _load(file, gzip.open, _TABLE)
     if not isinstance(table, pd.DataFrame):
         raise InputError(f"{file}: not a table but a {type(table).__name__}")
-    return table
+    return pd.DataFrame(table, copy=False)
 
 
 def load_records(file: Path, schema: str, moved: Mapping[str, str]) -> Any:
@@ -125,9 +199,12 @@ def _load(
     try:
         with opened(file, "rb") as source, warnings.catch_warnings():
             warnings.filterwarnings("ignore", message="dtype.*align")  # written by an older numpy
-            content = _Unpickler(source, allowed, moved).load()
-            source.read(1)  # a gzip's checksum is compared at its end
-            return content
+            if opened is gzip.open:
+                unzipped = source.read(MAX_UNZIPPED_BYTES + 1)  # to its end, where its checksum is compared
+                if len(unzipped) > MAX_UNZIPPED_BYTES:
+                    raise ValueError(f"longer than {MAX_UNZIPPED_BYTES:,} bytes")
+                source = io.BytesIO(unzipped)
+            return _Unpickler(source, allowed, moved).load()
     except Exception as error:  # a damaged pickle can raise any error
         raise InputError(f"{file}: cannot read it as a pickle of plain data: {_first_line(error)}") from error
 
