@@ -39,14 +39,15 @@ from foredrive.scene import VoxelSpec
 ROOT = Path("runs/faults").absolute()
 TEMPORARY = ROOT / "tmp"
 KILLS = {
-    "score": 10,
+    "score": 12,
     "convert": 10,
-    "train nemo_tiny": 9,
-    "train driveworld_tiny": 9,
-    "search index": 6,
+    "search index": 8,
+    "train nemo_tiny": 6,
     "reconstruct": 6,
-    "record": 4,
     "drive": 4,
+    "record": 4,
+    "evaluate": 4,
+    "train driveworld_tiny": 4,
 }
 """Kills of each command; fewer of those that take long."""
 KILLS_A_RUN = 3
@@ -63,6 +64,7 @@ PRELUDE = """
 import foredrive.runs.drive.recording, foredrive.runs.drive.suite, foredrive.runs.drive.in_towns
 import foredrive.runs.convert, foredrive.runs.train.run, foredrive.runs.rebuild.reconstruct
 import foredrive.runs.search.indexing, foredrive.runs.score.run, foredrive.training.fabric
+import foredrive.runs.evaluate.run, foredrive.view.run_report
 import foredrive.view.score_report, foredrive.view.drive_report, foredrive.view.rebuilt_sheet
 import lancedb
 """
@@ -158,6 +160,13 @@ def score() -> Command:
     return Command("score", ("score", str(results), "--truth", str(truth), "--out", str(out)), out)
 
 
+def evaluate() -> Command:
+    """Evaluate the shipped world model on the recording."""
+    out, log = ROOT / "evaluate", str(_town().folder)
+    arguments = ("evaluate", "embedded:nemo_town", "--logs", log, "--examples", "1", "--out", str(out))
+    return Command("evaluate", arguments, out)
+
+
 def _kills_of(make: Callable[[], Command]) -> Callable[[int], dict[str, float]]:
     def measure(seed: int) -> dict[str, float]:
         command = make()
@@ -238,12 +247,13 @@ BENCHMARK = Benchmark(
     arms={
         "score": _kills_of(score),
         "convert": _kills_of(convert),
-        "train nemo_tiny": _kills_of(lambda: train("nemo_tiny")),
-        "train driveworld_tiny": _kills_of(lambda: train("driveworld_tiny")),
         "search index": _kills_of(search_index),
+        "train nemo_tiny": _kills_of(lambda: train("nemo_tiny")),
         "reconstruct": _kills_of(reconstruct),
-        "record": _kills_of(record),
         "drive": _kills_of(drive),
+        "record": _kills_of(record),
+        "evaluate": _kills_of(evaluate),
+        "train driveworld_tiny": _kills_of(lambda: train("driveworld_tiny")),
         "bad inputs": bad_inputs,
     },
     seeds=(0,),

@@ -24,6 +24,7 @@ from pathlib import Path
 from statistics import fmean
 from typing import NamedTuple
 
+from benchmarks.common.killing import left_temporary
 from benchmarks.common.page_clients import SearchClients, ViewerClients
 from benchmarks.common.process_tree import TreeUse, in_session, tree_use
 from foredrive.evaluation.bench import Benchmark
@@ -127,7 +128,7 @@ def _soak(
         **_figures(looks),
         **count,
         "processes_left": float(len(left)),
-        "temporary_files_left": float(sum(path.is_file() for path in temporary.rglob("*"))),
+        "temporary_files_left": float(len(left_temporary(temporary))),
         "scratch_left": float(len(scratch)),
         "exit_code": float(program.returncode),
     }

@@ -187,12 +187,17 @@ def _judge_end(
     for name in differ:
         say(f"{command.name}: {name} is {'missing' if name not in there else 'not as it should be'}")
     scratch = [path for path in command.out.rglob("*") if path.name.endswith(".part")]
-    scratch += [path for path in temporary.rglob("*") if path.is_file()]
+    scratch += left_temporary(temporary)
     for path in scratch:
         say(f"{command.name}: {path} is left")
     found.files += len(reference)
     found.lost += len(differ)
     found.scratch_left += len(scratch)
+
+
+def left_temporary(folder: Path) -> list[Path]:
+    """Return files, sockets and the folders of sockets. PyTorch keeps an empty folder for its compiler."""
+    return [path for path in folder.rglob("*") if not path.is_dir() or path.name.startswith("pymp-")]
 
 
 def contents(folder: Path) -> dict[str, str]:

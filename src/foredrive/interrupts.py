@@ -5,12 +5,15 @@ import signal
 import sys
 import threading
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from types import FrameType
 
-STOPPING = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: signal.SIG_DFL}
+STOPPING: dict[signal.Signals, Any] = {
+    signal.SIGINT: signal.default_int_handler,
+    signal.SIGTERM: signal.SIG_DFL,
+}
 """Signals that interrupt a program, with Python's own handlers. Containers and schedulers send SIGTERM."""
 PATIENCE_S = 0.2
 """Time after which an interruption without effect is raised again."""
@@ -53,7 +56,7 @@ class LastingInterrupt:
         while not self._over.wait(PATIENCE_S):
             self._asks_again = True
             if is_blocked:
-                _thread.interrupt_main(self._number)
+                _thread.interrupt_main(signal.Signals(self._number))
             else:  # also wakes a sleeping main thread
                 signal.pthread_kill(self._main, self._number)
 

@@ -81,12 +81,12 @@ def _reconstruct(kind: object, shape: object, dtype: object) -> Any:
     """Return an empty array; its shape and its bytes, whose number NumPy compares, follow."""
     if kind is not _NDARRAY or shape != (0,):
         raise pickle.UnpicklingError("an array is not as NumPy writes it")
-    return multiarray._reconstruct(np.ndarray, (0,), dtype)  # type: ignore[attr-defined]
+    return multiarray._reconstruct(np.ndarray, (0,), dtype)
 
 
 def _scalar(dtype: Any, content: object) -> Any:
     """Return a number. Without content, it would have as many bytes as its type says."""
-    return multiarray.scalar(dtype, content)  # type: ignore[attr-defined]
+    return multiarray.scalar(dtype, content)
 
 
 def _encode(text: str, encoding: str) -> bytes:

@@ -74,7 +74,11 @@ def _bounded() -> Iterator[None]:
                 return connection.respond(503, "too many viewers\n")
             return process_request(connection, request)
 
-        bounds = {"create_connection": _BoundedConnection, "logger": _log, "open_timeout": REQUEST_S}
+        bounds: dict[str, Any] = {
+            "create_connection": _BoundedConnection,
+            "logger": _log,
+            "open_timeout": REQUEST_S,
+        }
         return serve(handler, host, port, process_request=checked, **options, **bounds)
 
     websockets.asyncio.server.serve = checking  # type: ignore[assignment, misc]
