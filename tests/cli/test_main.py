@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from torch._utils import ExceptionWrapper
 
 import foredrive
@@ -134,6 +135,15 @@ def test_mistakes_in_the_program_keep_their_traceback(run: Callable) -> None:
 
     with pytest.raises(ZeroDivisionError, match="a bug"):
         run(verb)
+
+
+@pytest.mark.parametrize("asked", ["torch.empty(10**14)", "bytearray(2**62)"])
+def test_memory_that_there_is_not_is_one_line(run: Callable, asked: str) -> None:
+    code, err = run(lambda: eval(asked, {"torch": torch}))
+    assert code == 2
+    assert err.startswith("foredrive: not enough memory")
+    assert err.count("\n") == 1
+    assert "372,529.0 GiB" in err or asked.startswith("bytearray")
 
 
 def test_a_missing_file_is_a_mistake_unless_a_verb_says_otherwise(run: Callable) -> None:

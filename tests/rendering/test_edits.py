@@ -134,3 +134,18 @@ def test_a_file_of_something_else_is_told(tmp_path: Path) -> None:
         load_edits(file)
     with pytest.raises(InputError, match="cannot be read"):
         load_edits(tmp_path / "nothing.json")
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        ('[{"kind": "move", "actor": 7, "offset_m": [NaN, 0, 0]}]', "0.move.offset_m.0: .*finite number"),
+        ('[{"kind": "move", "actor": 7, "yaw_rad": Infinity}]', "0.move.yaw_rad: .*finite number"),
+        ('[{"kind": "shift_ego", "offset_m": [0, 0, 1e999]}]', "0.shift_ego.offset_m.2: .*finite number"),
+        ("[" + ", ".join(['{"kind": "remove", "actor": 7}'] * 1001) + "]", "1,001 edits; there may be 1,000"),
+    ],
+)
+def test_edits_to_nowhere_and_without_end_are_refused(content: str, said: str, tmp_path: Path) -> None:
+    (tmp_path / "edits.json").write_text(content)
+    with pytest.raises(InputError, match=said):
+        load_edits(tmp_path / "edits.json")

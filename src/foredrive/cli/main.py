@@ -104,6 +104,8 @@ DISK_ERRORS = {
 }
 ERROR_NUMBER = re.compile(r"\[Errno (\d+)\]|\(os error (\d+)\)")
 """Matches the number of an operating system's error in a message of Python or Rust."""
+ASKED_MEMORY = re.compile(r"can't allocate memory: you tried to allocate (\d+) bytes")
+"""Matches the size in PyTorch's error, which is a RuntimeError."""
 
 
 def main(args: Sequence[str] | None = None) -> int:
@@ -138,7 +140,7 @@ def main(args: Sequence[str] | None = None) -> int:
     except Exception as error:
         if interrupt.pressed:  # the interrupted code raised another error
             return _end_interrupted()
-        reason = _disk_reason(error)
+        reason = _disk_reason(error) or _memory_reason(error)
         if reason is None:
             raise
         return _give_up(reason)
@@ -200,6 +202,16 @@ def _disk_reason(error: BaseException) -> str | None:
         if number in DISK_ERRORS:
             where = _written(error) or where
             return f"{where}: {DISK_ERRORS[number]}" if where else DISK_ERRORS[number]
+    return None
+
+
+def _memory_reason(error: BaseException) -> str | None:
+    """Return that more memory was asked for than there is; None if that is not the cause."""
+    for cause in _causes(error):
+        asked = ASKED_MEMORY.search(str(cause))
+        if asked is not None or isinstance(cause, MemoryError):
+            size = "" if asked is None else f": {int(asked[1]) / 2**30:,.1f} GiB were asked for"
+            return f"not enough memory{size}; smaller images, models or batches need less"
     return None
 
 

@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 
 import torch
 from jaxtyping import Float
-from pydantic import Discriminator, TypeAdapter, ValidationError
+from pydantic import Discriminator, FiniteFloat, TypeAdapter, ValidationError
 from torch import Tensor
 
 from foredrive.errors import InputError
@@ -19,8 +19,10 @@ from foredrive.geometry.se3 import inverse_se3, matrix_from_yaw
 from foredrive.rendering.scene_graph import SceneGraph
 from foredrive.rendering.tracks import ActorTracks
 
-Offset = tuple[float, float, float]
+Offset = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
 """Forward, left, up, m."""
+MAX_EDITS = 1000
+"""Largest number of edits in a file. Each may copy all tracks."""
 
 
 @dataclass(frozen=True)
@@ -29,7 +31,7 @@ class Move:
 
     actor: int
     offset_m: Offset = (0.0, 0.0, 0.0)
-    yaw_rad: float = 0.0
+    yaw_rad: FiniteFloat = 0.0
     kind: Literal["move"] = "move"
 
 
@@ -49,7 +51,7 @@ class Duplicate:
     copy: int
     """Id of the copy; must be free."""
     offset_m: Offset = (0.0, 0.0, 0.0)
-    yaw_rad: float = 0.0
+    yaw_rad: FiniteFloat = 0.0
     kind: Literal["duplicate"] = "duplicate"
 
 
@@ -66,7 +68,7 @@ class Insert:
     follows: int
     """Id of the actor whose path it follows."""
     offset_m: Offset = (0.0, 0.0, 0.0)
-    yaw_rad: float = 0.0
+    yaw_rad: FiniteFloat = 0.0
     kind: Literal["insert"] = "insert"
 
 
@@ -79,10 +81,10 @@ class DriveStraight:
     """Id of the copy; must be free."""
     at_m: Offset
     """Position of its centre at `at_s`, in the scene's frame, m."""
-    at_s: float
+    at_s: FiniteFloat
     velocity_mps: Offset = (0.0, 0.0, 0.0)
     """Velocity in the scene's axes."""
-    yaw_rad: float = 0.0
+    yaw_rad: FiniteFloat = 0.0
     """Heading about the z axis of the scene."""
     kind: Literal["send"] = "send"
 
@@ -92,7 +94,7 @@ class ShiftEgo:
     """An edit that moves the ego vehicle and its sensors at all times, by an offset in its own frame."""
 
     offset_m: Offset
-    yaw_rad: float = 0.0
+    yaw_rad: FiniteFloat = 0.0
     kind: Literal["shift_ego"] = "shift_ego"
 
 
@@ -190,6 +192,8 @@ def load_edits(path: Path) -> list[Edit]:
         raise InputError(
             f"{path}: not a list of edits: {f'{where}: ' if where else ''}{first['msg']}"
         ) from error
+    if len(edits) > MAX_EDITS:
+        raise InputError(f"{path}: {len(edits):,} edits; there may be {MAX_EDITS:,}")
     return edits
 
 
