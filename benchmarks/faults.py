@@ -209,7 +209,7 @@ def _recording(seconds: float) -> tuple[str, ...]:
         "--seconds",
         f"{seconds:g}",
         "--rate",
-        "5",
+        "4",
         "--image-size",
         *size,
         "--vehicles",
