@@ -16,7 +16,8 @@ from PIL import Image
 from test_task_pictures import agents
 
 from foredrive.cli.main import main
-from foredrive.data import LogPath
+from foredrive.data import CameraSpec, LogPath, Points
+from foredrive.data import write_log as write_recorded
 from foredrive.runs import Run, train_run
 from foredrive.runs.evaluate.display import DisplayPrediction
 from foredrive.scene import Trajectory, VoxelSpec
@@ -315,3 +316,38 @@ def test_a_picture_of_a_run_needs_enough_frames_before(
     assert main(told) == 2
     assert "too few frames before this one for the model" in capsys.readouterr().err
     assert not path.exists()
+
+
+def test_a_log_is_opened_where_its_sensors_have_data(tmp_path: Path) -> None:
+    """The middle has no sweep; one frame after it has no image; both are there 0.2 s after the middle."""
+    camera = CameraSpec(
+        "front",
+        np.array([[30.0, 0, 16], [0, 30, 12], [0, 0, 1]], np.float32),
+        np.array([[0, 0, 1, 1.5], [-1, 0, 0, 0], [0, -1, 0, 1.4], [0, 0, 0, 1]], np.float32),
+        (24, 32),
+    )
+    frames, image = 11, np.full((24, 32, 3), 90, np.uint8)
+    sweep = Points(np.array([[5.0, 0.0, 0.0], [6.0, 1.0, 0.5]]))
+    log = write_recorded(
+        tmp_path,
+        "drive",
+        t_s=0.1 * np.arange(frames),
+        T_world_ego=np.tile(np.eye(4), (frames, 1, 1)),
+        cameras=[camera],
+        images={"front": [None if frame == 6 else image for frame in range(frames)]},
+        sweeps=[None if frame in (3, 4, 5) else sweep for frame in range(frames)],
+    )
+    shown = LogFrames(log, 32)
+    assert shown.t_s[shown.nearest(None)] == pytest.approx(0.7)
+    assert shown.t_s[shown.nearest(0.5)] == pytest.approx(0.5)
+
+
+@pytest.mark.parametrize("name", ["film.mp4", "x.png", "drive.bag"])
+def test_a_file_that_is_no_log_is_told_what_view_opens(
+    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / name).write_bytes(b"\x89 no log")
+    assert main(["view", str(tmp_path / name)]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith(f"foredrive: {tmp_path / name}: view opens the folder of a 123D log")
+    assert "`foredrive convert`" in error

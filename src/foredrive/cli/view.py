@@ -16,6 +16,10 @@ if TYPE_CHECKING:
     from foredrive.view.log_frames import LogFrames
 
 EDITS = "edits.json"
+OPENED = (
+    "view opens the folder of a 123D log, of a split or data root with one log in it, "
+    "or of a reconstruction, and lists of clips (.json) of one log; `foredrive convert` makes logs"
+)
 
 
 def view(
@@ -41,7 +45,8 @@ def view(
             without edits and saves them as "edits.json" in the folder of the reconstruction.
         save: Write a picture (PNG) and serve no page: every camera with lidar and boxes, and the scene from
             above with the map. With --run: the images, the occupancy that the model predicts, and its plan.
-        t: Time since the start of the log, s; by default the middle of a log, the start of a reconstruction.
+        t: Time since the start of the log, s; by default the middle of a log, or near it where more of its
+            sensors have data; the start of a reconstruction.
         reach: Distance that the picture's view from above shows in each direction, m.
         host: Address at which the page is served; use 0.0.0.0 to make it visible to other machines.
         port: The page's port; if it is taken, the next free port.
@@ -59,6 +64,8 @@ def view(
         return
     if edits is not None:
         raise InputError(f"{log}: --edits needs the folder of a reconstruction")
+    if log.is_file() and log.suffix != ".json":
+        raise InputError(f"{log}: {OPENED}")
     found = find_one_log(log)
     if run is not None:
         run = check_run(run)

@@ -5,11 +5,12 @@ import functools
 from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Int, UInt8
 from torch import Tensor
 
 from foredrive.data import ClipConfig, ClipDataset, LogPath, collate
 from foredrive.data.cameras import pinhole_cameras
+from foredrive.data.lidar import frames_with_lidar
 from foredrive.data.logs import Log
 from foredrive.data.semantic_labels import read_semantics
 from foredrive.errors import InputError
@@ -93,7 +94,9 @@ class LogFrames:
         return len(self._clips)
 
     def nearest(self, t_s: float | None) -> int:
-        """Return the frame nearest to a time since the start of the log; by default the middle of the log.
+        """Return the frame nearest to a time since the start of the log.
+
+        By default it is, of the frames at which most sensors have data, the one nearest to the middle.
 
         Raises:
             InputError: the log has no such time.
@@ -101,7 +104,21 @@ class LogFrames:
         wanted_s = self.duration_s / 2 if t_s is None else t_s
         if not 0 <= wanted_s <= self.duration_s:
             raise InputError(f"{self.name}: no time {wanted_s:g} s in this log of {self.duration_s:.2f} s")
-        return min(range(len(self)), key=lambda index: abs(self.t_s[index] - wanted_s))
+        lacking = self._lacking_sensors() if t_s is None else np.zeros(len(self))
+        return min(range(len(self)), key=lambda index: (lacking[index], abs(self.t_s[index] - wanted_s)))
+
+    def _lacking_sensors(self) -> Int[np.ndarray, "N"]:
+        """Return how many cameras and lidars have no data at each frame; a run's prediction is one more."""
+        rows = np.searchsorted(self._log.t_us, self.now_us)
+        lacking = np.zeros(len(self), np.int64)
+        for frames in (
+            frames_with_lidar(self._log),
+            *(self._log.rows(camera.modality_key)[0] for camera in pinhole_cameras(self._log).values()),
+        ):
+            lacking += ~np.isin(rows, frames)
+        if self.run is not None:
+            lacking += np.array([index is None for index in self._observed_index])
+        return lacking
 
     def _clip(self, index: int) -> Clip:
         """Read a frame as a clip of one key frame, without batch dimension."""
