@@ -120,6 +120,14 @@ def test_what_is_inserted_has_an_id_of_its_own(run: Reconstruction) -> None:
     assert edited_scene(run.scene, own).graph.tracks.track_id.tolist() == [7, 12]
 
 
+def test_a_camera_has_all_names_by_which_a_log_has_it(run: Reconstruction) -> None:
+    vehicle = open_rebuilt(run.folder).vehicle
+    for name in ("ahead", "AHEAD", "pcam_f0", "PCAM_F0"):
+        assert plan_frames(vehicle, (name,)).cameras == (0,)
+    nameless = dataclasses.replace(vehicle, other_names=())
+    assert plan_frames(nameless, ("Ahead",)).cameras == (0,)
+
+
 def test_captions_say_what_was_changed() -> None:
     edits = [ShiftEgo((0.0, -2.0, 0.0)), Move(4, (1.0, 0.0, 0.0)), Remove(7), Remove(8)]
     assert rebuilt_video.describe_edits(edits) == "edited: 2 m to the right, 4 moved, without 7, and 1 more"

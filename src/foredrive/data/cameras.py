@@ -102,6 +102,12 @@ def find_camera(cameras: dict[str, PinholeCameraMetadata], name: str) -> Pinhole
     return by_name.get(name.lower()) or by_id.get(name.lower())
 
 
+def names_of_camera(log: Log, name: str) -> tuple[str, ...]:
+    """Return all names by which `find_camera` finds a camera; none if the log has no such camera."""
+    metadata = find_camera(pinhole_cameras(log), name)
+    return () if metadata is None else (metadata.camera_name, metadata.camera_id.serialize())
+
+
 def told_cameras(cameras: Iterable[PinholeCameraMetadata]) -> str:
     """Return a list of cameras for error messages, with both names that `find_camera` accepts."""
     names = dict.fromkeys((metadata.camera_name, metadata.camera_id.serialize()) for metadata in cameras)

@@ -62,6 +62,8 @@ class LoggedVehicle(Record):
     """Mount of the lidar; None without one."""
     reach_m: float
     """Range of the lidar, m; infinite without one."""
+    other_names: tuple[tuple[str, ...], ...] = ()
+    """Further names of each camera, such as 123D's; empty: none are known."""
 
     def check_time(self, t_s: float) -> None:
         """Check that a time lies within the drive.
@@ -81,13 +83,14 @@ class LoggedVehicle(Record):
         return EgoState(T[0], twist, t_s)
 
     def camera(self, name: str) -> int:
-        """Return the index of a camera in the rig.
+        """Return the index of a camera in the rig, by any of its names in any case.
 
         Raises:
             InputError: there is no camera of this name. The message lists those that exist.
         """
-        for index, known in enumerate(self.rig.names):
-            if known.lower() == name.lower():
+        others = self.other_names or ((),) * len(self.rig.names)
+        for index, names in enumerate(zip(self.rig.names, others, strict=True)):
+            if name.lower() in (alias.lower() for alias in (names[0], *names[1])):
                 return index
         raise InputError(f"no camera {name!r}; there are: {', '.join(self.rig.names) or 'none'}")
 
@@ -174,6 +177,7 @@ def load_vehicle(path: Path) -> LoggedVehicle:
             lidar=None if lidar is None else _lidar(lidar),
             T_ego_lidar=None if mounted is None else torch.tensor(mounted),
             reach_m=math.inf if saved["reach_m"] is None else float(saved["reach_m"]),
+            other_names=tuple(tuple(map(str, names)) for names in saved.get("other_names", [])),
         )
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror}") from error

@@ -1,5 +1,6 @@
 """Reconstruct a log as a scene that can be rendered: a folder with recipe, weights, metrics and pictures."""
 
+import dataclasses
 import json
 import logging
 import os
@@ -11,7 +12,7 @@ from typing import Any
 import torch
 
 from foredrive.data import LogPath
-from foredrive.data.cameras import pinhole_cameras
+from foredrive.data.cameras import names_of_camera, pinhole_cameras
 from foredrive.data.drives import lidar_of, read_drive
 from foredrive.data.logs import Log
 from foredrive.errors import InputError
@@ -231,8 +232,9 @@ def _vehicle(log: Log, drive: Clip, sweeps: Sequence[SweepView]) -> LoggedVehicl
     """Return the vehicle of a drive. Its lidar is the data set's model, or is estimated from the sweeps."""
     T_world_scene = drive.T_world_ego[0]
     seen = [view for view in sweeps if bool(view.beams.returned.any())]
+    other_names = tuple(names_of_camera(log, name) for name in drive.rig.names)
     if not seen:
-        return read_vehicle(drive, T_world_scene)
+        return dataclasses.replace(read_vehicle(drive, T_world_scene), other_names=other_names)
     fullest = max(seen, key=lambda view: len(view.beams.dt_s))
     beams, T_ego_lidar = fullest.beams, torch.eye(4)
     T_ego_lidar[:3, 3] = beams.origin_ego[beams.dt_s.abs().argmin()]
@@ -241,7 +243,8 @@ def _vehicle(log: Log, drive: Clip, sweeps: Sequence[SweepView]) -> LoggedVehicl
         beams, fullest.twist_ego, period_s=log.period_s or 0.1, reach_m=max_range_m
     )
     reach_m = max_range_m if lidar is None else lidar.max_range_m
-    return read_vehicle(drive, T_world_scene, lidar, T_ego_lidar, reach_m)
+    vehicle = read_vehicle(drive, T_world_scene, lidar, T_ego_lidar, reach_m)
+    return dataclasses.replace(vehicle, other_names=other_names)
 
 
 def _sensor_views(clip: Clip, T_world_scene: torch.Tensor) -> SensorViews:
