@@ -109,7 +109,7 @@ def test_the_page_is_served_beside_two_hundred_bad_clients(
                 stack.enter_context(socket.create_connection(("localhost", viewer.server.get_port()), 20))
             )
             with contextlib.suppress(OSError):  # closed for the next ones
-                client.sendall(sent)
+                clients[-1].sendall(sent)
         began_s = time.monotonic()
         with urllib.request.urlopen(viewer.url, timeout=20) as page:
             assert page.status == 200
@@ -249,7 +249,7 @@ def test_a_camera_of_one_s_own_sees_as_wide_as_the_window() -> None:
     [
         (["--t", "9"], "no time 9 s in this log"),
         (["--run", "{tmp}"], "{tmp}: not a run folder"),
-        (["--run", "{tmp}", "--save", "{tmp}/x.png"], "--save draws only the log"),
+        (["--run", "{tmp}", "--save", "{tmp}/x.png"], "{tmp}: not a run folder"),
         (["--host", "no-such-host.invalid"], "cannot serve a page at no-such-host.invalid"),
         (["--port", "70000"], "--port must be a number from 1 to 65535, got 70000"),
     ],
