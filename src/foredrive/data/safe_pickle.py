@@ -5,6 +5,7 @@ Some of the names that arrays and tables need can be called with other arguments
 classes are stand-ins that cannot be called, and functions check their arguments.
 """
 
+import functools
 import gzip
 import importlib
 import io
@@ -62,6 +63,8 @@ class _Unpickler(pickle.Unpickler):
         module = self._moved.get(module, module)
         if (module, name) not in self._allowed:
             raise pickle.UnpicklingError(f"it asks for {module}.{name}, which plain data do not need")
+        if name == "DataFrame":
+            return _table_class()
         if name in _CHECKED:
             return _CHECKED[name]
         return getattr(importlib.import_module(module), name)
@@ -70,11 +73,8 @@ class _Unpickler(pickle.Unpickler):
 class _StandIn:
     """Stands for a class that a pickle names and may not call."""
 
-    def __init__(self, kind: type) -> None:
-        self.kind = kind
 
-
-_NDARRAY, _INDEX, _RANGE = _StandIn(np.ndarray), _StandIn(pd.Index), _StandIn(pd.RangeIndex)
+_NDARRAY, _INDEX, _RANGE = _StandIn(), _StandIn(), _StandIn()
 
 
 def _reconstruct(kind: object, shape: object, dtype: object) -> Any:
@@ -107,18 +107,24 @@ def _new_index(kind: object, state: dict[str, Any]) -> Any:
     raise pickle.UnpicklingError("the index of a table is not as pandas writes it")
 
 
-class _Table(pd.DataFrame):
-    """A table that is made of its unpickled state alone."""
+@functools.cache
+def _table_class() -> type:
+    """Return the class of a table that is made of its unpickled state alone.
 
-    def __init__(self, *args: object, **options: object) -> None:
-        raise pickle.UnpicklingError("a table is not as pandas writes it")
+    It is made when it is needed, because logs are opened without pandas, which is slow to import.
+    """
+
+    class Table(pd.DataFrame):
+        def __init__(self, *args: object, **options: object) -> None:
+            raise pickle.UnpicklingError("a table is not as pandas writes it")
+
+    return Table
 
 
 _CHECKED: Mapping[str, Any] = {
     "ndarray": _NDARRAY,
     "Index": _INDEX,
     "RangeIndex": _RANGE,
-    "DataFrame": _Table,
     "_reconstruct": _reconstruct,
     "scalar": _scalar,
     "encode": _encode,
