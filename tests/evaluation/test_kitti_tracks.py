@@ -38,7 +38,7 @@ def test_one_switch(tmp_path: Path) -> None:
     assert figures["tracking.kitti.car.motp_overlap"] == pytest.approx(1.0)
     assert figures["tracking.kitti.car.det_a"] == pytest.approx(1.0)
     assert figures["tracking.kitti.car.hota"] == pytest.approx(0.5**0.5)
-    assert figures["tracking.kitti.pedestrian.mota"] is None
+    assert not [name for name in figures if "pedestrian" in name]  # the truth has none
 
 
 def test_sequences_are_not_joined(tmp_path: Path) -> None:

@@ -53,7 +53,7 @@ class KittiBoxes:
 
 
 def score_kitti_tracks(folder: Path, truth: Path) -> Figures:
-    """Return HOTA and CLEAR MOT of each class over all sequences of the truth.
+    """Return HOTA and CLEAR MOT of each class that the truth has, over all of its sequences.
 
     Raises:
         InputError: a line is wrong, or a sequence has no truth. The message names the first.
@@ -69,16 +69,21 @@ def score_kitti_tracks(folder: Path, truth: Path) -> Figures:
             (true, read_sequence(folder / path.name, _RESULT_FIELDS) if path.name in files else true[:0])
         )
     given = sum(len(found) for _, found in pairs)
+    judged = [name for name in CLASSES if any((true.kind == name).any() for true, _ in pairs)]
+    unjudged = [name for name in CLASSES if name not in judged]
     pairs = [(true, found[np.isin(found.kind, KITTI_TYPES)]) for true, found in pairs]
     others = given - sum(len(found) for _, found in pairs)
-    tell_left_out(folder, {"boxes of other classes": others}, given)
+    absent = sum(int(np.isin(found.kind, unjudged).sum()) for _, found in pairs)
+    tell_left_out(
+        folder, {"boxes of other classes": others, "boxes of classes that the truth lacks": absent}, given
+    )
     figures: Figures = {
         "data_set": "kitti",
         "scenes": len(paths),
         "scenes_without_results": len(paths) - len(files),
         "boxes_of_other_classes_left_out": others,
     }
-    for name in CLASSES:
+    for name in judged:
         figures |= {f"tracking.kitti.{name}.{key}": value for key, value in _score_class(pairs, name).items()}
     return figures
 
