@@ -10,6 +10,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -85,11 +86,13 @@ def test_a_difference_is_found(trained: Run, tmp_path: Path) -> None:
 def fanned_out(folder: Path) -> Iterator["subprocess.Popen[str]"]:
     """A program with two workers."""
     (folder / "program.py").write_text(FANNED_OUT)
-    (folder / "tmp").mkdir()
+    # The names of sockets in it have at most 108 characters, which pytest's folders may exceed by themselves.
+    short = Path(tempfile.mkdtemp())
+    (folder / "tmp").symlink_to(short)
     program = subprocess.Popen(
         [sys.executable, folder / "program.py"],
         cwd=folder,
-        env=os.environ | {"TMPDIR": str(folder / "tmp")},
+        env=os.environ | {"TMPDIR": str(short)},
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
@@ -99,6 +102,7 @@ def fanned_out(folder: Path) -> Iterator["subprocess.Popen[str]"]:
     for pid in in_session(program.pid):
         os.kill(pid, signal.SIGKILL)
     program.communicate()
+    shutil.rmtree(short, ignore_errors=True)
 
 
 def wait_for_the_end(program: "subprocess.Popen[str]") -> str:

@@ -58,6 +58,10 @@ def entered_by_first(context: AbstractContextManager[None], fabric: "Fabric") ->
         yield
 
 
+class _ProcessLost(BaseException):
+    """Ends this process at once: no handler of damaged files may take it for damage."""
+
+
 @contextlib.contextmanager
 def naming_lost_processes(fabric: "Fabric") -> Iterator[None]:
     """Replace errors of the connection to a process that has ended by one line.
@@ -73,12 +77,14 @@ def naming_lost_processes(fabric: "Fabric") -> Iterator[None]:
 
     def end(number: int, frame: "FrameType | None") -> None:
         signal.signal(signal.SIGTERM, signal.SIG_IGN)
-        raise InputError(_GO_ON)
+        raise _ProcessLost
 
     in_main_thread = threading.current_thread() is threading.main_thread()
     before = signal.signal(signal.SIGTERM, end) if in_main_thread else None
     try:
         yield
+    except _ProcessLost:
+        raise InputError(_GO_ON) from None
     except RuntimeError as error:
         # gloo's errors have no class of their own
         if isinstance(error, torch.distributed.DistError) or "gloo" in str(error):
