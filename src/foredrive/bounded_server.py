@@ -198,7 +198,7 @@ class BoundedHandler(BaseHTTPRequestHandler):
 
 
 class _UntilLate(io.RawIOBase):
-    """What arrives on a connection until a time. A time-out of the socket would begin anew with each byte."""
+    """Reader of a connection up to a deadline. A time-out of the socket would begin anew with each byte."""
 
     def __init__(self, connection: socket.socket, until_s: float) -> None:
         self._connection, self._until_s = connection, until_s

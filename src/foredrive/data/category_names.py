@@ -31,14 +31,14 @@ rider stands for the cycle, as in KITTI."""
 @functools.cache
 def _categories() -> dict[str, Category]:
     """Return the category of each known name, in its plain spelling."""
-    known = {
+    labels = {
         _plain(label.name): category_of(label)
         for kind in BOX_DETECTION_LABEL_REGISTRY.values()
         for label in kind
     }
-    known |= {_plain(name): category_of(label) for name, label in NUSCENES_DETECTION_NAME_DICT.items()}
+    labels |= {_plain(name): category_of(label) for name, label in NUSCENES_DETECTION_NAME_DICT.items()}
     named = {name: category for category, names in _MORE_NAMES.items() for name in names.split()}
-    return known | named | {category.name.lower(): category for category in Category}
+    return labels | named | {category.name.lower(): category for category in Category}
 
 
 def category_named(name: str) -> Category | None:
@@ -47,11 +47,9 @@ def category_named(name: str) -> Category | None:
     Letter case, blanks, dots, dashes, underscores, a plural's s and a prefix TYPE_ make no difference.
     """
     plain = _plain(name)
-    known = _categories()
-    return next(
-        (known[key] for key in (plain, plain.removeprefix("type_"), plain.removesuffix("s")) if key in known),
-        None,
-    )
+    categories = _categories()
+    spellings = (plain, plain.removeprefix("type_"), plain.removesuffix("s"))
+    return next((categories[spelling] for spelling in spellings if spelling in categories), None)
 
 
 def category_or_other(name: str, source: str) -> Category:

@@ -130,7 +130,7 @@ _CHECKED: Mapping[str, Any] = {
     "encode": _encode,
     "_new_Index": _new_index,
 }
-"""What stands for an allowed name; others cannot take more than they are given."""
+"""Stand-ins by allowed name. Other allowed names cannot take more memory than they are given."""
 
 
 def load_pickle(file: Path) -> Any:

@@ -219,10 +219,10 @@ def _route(window: _Window, row: int) -> Float64[np.ndarray, "M 3"] | None:
     """Return the middle of the lanes of a car from beside its rear axle on; None if it changes lanes."""
     before, after = (window.moments[k].state.vehicles.path[row] for k in (0, -1))
     # The rear axle may still be in the lane before that of the middle of the car.
-    known = [lane for lane in before[BEHIND - 1 :].tolist() if lane >= 0]
-    if int(after[BEHIND]) not in known:
+    ahead = [lane for lane in before[BEHIND - 1 :].tolist() if lane >= 0]
+    if int(after[BEHIND]) not in ahead:
         return None
-    lanes = known[: known.index(int(after[BEHIND]))] + [lane for lane in after[BEHIND:].tolist() if lane >= 0]
+    lanes = ahead[: ahead.index(int(after[BEHIND]))] + [lane for lane in after[BEHIND:].tolist() if lane >= 0]
     parts = [window.traffic.lanes.samples(lane) for lane in lanes]
     xyz = np.concatenate(parts)
     begin_m, end_m = (window.moments[k].poses.axle_xyz[row] for k in (0, -1))

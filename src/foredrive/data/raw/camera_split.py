@@ -24,13 +24,13 @@ PERIOD_S = 0.1
 """Time between frames without times."""
 _MAX_TURN_RAD = np.deg2rad(2.0)
 _MAX_SHIFT_OF_PATH, _MAX_SHIFT_OF_BASELINE = 0.02, 0.05
-"""How far the place of a camera to the first one may vary: shares of the path, and of their distance."""
+"""Largest deviation of a camera's place to the first one: shares of the path, and of their distance."""
 _MIN_INTERPOLATED = 3
 """Fewest images between those of the first camera that show a constant place."""
 _MAX_CAMERAS, _MAX_RUNS = 11, 6
 """Most cameras of a log, and runs of digits in a name that are looked at."""
 _LENS_VARIES = 0.05
-"""How much intrinsics of one camera may vary: a share of the focal length, and of the image's width."""
+"""Largest difference of intrinsics of one camera: a share of the focal length or of the width."""
 _PARTS_OF_DATA = {"train", "val", "test", "training", "validation", "testing", "images", "input", "rgb"}
 """Names of folders that hold parts of a data set and do not name cameras."""
 
@@ -41,7 +41,7 @@ class PosedImage:
 
     file: Path
     path: str
-    """Of the file, in the folder of the data set."""
+    """Path of the file within the data set."""
     T_world_cam: Float64[np.ndarray, "4 4"]
     t_s: float | None
     """As the data set has it: s, or ms, µs or ns since 1970."""
@@ -69,11 +69,11 @@ class _Grouping:
     """A way to tell the cameras of images apart."""
 
     kind: str
-    """What cameras are told apart by, for messages."""
+    """Name of the way, for messages."""
     cameras: list[str]
-    """Of each image."""
+    """Name of the camera of each image."""
     numbers: list[str]
-    """Of each image: what its name says of the frame. Images of equal numbers were taken together."""
+    """Part of each image's name that numbers the frame. Images of equal numbers were taken together."""
 
 
 def split_into_cameras(images: Sequence[PosedImage], where: str) -> list[RigCamera]:
