@@ -42,7 +42,7 @@ class RebuildRecipe(Generic[R]):
     hold_out_every: int = 2
     """The last frame of every group of this size is held out for evaluation; 0 holds out none."""
     actors: bool = True
-    """What moves is a part of its own: an actor. If False, everything is static."""
+    """Moving objects are parts of their own, the actors. If False, everything is static."""
     moves_m: float = MOVES_M
     """Standard deviation of the position of what moves, m. Tracks that move less belong to the static part.
     0: all tracks are actors, so that parked vehicles can be removed and moved too."""

@@ -71,7 +71,7 @@ class _Ego:
     row: int
     route_xyz: Float64[np.ndarray, "M 3"]
     deviation: PathDeviation
-    """Of the recording vehicle from the car, which drives in the middle of its lane."""
+    """Deviation of the recording vehicle from the car, which drives in the middle of its lane."""
     at_light: bool
 
 

@@ -30,7 +30,7 @@ OUTPUT_CAPTION = "Output: predicted occupancy and plan (red; driven path: green)
 
 @dataclass(frozen=True)
 class Overview:
-    """What a model receives at one time, and what it sees and plans. Nothing has leading dimensions."""
+    """Input of a model at one time, with its occupancy and plan. Nothing has leading dimensions."""
 
     title: str
     clip: Clip

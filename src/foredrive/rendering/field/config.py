@@ -58,7 +58,7 @@ class FieldConfig:
     samples: int = 32
     """Samples on a ray at which the field is evaluated."""
     resampling: Resampling = "greedy"
-    """How samples are drawn from the weights of a proposal."""
+    """Rule by which samples are drawn from the weights of a proposal."""
     spacing_m: float = 20.0
     """The first samples are uniform in t / (t + spacing): the power spacing of Zip-NeRF with λ = -1."""
     sky_m: float = 20_000.0
@@ -77,7 +77,7 @@ class FieldConfig:
     beta: float = 20.0
     """Initial slope β of the opacity."""
     biases: bool = True
-    """Whether the field's layers have biases. Those of tiny-cuda-nn have none."""
+    """The layers of the field have biases. Those of tiny-cuda-nn have none."""
     width: int = 32
     """Channels of hidden layers and of the field's features."""
     geometry_layers: int = 2

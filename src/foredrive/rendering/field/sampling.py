@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 Resampling = Literal["greedy", "padded"]
-"""How the borders of new intervals follow from the weights of others.
+"""Rules by which the borders of new intervals follow from the weights of others.
 
 greedy: 0.01 / N is added to the weights of N intervals, and the new ones reach from the first border to the
 last. padded: 0.01 is added to each weight, and the borders are the middles of equal quantiles, as in NeuRAD's

@@ -58,7 +58,7 @@ class ReconstructionData:
     tracks: ActorTracks
     """The actors."""
     obstacles: ActorTracks
-    """What belongs to the static part."""
+    """Tracks that belong to the static part."""
     vehicle: LoggedVehicle
 
 

@@ -74,7 +74,7 @@ class Rules:
     struck_counts: bool
     """Whether an impact counts if the actor comes from behind the ego vehicle."""
     moving_stay: bool
-    """Whether the log's moving actors outside the scenario are there. Parked vehicles always are."""
+    """The moving actors of the log outside the scenario take part. Parked vehicles always are."""
     unchecked_end_s: float
     """Time at the end of a run in which collisions are not looked for, s."""
     left_way_score: float
