@@ -31,7 +31,7 @@ from foredrive.recipes import RECIPES
 RECIPES["miniature"] = miniature()
 """
 FANNED_OUT = """
-import contextlib, sys, time
+import contextlib, os, sys, time
 from pathlib import Path
 from foredrive.cli import main as program
 from foredrive.files import atomic_path
@@ -39,7 +39,7 @@ from foredrive.runs.fan_out import fan_out
 def work(seconds):
     with atomic_path(Path("out", str(seconds))) as temporary:
         temporary.write_text("half")
-        print("working", flush=True)
+        os.write(1, b"working\\n")  # at once: the lines of two workers share a pipe
         time.sleep(seconds)
 def fan():
     with contextlib.closing(fan_out([600.0, 601.0], work, 2)) as results:
@@ -98,11 +98,13 @@ def fanned_out(folder: Path) -> Iterator["subprocess.Popen[str]"]:
         text=True,
         start_new_session=True,
     )
-    yield program
-    for pid in in_session(program.pid):
-        os.kill(pid, signal.SIGKILL)
-    program.communicate()
-    shutil.rmtree(short, ignore_errors=True)
+    try:
+        yield program
+    finally:
+        for pid in in_session(program.pid):
+            os.kill(pid, signal.SIGKILL)
+        program.communicate()
+        shutil.rmtree(short, ignore_errors=True)
 
 
 def wait_for_the_end(program: "subprocess.Popen[str]") -> str:
