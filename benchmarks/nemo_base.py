@@ -61,8 +61,8 @@ def made_up(recipe: Recipe) -> Example:
         ego_speed_valid=yes,
         command=torch.full((1,), 2),
         command_valid=yes[:, 0],
-        target_xy=torch.zeros(batch, 2),
-        target_valid=yes[:, 0],
+        route_xy=torch.zeros(batch, 7, 2),
+        route_valid=yes[:, :1].expand(-1, 7),
         future=Trajectory(
             xy=torch.stack([torch.arange(1, steps + 1) * 2.0, torch.zeros(steps)], -1)[None, None],
             yaw=torch.zeros(1, 1, steps),

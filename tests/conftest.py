@@ -41,6 +41,7 @@ from foredrive.scene import (  # noqa: E402
     VoxelSpec,
 )
 from foredrive.scene.boxes import unlabelled  # noqa: E402
+from foredrive.scene.clip import ROUTE_M  # noqa: E402
 
 if TYPE_CHECKING:
     from foredrive.data import LogPath
@@ -159,8 +160,9 @@ def synthetic_example(
         ego_speed_valid=yes,
         command=torch.where(turn_radps > 0, Command.LEFT, Command.RIGHT),
         command_valid=torch.ones(batch, dtype=torch.bool),
-        target_xy=torch.stack([20.0 + item, 6.0 - 9.0 * item], -1),
-        target_valid=torch.ones(batch, dtype=torch.bool),
+        route_xy=torch.tensor(ROUTE_M)[:, None]
+        * torch.stack([1.0 + 0.05 * item, 0.3 - 0.45 * item], -1)[:, None],
+        route_valid=torch.ones(batch, len(ROUTE_M), dtype=torch.bool),
         future=Trajectory(
             xy=T_now_step[:, None, :, :2, 3].float(),
             yaw=yaw_from_matrix(T_now_step)[:, None].float(),

@@ -79,8 +79,8 @@ def one_example(seed: int) -> Example:
         ego_speed_valid=torch.ones(1, frames, dtype=torch.bool),
         command=torch.tensor([int(Command.LEFT if turn_radps > 0 else Command.RIGHT)]),
         command_valid=torch.ones(1, dtype=torch.bool),
-        target_xy=torch.zeros(1, 2),
-        target_valid=torch.zeros(1, dtype=torch.bool),
+        route_xy=torch.zeros(1, 7, 2),
+        route_valid=torch.zeros(1, 7, dtype=torch.bool),
         future=Trajectory(
             xy=T_now_ego[None, None, PAST + 1 :, :2, 3].float(),
             yaw=yaw_from_matrix(T_now_ego)[None, None, PAST + 1 :].float(),

@@ -204,7 +204,7 @@ def test_a_route_derived_from_the_driven_path_is_no_route(tmp_path: Path) -> Non
     assert clips.command_source["route"] == 0
     assert clips.command_source["driven_future"] > 0
     assert clips[0].clip.command == Command.STRAIGHT
-    assert not clips[0].clip.target_valid
+    assert not clips[0].clip.route_valid.any()
 
 
 def batch_of(clips: ClipDataset, workers: int) -> Example:

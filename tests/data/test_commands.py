@@ -2,8 +2,10 @@
 
 import numpy as np
 import pytest
+from jaxtyping import Float64
 
-from foredrive.data.commands import LATERAL_M, route_offset_m, route_target
+from foredrive.data.commands import LATERAL_M, route_ahead, route_offset_m
+from foredrive.scene.clip import TARGET
 
 
 def arc_m(xy: np.ndarray) -> np.ndarray:
@@ -46,10 +48,15 @@ def test_the_target_is_seen_from_the_vehicle_wherever_it_stands(heading_rad: flo
     T = np.eye(4)
     T[:2, 0], T[:2, 1] = forward, [-forward[1], forward[0]]
     T[:2, 3] = 30.0 * forward - 2.0 * T[:2, 1]
-    at = route_target(arc_m(route), route, 30.0, T)
-    np.testing.assert_allclose(at, [20.0, 2.0], atol=1e-9)
-    np.testing.assert_allclose(route_target(arc_m(route), route, 36.0, T), [20.0, 8.0], atol=1e-9)
-    np.testing.assert_allclose(route_target(arc_m(route), route, 99.0, T), [20.0, 52.0], atol=1e-9)  # its end
+
+    def points(progress_m: float, pose: Float64[np.ndarray, "4 4"] = T) -> list[list[float]]:
+        return route_ahead(arc_m(route), route, progress_m, pose).xy[[0, 3, TARGET]].round(9).tolist()
+
+    assert points(30.0) == [[2.0, 2.0], [15.0, 2.0], [20.0, 2.0]]
+    assert points(36.0) == [[8.0, 2.0], [20.0, 3.0], [20.0, 8.0]]
+    assert points(99.0) == [[20.0, 52.0]] * 2 + [[20.0, 52.0]]  # its end
     turned = T.copy()
     turned[:2, 0], turned[:2, 1] = T[:2, 1], -T[:2, 0]  # it faces left
-    np.testing.assert_allclose(route_target(arc_m(route), route, 30.0, turned), [2.0, -20.0], atol=1e-9)
+    assert points(30.0, turned) == [[2.0, -2.0], [2.0, -15.0], [2.0, -20.0]]
+    valid = [route_ahead(arc_m(route), route, p, T).valid.tolist() for p in (30.0, 80.0, 99.9)]
+    assert valid == [[True] * 7, [True] * 5 + [False] * 2, [True] + [False] * 6]

@@ -58,8 +58,8 @@ def drive(t_s: list[float], T_world_ego: torch.Tensor, centre: torch.Tensor, val
         ego_speed_valid=torch.zeros(1, t, dtype=torch.bool),
         command=torch.zeros(1, dtype=torch.long),
         command_valid=torch.zeros(1, dtype=torch.bool),
-        target_xy=torch.zeros(1, 2),
-        target_valid=torch.zeros(1, dtype=torch.bool),
+        route_xy=torch.zeros(1, 7, 2),
+        route_valid=torch.zeros(1, 7, dtype=torch.bool),
         future=Trajectory(
             xy=torch.zeros(1, 1, 6, 2),
             yaw=torch.zeros(1, 1, 6),

@@ -9,6 +9,7 @@ from small_drives import drives
 from foredrive.errors import InputError
 from foredrive.models.ego_mlp import ego_speeds, ego_status
 from foredrive.scene import Command
+from foredrive.scene.clip import TARGET
 
 
 def test_the_ego_status_by_hand() -> None:
@@ -29,9 +30,9 @@ def test_the_ego_status_by_hand() -> None:
     clip.command_valid[:] = False
     assert ego_status(clip, past_frames=2)[0, 9:].tolist() == [0.0, 0.0, 0.0]
     torch.testing.assert_close(ego_status(clip, 2), ego_status(clip.observed(), 2))
-    clip.target_xy[:], clip.target_valid[:] = torch.tensor([19.0, -4.0]), True
+    clip.route_xy[:, TARGET], clip.route_valid[:] = torch.tensor([19.0, -4.0]), True
     assert ego_status(clip, past_frames=0, target=True)[0].tolist() == [2.0, 0.0, 0.0, 0.0, 19.0, -4.0, 1.0]
-    clip.target_valid[:] = False
+    clip.route_valid[:] = False
     assert ego_status(clip, past_frames=0, target=True)[0].tolist() == [2.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]
     with pytest.raises(InputError, match="needs 5 frames before now"):
         ego_status(clip, past_frames=5)

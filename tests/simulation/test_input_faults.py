@@ -30,7 +30,7 @@ def shown(faults: Faults, plans: int = 4, seed: int = 0) -> tuple[list[Clip], li
     clips = []
     for k in range(plans):
         clip = one_example(k).clip.observed()
-        clips.append(dataclasses.replace(clip, target_valid=torch.tensor([True])))
+        clips.append(dataclasses.replace(clip, route_valid=torch.ones(1, 7, dtype=torch.bool)))
         agent.act(clips[-1])
     return keeper.seen, clips
 
@@ -63,7 +63,7 @@ def test_noise_has_its_size_and_a_key_frame_keeps_it() -> None:
     error = torch.stack([s.ego_speed_mps - c.ego_speed_mps for s, c in zip(seen, clips, strict=True)])[:, 0]
     assert 0.3 < float(error[:, -1].std()) < 0.7
     torch.testing.assert_close(error[4, 1], error[3, 2], atol=1e-5, rtol=0)
-    moved = torch.stack([s.target_xy - c.target_xy for s, c in zip(seen, clips, strict=True)])
+    moved = torch.stack([s.route_xy - c.route_xy for s, c in zip(seen, clips, strict=True)])
     assert 1.3 < float(moved.std()) < 2.7
     again, _ = shown(Faults(speed_noise_mps=0.5, position_noise_m=2.0), plans=3)
     torch.testing.assert_close(again[2].ego_speed_mps, seen[2].ego_speed_mps)

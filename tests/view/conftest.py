@@ -204,8 +204,8 @@ def make_clip() -> Clip:
         ego_speed_valid=torch.ones(FRAMES, dtype=torch.bool),
         command=torch.tensor(Command.STRAIGHT),
         command_valid=torch.tensor(True),
-        target_xy=torch.zeros(2),
-        target_valid=torch.tensor(False),
+        route_xy=torch.zeros(7, 2),
+        route_valid=torch.zeros(7, dtype=torch.bool),
         future=Trajectory(
             torch.stack([future_x, 0.02 * future_x**2], -1)[None],
             torch.zeros(1, 6),

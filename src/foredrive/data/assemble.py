@@ -2,11 +2,10 @@
 
 from collections.abc import Sequence
 
-import numpy as np
 import torch
-from jaxtyping import Float64
 
 from foredrive.data.batches import stack_records
+from foredrive.data.commands import RouteAhead, clip_route
 from foredrive.data.frame_store import FrameData
 from foredrive.data.lidar import empty_sweep
 from foredrive.data.logs import Log
@@ -22,7 +21,7 @@ def assemble_clip(
     future: Trajectory,
     *,
     command: int | None = None,
-    target_xy: Float64[np.ndarray, "2"] | None = None,
+    route: RouteAhead | None = None,
     map_patch: MapPatch | None = None,
 ) -> Clip:
     """Assemble a clip of T frames with their poses and speeds. Arguments that are None are masked.
@@ -35,12 +34,13 @@ def assemble_clip(
         sweeps: T sweeps, each with whether it includes the beams that did not return.
         future: path of the vehicle from now on.
         command: driving command at now.
-        target_xy: target point of the route in the ego frame at now, m.
+        route: the next points of the route.
         map_patch: map around the vehicle at now.
     """
     chosen = list(frames)
     speed_mps = torch.from_numpy(log.speed_mps[chosen]).float()
     whole = stack_records(seen)
+    route_xy, route_valid = clip_route(route)
     return Clip(
         t_s=torch.from_numpy((log.t_us[chosen] - log.t_us[now]) * 1e-6).float(),
         T_world_ego=torch.from_numpy(log.T_world_ego[chosen]),
@@ -56,8 +56,8 @@ def assemble_clip(
         ego_speed_valid=speed_mps.isfinite(),
         command=torch.tensor(0 if command is None else int(command)),
         command_valid=torch.tensor(command is not None),
-        target_xy=torch.zeros(2) if target_xy is None else torch.from_numpy(target_xy).float(),
-        target_valid=torch.tensor(target_xy is not None),
+        route_xy=route_xy,
+        route_valid=route_valid,
         future=future,
         map=map_patch,
     )

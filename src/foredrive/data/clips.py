@@ -15,7 +15,7 @@ from torch.utils.data import Dataset
 
 from foredrive.data.assemble import assemble_clip
 from foredrive.data.cameras import find_camera, pinhole_cameras, told_cameras
-from foredrive.data.commands import command_at, count_command_sources, target_at
+from foredrive.data.commands import command_at, count_command_sources, route_ahead_at
 from foredrive.data.frame_store import FrameStore
 from foredrive.data.label_store import LabelStore
 from foredrive.data.labels import VoxelLabels
@@ -256,7 +256,7 @@ class ClipDataset(Dataset[Example]):
             [read_sweep(log, frame) if config.lidar else None for frame in frames],
             self._future(log, now),
             command=command,
-            target_xy=target_at(log, now),
+            route=route_ahead_at(log, now),
             map_patch=read_map_patch(log, now) if config.map else None,
         )
 

@@ -1,14 +1,19 @@
 """The driving command at a frame, from the log's route or from the driven future."""
 
+from typing import NamedTuple
+
 import numpy as np
-from jaxtyping import Float64, Int64
+import torch
+from jaxtyping import Bool, Float, Float64, Int64
 from py123d.api.scene.arrow.modalities.sync_utils import get_modality_table
 from py123d.datatypes import ModalityType, RouteMetadata
+from torch import Tensor
 
 from foredrive.data.arrow_files import reading
 from foredrive.data.logs import Log
 from foredrive.geometry.polylines import points_at
 from foredrive.scene import Command, Trajectory
+from foredrive.scene.clip import ROUTE_M
 
 LATERAL_M = 2.0
 """Minimum lateral offset of a turn, by the nuScenes convention (ST-P3, UniAD, VAD)."""
@@ -59,8 +64,24 @@ def command_of(lateral_m: float) -> Command:
     return Command.RIGHT if lateral_m <= -LATERAL_M else Command.STRAIGHT
 
 
-def target_at(log: Log, frame: int) -> Float64[np.ndarray, "2"] | None:
-    """Return the target point of the route (see `route_target`), or None without a provided route.
+class RouteAhead(NamedTuple):
+    """The next points of a route, `scene.clip.ROUTE_M` from the point beside the vehicle."""
+
+    xy: Float64[np.ndarray, "R 2"]
+    """Vehicle frame: x forward, y left, m. Points beyond the end of the route are its end."""
+    valid: Bool[np.ndarray, "R"]
+    """False beyond the end of the route."""
+
+
+def clip_route(route: RouteAhead | None) -> tuple[Float[Tensor, "R 2"], Bool[Tensor, "R"]]:
+    """Return `route_xy` and `route_valid` of an unbatched `Clip`. None: no route was given."""
+    if route is None:
+        return torch.zeros(len(ROUTE_M), 2), torch.zeros(len(ROUTE_M), dtype=torch.bool)
+    return torch.from_numpy(route.xy).float(), torch.from_numpy(route.valid)
+
+
+def route_ahead_at(log: Log, frame: int) -> RouteAhead | None:
+    """Return the next points of the route, or None without a provided route.
 
     Raises:
         InputError: the route cannot be read.
@@ -69,27 +90,28 @@ def target_at(log: Log, frame: int) -> Float64[np.ndarray, "2"] | None:
     if route is None:
         return None
     arc_m, xyz, progress_m = route
-    return route_target(arc_m, xyz[:, :2], progress_m, log.T_world_ego[frame])
+    return route_ahead(arc_m, xyz[:, :2], progress_m, log.T_world_ego[frame])
 
 
-def route_target(
+def route_ahead(
     arc_m: Float64[np.ndarray, "K"],
     xy: Float64[np.ndarray, "K 2"],
     progress_m: float,
     T_world_ego: Float64[np.ndarray, "4 4"],
-) -> Float64[np.ndarray, "2"]:
-    """Return the route point LOOKAHEAD_M ahead, or the route's end.
-
-    It is in the vehicle frame: x forward, y left, m.
+) -> RouteAhead:
+    """Return the next points of a route.
 
     Args:
+        xy: the route, m.
         arc_m: arc length of each route point.
         progress_m: arc length of the ego's projection on the route.
     """
-    ahead = points_at(xy, arc_m, progress_m + LOOKAHEAD_M)
+    at_m = progress_m + np.array(ROUTE_M)
+    dx, dy = (points_at(xy, arc_m, at_m) - T_world_ego[:2, 3]).T
     forward = T_world_ego[:2, 0] / np.hypot(*T_world_ego[:2, 0])
-    dx, dy = ahead - T_world_ego[:2, 3]
-    return np.array([dx * forward[0] + dy * forward[1], dy * forward[0] - dx * forward[1]])
+    ego_xy = np.stack([dx * forward[0] + dy * forward[1], dy * forward[0] - dx * forward[1]], axis=-1)
+    # Of a vehicle beside the end of the route, the first point is given all the same: it is where to stop.
+    return RouteAhead(ego_xy, np.append(True, at_m[1:] <= arc_m[-1]))
 
 
 def _route_offset_m(log: Log, frame: int) -> float | None:

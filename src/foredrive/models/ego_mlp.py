@@ -9,6 +9,7 @@ from torch import Tensor, nn
 from foredrive.errors import InputError
 from foredrive.geometry.se3 import compose_se3, inverse_se3, yaw_from_matrix
 from foredrive.scene import Clip, Command, Trajectory
+from foredrive.scene.clip import TARGET
 
 
 def ego_speeds(clip: Clip) -> Float[Tensor, "b T"]:
@@ -56,9 +57,10 @@ def ego_status(clip: Clip, past_frames: int, *, target: bool = False) -> Float[T
 
 
 def route_target(clip: Clip) -> Float[Tensor, "b 3"]:
-    """Return the target point of the route: x, y (m) and 1; zeros where it is unknown."""
-    known = clip.target_valid[:, None]
-    return torch.cat([torch.where(known, clip.target_xy, 0.0), known.to(clip.target_xy)], dim=-1)
+    """Return the route point 20 m ahead, or the route's end: x, y (m) and 1; zeros without a route."""
+    given = clip.route_valid.any(-1, keepdim=True)
+    target_xy = clip.route_xy[:, TARGET]
+    return torch.cat([torch.where(given, target_xy, 0.0), given.to(target_xy)], dim=-1)
 
 
 def status_vector(

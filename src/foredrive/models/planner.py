@@ -38,7 +38,7 @@ class PlannerConfig:
     """Number of key frames before now whose pose and speed enter the query. In the paper only the speed at
     now does, which does not reveal braking."""
     target: bool = False
-    """Add the target point of the route (`Clip.target_xy`) to the query, as agents on CARLA's leaderboards
+    """Add the target point of the route (20 m ahead) to the query, as agents on CARLA's leaderboards
     do. The paper uses only the command."""
     ego_mlp: EgoMLPConfig | None = None
     """MLP whose plan is corrected, fitted to the demonstrations before fine-tuning. None corrects the plan

@@ -19,6 +19,10 @@ from foredrive.scene.trajectory import Trajectory
 from foredrive.scene.voxels import VoxelGrid
 
 NOW_TOLERANCE_S = 1e-4
+ROUTE_M = (2.0, 5.0, 10.0, 15.0, 20.0, 30.0, 40.0)
+"""Distances along the route of the points that an agent is given, m."""
+TARGET = ROUTE_M.index(20.0)
+"""The one of these points that agents with a single target point are given, as on CARLA's leaderboards."""
 
 
 class Command(enum.IntEnum):
@@ -62,10 +66,11 @@ class Clip(Record):
     command: Int[Tensor, "*b"]
     """The `Command` at now."""
     command_valid: Bool[Tensor, "*b"]
-    target_xy: Float[Tensor, "*b 2"]
-    """Route point 20 m (`data.commands.LOOKAHEAD_M`) ahead of the route point beside the vehicle, in the ego
-    frame at now, m. CARLA's global plan gives an agent this point in addition to the command."""
-    target_valid: Bool[Tensor, "*b"]
+    route_xy: Float[Tensor, "*b R 2"]
+    """Route points at the distances `ROUTE_M` from the point beside the vehicle, in the ego frame at now, m.
+    Those beyond the end of the route are its end."""
+    route_valid: Bool[Tensor, "*b R"]
+    """False for points beyond the end of the route, and for all where no route was given."""
     future: Trajectory
     """The recorded future (M = 1): target of training and evaluation, hidden from the agent."""
     map: MapPatch | None = None

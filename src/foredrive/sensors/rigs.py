@@ -90,7 +90,12 @@ TELE = "FTCAM_TELE_F0"
 """123D's name for a front camera with a long focal length."""
 DRIVING = RigPlan(SURROUND.image_hw, {**SURROUND.cameras, TELE: Mount((1.70, 0.00, 1.65), 0.0, 30.0, 6.0)})
 """`SURROUND` with a narrow front camera, tilted up. In it, a lamp of 0.3 m is 3 px at 40 m."""
-RIGS: Mapping[str, RigPlan] = {"surround": SURROUND, "driving": DRIVING}
+FRONT_TELE = RigPlan(
+    (96, 256),
+    {"PCAM_F0": Mount((1.70, 0.00, 1.60), 0.0, 100.0, 2.0), TELE: Mount((1.70, 0.00, 1.65), 0.0, 30.0, 5.0)},
+)
+"""A wide and a narrow front camera: what a small driver sees."""
+RIGS: Mapping[str, RigPlan] = {"surround": SURROUND, "driving": DRIVING, "front_tele": FRONT_TELE}
 
 
 def find_rig(name: str) -> RigPlan:

@@ -61,7 +61,7 @@ class FaultyAgent:
         return dataclasses.replace(clip, images=images, image_valid=valid)
 
     def _noisy(self, clip: Clip, now_s: float) -> Clip:
-        """Return a clip with noise on speed and target point. A key frame keeps its noise."""
+        """Return a clip with noise on speed and position on the route. A key frame keeps its noise."""
         faults = self._faults
         if faults.speed_noise_mps > 0:
             error = [self._speed_error(round(float(t_s) + now_s, 3)) for t_s in clip.t_s[0]]
@@ -69,7 +69,7 @@ class FaultyAgent:
             clip = dataclasses.replace(clip, ego_speed_mps=speed)
         if faults.position_noise_m > 0:
             moved = torch.from_numpy(self._rng.normal(0, faults.position_noise_m, 2)).float()
-            clip = dataclasses.replace(clip, target_xy=clip.target_xy + moved)
+            clip = dataclasses.replace(clip, route_xy=clip.route_xy + moved)
         return clip
 
     def _speed_error(self, t_s: float) -> float:

@@ -9,6 +9,7 @@ from jaxtyping import Float64, UInt8
 from torch import Tensor
 
 from foredrive.data.batches import stack_records
+from foredrive.data.commands import RouteAhead, clip_route
 from foredrive.data.lidar import empty_sweep
 from foredrive.scene import Boxes, CameraRig, Clip, Command, LidarSweep, Trajectory
 from foredrive.simulation.dynamics import STEP_S
@@ -35,15 +36,16 @@ def make_clip(
     frames: Sequence[KeyFrame],
     rig: CameraRig | None,
     command: Command,
-    target_xy: Float64[np.ndarray, "2"] | None = None,
+    route: RouteAhead | None = None,
 ) -> Clip:
     """Build a clip from key frames. The last frame is now; the future is marked invalid.
 
     Args:
         rig: rig of the images, without leading dimensions. None without images.
-        target_xy: target point on the route, as in `Clip`. None if it is not known.
+        route: next points of the route. None if it is not known.
     """
     count, rig = len(frames), rig or _no_cameras()
+    route_xy, route_valid = clip_route(route)
     yes = torch.ones(count, dtype=torch.bool)
     sensed = torch.tensor([frame.sweep is not None for frame in frames])
     return Clip(
@@ -61,8 +63,8 @@ def make_clip(
         ego_speed_valid=yes,
         command=torch.tensor(int(command)),
         command_valid=torch.tensor(True),
-        target_xy=torch.zeros(2) if target_xy is None else torch.from_numpy(target_xy).float(),
-        target_valid=torch.tensor(target_xy is not None),
+        route_xy=route_xy,
+        route_valid=route_valid,
         future=Trajectory(
             xy=torch.zeros(1, HORIZON_STEPS, 2),
             yaw=torch.zeros(1, HORIZON_STEPS),

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64
 
-from foredrive.data.commands import command_of, route_offset_m, route_target
+from foredrive.data.commands import RouteAhead, command_of, route_ahead, route_offset_m
 from foredrive.errors import InputError
 from foredrive.geometry.polylines import arc_lengths, points_at
 from foredrive.scene import BicycleState, CameraRig, Clip, Command, Event
@@ -102,16 +102,14 @@ class RouteLine:
         return Event(ended, t_s, (ego.x_m, ego.y_m), text)
 
     def observe(self, frames: Sequence[KeyFrame], progress: RouteProgress, rig: CameraRig | None) -> Clip:
-        """Return the clip of some key frames, with the command and the target point of the route."""
-        target_xy = self.target_xy(progress, frames[-1].T_world_ego)
-        return make_clip(frames, rig, self.command(progress), target_xy)
+        """Return the clip of some key frames, with the command and the next points of the route."""
+        route = self.ahead(progress, frames[-1].T_world_ego)
+        return make_clip(frames, rig, self.command(progress), route)
 
     def command(self, progress: RouteProgress) -> Command:
         """Return the next command of the route, computed as for recorded logs."""
         return command_of(route_offset_m(self._arc_m, self._xy, progress.done_m))
 
-    def target_xy(
-        self, progress: RouteProgress, T_world_ego: Float64[np.ndarray, "4 4"]
-    ) -> Float64[np.ndarray, "2"]:
-        """Return the target point on the route in the ego frame, m, computed as for recorded logs."""
-        return route_target(self._arc_m, self._xy, progress.done_m, T_world_ego)
+    def ahead(self, progress: RouteProgress, T_world_ego: Float64[np.ndarray, "4 4"]) -> RouteAhead:
+        """Return the next points of the route in the ego frame, computed as for recorded logs."""
+        return route_ahead(self._arc_m, self._xy, progress.done_m, T_world_ego)

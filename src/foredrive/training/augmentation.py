@@ -87,7 +87,7 @@ def _mirrored_clip(clip: Clip, chosen: Bool[Tensor, "b"]) -> Clip:
         sweeps=_mirrored_sweep(clip.sweeps, chosen),
         boxes=mirrored_boxes(clip.boxes, chosen),
         command=_pick(chosen, turned, clip.command),
-        target_xy=_negated(clip.target_xy, chosen, (1.0, -1.0)),
+        route_xy=_negated(clip.route_xy, chosen, (1.0, -1.0)),
         future=dataclasses.replace(
             clip.future,
             xy=_negated(clip.future.xy, chosen, (1.0, -1.0)),

@@ -25,13 +25,14 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from foredrive.errors import InputError
+from foredrive.geometry.polylines import arc_lengths, points_at
 from foredrive.json_server import Address
 from foredrive.scene import CameraRig, Clip, Command, Trajectory
 from foredrive.simulation.observation import FRAME_DT_S, HORIZON_STEPS
 from foredrive.simulation.remote.planner_client import FIRST_US
 from foredrive.simulation.simple_agents import plan_of
 
-ROUTE_STEP_M, ROUTE_M = 2.0, 40.0
+STEP_M, LENGTH_M = 2.0, 40.0
 TURN_M = {Command.LEFT: 6.0, Command.RIGHT: -6.0, Command.STRAIGHT: 0.0}
 """How far to the side the route leads within 20 m if its target point is not known."""
 
@@ -173,13 +174,17 @@ def _camera(rig: CameraRig, index: int) -> Any:
 
 
 def _route(clip: Clip) -> Float64[np.ndarray, "N 3"]:
-    """Return points of the route ahead in the ego frame: straight to the target point, and on from there."""
+    """Return points of the route ahead in the ego frame: through the route's points, and straight on."""
     command = Command(int(clip.command)) if bool(clip.command_valid) else Command.STRAIGHT
-    known = bool(clip.target_valid)
-    target = clip.target_xy.double().numpy() if known else np.array([20.0, TURN_M[command]])
-    direction = target / max(float(np.linalg.norm(target)), 1e-6)
-    at_m = np.arange(0.0, ROUTE_M + 1e-6, ROUTE_STEP_M)
-    return np.column_stack([at_m[:, None] * direction, np.zeros(len(at_m))])
+    given = clip.route_xy[clip.route_valid].double().numpy()
+    if not len(given):
+        given = np.array([[20.0, TURN_M[command]]])
+    corners = np.concatenate([np.zeros((1, 2)), given])
+    step = corners[-1] - corners[-2]
+    beyond = corners[-1] + LENGTH_M * step / max(float(np.linalg.norm(step)), 1e-6)
+    corners = np.concatenate([corners, beyond[None]])
+    xy = points_at(corners, arc_lengths(corners), np.arange(0.0, LENGTH_M + 1e-6, STEP_M))
+    return np.column_stack([xy, np.zeros(len(xy))])
 
 
 def points_of(plan: TimedPoses, T_local_now: Float64[np.ndarray, "4 4"], now_us: int) -> torch.Tensor:

@@ -15,10 +15,11 @@ from jaxtyping import Float64
 
 from foredrive.data.batches import stack_records
 from foredrive.data.boxes import no_boxes
-from foredrive.data.commands import LOOKAHEAD_M, command_of
+from foredrive.data.commands import RouteAhead, command_of, route_ahead
 from foredrive.errors import InputError
-from foredrive.geometry.polylines import arc_lengths, points_at
+from foredrive.geometry.polylines import arc_lengths
 from foredrive.scene import Agent, CameraRig, Command, Trajectory
+from foredrive.scene.clip import TARGET
 from foredrive.simulation.observation import FRAME_DT_S, KeyFrame, no_images
 from foredrive.simulation.plans import waypoints_of
 from foredrive.simulation.remote.planner_messages import nuscenes_name
@@ -127,14 +128,14 @@ def serve_alpasim(driver: AlpasimDriver, host: str, port: int) -> tuple[Any, int
     return server, bound
 
 
-def route_of(waypoints: Float64[np.ndarray, "N 3"]) -> tuple[Command, Float64[np.ndarray, "2"] | None]:
-    """Return the command and the target point of a route in the ego frame: those 20 m ahead."""
+def route_of(waypoints: Float64[np.ndarray, "N 3"]) -> tuple[Command, RouteAhead | None]:
+    """Return the command and the next points of a route in the ego frame."""
     if len(waypoints) < 2:
         return Command.STRAIGHT, None
     xy = np.asarray(waypoints[:, :2], dtype=float)
     arc_m = arc_lengths(xy)
-    target = points_at(xy, arc_m, float(arc_m[np.argmin(np.hypot(*xy.T))]) + LOOKAHEAD_M)
-    return command_of(float(target[1])), target
+    route = route_ahead(arc_m, xy, float(arc_m[np.argmin(np.hypot(*xy.T))]), np.eye(4))
+    return command_of(float(route.xy[TARGET, 1])), route
 
 
 def timed(plan: Trajectory, now_us: int) -> TimedPoses:

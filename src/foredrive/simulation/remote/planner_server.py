@@ -5,12 +5,11 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
-import numpy as np
 import torch
-from jaxtyping import Float64
 
 from foredrive.data.batches import stack_records
 from foredrive.data.boxes import no_boxes
+from foredrive.data.commands import RouteAhead
 from foredrive.errors import InputError
 from foredrive.json_server import Answer, validated
 from foredrive.scene import Agent, CameraRig, Clip, Command, Trajectory
@@ -86,10 +85,10 @@ def seen_clip(
     frames: Sequence[KeyFrame],
     rig: CameraRig | None,
     command: Command,
-    target_xy: Float64[np.ndarray, "2"] | None = None,
+    route: RouteAhead | None = None,
 ) -> Clip:
     """Return what an agent observes of key frames without ground truth. It is unbatched."""
-    clip = make_clip(frames, rig, command, target_xy)
+    clip = make_clip(frames, rig, command, route)
     return dataclasses.replace(clip, boxes_valid=torch.zeros_like(clip.boxes_valid))
 
 
