@@ -113,6 +113,20 @@ def test_light_lead_vehicle_and_people_on_the_route(log: Log) -> None:
     torch.testing.assert_close(found.crossing_xy, torch.tensor(expected)[None].float(), atol=1e-3, rtol=0)
 
 
+def test_cells_of_the_path_are_occupied_over_time(log: Log) -> None:
+    """The lead car drives on at 3 m/s; the first walker enters after 2.9 s, the last one later than 4 s."""
+    found = read_affordances(log, FRAME // 5)
+    assert bool(found.occupied_known.all())
+    for step in range(9):
+        rear_m = LEAD_REAR_X - front_x(log) + 1.5 * step
+        cells = set(range(int(rear_m // 2), int((rear_m + 4.0) // 2) + 1))
+        cells |= {int((WALKER_X - front_x(log)) // 2)} if step >= 6 else set()
+        assert set(found.occupied[step].nonzero()[:, 0].tolist()) == cells, step
+    late = read_affordances(log, 7)  # the log ends after 2 s, the route 42 m ahead of the axle
+    assert late.occupied_known.any(1).tolist() == [True] * 5 + [False] * 4
+    assert late.occupied_known[0].tolist() == [True] * 18 + [False] * 6
+
+
 def test_lights_behind_and_far_ahead_do_not_count(log: Log) -> None:
     late = read_affordances(log, 7)  # the axle is at x = 17.5, the bumper 3.6 m beyond the line
     assert (bool(late.light_known), int(late.light)) == (True, LightState.NONE)

@@ -13,22 +13,27 @@ from jaxtyping import Bool, Float, Float64, Int64
 from py123d.datatypes import Lane, MapLayer, TrafficLightStatus
 from torch import Tensor
 
-from foredrive.data.agent_futures import read_futures
+from foredrive.data.agent_futures import annotated_at, read_futures
 from foredrive.data.arrow_files import reading
-from foredrive.data.boxes import read_boxes
+from foredrive.data.boxes import read_boxes, read_tracks
 from foredrive.data.commands import route_at
 from foredrive.data.logs import Log
-from foredrive.data.recorded import read_signal_lamps, read_traffic_lights
+from foredrive.data.recorded import read_signal_lamps, read_traffic_lights, read_visibility
 from foredrive.geometry.path_frame import along_path, path_headings
+from foredrive.geometry.path_occupancy import cells_covered
 from foredrive.geometry.polylines import arc_lengths, points_at
 from foredrive.scene import Boxes
 from foredrive.scene.affordances import (
+    CELL_M,
+    CELLS,
     CROSSING_RANGE_M,
     CROSSING_S,
+    HALF_WIDTH_M,
     LATER_DT_S,
     LATER_STEPS,
     LEAD_RANGE_M,
     LIGHT_RANGE_M,
+    TIMES,
     Affordances,
 )
 from foredrive.scene.boxes import VEHICLES, Category
@@ -43,9 +48,9 @@ ALIGNED_COS = 0.5
 LEVEL_M = 2.5
 """A stop line is on the path if its lane begins at most this far beside it, at most 60° turned, at its
 height."""
-IN_WAY_M = 1.2
-"""A vehicle is in the path if a part of it is at most this far beside it: half the ego vehicle and a margin.
-"""
+FOLLOWS_M, FOLLOWS_SLOPE = 2.0, 0.15
+"""A road user behind the rear axle follows the ego vehicle if it is at most this far beside its axis: more
+the further behind it is."""
 ENTERED_M = 1.7
 """A person has entered the path at this distance from it."""
 STATE_OF_STATUS = {
@@ -87,6 +92,7 @@ def read_affordances(log: Log, frame: int) -> Affordances:
     boxes = read_boxes(log, frame)
     lead, lead_m, lead_mps, lead_known = lead_of(boxes, path)
     crossing, crossing_known = _crossing(log, frame, boxes, path)
+    occupied, occupied_known = _occupied(log, frame, boxes, path)
     return Affordances(
         path_xy=path.xy,
         path_valid=path.valid,
@@ -104,6 +110,8 @@ def read_affordances(log: Log, frame: int) -> Affordances:
         crossing_xy=crossing,
         crossing=torch.ones(len(crossing), dtype=torch.bool),
         crossing_known=torch.tensor(crossing_known),
+        occupied=occupied,
+        occupied_known=occupied_known,
     )
 
 
@@ -227,7 +235,7 @@ def lead_of(boxes: Boxes | None, path: PathAhead) -> tuple[bool, float, float, b
     points = _points_of(chosen)
     along_m, left_m = along_path(points.flatten(0, 1), path.xy, path.valid)
     gap_m = (along_m - path.front_m).view(points.shape[:2])
-    in_way = (left_m.view(points.shape[:2]).abs() < IN_WAY_M) & (gap_m > -1.0)
+    in_way = (left_m.view(points.shape[:2]).abs() < HALF_WIDTH_M) & (gap_m > -1.0)
     nearest_m = gap_m.masked_fill(~in_way, torch.inf).amin(-1)
     if len(nearest_m) and float(nearest_m.min()) <= LEAD_RANGE_M:
         row = int(nearest_m.argmin())
@@ -254,6 +262,67 @@ def _crossing(
     entered = (left_m.view(there.shape).abs() < ENTERED_M) & (ahead_m > -1.0) & (ahead_m < CROSSING_RANGE_M)
     person = (boxes.category == int(Category.PEDESTRIAN)) & boxes.valid
     return boxes.centre[person & (entered & there).any(-1), :2], True
+
+
+def _occupied(
+    log: Log, frame: int, boxes: Boxes | None, path: PathAhead
+) -> tuple[Bool[Tensor, "T G"], Bool[Tensor, "T G"]]:
+    """Return which cells of the path are occupied at which times, and where the log tells."""
+    tracks = read_tracks(log)
+    if boxes is None or tracks is None or not bool(path.valid.any()):
+        nothing = torch.zeros(TIMES, CELLS, dtype=torch.bool)
+        return nothing, nothing
+    future = read_futures(log, frame, TIMES - 1, LATER_DT_S)
+    by_user = occupied_by(
+        boxes,
+        torch.cat([boxes.centre[:, None, :2], future.xy], dim=1),
+        torch.cat([boxes.yaw[:, None], future.yaw], dim=1),
+        torch.cat([boxes.valid[:, None], future.valid], dim=1),
+        path,
+    )
+    seen = torch.ones(len(boxes.yaw), dtype=torch.bool)
+    if (share := read_visibility(log, frame)) is not None:
+        seen = share > 0
+    occupied = by_user[seen].any(0)
+    reach_m = path.front_m + CELL_M * torch.arange(1, CELLS + 1)
+    inside = reach_m <= float(path.valid.sum()) - 1.0
+    t_us = log.t_us[frame] + np.round(np.arange(TIMES) * LATER_DT_S * 1e6).astype(np.int64)
+    annotated = torch.from_numpy(annotated_at(tracks, t_us))
+    known = annotated[:, None] & inside & (occupied | ~by_user[~seen].any(0))
+    return occupied & known, known
+
+
+def occupied_by(
+    boxes: Boxes,
+    xy: Float[Tensor, "M T 2"],
+    yaw: Float[Tensor, "M T"],
+    valid: Bool[Tensor, "M T"],
+    path: PathAhead,
+) -> Bool[Tensor, "M T G"]:
+    """Return which of the `CELLS` of a path each road user covers over time.
+
+    Those that are behind the ego vehicle in its lane at first cover nothing: they follow it.
+
+    Args:
+        boxes: unbatched, in the frame of the path.
+        xy, yaw, valid: their middles and headings over time, m and rad.
+        path: the path.
+    """
+    x, y, z = boxes.centre.unbind(-1)
+    behind = (x < 0) & (y.abs() < FOLLOWS_M - FOLLOWS_SLOPE * x)
+    level = z.abs() < LEVEL_M + 0.5 * boxes.size_lwh[:, 2]
+    return cells_covered(
+        xy,
+        yaw,
+        valid & (~behind & level)[:, None],
+        boxes.size_lwh[:, :2],
+        path.xy,
+        path.valid,
+        path.front_m,
+        HALF_WIDTH_M,
+        CELLS,
+        CELL_M,
+    )
 
 
 def _points_of(boxes: Boxes) -> Float[Tensor, "M P 2"]:

@@ -75,7 +75,7 @@ def read_instances(log: Log, frame: int, steps: int, dt_s: float, spec: PlaneSpe
     vehicles = np.isin(tracks.category, [int(kind) for kind in VEHICLES]) & ~tracks.is_ego
     ids = np.unique(tracks.track_id[vehicles])
     states = track_states(tracks, log.T_world_ego[frame], ids, t_us)
-    valid = _annotated(tracks.row_t_us, t_us)
+    valid = annotated_at(tracks, t_us)
     for step in range(steps + 1):
         there = np.flatnonzero(states.valid[:, step] & valid[step])
         size_m = tracks.size_lwh[states.box[there, step], :2]
@@ -136,8 +136,9 @@ def _now_us(log: Log, frame: int, tracks: Tracks) -> int:
     return int(log.t_us[frame] if row is None else tracks.row_t_us[row])
 
 
-def _annotated(row_t_us: Int64[np.ndarray, "R"], t_us: Int64[np.ndarray, "S"]) -> Bool[np.ndarray, "S"]:
-    """Return whether there are annotated rows close before and after each time."""
+def annotated_at(tracks: Tracks, t_us: Int64[np.ndarray, "S"]) -> Bool[np.ndarray, "S"]:
+    """Return whether there are annotated rows of a log close before and after each time, µs."""
+    row_t_us = tracks.row_t_us
     after = np.searchsorted(row_t_us, t_us - SLACK_S * 1e6)
     before = np.searchsorted(row_t_us, t_us + SLACK_S * 1e6, side="right") - 1
     inside = (after < len(row_t_us)) & (before >= 0)

@@ -14,6 +14,13 @@ CROSSING_RANGE_M = 25.0
 CROSSING_S = 4.0
 """Someone crosses who enters the path within this time, s."""
 LATER_STEPS, LATER_DT_S = 6, 0.5
+CELLS, CELL_M = 24, 2.0
+"""Cells of the path ahead of the front bumper, and their length, m."""
+TIMES = 9
+"""Times of the occupancy of the path: now and every `LATER_DT_S` up to 4 s."""
+HALF_WIDTH_M = 1.2
+"""A road user is in the path if a part of it is at most this far beside it, m: half the ego vehicle and a
+margin."""
 
 
 @dataclass(frozen=True)
@@ -52,6 +59,11 @@ class Affordances(Record):
     crossing: Bool[Tensor, "*b K"]
     """False for padding."""
     crossing_known: Bool[Tensor, "*b"]
+    occupied: Bool[Tensor, "*b T G"]
+    """Whether a road user is in each of `CELLS` of the path at each of `TIMES`, by the recorded futures."""
+    occupied_known: Bool[Tensor, "*b T G"]
+    """False beyond the end of the route, where nobody annotated the time, and where only road users are that
+    cannot be seen now."""
 
 
 @dataclass(frozen=True)
@@ -69,3 +81,5 @@ class AffordanceEstimate(Record):
     """Places of the K most probable people who cross, the first most probable."""
     crossing: Float[Tensor, "*b K"]
     """Their probabilities."""
+    occupied: Float[Tensor, "*b T G"] | None = None
+    """Probability that a cell of the path is occupied at a time."""
