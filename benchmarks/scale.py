@@ -113,7 +113,7 @@ def _linked(log: LogPath, copy: int) -> LogPath:
 def _link_cache(dataset: ClipDataset, logs: list[LogPath]) -> None:
     """Give all logs the cache entries of the first one, as if each had been read once."""
     cameras = [dataset._cameras[0][name] for name in dataset.camera_names]
-    opened = {log.path.folder: log for log in dataset._logs}
+    opened = {log.path.folder: log for log in dataset.logs}
     first = opened[logs[0].folder]
     for frame in range(len(first)):
         for log in logs[1:]:

@@ -13,6 +13,7 @@ FLOORS = [
     {"sensors", "sets"},
     {"data", "towns", "rendering", "models", "losses", "metrics"},
     {"search", "simulation", "training", "evaluation", "export"},
+    {"driver"},
     {"recipes"},
     {"runs"},
     {"view"},

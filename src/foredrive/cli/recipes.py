@@ -16,15 +16,17 @@ def recipes(
         name: Print this recipe; without a name, all recipes are listed.
     """
     with importing():
+        from foredrive.driver.recipe import DRIVER_RECIPES
         from foredrive.recipes.config import recipe_yaml
-        from foredrive.recipes.known import RECIPES, find_recipe
+        from foredrive.recipes.known import RECIPES, find_driver_recipe, find_recipe
         from foredrive.recipes.rebuilding import REBUILD_RECIPES, find_rebuild_recipe
 
     if name is not None:
-        recipe = find_rebuild_recipe(name) if name in REBUILD_RECIPES else find_recipe(name)
+        driver = find_driver_recipe(name)
+        recipe = driver or (find_rebuild_recipe(name) if name in REBUILD_RECIPES else find_recipe(name))
         print(recipe_yaml(recipe), end="")
         return
-    for verb, known in (("train", RECIPES), ("reconstruct", REBUILD_RECIPES)):
+    for verb, known in (("train", RECIPES), ("train", DRIVER_RECIPES), ("reconstruct", REBUILD_RECIPES)):
         print(f"foredrive {verb}:")
         for key, entry in known.items():
             print(f"  {key:28} {entry.about}")

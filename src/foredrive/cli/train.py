@@ -62,10 +62,20 @@ def train(
 
     with importing():
         from foredrive.recipes import find_recipe, with_occupancy_source
+        from foredrive.recipes.known import find_driver_recipe
         from foredrive.recipes.task_heads import heads_for, with_joint_heads, with_settings
         from foredrive.runs import train_run
+        from foredrive.runs.train.driver import train_driver
         from foredrive.runs.train.tasks import TASKS, probe_run, train_heads
 
+    driver = find_driver_recipe(recipe, set)
+    if driver is not None:
+        if tasks or start is not None or rank() is not None:
+            raise InputError(f"{driver.name} trains a driver: leave out --tasks, --start and torchrun")
+        train_driver(driver, found, out, cache)
+        print(f"trained {driver.name}: {out}")
+        print(f"next: foredrive drive --agent {out} --routes town05-short --out {out / 'short'}")
+        return
     of_heads = tuple(entry.removeprefix(TASKS + ".") for entry in set if entry.startswith(TASKS + "."))
     others = tuple(entry for entry in set if not entry.startswith(TASKS + ".")) if tasks else set
     chosen = with_occupancy_source(find_recipe(recipe, others), occupancy)

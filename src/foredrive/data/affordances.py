@@ -41,8 +41,9 @@ from foredrive.scene.traffic_light import LightState
 
 POINTS = 72
 """Points of the path, a metre apart."""
-PASSED_M = 2.0
-"""A light counts until the front bumper is this far beyond its line."""
+PASSED_M = 4.4
+"""A light counts until the front bumper is this far beyond its line: until then the point whose crossing is
+judged, near the rear axle, has not crossed it (`simulation.lane_rules`)."""
 BESIDE_M = 1.75
 ALIGNED_COS = 0.5
 LEVEL_M = 2.5

@@ -96,8 +96,8 @@ class ClipDataset(Dataset[Example]):
         if not logs:
             raise InputError("a data set needs at least one log")
         self.config = config
-        self._logs = [Log(path) for path in logs]
-        self._cameras = [pinhole_cameras(log) for log in self._logs]
+        self.logs = [Log(path) for path in logs]
+        self._cameras = [pinhole_cameras(log) for log in self.logs]
         self.camera_names = self._choose_cameras()
         self._frames = FrameStore(cache_dir, config.image_hw, self.camera_names)
         self._labels = LabelStore(
@@ -105,13 +105,11 @@ class ClipDataset(Dataset[Example]):
         )
         self._truth = None if config.tasks is None else TaskTruthStore(cache_dir, config.tasks, config.voxels)
         if config.occupancy_source == "recorded":
-            for log in self._logs:
+            for log in self.logs:
                 check_recorded_occupancy(log)
-        frames = [
-            self._sensed_now(number, _clip_frames(log, config)) for number, log in enumerate(self._logs)
-        ]
+        frames = [self._sensed_now(number, _clip_frames(log, config)) for number, log in enumerate(self.logs)]
         self._clip_frames = np.concatenate(frames)
-        self._clip_logs = np.repeat(np.arange(len(self._logs)), [len(of_log) for of_log in frames])
+        self._clip_logs = np.repeat(np.arange(len(self.logs)), [len(of_log) for of_log in frames])
         if not len(self):
             raise InputError(f"{logs[0].folder}: none of the selected parts is long enough for a clip")
 
@@ -127,7 +125,7 @@ class ClipDataset(Dataset[Example]):
         """
         counts = Counter({"route": 0, "driven_future": 0, "none": 0})
         nows = self._clip_frames[:, self.config.past_frames]
-        for number, log in enumerate(self._logs):
+        for number, log in enumerate(self.logs):
             of_log = nows[self._clip_logs == number]
             counts.update(
                 count_command_sources(log, of_log, self.config.horizon_steps, self.config.horizon_dt_s)
@@ -139,7 +137,7 @@ class ClipDataset(Dataset[Example]):
 
         A log may go on without images, for the true future of the last ones.
         """
-        log, cameras = self._logs[number], self._cameras[number]
+        log, cameras = self.logs[number], self._cameras[number]
         chosen = [camera for name in self.camera_names if (camera := find_camera(cameras, name)) is not None]
         sensed = [log.rows(camera.modality_key)[0] for camera in chosen]
         if not any(len(frames) for frames in sensed):
@@ -147,18 +145,18 @@ class ClipDataset(Dataset[Example]):
         sensed += [frames_with_lidar(log)] if self.config.lidar else []
         return clips[np.isin(clips[:, self.config.past_frames], np.concatenate(sensed))]
 
-    def _clip(self, index: int) -> tuple[int, list[int]]:
-        """Return the number of the log of a clip, and the clip's frames."""
+    def frames_of(self, index: int) -> tuple[int, list[int]]:
+        """Return the number of the log of a clip in `logs`, and the clip's frames."""
         return int(self._clip_logs[index]), self._clip_frames[index].tolist()
 
     def now_us(self, index: int) -> int:
         """Return the now of a clip in the time of its log, µs."""
-        number, frames = self._clip(index)
-        return int(self._logs[number].t_us[frames[self.config.past_frames]])
+        number, frames = self.frames_of(index)
+        return int(self.logs[number].t_us[frames[self.config.past_frames]])
 
     def log_path(self, index: int) -> LogPath:
         """Return the log of a clip."""
-        return self._logs[self._clip_logs[index]].path
+        return self.logs[self._clip_logs[index]].path
 
     def key(self, index: int) -> str:
         """Return the name of the log and the time of the now of a clip, for messages."""
@@ -170,8 +168,8 @@ class ClipDataset(Dataset[Example]):
         Raises:
             InputError: data cannot be read.
         """
-        number, frames = self._clip(index)
-        log = self._logs[number]
+        number, frames = self.frames_of(index)
+        log = self.logs[number]
         labels = [self._voxel_labels(log, frame) for frame in frames]
         occupied = torch.stack([label.occupied for label in labels])
         return Example(
@@ -196,8 +194,8 @@ class ClipDataset(Dataset[Example]):
         Raises:
             InputError: the future cannot be read.
         """
-        number, frames = self._clip(index)
-        log, now = self._logs[number], frames[self.config.past_frames]
+        number, frames = self.frames_of(index)
+        log, now = self.logs[number], frames[self.config.past_frames]
         return float(np.nan_to_num(log.speed_mps[now])), self._future(log, now)
 
     def truth(self, index: int) -> TaskTruth | None:
@@ -208,9 +206,9 @@ class ClipDataset(Dataset[Example]):
         """
         if self._truth is None:
             return None
-        number, frames = self._clip(index)
+        number, frames = self.frames_of(index)
         cameras = [find_camera(self._cameras[number], name) for name in self.camera_names]
-        return self._truth.read(self._logs[number], frames[self.config.past_frames], cameras)
+        return self._truth.read(self.logs[number], frames[self.config.past_frames], cameras)
 
     def _voxel_labels(self, log: Log, frame: int) -> VoxelLabels:
         if self.config.occupancy_source == "recorded":
@@ -239,8 +237,8 @@ class ClipDataset(Dataset[Example]):
         Raises:
             InputError: data cannot be read.
         """
-        number, frames = self._clip(index)
-        log, config = self._logs[number], self.config
+        number, frames = self.frames_of(index)
+        log, config = self.logs[number], self.config
         now = frames[config.past_frames]
         driven = log.driven_future(now, config.horizon_steps, config.horizon_dt_s)
         command, _ = command_at(log, now, driven)

@@ -6,8 +6,17 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from foredrive.driver.recipe import DRIVER_RECIPES, DriverRecipe
 from foredrive.errors import InputError
-from foredrive.recipes.config import Recipe, is_recipe_file, load_recipe, overridden, recipe_from
+from foredrive.recipes.config import (
+    Recipe,
+    is_recipe_file,
+    load_recipe,
+    overridden,
+    read_values,
+    recipe_from,
+    validated,
+)
 from foredrive.recipes.driveworld import (
     driveworld_base,
     driveworld_drive_tele,
@@ -54,8 +63,26 @@ def find_recipe(name: str, settings: Sequence[str] = ()) -> Recipe[Any, Any]:
     elif name in RECIPES:
         recipe = RECIPES[name]
     else:
-        raise InputError(f"no recipe {name!r}{nearest_name(name, RECIPES)}")
+        raise InputError(f"no recipe {name!r}{nearest_name(name, [*RECIPES, *DRIVER_RECIPES])}")
     return recipe_from(overridden(asdict(recipe), settings), name) if settings else recipe
+
+
+def find_driver_recipe(name: str, settings: Sequence[str] = ()) -> DriverRecipe | None:
+    """Return the recipe of a driver as `find_recipe` does. None: the name is that of another recipe.
+
+    Raises:
+        InputError: the file cannot be read, or a setting does not fit.
+    """
+    if is_recipe_file(name):
+        values = read_values(Path(name))
+        if not isinstance(values, dict) or values.get("kind") != "driver":
+            return None
+    elif name in DRIVER_RECIPES:
+        values = asdict(DRIVER_RECIPES[name])
+    else:
+        return None
+    recipe: DriverRecipe = validated(DriverRecipe, overridden(values, settings), name)
+    return recipe
 
 
 def nearest_name(name: str, known: Sequence[str] | dict[str, Any]) -> str:

@@ -37,7 +37,7 @@ class Affordances(Record):
     light: Int[Tensor, "*b"]
     """`LightState` of the next light on the path; NONE if none is within `LIGHT_RANGE_M`."""
     light_m: Float[Tensor, "*b"]
-    """Distance of its stop line. It is negative while the bumper is less than 2 m beyond the line."""
+    """Distance of its stop line. It is negative while the bumper is up to 4.4 m beyond the line."""
     light_known: Bool[Tensor, "*b"]
     light_later: Int[Tensor, "*b S"]
     """`LightState` of the same light at `LATER_STEPS` times, `LATER_DT_S` apart; the last known one beyond
@@ -81,5 +81,15 @@ class AffordanceEstimate(Record):
     """Places of the K most probable people who cross, the first most probable."""
     crossing: Float[Tensor, "*b K"]
     """Their probabilities."""
-    occupied: Float[Tensor, "*b T G"] | None = None
-    """Probability that a cell of the path is occupied at a time."""
+
+
+@dataclass(frozen=True)
+class PathEstimate(Record):
+    """The prediction of what is on the path: its next light, and who is in it over time."""
+
+    light: Float[Tensor, "*b 4"]
+    """Probability of each `LightState`."""
+    light_m: Float[Tensor, "*b"]
+    """Distance of its stop line, m."""
+    occupied: Float[Tensor, "*b T G"]
+    """Probability that a cell of the path is occupied at a time, as in `Affordances`."""

@@ -1,53 +1,41 @@
-"""A rule-based agent: it follows the route by the intelligent driver model."""
+"""A rule-based agent: it follows the route by the intelligent driver model and gives way (`speed_rule`)."""
 
 from collections.abc import Callable
-from typing import NamedTuple
 
 import numpy as np
 import torch
 from jaxtyping import Float64
 
-from foredrive.data.affordances import PathAhead, lead_of, path_ahead
+from foredrive.data.affordances import PASSED_M, PathAhead, lead_of, occupied_by, path_ahead
 from foredrive.geometry.path_frame import along_path, path_headings
 from foredrive.geometry.polylines import arc_lengths, points_at
-from foredrive.scene import Boxes, Category, Clip, Trajectory
-from foredrive.scene.affordances import CROSSING_RANGE_M, LIGHT_RANGE_M, AffordanceEstimate
+from foredrive.scene import Boxes, Clip, Trajectory
+from foredrive.scene.affordances import (
+    CELL_M,
+    LATER_DT_S,
+    LIGHT_RANGE_M,
+    TIMES,
+    PathEstimate,
+)
 from foredrive.scene.traffic_light import LightState
-from foredrive.simulation.dynamics import EGO
-from foredrive.simulation.observation import FRAME_DT_S, HORIZON_STEPS
+from foredrive.simulation.lane_rules import LEVEL_M
 from foredrive.simulation.simple_agents import plan_of
+from foredrive.simulation.speed_rule import FRONT_M, Obstacle, PathView, rule_progress
 from foredrive.simulation.town import TownSimulator
 from foredrive.simulation.town_lanes import stop_lines
 from foredrive.towns.map.town_map import load_town_map
-from foredrive.towns.traffic.car_following import follow_acceleration, free_acceleration
 
-DESIRED_MPS, ACCELERATION_MPS2, BRAKING_MPS2 = 8.0, 1.5, 2.5
-STANDSTILL_M, TIME_GAP_S = 2.0, 1.2
-"""Parameters of the model: a calm driver in town."""
-LATERAL_MPS2 = 2.0
-"""Bound of the lateral acceleration; it slows the vehicle before curves."""
-LOOKS_M = 20.0
-BESIDE_M, ENTERS_M, WALKS_S = 1.75, 1.7, 3.0
-"""Largest distance of a stop line from the path; distance at which a person is on it, within this time."""
+BESIDE_M = 1.75
+"""Largest distance of a stop line from the path."""
 PROBABLE = 0.5
 REJOINS_M = 8.0
-STEPS_PER_FRAME = 5
-FRONT_M = EGO.axle_to_centre_m + 0.5 * EGO.length_m
-
-
-class Obstacle(NamedTuple):
-    """Something to follow or to stop at."""
-
-    gap_m: float
-    """Distance from the front bumper along the path."""
-    speed_mps: float
 
 
 class IdmAgent:
     """An `Agent` on the route's line that keeps its distance by the intelligent driver model.
 
-    It knows the route and its place on it. Lights, the lead vehicle and people come from the simulator or
-    from `perceive`.
+    It knows the route and its place on it. Lights and road users come from the simulator, which move on at
+    constant velocity, or from `perceive`.
 
     Args:
         simulator: the town that it drives in.
@@ -55,7 +43,7 @@ class IdmAgent:
     """
 
     def __init__(
-        self, simulator: TownSimulator, perceive: Callable[[Clip], AffordanceEstimate] | None = None
+        self, simulator: TownSimulator, perceive: Callable[[Clip], PathEstimate] | None = None
     ) -> None:
         self._simulator, self._perceive = simulator, perceive
 
@@ -66,115 +54,73 @@ class IdmAgent:
         arc_m, T_world_ego = arc_lengths(xyz), clip.T_world_ego[clip.now].numpy()
         path = path_ahead(xyz, arc_m, self._simulator.done_m, T_world_ego, FRONT_M)
         if self._perceive is None:
-            obstacles = self._known(clip.boxes[clip.now], path, T_world_ego)
+            light, light_m = self._light(path, T_world_ego)
+            view = true_view(clip.boxes[clip.now], path, light, light_m)
         else:
-            obstacles = _told(self._perceive(observation), path)
-        along_m = drive_along(path, float(clip.ego_speed_mps[clip.now]), obstacles)
-        return plan_of(torch.from_numpy(_waypoints(path, along_m)).float()[None, None])
-
-    def _known(
-        self, boxes: Boxes, path: PathAhead, T_world_ego: Float64[np.ndarray, "4 4"]
-    ) -> list[Obstacle]:
-        """Return the obstacles from the state of the simulator."""
-        found = []
-        there, gap_m, speed_mps, _ = lead_of(boxes, path)
-        if there:
-            found.append(Obstacle(gap_m, speed_mps))
-        people = boxes[(boxes.category == int(Category.PEDESTRIAN)) & boxes.valid]
-        found += _people(people.centre[:, :2], people.velocity.nan_to_num(), path)
-        light, light_m = self._light(path, T_world_ego)
-        return found + _stops(light, light_m)
+            view = estimated_view(self._perceive(observation)[0])
+        along_m = rule_progress(path, float(clip.ego_speed_mps[clip.now]), view)
+        return plan_of(torch.from_numpy(waypoints_along(path, along_m)).float()[None, None])
 
     def _light(self, path: PathAhead, T_world_ego: Float64[np.ndarray, "4 4"]) -> tuple[LightState, float]:
         """Return state and distance of the next light on the path."""
         lines = stop_lines(load_town_map(self._simulator.scenario.town))
         states = self._simulator.traffic.zone_lights(self._simulator.state.decided.time_s)
         T_ego_world = np.linalg.inv(T_world_ego)
-        at = lines.xyz @ T_ego_world[:3, :3].T + T_ego_world[:3, 3]
+        xyz = lines.xyz @ T_ego_world[:3, :3].T + T_ego_world[:3, 3]
         ahead = lines.ahead @ T_ego_world[:2, :2].T
-        along, left = along_path(torch.from_numpy(at[:, :2]).float(), path.xy, path.valid)
+        along, left = along_path(torch.from_numpy(xyz[:, :2]).float(), path.xy, path.valid)
         heading = path_headings(along, path.xy, path.valid).numpy()
         gap_m = along.double().numpy() - path.front_m
+        height_m = np.interp(along.numpy(), np.arange(len(path.z)), path.z)
         mine = (left.abs().numpy() < BESIDE_M) & ((heading * ahead).sum(-1) > 0.5) & ~lines.is_sign
-        mine &= (gap_m > -0.5) & (gap_m < LIGHT_RANGE_M) & (states[lines.zone] != LightState.NONE)
+        mine &= (gap_m > -PASSED_M) & (gap_m < LIGHT_RANGE_M) & (states[lines.zone] != LightState.NONE)
+        mine &= np.abs(xyz[:, 2] - height_m) < LEVEL_M
         if not mine.any():
             return LightState.NONE, 0.0
         row = int(np.where(mine, gap_m, np.inf).argmin())
         return LightState(int(states[lines.zone[row]])), float(gap_m[row])
 
 
-def drive_along(path: PathAhead, speed_mps: float, obstacles: list[Obstacle]) -> Float64[np.ndarray, "T"]:
-    """Return the distance along the path at each waypoint, by the IDM behind the nearest of all obstacles."""
-    dt_s = FRAME_DT_S / STEPS_PER_FRAME
-    desired = np.array([_curve_speed(path)])
-    limits = (np.array([ACCELERATION_MPS2]), np.array([BRAKING_MPS2]))
-    along_m, speed, found = 0.0, speed_mps, []
-    for step in range(HORIZON_STEPS * STEPS_PER_FRAME):
-        v = np.array([speed])
-        free = free_acceleration(v, desired, *limits)
-        wanted = float(free[0])
-        for obstacle in obstacles:
-            gap = obstacle.gap_m + obstacle.speed_mps * step * dt_s - along_m
-            behind = follow_acceleration(
-                free,
-                v,
-                v - obstacle.speed_mps,
-                np.array([gap]),
-                np.array([STANDSTILL_M]),
-                np.array([TIME_GAP_S]),
-                *limits,
-            )
-            wanted = min(wanted, float(behind[0]))
-        after = max(0.0, speed + max(wanted, -8.0) * dt_s)
-        along_m, speed = along_m + 0.5 * (speed + after) * dt_s, after
-        if (step + 1) % STEPS_PER_FRAME == 0:
-            found.append(along_m)
-    return np.array(found)
+def true_view(boxes: Boxes, path: PathAhead, light: LightState, light_m: float) -> PathView:
+    """Return the view of a path where boxes are known: they go on at constant velocity.
+
+    Args:
+        boxes: unbatched, in the frame of the path.
+        path: the path.
+        light, light_m: the next light and its distance.
+    """
+    there, gap_m, speed_mps, _ = lead_of(boxes, path)
+    t_s = LATER_DT_S * torch.arange(TIMES)
+    moved = boxes.velocity.nan_to_num()[:, None] * t_s[:, None]
+    occupied = occupied_by(
+        boxes,
+        boxes.centre[:, None, :2] + moved,
+        boxes.yaw[:, None].expand(-1, TIMES),
+        boxes.valid[:, None].expand(-1, TIMES),
+        path,
+    )
+    lead = Obstacle(gap_m, max(speed_mps, 0.0)) if there else None
+    return PathView(light, light_m, lead, occupied.any(0).numpy())
 
 
-def _told(estimate: AffordanceEstimate, path: PathAhead) -> list[Obstacle]:
-    """Return the obstacles of an estimate, a batch of one."""
-    found = []
-    if float(estimate.lead[0]) >= PROBABLE:
-        found.append(Obstacle(max(float(estimate.lead_m[0]), 0.0), max(float(estimate.lead_mps[0]), 0.0)))
-    probable = estimate.crossing_xy[0][estimate.crossing[0] >= PROBABLE]
-    found += _people(probable, torch.zeros_like(probable), path, within_m=6.0)
-    return found + _stops(LightState(int(estimate.light[0].argmax())), float(estimate.light_m[0]))
+def estimated_view(estimate: PathEstimate) -> PathView:
+    """Return the view of a path of an unbatched estimate."""
+    occupied = (estimate.occupied >= PROBABLE).cpu().numpy()
+    return PathView(
+        LightState(int(estimate.light.argmax())), float(estimate.light_m), lead_in(occupied), occupied
+    )
 
 
-def _people(
-    xy: torch.Tensor, velocity: torch.Tensor, path: PathAhead, within_m: float = ENTERS_M
-) -> list[Obstacle]:
-    """Return obstacles for people who are or will be on the path, at constant velocity."""
-    found = []
-    for t_s in np.arange(0.0, WALKS_S + 0.1, 0.5):
-        along, left = along_path(xy + t_s * velocity, path.xy, path.valid)
-        gap_m = along - path.front_m
-        on_path = (left.abs() < within_m) & (gap_m > 0) & (gap_m < CROSSING_RANGE_M)
-        found += [Obstacle(float(gap), 0.0) for gap in gap_m[on_path]]
-    return found
+def lead_in(occupied: np.ndarray) -> Obstacle | None:
+    """Return the first road user in the path now, its speed by the first occupied cell two seconds later."""
+    if not occupied[0].any():
+        return None
+    first, later = int(occupied[0].argmax()), round(2.0 / LATER_DT_S)
+    moved = int(occupied[later].argmax()) - first if occupied[later].any() else 0
+    return Obstacle(max(CELL_M * first + 0.25 * CELL_M, 0.3), max(CELL_M * moved / 2.0, 0.0))
 
 
-def _stops(light: LightState, light_m: float) -> list[Obstacle]:
-    """Return the obstacle of a light: red stops, yellow too where there is room to brake."""
-    room = light_m > DESIRED_MPS**2 / (2 * BRAKING_MPS2)
-    if light is LightState.RED or (light is LightState.YELLOW and room):
-        return [Obstacle(light_m + 1.0, 0.0)]  # the model stops `STANDSTILL_M` before it
-    return []
-
-
-def _curve_speed(path: PathAhead) -> float:
-    """Return the speed at which the lateral acceleration of the next metres is bearable."""
-    count = min(int(path.valid.sum()), int(LOOKS_M))
-    if count < 8:
-        return DESIRED_MPS
-    xy = path.xy[:count].numpy()
-    heading = np.unwrap(np.arctan2(*(xy[4:] - xy[:-4]).T[::-1]))
-    bend = float(np.abs(np.diff(heading)).max()) if len(heading) > 1 else 0.0
-    return float(min(DESIRED_MPS, np.sqrt(LATERAL_MPS2 / max(bend, 1e-6))))
-
-
-def _waypoints(path: PathAhead, along_m: Float64[np.ndarray, "T"]) -> Float64[np.ndarray, "T 2"]:
+def waypoints_along(path: PathAhead, along_m: Float64[np.ndarray, "S"]) -> Float64[np.ndarray, "S 2"]:
     """Return points of the path, which the vehicle rejoins over `REJOINS_M`."""
     xy = path.xy[path.valid].double().numpy()
     if len(xy) < 2:

@@ -9,16 +9,17 @@ from typing import Literal
 
 import torch
 
+from foredrive.driver.agent import Driver, Perception, SightDriver
 from foredrive.errors import InputError
 from foredrive.json_server import Address
 from foredrive.models.ego_mlp import EgoMLP
 from foredrive.runs.drive.seeing_agents import SeeingAgent, following
 from foredrive.runs.shipped import run_folder
 from foredrive.runs.train.baselines import run_baselines
+from foredrive.runs.train.driver import is_driver, load_driver, open_driver
 from foredrive.runs.train.rigs import TrainedRigs, check_rig, read_rigs
 from foredrive.runs.train.run import load_agent, open_run
-from foredrive.scene import Agent, Clip
-from foredrive.scene.affordances import AffordanceEstimate
+from foredrive.scene import Agent
 from foredrive.sensors.rigs import SURROUND, RigPlan
 from foredrive.simulation.demonstrations import AlternatingStudent, DisturbedExpert
 from foredrive.simulation.idm_agent import IdmAgent
@@ -105,11 +106,13 @@ def inputs_of(agent: str) -> AgentInputs:
         return AgentInputs(cameras=True, lidar=False, past_frames=1)
     if agent in (EXPERT, STOP, CONSTANT_VELOCITY, DISTURBED, IDM, *OF_LOGS):
         return AgentInputs(cameras=False, lidar=agent == CORRIDOR, past_frames=1)
-    clips = open_run(_run_folder(agent)).recipe.clips
+    folder = _run_folder(agent)
+    clips = (open_driver(folder) if is_driver(folder) else open_run(folder)).recipe.clips
     if abs(clips.frame_dt_s - FRAME_DT_S) > 1e-6:
         raise InputError(f"{agent}: trained on key frames {clips.frame_dt_s} s apart, not {FRAME_DT_S} s")
     seeing = not agent.startswith(EGO_MLP)
-    return AgentInputs(seeing, lidar=True, past_frames=clips.past_frames, camera_names=clips.cameras)
+    lidar = not is_driver(folder)
+    return AgentInputs(seeing, lidar, past_frames=clips.past_frames, camera_names=clips.cameras)
 
 
 def rig_of(agent: str) -> RigPlan:
@@ -179,7 +182,11 @@ def make_agent(
         return IdmAgent(_town(town))
     folder = _run_folder(agent)
     if agent.startswith(IDM_BY_SIGHT):
-        return IdmAgent(_town(town), _affordances(folder))
+        if not is_driver(folder):
+            raise InputError(f"{folder}: {IDM_BY_SIGHT}RUN needs the run of a driver, such as driver_small")
+        return IdmAgent(_town(town), Perception(_driver(folder)))
+    if is_driver(folder):
+        return SightDriver(_driver(folder))
     if agent.startswith((STUDENT, OLD_STUDENT)):
         return AlternatingStudent(following(_seeing(folder), clock), _expert(town), clock, seed)
     student = _fitted(folder) if agent.startswith(EGO_MLP) else following(_seeing(folder), clock)
@@ -231,26 +238,6 @@ def _town(town: TownSimulator | None) -> TownSimulator:
     return town
 
 
-def _affordances(folder: Path) -> Callable[[Clip], AffordanceEstimate]:
-    """Return a function from an observation to what a run tells of lights, lead vehicle and people."""
-    run = open_run(folder)
-    heads = None if run.recipe.tasks is None else run.recipe.tasks.heads
-    if heads is None or heads.affordances is None:
-        raise InputError(f"{folder}: {IDM_BY_SIGHT}RUN needs a run with affordances, such as nemo_drive_tele")
-    seeing = _seeing(folder)
-
-    @torch.no_grad()
-    def perceive(observation: Clip) -> AffordanceEstimate:
-        clip = seeing.seen(observation)
-        found = seeing.agent.perceive(seeing.agent.rollout(clip, 0)[0])
-        assert found is not None
-        assert found.affordances is not None
-        estimate: AffordanceEstimate = found.affordances.estimate().to("cpu")
-        return estimate
-
-    return perceive
-
-
 def _run_folder(agent: str) -> Path:
     prefix = next(
         (known for known in (EGO_MLP, STUDENT, OLD_STUDENT, IDM_BY_SIGHT) if agent.startswith(known)), ""
@@ -270,6 +257,11 @@ def _run_folder(agent: str) -> Path:
 def _seeing(folder: Path) -> SeeingAgent:
     run, device = open_run(folder), "cuda" if torch.cuda.is_available() else "cpu"
     return SeeingAgent(load_agent(run).to(device), run.recipe.clips.image_hw, device)
+
+
+@lru_cache(maxsize=1)
+def _driver(folder: Path) -> Driver:
+    return load_driver(open_driver(folder))
 
 
 @lru_cache(maxsize=1)

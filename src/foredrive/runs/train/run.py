@@ -89,7 +89,7 @@ def open_run(folder: Path) -> Run:
     recipe = load_recipe(folder / CONFIG)
     try:
         written = json.loads((folder / LOGS).read_text())
-        logs = tuple(_read_log(entry) for entry in written["logs"])
+        logs = tuple(read_log(entry) for entry in written["logs"])
         start = written.get("start")
         return Run(folder, recipe, logs, Path(written["cache_dir"]), None if start is None else Path(start))
     except (OSError, ValueError, LookupError, TypeError, RecursionError) as error:
@@ -307,11 +307,7 @@ def load_agent(run: Run) -> PlanningAgent[Any]:
 
 
 def _write(run: Run) -> None:
-    logs = [
-        {"folder": str(log.folder), "maps_dir": str(log.maps_dir)}
-        | ({"parts_s": log.parts_s} if log.parts_s else {})
-        for log in run.logs
-    ]
+    logs = [written_log(log) for log in run.logs]
     with atomic_path(run.folder / LOGS) as temporary:
         start = None if run.start is None else str(run.start)
         entries = {"logs": logs, "cache_dir": str(run.cache_dir), "start": start}
@@ -319,7 +315,14 @@ def _write(run: Run) -> None:
     save_recipe(run.recipe, run.folder / CONFIG)
 
 
-def _read_log(entry: dict[str, Any]) -> LogPath:
+def written_log(log: LogPath) -> dict[str, object]:
+    """Return the entry of a log in a run's list."""
+    entry: dict[str, object] = {"folder": str(log.folder), "maps_dir": str(log.maps_dir)}
+    return entry | ({"parts_s": log.parts_s} if log.parts_s else {})
+
+
+def read_log(entry: dict[str, Any]) -> LogPath:
+    """Return the log of an entry of a run's list."""
     parts = tuple((float(start), float(end)) for start, end in entry.get("parts_s", ()))
     return LogPath(Path(entry["folder"]), Path(entry["maps_dir"]), parts).absolute()
 

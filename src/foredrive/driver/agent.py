@@ -1,0 +1,185 @@
+"""A driver in closed loop: its eyes, its planner, and what it remembers from plan to plan."""
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float64
+from scipy.interpolate import PchipInterpolator
+from torch import Tensor, nn
+
+from foredrive.data.affordances import PASSED_M, POINTS, PathAhead
+from foredrive.driver.eyes import CameraEyes
+from foredrive.driver.sight import Sight
+from foredrive.driver.speed_planner import SpeedPlanner, profile_progress
+from foredrive.models.ego_mlp import ego_speeds
+from foredrive.scene import Clip, Trajectory
+from foredrive.scene.affordances import PathEstimate
+from foredrive.scene.clip import ROUTE_M
+from foredrive.scene.traffic_light import LightState
+from foredrive.simulation.idm_agent import waypoints_along
+from foredrive.simulation.observation import HORIZON_STEPS
+from foredrive.simulation.simple_agents import plan_of
+from foredrive.simulation.speed_rule import FRONT_M, curve_speed
+
+SEEN = 0.5
+"""Probability of a lamp from which the light of a frame counts."""
+FADES, LONGEST = 0.5, 5.0
+"""Share of the evidence for a stop that is kept from plan to plan, and its bound (logit)."""
+NEAR_M, OTHER_M = 7.0, 12.0
+"""A light that is not seen is remembered within the first distance before its line. A distance that differs
+by more than the second is that of another light."""
+FORGETS = 30
+"""Plans without a lamp after which a light is forgotten."""
+STANDS_MPS = 0.2
+WAITS, CREEPS, IMPATIENT = 10, 8, 70
+"""Plans that the vehicle stands without a red light before it creeps, for which it creeps, and after which it
+creeps in spite of a light: it is seen wrongly, or no light at all."""
+SURE = 0.93
+"""While it creeps, only road users that are as probable as this stop it."""
+
+
+class Driver(nn.Module):
+    """Eyes and a planner.
+
+    Args:
+        eyes: what sees the route.
+        planner: what scores speeds.
+    """
+
+    def __init__(self, eyes: CameraEyes, planner: SpeedPlanner) -> None:
+        super().__init__()
+        self.eyes, self.planner = eyes, planner
+
+    @torch.no_grad()
+    def see(self, clip: Clip) -> Sight:
+        """Return what is seen at now."""
+        sight: Sight = self.eyes(clip)
+        return sight
+
+
+class LightMemory:
+    """What was seen of the next light in the plans before: near its line, its lamps are out of view."""
+
+    def __init__(self) -> None:
+        self._evidence, self._line_m, self._unseen = 0.0, None, 0  # type: float, float | None, int
+        self._yellow = False
+
+    def update(self, view: PathEstimate, moved_m: float) -> PathEstimate:
+        """Return the view with the light that is seen or remembered.
+
+        Args:
+            view: of a batch of one.
+            moved_m: distance driven since the plan before.
+        """
+        p, line_m = view.light[0].tolist(), float(view.light_m[0])
+        if self._line_m is not None:
+            self._line_m -= moved_m
+        stops = p[LightState.RED] + p[LightState.YELLOW]
+        if 1 - p[LightState.NONE] > SEEN:
+            odds = float(np.log((stops + 0.02) / (1.02 - stops)))
+            self._evidence = float(np.clip(FADES * self._evidence + odds, -LONGEST, LONGEST))
+            self._unseen, self._yellow = 0, p[LightState.YELLOW] > p[LightState.RED]
+            if self._line_m is None or abs(line_m - self._line_m) > OTHER_M:
+                self._line_m = line_m
+            else:
+                self._line_m = 0.6 * self._line_m + 0.4 * line_m
+        else:
+            self._unseen += 1
+            near = self._line_m is not None and -PASSED_M < self._line_m < NEAR_M
+            self._evidence *= 1.0 if near else FADES
+        if self._unseen > FORGETS or (self._line_m is not None and self._line_m < -PASSED_M):
+            self.forget()
+        if self._line_m is None:
+            light = torch.eye(4)[LightState.NONE]
+            return PathEstimate(light[None].to(view.light), torch.zeros_like(view.light_m), view.occupied)
+        stop = 1 / (1 + float(np.exp(-2 * self._evidence)))
+        light = torch.zeros(4)
+        light[LightState.YELLOW if self._yellow else LightState.RED] = stop
+        light[LightState.GREEN] = 1 - stop
+        return PathEstimate(
+            light[None].to(view.light), torch.full_like(view.light_m, self._line_m), view.occupied
+        )
+
+    def forget(self) -> None:
+        """Forget the light."""
+        self._evidence, self._line_m, self._unseen = 0.0, None, 0
+
+
+class Perception:
+    """What a driver knows of its route in one drive: its sight, and its memory of lights and of standing.
+
+    Args:
+        driver: eyes and planner.
+    """
+
+    def __init__(self, driver: Driver) -> None:
+        self._driver, self._lights = driver, LightMemory()
+        self._before: Tensor | None = None
+        self._stood, self._creeping = 0, 0
+
+    def __call__(self, observation: Clip) -> PathEstimate:
+        """Return what is on the route of an observation of a batch of one."""
+        view = self._driver.see(observation).estimate()
+        here = observation.T_world_ego[0, observation.now, :3, 3]
+        moved_m = 0.0 if self._before is None else float((here - self._before).norm())
+        self._before = here
+        view = self._lights.update(view, moved_m)
+        return self._patient(view, float(ego_speeds(observation)[0, observation.now]))
+
+    def _patient(self, view: PathEstimate, speed_mps: float) -> PathEstimate:
+        """Return the view with less on the route where the vehicle has stood for long."""
+        self._stood = self._stood + 1 if speed_mps < STANDS_MPS else 0
+        stopped_by_light = float(view.light[0, [LightState.RED, LightState.YELLOW]].sum()) > 0.5
+        if (self._stood > WAITS and not stopped_by_light) or self._stood > IMPATIENT:
+            self._creeping = CREEPS
+            if self._stood > IMPATIENT:
+                self._lights.forget()
+        if self._creeping == 0:
+            return view
+        self._creeping -= 1
+        return PathEstimate(view.light, view.light_m, (view.occupied > SURE).to(view.occupied))
+
+
+class SightDriver:
+    """An `Agent` of one drive that scores speeds by what its driver sees.
+
+    Args:
+        driver: eyes and planner.
+    """
+
+    def __init__(self, driver: Driver) -> None:
+        self._driver, self._perception = driver, Perception(driver)
+
+    @torch.no_grad()
+    def act(self, observation: Clip) -> Trajectory:
+        """Return the plan for an observation of a batch of one. Without a route it goes straight on."""
+        view = self._perception(observation)
+        path = given_path(observation)
+        speed = ego_speeds(observation)[:, observation.now]
+        limit = torch.full_like(speed, curve_speed(path))
+        best = int(self._driver.planner(view, speed, limit)[0].argmax())
+        progress_m = profile_progress(speed, limit, HORIZON_STEPS)[0, best].double().cpu().numpy()
+        return plan_of(torch.from_numpy(waypoints_along(path, progress_m)).float()[None, None])
+
+
+def given_path(observation: Clip) -> PathAhead:
+    """Return the route of an observation as a smooth path, a point a metre; straight ahead without one."""
+    valid = observation.route_valid[0].cpu().numpy()
+    along_m = np.array(ROUTE_M)[valid]
+    xy = observation.route_xy[0].double().cpu().numpy()[valid]
+    if len(along_m) < 2:
+        along_m, xy = np.array([2.0, 40.0]), np.array([[2.0, 0.0], [40.0, 0.0]])
+    # The point beside the vehicle: the route does not tell it, and the vehicle may be aside.
+    step = (xy[1] - xy[0]) / (along_m[1] - along_m[0])
+    xy = np.concatenate([(xy[0] - along_m[0] * step)[None], xy])
+    along_m = np.append(0.0, along_m)
+    last_m = int(along_m[-1])
+    line = PchipInterpolator(along_m, xy)(np.arange(last_m + 1.0))
+    return _on_grid(line)
+
+
+def _on_grid(line: Float64[np.ndarray, "K 2"]) -> PathAhead:
+    count = min(len(line), POINTS)
+    xy: Float[Tensor, "R 2"] = torch.zeros(POINTS, 2)
+    xy[:count] = torch.from_numpy(line[:count]).float()
+    valid = torch.arange(POINTS) < count
+    return PathAhead(xy, np.zeros(POINTS), valid, FRONT_M, True)

@@ -1,0 +1,153 @@
+"""Eyes of a driver: a small convolutional network on two cameras and some key frames."""
+
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from foredrive.driver.route_cells import BESIDE_M, HEIGHTS_M, route_cells, sample_cameras
+from foredrive.driver.sight import LampHead, OccupancyHead, Sight, conv_block
+from foredrive.errors import InputError
+from foredrive.geometry.se3 import compose_se3, inverse_se3, transform_points
+from foredrive.models.ego_mlp import ego_speeds
+from foredrive.scene import Clip
+from foredrive.scene.clip import ROUTE_M
+
+FINE, COARSE, FINE_READ = 32, 48, 16
+"""Channels of the features at strides 4 and 8, and how many of the former the cells read."""
+CONTEXT = 64
+SPEED_SCALE_MPS, ROUTE_SCALE_M = 8.0, 20.0
+MEAN_GREY, SPREAD_GREY = 0.45, 0.25
+
+
+@dataclass(frozen=True)
+class CameraEyesConfig:
+    """Sizes of `CameraEyes`."""
+
+    frames: int = 2
+    """Key frames that are read, now included."""
+    cameras: int = 2
+    blind: bool = False
+    """Images are black: what the route and the speed alone tell."""
+
+
+class Trunk(nn.Module):
+    """Features of one camera at strides 4 and 8; the latter know those at 16 too."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.fine = nn.Sequential(conv_block(3, 16, 5), conv_block(16, FINE), conv_block(FINE, FINE, 3, 1))
+        self.middle = nn.Sequential(conv_block(FINE, 64), conv_block(64, 64, 3, 1))
+        self.deep = nn.Sequential(conv_block(64, 96), conv_block(96, 96, 3, 1))
+        self.of_middle, self.of_deep = nn.Conv2d(64, COARSE, 1), nn.Conv2d(96, COARSE, 1)
+
+    def forward(
+        self, images: Float[Tensor, "n 3 H W"]
+    ) -> tuple[Float[Tensor, "n _F _h _w"], Float[Tensor, "n _K _y _x"]]:
+        """Return the features at strides 4 and 8."""
+        fine = self.fine(images)
+        middle = self.middle(fine)
+        coarse = self.of_middle(middle)
+        deep = F.interpolate(self.of_deep(self.deep(middle)), size=coarse.shape[-2:], mode="nearest")
+        return fine, F.relu(coarse + deep)
+
+
+class CameraEyes(nn.Module):
+    """A convolutional trunk for each camera, features sampled along the route in each key frame, two heads.
+
+    Cells of the route are fixed in the world: in the frames before now they are read where the cameras were
+    then, so that what moves differs between frames and what stands does not.
+
+    Args:
+        config: sizes.
+    """
+
+    def __init__(self, config: CameraEyesConfig) -> None:
+        super().__init__()
+        self.config = config
+        self.trunks = nn.ModuleList([Trunk() for _ in range(config.cameras)])
+        self.narrow = nn.ModuleList([nn.Conv2d(FINE, FINE_READ, 1) for _ in range(config.cameras)])
+        self.context = nn.Sequential(
+            nn.Linear(3 * len(ROUTE_M) + 1, CONTEXT), nn.ReLU(), nn.Linear(CONTEXT, CONTEXT), nn.ReLU()
+        )
+        self.lamps = LampHead(FINE + COARSE, COARSE, CONTEXT, config.cameras)
+        of_frame = config.cameras * len(HEIGHTS_M) * (COARSE + FINE_READ + 1)
+        self.occupancy = OccupancyHead(config.frames * of_frame + 4)
+
+    def forward(self, clip: Clip) -> Sight:
+        """Return what is seen of the route at now.
+
+        Raises:
+            InputError: the clip has other cameras or fewer frames.
+        """
+        now, config = clip.now, self.config
+        if clip.images.shape[2] != config.cameras or now + 1 < config.frames:
+            raise InputError(
+                f"a driver with {config.cameras} cameras and {config.frames} key frames cannot see a clip "
+                f"of {clip.images.shape[2]} cameras and {now + 1} key frames"
+            )
+        frames = clip.frames(slice(now + 1 - config.frames, now + 1))
+        speed = ego_speeds(clip.observed())[:, now] / SPEED_SCALE_MPS
+        route = clip.route_xy / ROUTE_SCALE_M
+        route = torch.cat([route, clip.route_valid[..., None].to(route)], dim=-1)
+        context = self.context(torch.cat([route.flatten(1), speed[:, None]], dim=-1))
+        cells = route_cells(clip.route_xy, clip.route_valid)
+        fine, coarse = self._features(frames)
+        mean = coarse[:, -1].mean((-2, -1))
+        wide = F.interpolate(coarse[:, -1].flatten(0, 1), size=fine.shape[-2:], mode="nearest")
+        wide = wide.unflatten(0, (len(cells), config.cameras))
+        lamps = self.lamps(torch.cat([fine[:, -1], wide], dim=2), mean, context)
+        read = self._read(frames, cells, fine, coarse)
+        place = torch.cat(
+            [
+                cells.permute(0, 3, 1, 2) / ROUTE_SCALE_M,
+                cells.new_tensor(BESIDE_M).div(10.0).expand(len(cells), 1, *cells.shape[1:3]),
+                speed.to(cells)[:, None, None, None].expand(-1, 1, *cells.shape[1:3]),
+            ],
+            dim=1,
+        )
+        light, lamp_logits, lamp_line = lamps
+        return Sight(light, lamp_logits, lamp_line, self.occupancy(torch.cat([read.to(place), place], dim=1)))
+
+    def _features(
+        self, frames: Clip
+    ) -> tuple[Float[Tensor, "b T C _F _h _w"], Float[Tensor, "b T C _K _y _x"]]:
+        """Return the features of all images at strides 4 and 8."""
+        b, t = frames.images.shape[:2]
+        images = (frames.images.float() / 255 - MEAN_GREY) / SPREAD_GREY
+        if self.config.blind:
+            images = torch.zeros_like(images)
+        fine, coarse = [], []
+        for c, trunk in enumerate(self.trunks):
+            one = images[:, :, c].flatten(0, 1).contiguous(memory_format=torch.channels_last)
+            at_4, at_8 = trunk(one)
+            fine.append(at_4.unflatten(0, (b, t)))
+            coarse.append(at_8.unflatten(0, (b, t)))
+        return torch.stack(fine, dim=2), torch.stack(coarse, dim=2)
+
+    def _read(
+        self,
+        frames: Clip,
+        cells: Float[Tensor, "b G L 2"],
+        fine: Float[Tensor, "b T C _F _h _w"],
+        coarse: Float[Tensor, "b T C _K _y _x"],
+    ) -> Float[Tensor, "b _N G L"]:
+        """Return the features of all frames and cameras in the cells."""
+        b, count = cells.shape[0], len(HEIGHTS_M)
+        z = cells.new_tensor(HEIGHTS_M)[:, None, None, None].expand(count, *cells.shape[1:3], 1)
+        points = torch.cat([cells[:, None].expand(-1, count, -1, -1, -1), z.expand(b, *z.shape)], dim=-1)
+        points = points.flatten(1, 3)
+        T_frame_now = compose_se3(inverse_se3(frames.T_world_ego), frames.T_world_ego[:, -1:]).float()
+        read = []
+        for t in range(frames.images.shape[1]):
+            moved = transform_points(T_frame_now[:, t], points)
+            rig, valid = frames.rig[:, t], frames.image_valid[:, t]
+            narrow = torch.stack([layer(fine[:, t, c]) for c, layer in enumerate(self.narrow)], dim=1)
+            at_8 = sample_cameras(coarse[:, t], valid, rig, moved)[:, :, :-1]
+            at_4 = sample_cameras(narrow, valid, rig, moved)
+            both = torch.cat([at_8, at_4], dim=2)  # [b C F N]
+            both = both.unflatten(-1, (count, *cells.shape[1:3])).permute(0, 1, 3, 2, 4, 5)
+            read.append(both.flatten(1, 3))
+        return torch.cat(read, dim=1)

@@ -1,0 +1,158 @@
+"""How well a driver sees: figures over packed clips, before any planning."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+
+from foredrive.data.affordances import PathAhead
+from foredrive.driver.agent import Driver
+from foredrive.driver.losses import lamp_places
+from foredrive.driver.packed import PackedClips, join
+from foredrive.models.ego_mlp import ego_speeds
+from foredrive.scene.affordances import CELL_M, LATER_DT_S, TIMES, Affordances, PathEstimate
+from foredrive.scene.traffic_light import LightState
+from foredrive.simulation.speed_rule import FRONT_M, drive_along, meets_somebody
+
+LIGHT_M, OBSTACLE_M = 40.0, 30.0
+"""Distances up to which lights and the first obstacle are judged."""
+THRESHOLDS = (0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8)
+FALSE_AT_MOST = 0.1
+BATCH = 32
+
+
+class Moment(NamedTuple):
+    """What counts of one clip."""
+
+    state: int
+    """True `LightState`."""
+    named: int
+    """The most probable one."""
+    light_m: float
+    light_error_m: float
+    visible: bool
+    """Whether a lamp of the light is in an image."""
+    lit: bool
+    """Whether the truth knows the light."""
+    first: int
+    """First cell of the path that is occupied now; -1 without."""
+    first_seen: Float[np.ndarray, "K"]
+    """The same of the estimate at each of `THRESHOLDS`."""
+    conflict: bool
+    """Whether somebody is met who drives on freely."""
+    conflict_seen: Bool[np.ndarray, "K"]
+    """The same by the estimate at each of `THRESHOLDS`."""
+    crossing: bool
+    """The conflict is with somebody who is not in the path now."""
+
+
+def judge_sight(
+    driver: Driver, clips: PackedClips, tick: Callable[[], None] = lambda: None
+) -> dict[str, float]:
+    """Return how well a driver sees lights and road users on its route.
+
+    `light_accuracy_40m` and `red_missed_40m` count lights within 40 m with a lamp in an image; a red light is
+    missed if neither red nor yellow is named. `conflict_recall` is the share of the moments in which somebody
+    would be met who drives on freely, that are seen, at the threshold with at most 10 % of the other moments
+    taken for such; `crossing_recall` counts those with somebody who is not in the path yet.
+    `first_obstacle_error_m` is the median error of the first occupied cell now, a missed one counted as the
+    distance to the end of the range.
+
+    Args:
+        driver: in evaluation mode.
+        clips: with known truth.
+        tick: called after each batch.
+    """
+    moments: list[Moment] = []
+    for start in range(0, len(clips), BATCH):
+        batch = join([clips[index] for index in range(start, min(start + BATCH, len(clips)))])
+        sight = driver.see(batch.clip)
+        estimate, speed = sight.estimate(), ego_speeds(batch.clip)[:, batch.clip.now]
+        size = (sight.lamp_logits.shape[-2], sight.lamp_logits.shape[-1])
+        lamps = lamp_places(batch.truth, batch.clip.rig[:, batch.clip.now], size).inside.flatten(1).any(1)
+        for row in range(len(speed)):
+            moments.append(_moment(batch.truth[row], estimate[row], float(speed[row]), bool(lamps[row])))
+        tick()
+    return _figures(moments)
+
+
+def _moment(truth: Affordances, estimate: PathEstimate, speed_mps: float, visible: bool) -> Moment:
+    path = PathAhead(truth.path_xy, np.zeros(len(truth.path_xy)), truth.path_valid, FRONT_M, True)
+    known = truth.occupied_known
+    occupied = (truth.occupied & known).numpy()
+    p = torch.where(known, estimate.occupied, 0.0).numpy()
+    # Driving on freely, for as long as the truth reaches.
+    free_m = drive_along(path, speed_mps, [])
+    times = LATER_DT_S * np.arange(1, TIMES)
+    free_m = np.interp(times, LATER_DT_S * np.arange(len(free_m) + 1), np.append(0.0, free_m))
+    seen = np.array([meets_somebody(free_m, p >= threshold) for threshold in THRESHOLDS])
+    conflict = meets_somebody(free_m, occupied)
+    return Moment(
+        state=int(truth.light),
+        named=int(estimate.light.argmax()),
+        light_m=float(truth.light_m),
+        light_error_m=abs(float(estimate.light_m) - float(truth.light_m)),
+        visible=visible,
+        lit=bool(truth.light_known),
+        first=_first(occupied[0]),
+        first_seen=np.array([_first(p[0] >= threshold) for threshold in THRESHOLDS], dtype=float),
+        conflict=conflict,
+        conflict_seen=seen,
+        crossing=conflict and not meets_somebody(free_m, occupied & occupied[:1]),
+    )
+
+
+def _first(occupied: Bool[np.ndarray, "G"]) -> int:
+    return int(occupied.argmax()) if occupied.any() else -1
+
+
+def _figures(moments: list[Moment]) -> dict[str, float]:
+    state, named = (np.array([getattr(m, name) for m in moments]) for name in ("state", "named"))
+    light_m, lit = np.array([m.light_m for m in moments]), np.array([m.lit for m in moments])
+    visible = np.array([m.visible for m in moments])
+    near = lit & visible & (state != LightState.NONE) & (light_m <= LIGHT_M)
+    stops = np.isin(named, [LightState.RED, LightState.YELLOW])
+    red, green, none = (
+        near & (state == LightState.RED),
+        near & (state == LightState.GREEN),
+        lit & (state == 0),
+    )
+    right = near & (named == state)
+    conflict = np.array([m.conflict for m in moments])
+    crossing = np.array([m.crossing for m in moments])
+    seen = np.stack([m.conflict_seen for m in moments])
+    # The lowest threshold that is seldom wrong.
+    false = seen[~conflict].mean(0)
+    chosen = next((k for k in range(len(THRESHOLDS)) if false[k] <= FALSE_AT_MOST), len(THRESHOLDS) - 1)
+    first = np.array([m.first for m in moments])
+    first_seen = np.stack([m.first_seen for m in moments])[:, THRESHOLDS.index(0.5)]
+    obstacle = (first >= 0) & (first * CELL_M < OBSTACLE_M)
+    error_m = np.where(first_seen < 0, OBSTACLE_M - CELL_M * first, CELL_M * np.abs(first_seen - first))
+    return {
+        "light_accuracy_40m": _mean(named[near] == state[near]),
+        "red_missed_40m": _mean(~stops[red]),
+        "green_stopped_40m": _mean(stops[green]),
+        "none_stopped": _mean(stops[none]),
+        "light_error_m": _median(np.array([m.light_error_m for m in moments])[right]),
+        "lights": float(near.sum()),
+        "conflict_recall": _mean(seen[conflict, chosen]),
+        "conflict_false": float(false[chosen]),
+        "crossing_recall": _mean(seen[conflict & crossing, chosen]),
+        "threshold": THRESHOLDS[chosen],
+        "conflicts": float(conflict.sum()),
+        "crossings": float((conflict & crossing).sum()),
+        "first_obstacle_error_m": _median(error_m[obstacle]),
+        "first_obstacle_missed": _mean(first_seen[obstacle] < 0),
+        "first_obstacle_false": _mean(first_seen[first < 0] >= 0),
+        "frames": float(len(moments)),
+    }
+
+
+def _mean(values: np.ndarray) -> float:
+    return float(values.mean()) if len(values) else float("nan")
+
+
+def _median(values: np.ndarray) -> float:
+    return float(np.median(values)) if len(values) else float("nan")

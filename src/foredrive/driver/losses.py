@@ -1,0 +1,108 @@
+"""Losses of a driver's sight."""
+
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from foredrive.driver.sight import Sight, scaled_line
+from foredrive.geometry.projection import project
+from foredrive.geometry.se3 import inverse_se3, transform_points
+from foredrive.losses.masked import masked_mean
+from foredrive.scene import CameraRig
+from foredrive.scene.affordances import Affordances
+from foredrive.scene.traffic_light import LightState
+
+
+@dataclass(frozen=True)
+class SightWeights:
+    """Weights of the terms."""
+
+    light: float = 1.0
+    lamps: float = 0.5
+    light_m: float = 1.0
+    occupied: float = 5.0
+    there: float = 2.5
+    """Weight of occupied cells in the last term: a missed road user is worse than a false one."""
+    crossing: float = 2.0
+    """Factor for cells that are free now and occupied later: who crosses or cuts in."""
+
+
+def sight_losses(
+    sight: Sight, truth: Affordances, rig: CameraRig, weights: SightWeights
+) -> dict[str, Float[Tensor, ""]]:
+    """Return the losses by name; "loss" is their sum. What the truth does not know has none.
+
+    Args:
+        sight: of b items.
+        truth: of b items.
+        rig: cameras at now, [b C].
+        weights: weights of the terms.
+    """
+    lamps = lamp_places(truth, rig, (sight.lamp_logits.shape[-2], sight.lamp_logits.shape[-1]))
+    visible = lamps.inside.any(-1).any(-1)
+    is_none = truth.light == LightState.NONE
+    # A light whose lamps are in no image cannot be named, and neither can "none" be learned from it.
+    judged = truth.light_known & (is_none | visible)
+    each = F.cross_entropy(sight.light_logits, truth.light.long(), reduction="none")
+    losses = {
+        "light": weights.light * masked_mean(each, judged),
+        "lamps": weights.lamps * _lamp_loss(sight, truth, lamps),
+        "light_m": weights.light_m * _line_loss(sight, truth, lamps),
+        "occupied": weights.occupied * _occupancy_loss(sight, truth, weights),
+    }
+    return losses | {"loss": torch.stack(list(losses.values())).sum()}
+
+
+@dataclass(frozen=True)
+class LampPlaces:
+    """Places of L lamps in the feature maps of C cameras."""
+
+    row: Int[Tensor, "b C L"]
+    column: Int[Tensor, "b C L"]
+    inside: Bool[Tensor, "b C L"]
+
+
+def lamp_places(truth: Affordances, rig: CameraRig, size: tuple[int, int]) -> LampPlaces:
+    """Return where the lamps of the light on the route are in feature maps of `size` rows and columns."""
+    b, cameras = rig.K.shape[:2]
+    points = truth.lamp_xyz[:, None].expand(b, cameras, -1, -1)
+    uv, _, inside = project(
+        transform_points(inverse_se3(rig.T_ego_cam), points), rig.K, rig.dist, rig.size_hw
+    )
+    known = truth.lamp & (truth.lamps_known & (truth.light != LightState.NONE))[:, None]
+    column = (uv[..., 0] * size[1] / rig.size_hw[1]).floor().long().clamp(0, size[1] - 1)
+    row = (uv[..., 1] * size[0] / rig.size_hw[0]).floor().long().clamp(0, size[0] - 1)
+    return LampPlaces(row, column, inside & known[:, None])
+
+
+def _lamp_loss(sight: Sight, truth: Affordances, lamps: LampPlaces) -> Float[Tensor, ""]:
+    """Return the focal loss (Lin et al. 2017, γ = 2) of the lamps in place, per lamp."""
+    target = torch.zeros_like(sight.lamp_logits)
+    item, camera, lamp = lamps.inside.nonzero(as_tuple=True)
+    colour = truth.light[item].long() - 1
+    target[item, camera, colour, lamps.row[item, camera, lamp], lamps.column[item, camera, lamp]] = 1.0
+    each = F.binary_cross_entropy_with_logits(sight.lamp_logits, target, reduction="none")
+    p = sight.lamp_logits.sigmoid()
+    wrong = torch.where(target > 0, 1 - p, p)
+    of_item = truth.lamps_known[:, None, None, None, None]
+    return (wrong.square() * each * of_item).sum() / target.sum().clamp_min(1)
+
+
+def _line_loss(sight: Sight, truth: Affordances, lamps: LampPlaces) -> Float[Tensor, ""]:
+    """Return the error of the stop line's distance, read at each lamp, in `Sight.lamp_line`'s scale."""
+    item, camera, lamp = lamps.inside.nonzero(as_tuple=True)
+    read = sight.lamp_line[item, camera, lamps.row[item, camera, lamp], lamps.column[item, camera, lamp]]
+    error = (read - scaled_line(truth.light_m[item])).abs()
+    return error.sum() / max(len(item), 1)
+
+
+def _occupancy_loss(sight: Sight, truth: Affordances, weights: SightWeights) -> Float[Tensor, ""]:
+    """Return the weighted cross-entropy of the cells that are known."""
+    occupied = truth.occupied
+    later = occupied & ~occupied[:, :1]
+    weight = torch.where(occupied, weights.there, 1.0) * torch.where(later, weights.crossing, 1.0)
+    each = F.binary_cross_entropy_with_logits(sight.occupied_logits, occupied.float(), reduction="none")
+    return masked_mean(weight * each, truth.occupied_known)

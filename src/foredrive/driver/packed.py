@@ -1,0 +1,198 @@
+"""Clips packed for fast reading: one file of a log, so that images are decoded and truth is read once."""
+
+import dataclasses
+import hashlib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeVar
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import Tensor
+from torch.utils.data import Dataset
+
+from foredrive.data import ClipDataset
+from foredrive.data.batches import stack_records
+from foredrive.errors import InputError
+from foredrive.files import atomic_path
+from foredrive.scene import Clip
+from foredrive.scene.affordances import Affordances
+from foredrive.scene.record import Record
+
+PACK_VERSION = 1
+"""Version in every name. Increase it when the content of the files changes."""
+LAMPS, PEOPLE = 12, 8
+"""Entries to which lamps and people are padded or cut, so that clips stack."""
+R = TypeVar("R", bound=Record)
+
+
+@dataclass(frozen=True)
+class RouteExample(Record):
+    """A clip without boxes and sweeps, and what is on its route: one item of a driver's training."""
+
+    clip: Clip
+    truth: Affordances
+    key: tuple[str, ...]
+
+
+def join(examples: Sequence[RouteExample]) -> RouteExample:
+    """Return a batch."""
+    keys = tuple(key for example in examples for key in example.key)
+    batch = stack_records([dataclasses.replace(example, key=()) for example in examples])
+    return dataclasses.replace(batch, key=keys)
+
+
+class PackedClips(Dataset[RouteExample]):
+    """The clips of a data set with their affordances, read from packed files.
+
+    A frame's images are kept once, however many clips show it. The name of a file is a hash of all that its
+    content depends on. Damaged files are made again.
+
+    Args:
+        dataset: clips with affordances among their tasks.
+        folder: folder of the files.
+
+    Raises:
+        InputError: the clips have no affordances.
+    """
+
+    def __init__(self, dataset: ClipDataset, folder: Path) -> None:
+        if dataset.config.tasks is None or not dataset.config.tasks.affordances:
+            raise InputError("a driver learns from affordances: set clips.tasks.affordances to true")
+        self._dataset, self._folder = dataset, folder
+        self._rows: list[tuple[Path, int]] = []
+        """File of each clip, and its row there."""
+        self._first: dict[Path, list[int]] = {}
+        for index in range(len(dataset)):
+            file = self._file(index)
+            rows = self._first.setdefault(file, [])
+            self._rows.append((file, len(rows)))
+            rows.append(index)
+        self._template = self._read(0)
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    def pack(self, tick: Callable[[], None] = lambda: None) -> None:
+        """Write the files that are missing. `tick` is called after each log.
+
+        Raises:
+            InputError: data cannot be read.
+            OSError: the disk is full.
+        """
+        for file, clips in self._first.items():
+            if not _is_whole(file):
+                self._write(file, clips)
+            tick()
+
+    @property
+    def logs(self) -> int:
+        """Return the number of logs."""
+        return len(self._first)
+
+    def __getitem__(self, index: int) -> RouteExample:
+        """Read one clip.
+
+        Raises:
+            InputError: its file is missing or damaged.
+        """
+        file, row = self._rows[index]
+        try:
+            with safe_open(file, "pt") as stored:
+                tensors = {
+                    name: stored.get_slice(name)[row]
+                    for name in stored.keys()  # noqa: SIM118 - it is no mapping
+                    if name not in ("frames", "images")
+                }
+                images = stored.get_slice("images")
+                seen = torch.stack([images[frame] for frame in stored.get_slice("frames")[row].tolist()])
+        except (OSError, SafetensorError) as error:
+            raise InputError(f"{file}: a packed clip cannot be read: {error}") from error
+        example = _with_tensors(self._template, tensors)
+        return dataclasses.replace(
+            example, clip=dataclasses.replace(example.clip, images=seen), key=(self._dataset.key(index),)
+        )
+
+    def _file(self, index: int) -> Path:
+        number, _ = self._dataset.frames_of(index)
+        log = self._dataset.logs[number]
+        config = dataclasses.replace(self._dataset.config, part_s=None)
+        key = (PACK_VERSION, log.fingerprint, config, self._dataset.camera_names)
+        name = hashlib.blake2b(repr(key).encode(), digest_size=16).hexdigest()
+        return self._folder / name[:2] / f"{name}.safetensors"
+
+    def _write(self, file: Path, clips: list[int]) -> None:
+        examples = [self._read(index) for index in clips]
+        numbers = [self._dataset.frames_of(index)[1] for index in clips]
+        images: dict[int, Tensor] = {}
+        for example, frames in zip(examples, numbers, strict=True):
+            images |= dict(zip(frames, example.clip.images, strict=True))
+        rows = {frame: row for row, frame in enumerate(images)}
+        batch = stack_records([_without_images(example) for example in examples])
+        tensors = _tensors(batch) | {
+            "images": torch.stack(list(images.values())),
+            "frames": torch.tensor([[rows[frame] for frame in frames] for frames in numbers]),
+        }
+        with atomic_path(file, durable=False) as temporary:
+            save_file({name: tensor.contiguous() for name, tensor in tensors.items()}, temporary)
+
+    def _read(self, index: int) -> RouteExample:
+        """Read a clip from its log."""
+        clip, truth = self._dataset.clip(index), self._dataset.truth(index)
+        assert truth is not None
+        assert truth.affordances is not None
+        boxes = clip.boxes[:, :0]
+        known = truth.affordances
+        padded = dataclasses.replace(
+            known,
+            lamp_xyz=_padded(known.lamp_xyz, LAMPS),
+            lamp=_padded(known.lamp, LAMPS),
+            crossing_xy=_padded(known.crossing_xy, PEOPLE),
+            crossing=_padded(known.crossing, PEOPLE),
+        )
+        return RouteExample(dataclasses.replace(clip, boxes=boxes), padded, ())
+
+
+def _padded(values: Tensor, count: int) -> Tensor:
+    rows = values.new_zeros(count, *values.shape[1:])
+    rows[: len(values)] = values[:count]
+    return rows
+
+
+def _without_images(example: RouteExample) -> RouteExample:
+    images = example.clip.images[:, :0]
+    return dataclasses.replace(example, clip=dataclasses.replace(example.clip, images=images))
+
+
+def _tensors(record: Record, prefix: str = "") -> dict[str, Tensor]:
+    """Return the tensors of a record by dotted names."""
+    tensors: dict[str, Tensor] = {}
+    for field in dataclasses.fields(record):
+        value = getattr(record, field.name)
+        if isinstance(value, Tensor):
+            tensors[prefix + field.name] = value
+        elif isinstance(value, Record):
+            tensors |= _tensors(value, f"{prefix}{field.name}.")
+    return tensors
+
+
+def _with_tensors(record: R, tensors: dict[str, Tensor], prefix: str = "") -> R:
+    """Return a record with other tensors, by the names of `_tensors`."""
+    changed: dict[str, Tensor | Record] = {}
+    for field in dataclasses.fields(record):
+        value = getattr(record, field.name)
+        if isinstance(value, Tensor):
+            changed[field.name] = tensors[prefix + field.name]
+        elif isinstance(value, Record):
+            changed[field.name] = _with_tensors(value, tensors, f"{prefix}{field.name}.")
+    return dataclasses.replace(record, **changed)
+
+
+def _is_whole(file: Path) -> bool:
+    try:
+        with safe_open(file, "pt"):
+            return True
+    except (OSError, SafetensorError):
+        return False

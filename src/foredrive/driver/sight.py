@@ -1,0 +1,142 @@
+"""What a driver sees of its route, and the head that reads it from image features."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from foredrive.driver.route_cells import BESIDE_M
+from foredrive.scene.affordances import CELLS, TIMES, PathEstimate
+from foredrive.scene.record import Record
+from foredrive.scene.traffic_light import LightState
+
+COLOURS = (LightState.RED, LightState.YELLOW, LightState.GREEN)
+RARE_LOGIT, NONE_LOGIT = -4.0, -2.0
+LIGHT_SCALE_M, LINE_BEFORE_LAMP_M = 20.0, 4.0
+"""The distance of a stop line is read at the lamp, as a logarithm from some metres before the line."""
+
+
+@dataclass(frozen=True)
+class Sight(Record):
+    """Logits of what is on the route. `PathEstimate` holds the probabilities."""
+
+    light_logits: Float[Tensor, "b 4"]
+    """Of each `LightState`: for NONE of the whole, for the others the largest of `lamp_logits`."""
+    lamp_logits: Float[Tensor, "b C 3 h w"]
+    """Whether a red, yellow or green lamp of the light on the route is at a place of an image."""
+    lamp_line: Float[Tensor, "b C h w"]
+    """The distance of the stop line as it is read at each place: log((m + 4) / 20)."""
+    occupied_logits: Float[Tensor, "b T G"]
+
+    @property
+    def light_m(self) -> Float[Tensor, "b"]:
+        """Return the distance of the stop line, read where a lamp is most probable, m."""
+        place = self.lamp_logits.amax(2).flatten(1).argmax(1, keepdim=True)
+        return line_m(self.lamp_line.flatten(1).gather(1, place)[:, 0])
+
+    def estimate(self) -> PathEstimate:
+        """Return probabilities and distances."""
+        return PathEstimate(self.light_logits.softmax(-1), self.light_m, self.occupied_logits.sigmoid())
+
+
+def line_m(scaled: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
+    """Return the distance of a stop line, m, of a number as in `Sight.lamp_line`."""
+    return LIGHT_SCALE_M * scaled.clamp(-3, 2).exp() - LINE_BEFORE_LAMP_M
+
+
+def scaled_line(light_m: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
+    """Return the inverse of `line_m`."""
+    return ((light_m + LINE_BEFORE_LAMP_M).clamp_min(1.0) / LIGHT_SCALE_M).log()
+
+
+class LampHead(nn.Module):
+    """Reads lamps at every place of fine image features, given the route.
+
+    The largest logit of each colour over all places decides, so that a few pixels count as much as a wall.
+
+    Args:
+        channels: channels of the fine features of each of C cameras.
+        wide: channels of features whose mean tells that there is no light.
+        context: length of the vector of route and speed.
+        cameras: C.
+        hidden: width.
+    """
+
+    def __init__(self, channels: int, wide: int, context: int, cameras: int, hidden: int = 64) -> None:
+        super().__init__()
+        self.read = nn.ModuleList([nn.Conv2d(channels + 2, hidden, 3, padding=1) for _ in range(cameras)])
+        self.scale = nn.ModuleList([nn.Linear(context, hidden) for _ in range(cameras)])
+        self.shift = nn.ModuleList([nn.Linear(context, hidden) for _ in range(cameras)])
+        self.lamps = nn.ModuleList([_lamp_layers(hidden) for _ in range(cameras)])
+        self.none = nn.Linear(context + cameras * wide, 1)
+        nn.init.constant_(self.none.bias, NONE_LOGIT)
+
+    def forward(
+        self, fine: Float[Tensor, "b C F h w"], mean: Float[Tensor, "b C W"], context: Float[Tensor, "b V"]
+    ) -> tuple[Float[Tensor, "b 4"], Float[Tensor, "b C 3 h w"], Float[Tensor, "b C h w"]]:
+        """Return `Sight.light_logits`, `lamp_logits` and `lamp_line`."""
+        b, _, _, h, w = fine.shape
+        y, x = torch.meshgrid(torch.linspace(-1, 1, h), torch.linspace(-1, 1, w), indexing="ij")
+        place = torch.stack([x, y]).to(fine).expand(b, 2, h, w)
+        maps = []
+        for c, (read, scale, shift, lamps) in enumerate(
+            zip(self.read, self.scale, self.shift, self.lamps, strict=True)
+        ):
+            features = read(torch.cat([fine[:, c], place], dim=1))
+            gated = features * (1 + scale(context))[..., None, None] + shift(context)[..., None, None]
+            maps.append(lamps(gated.relu()))
+        maps_of_all = torch.stack(maps, dim=1).float()
+        none = self.none(torch.cat([context, mean.flatten(1)], dim=-1)).float()
+        lamps_logits = maps_of_all[:, :, : len(COLOURS)]
+        colours = lamps_logits.flatten(3).amax(-1).amax(1)
+        return torch.cat([none, colours], dim=-1), lamps_logits, maps_of_all[:, :, len(COLOURS)]
+
+
+def _lamp_layers(hidden: int) -> nn.Sequential:
+    last = nn.Conv2d(48, len(COLOURS) + 1, 1)
+    assert last.bias is not None
+    nn.init.constant_(last.bias[: len(COLOURS)], RARE_LOGIT - 1)
+    return nn.Sequential(nn.Conv2d(hidden, 48, 3, padding=1), nn.ReLU(), last)
+
+
+class OccupancyHead(nn.Module):
+    """Reads who is on the route, and will be, from features in the cells along and beside it.
+
+    Convolutions in the plane of the cells, then along the route alone.
+
+    Args:
+        channels: channels of each cell.
+        width: width of the convolutions.
+    """
+
+    def __init__(self, channels: int, width: int = 64) -> None:
+        super().__init__()
+        self.cells = nn.Conv2d(channels, width, 1)
+        self.plane = nn.Sequential(nn.ReLU(), *(conv_block(width, width, stride=1) for _ in range(3)))
+        last = nn.Conv1d(width, TIMES, 1)
+        assert last.bias is not None
+        nn.init.constant_(last.bias, RARE_LOGIT + 1.5)
+        self.route = nn.Sequential(
+            nn.Conv1d(width * len(BESIDE_M), 96, 1),
+            nn.ReLU(),
+            nn.Dropout(0.1),
+            nn.Conv1d(96, width, 3, padding=1),
+            nn.ReLU(),
+            last,
+        )
+
+    def forward(self, cells: Float[Tensor, "b F G L"]) -> Float[Tensor, f"b {TIMES} {CELLS}"]:
+        """Return the logits of occupancy."""
+        plane = self.plane(self.cells(cells))  # [b F G L]
+        logits: Tensor = self.route(plane.permute(0, 1, 3, 2).flatten(1, 2))
+        return logits.float()
+
+
+def conv_block(inputs: int, outputs: int, size: int = 3, stride: int = 2) -> nn.Sequential:
+    """Return a convolution with batch normalisation and ReLU."""
+    return nn.Sequential(
+        nn.Conv2d(inputs, outputs, size, stride, size // 2, bias=False),
+        nn.BatchNorm2d(outputs),
+        nn.ReLU(inplace=True),
+    )
