@@ -49,6 +49,12 @@ WORLDS = 3
 """Kinds of daylight in which a town is seen where no conditions are given."""
 LIGHT_M, AT_LIGHT_SHARE = 45.0, 2 / 3
 """Egos with a light within this distance ahead, m, fill this share of a window if there are enough."""
+STANDING_MPS, STANDING_SHARE = 0.5, 0.25
+"""Egos that are slower than this, m/s, are at most this share of a window: half of all traffic waits."""
+INSERTED_SHARES = (0.25, 0.35, 0.25, 0.15)
+"""Shares of the logs with 0, 1, 2 and 3 inserted people or cyclists."""
+MEETING_SHARE, MEETING_S = 0.5, 1.5
+"""Share of them who cross at most this long before or after the ego comes by, s, if it does."""
 MIN_PATH_M, AHEAD_M = 12.0, 150.0
 """Least length of a route, and its length beyond the distance that is driven, m."""
 _FIRST_INSERTED_ID = 1_000_000
@@ -79,6 +85,7 @@ class _Ego:
 class _Inserted:
     """A person or cyclist who waits, then moves straight on."""
 
+    track_id: int
     category: Category
     size_lwh: Float64[np.ndarray, "3"]
     foot_m: Float64[np.ndarray, "3"]
@@ -95,7 +102,7 @@ class _Inserted:
         centre_m = self.foot_m + max(t_s - self.waits_s, 0.0) * velocity
         centre_m[2] += 0.5 * self.size_lwh[2]
         return ActorState(
-            _FIRST_INSERTED_ID,
+            self.track_id,
             self.category,
             centre_m,
             self.yaw,
@@ -148,7 +155,7 @@ def record_virtual_egos(
             path = LogPath(out / "logs" / split / f"{town}_seed{seed}_ego{len(logs):04d}", maps)
             if not (path.folder / "sync.arrow").is_file():  # logs get their names when they are whole
                 world = worlds[int(of_log.integers(len(worlds)))]
-                inserted = _insert(ego, of_log)
+                inserted = _insert_all(window, ego, of_log)
                 place = (out, split, path.folder.name, camera_specs(sensors.rig), maps, town, ego.route_xyz)
                 with LogWriter(*place) as writer:
                     for k in range(len(window.moments)):
@@ -202,6 +209,8 @@ def _choose_egos(window: _Window, rng: np.random.Generator) -> list[_Ego]:
     lasting = first.active & last.active & (first.track_id == last.track_id)
     rows = np.flatnonzero(lasting & (first.category == int(Category.CAR)))
     rng.shuffle(rows)
+    standing = rows[first.speed_mps[rows] < STANDING_MPS][round(STANDING_SHARE * EGOS_PER_WINDOW) :]
+    rows = rows[~np.isin(rows, standing)]
     egos = []
     for row in rows.tolist():
         route = _route(window, row)
@@ -244,17 +253,19 @@ def _comes_to_light(window: _Window, row: int) -> bool:
     return bool((window.traffic.signals.guarded[path[1:]] & (gap_m[:-1] < LIGHT_M)).any())
 
 
-def _insert(ego: _Ego, rng: np.random.Generator) -> list[_Inserted]:
-    """Draw people and cyclists who stand beside the ego's path, or cross it some time ahead of the ego.
+def _insert_all(window: _Window, ego: _Ego, rng: np.random.Generator) -> list[_Inserted]:
+    """Draw people and cyclists who stand beside the ego's path, or cross it ahead of the ego."""
+    count = int(rng.choice(len(INSERTED_SHARES), p=INSERTED_SHARES))
+    drawn = [_insert(window, ego, _FIRST_INSERTED_ID + number, rng) for number in range(count)]
+    return [inserted for inserted in drawn if inserted is not None]
 
-    Seven of ten logs have one. Cyclists at the kerb face the road before they ride.
-    """
-    if rng.random() > 0.7:
-        return []
+
+def _insert(window: _Window, ego: _Ego, track_id: int, rng: np.random.Generator) -> _Inserted | None:
+    """Draw a person or cyclist. Cyclists at the kerb face the road before they ride."""
     arc_m = arc_lengths(ego.route_xyz)
     ahead_m = rng.uniform(8.0, 45.0)
     if ahead_m + 1.0 > arc_m[-1]:
-        return []
+        return None
     place, further = points_at(ego.route_xyz, arc_m, np.array([ahead_m, ahead_m + 1.0]))
     heading = float(np.arctan2(*(further - place)[1::-1]))
     cycles = rng.random() < 0.6
@@ -264,17 +275,30 @@ def _insert(ego: _Ego, rng: np.random.Generator) -> list[_Inserted]:
     yaw = heading - side * 0.5 * np.pi + rng.normal(0.0, 0.25)
     if rng.random() < 0.15:  # along the road in place of across it
         yaw += 0.5 * np.pi * rng.choice([-1.0, 1.0])
-    return [
-        _Inserted(
-            Category.BICYCLE if cycles else Category.PEDESTRIAN,
-            np.array([1.75, 0.6, 1.7] if cycles else [0.5, 0.55, 1.72]),
-            foot_m,
-            float(yaw),
-            float(rng.uniform(3.5, 6.0) if cycles else rng.uniform(0.6, 2.5)),
-            float(rng.uniform(-1.0, 6.0)) if rng.random() < 0.85 else np.inf,
-            int(rng.integers(2**31)),
-        )
-    ]
+    speed_mps = float(rng.uniform(3.5, 6.0) if cycles else rng.uniform(0.6, 2.5))
+    waits_s = float(rng.uniform(-1.0, 6.0)) if rng.random() < 0.85 else np.inf
+    comes_s = _comes_by_s(window, ego, float(ahead_m))
+    if rng.random() < MEETING_SHARE and comes_s is not None:
+        waits_s = comes_s + float(rng.uniform(-MEETING_S, MEETING_S)) - beside_m / speed_mps
+    return _Inserted(
+        track_id,
+        Category.BICYCLE if cycles else Category.PEDESTRIAN,
+        np.array([1.75, 0.6, 1.7] if cycles else [0.5, 0.55, 1.72]),
+        foot_m,
+        float(yaw),
+        speed_mps,
+        waits_s,
+        int(rng.integers(2**31)),
+    )
+
+
+def _comes_by_s(window: _Window, ego: _Ego, ahead_m: float) -> float | None:
+    """Return the time in the window at which an ego has driven some way; None: it does not."""
+    xyz = np.stack([moment.poses.axle_xyz[ego.row] for moment in window.moments])
+    driven_m = arc_lengths(xyz)
+    if driven_m[-1] < ahead_m:
+        return None
+    return float(np.interp(ahead_m, driven_m, KEY_DT_S * np.arange(len(driven_m))))
 
 
 def _frame(
