@@ -1,5 +1,7 @@
 """A driver in closed loop: its eyes, its planner, and what it remembers from plan to plan."""
 
+from collections.abc import Callable
+
 import numpy as np
 import torch
 from jaxtyping import Float, Float64
@@ -144,21 +146,52 @@ class SightDriver:
 
     Args:
         driver: eyes and planner.
+        perceive: returns what is on the route of an observation of a batch of one, in place of the eyes.
     """
 
-    def __init__(self, driver: Driver) -> None:
-        self._driver, self._perception = driver, Perception(driver)
+    def __init__(self, driver: Driver, perceive: Callable[[Clip], PathEstimate] | None = None) -> None:
+        self._planner, self._perceive = driver.planner, perceive or Perception(driver)
 
     @torch.no_grad()
     def act(self, observation: Clip) -> Trajectory:
         """Return the plan for an observation of a batch of one. Without a route it goes straight on."""
-        view = self._perception(observation)
+        view = self._perceive(observation)
         path = given_path(observation)
         speed = ego_speeds(observation)[:, observation.now]
         limit = torch.full_like(speed, curve_speed(path))
-        best = int(self._driver.planner(view, speed, limit)[0].argmax())
+        best = int(self._planner(view, speed, limit)[0].argmax())
         progress_m = profile_progress(speed, limit, HORIZON_STEPS)[0, best].double().cpu().numpy()
         return plan_of(torch.from_numpy(waypoints_along(path, progress_m)).float()[None, None])
+
+
+class PartlyTrue:
+    """Perception of which a part is replaced by the truth, to see what each part costs.
+
+    Args:
+        seen: perception by sight.
+        true: perception of the truth.
+        lights: whether lights are true.
+        users: whether road users are true.
+    """
+
+    def __init__(
+        self,
+        seen: Callable[[Clip], PathEstimate],
+        true: Callable[[Clip], PathEstimate],
+        *,
+        lights: bool,
+        users: bool,
+    ) -> None:
+        self._seen, self._true, self._lights, self._users = seen, true, lights, users
+
+    def __call__(self, observation: Clip) -> PathEstimate:
+        """Return what is on the route of an observation of a batch of one."""
+        true = self._true(observation)
+        if self._lights and self._users:
+            return true
+        seen = self._seen(observation)
+        light = true if self._lights else seen
+        return PathEstimate(light.light, light.light_m, (true if self._users else seen).occupied)
 
 
 def given_path(observation: Clip) -> PathAhead:

@@ -15,7 +15,7 @@ from foredrive.driver.eyes import CameraEyes
 from foredrive.driver.losses import SightWeights, sight_losses
 from foredrive.driver.packed import PackedClips, RouteExample, join
 from foredrive.driver.recipe import PlanFit
-from foredrive.driver.speed_planner import chosen_labels, profile_progress
+from foredrive.driver.speed_planner import chosen_labels, profile_numbers, profile_progress
 from foredrive.errors import InputError
 from foredrive.models.ego_mlp import ego_speeds
 from foredrive.scene.affordances import Affordances, PathEstimate
@@ -27,7 +27,7 @@ from foredrive.training.in_memory_fit import fit_in_memory
 FASTEST_MPS = 9.0
 BRIGHTNESS, CONTRAST, COLOUR = 0.06, 0.2, 0.03
 """Standard deviations of the changes of an image in training, as shares of its range."""
-BATCH = 32
+BATCH, ROWS = 32, 512
 
 
 class SightObjective(nn.Module):
@@ -116,8 +116,8 @@ def fit_planner(
     labels: list[Float[np.ndarray, S]] = []
     for start in range(0, len(chosen), BATCH):
         batch = join([clips[int(index)] for index in chosen[start : start + BATCH]])
-        sight = driver.see(batch.clip).estimate()
         truth, own = true_estimate(batch.truth), ego_speeds(batch.clip)[:, batch.clip.now]
+        sight = driver.see(batch.clip).estimate() if fit.seen_share > 0 else truth
         for row in range(len(own)):
             if int(batch.truth.path_valid[row].sum()) < 2:
                 continue
@@ -132,8 +132,16 @@ def fit_planner(
         tick()
     if not labels:
         raise InputError("no clip has a route: a planner of speeds has nothing to learn from")
-    both = {True: stack_records(seen), False: stack_records(truths)}
     speed, limit = torch.tensor(speeds), torch.tensor(limits)
+    both = {
+        by_sight: torch.cat(
+            [
+                profile_numbers(stack_records(views[k : k + ROWS]), speed[k : k + ROWS], limit[k : k + ROWS])
+                for k in range(0, len(views), ROWS)
+            ]
+        )
+        for by_sight, views in ((False, truths), (True, seen))
+    }
     rule_m = torch.from_numpy(np.stack(labels)).float()
     progress_m = profile_progress(speed, limit, HORIZON_STEPS)
     target = chosen_labels(progress_m, rule_m)
@@ -141,7 +149,7 @@ def fit_planner(
 
     def loss(rows: Tensor) -> Tensor:
         by_sight = bool(torch.rand((), generator=generator) < fit.seen_share)
-        logits = driver.planner(both[by_sight][rows], speed[rows], limit[rows])
+        logits = driver.planner.logits(both[by_sight][rows])
         return -(target[rows] * logits.log_softmax(-1)).sum(-1).mean()
 
     fit_in_memory(driver.planner, len(rule_m), loss, fit, seed)

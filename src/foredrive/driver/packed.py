@@ -162,7 +162,7 @@ def _padded(values: Tensor, count: int) -> Tensor:
 
 
 def _without_images(example: RouteExample) -> RouteExample:
-    images = example.clip.images[:, :0]
+    images = example.clip.images[..., :0, :0]
     return dataclasses.replace(example, clip=dataclasses.replace(example.clip, images=images))
 
 

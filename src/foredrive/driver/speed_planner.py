@@ -92,7 +92,10 @@ class SpeedPlanner(nn.Module):
             view: what is on the path; probabilities, or the truth as 0 and 1.
             speed_mps, limit_mps: as of `profile_progress`.
         """
-        numbers = profile_numbers(view, speed_mps, limit_mps)
+        return self.logits(profile_numbers(view, speed_mps, limit_mps))
+
+    def logits(self, numbers: Float[Tensor, "b P N"]) -> Float[Tensor, "b P"]:
+        """Return the logit of each profile from its `profile_numbers`."""
         which = torch.eye(len(PROFILES)).to(numbers).expand(len(numbers), -1, -1)
         scores: Tensor = self.score(torch.cat([numbers, which], dim=-1))
         return scores[..., 0]

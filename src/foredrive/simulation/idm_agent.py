@@ -34,8 +34,8 @@ REJOINS_M = 8.0
 class IdmAgent:
     """An `Agent` on the route's line that keeps its distance by the intelligent driver model.
 
-    It knows the route and its place on it. Lights and road users come from the simulator, which move on at
-    constant velocity, or from `perceive`.
+    It knows the route and its place on it. Lights and road users come from the simulator, where the latter
+    go on at constant velocity, or from `perceive`.
 
     Args:
         simulator: the town that it drives in.
@@ -45,21 +45,50 @@ class IdmAgent:
     def __init__(
         self, simulator: TownSimulator, perceive: Callable[[Clip], PathEstimate] | None = None
     ) -> None:
-        self._simulator, self._perceive = simulator, perceive
+        self._truth, self._perceive = TruePerception(simulator), perceive
 
     def act(self, observation: Clip) -> Trajectory:
         """Return the plan for an observation of a batch of one."""
         clip = observation[0]
-        xyz = self._simulator.scenario.route_xyz
-        arc_m, T_world_ego = arc_lengths(xyz), clip.T_world_ego[clip.now].numpy()
-        path = path_ahead(xyz, arc_m, self._simulator.done_m, T_world_ego, FRONT_M)
+        path = self._truth.path(clip)
         if self._perceive is None:
-            light, light_m = self._light(path, T_world_ego)
-            view = true_view(clip.boxes[clip.now], path, light, light_m)
+            view = self._truth.view(clip, path)
         else:
             view = estimated_view(self._perceive(observation)[0])
         along_m = rule_progress(path, float(clip.ego_speed_mps[clip.now]), view)
         return plan_of(torch.from_numpy(waypoints_along(path, along_m)).float()[None, None])
+
+
+class TruePerception:
+    """What is on the route, read from the simulator.
+
+    Args:
+        simulator: the town that is driven in.
+    """
+
+    def __init__(self, simulator: TownSimulator) -> None:
+        self._simulator = simulator
+
+    def __call__(self, observation: Clip) -> PathEstimate:
+        """Return the view of an observation of a batch of one as an estimate that is sure."""
+        clip = observation[0]
+        view = self.view(clip, self.path(clip))
+        return PathEstimate(
+            torch.eye(4)[[view.light]],
+            torch.tensor([view.light_m]),
+            torch.from_numpy(view.occupied).float()[None],
+        )
+
+    def path(self, clip: Clip) -> PathAhead:
+        """Return the route ahead of an unbatched observation."""
+        xyz = self._simulator.scenario.route_xyz
+        T_world_ego = clip.T_world_ego[clip.now].numpy()
+        return path_ahead(xyz, arc_lengths(xyz), self._simulator.done_m, T_world_ego, FRONT_M)
+
+    def view(self, clip: Clip, path: PathAhead) -> PathView:
+        """Return what is on a path: the state of its light, and boxes that go on at constant velocity."""
+        light, light_m = self._light(path, clip.T_world_ego[clip.now].numpy())
+        return true_view(clip.boxes[clip.now], path, light, light_m)
 
     def _light(self, path: PathAhead, T_world_ego: Float64[np.ndarray, "4 4"]) -> tuple[LightState, float]:
         """Return state and distance of the next light on the path."""

@@ -9,7 +9,7 @@ from typing import Literal
 
 import torch
 
-from foredrive.driver.agent import Driver, Perception, SightDriver
+from foredrive.driver.agent import Driver, PartlyTrue, Perception, SightDriver
 from foredrive.errors import InputError
 from foredrive.json_server import Address
 from foredrive.models.ego_mlp import EgoMLP
@@ -22,7 +22,7 @@ from foredrive.runs.train.run import load_agent, open_run
 from foredrive.scene import Agent
 from foredrive.sensors.rigs import SURROUND, RigPlan
 from foredrive.simulation.demonstrations import AlternatingStudent, DisturbedExpert
-from foredrive.simulation.idm_agent import IdmAgent
+from foredrive.simulation.idm_agent import IdmAgent, TruePerception
 from foredrive.simulation.observation import FRAME_DT_S
 from foredrive.simulation.remote.json_http import read_address
 from foredrive.simulation.remote.planner_client import ALIVE_S, HttpPlanner, check_planner
@@ -45,6 +45,8 @@ GRPC = "grpc://"
 """Beginning of the address of a driver behind AlpaSim's contract."""
 DISTURBED, STUDENT = "disturbed", "student:"
 IDM, IDM_BY_SIGHT = "idm", "idm:"
+PARTLY_TRUE = {"true:": (True, True), "true-lights:": (True, False), "true-users:": (False, True)}
+"""Prefixes of a driver's run that drives with lights, and with road users, as they truly are."""
 OLD_STUDENT = "pupil:"
 """The prefix of `STUDENT` in earlier versions, still accepted."""
 
@@ -95,8 +97,9 @@ def inputs_of(agent: str) -> AgentInputs:
             "log" and "lidar-corridor" follow the path of a reconstructed log.
             "http://HOST:PORT" is a planner in another process (`HttpPlanner`), "grpc://HOST:PORT" a driver of
             AlpaSim (`GrpcDriver`).
-            "idm" follows the route by the intelligent driver model and knows who is ahead and the lights;
-            "idm:RUN" knows of them what the affordances of a run tell.
+            "idm" follows the route by the intelligent driver model and knows lights and road users;
+            "idm:RUN" knows of them what a driver's run sees. "true:RUN", "true-lights:RUN" and
+            "true-users:RUN" are a driver to whom both, the lights, or the road users are told as they are.
 
     Raises:
         InputError: there is no such agent, or it was trained on another frame interval.
@@ -110,7 +113,7 @@ def inputs_of(agent: str) -> AgentInputs:
     clips = (open_driver(folder) if is_driver(folder) else open_run(folder)).recipe.clips
     if abs(clips.frame_dt_s - FRAME_DT_S) > 1e-6:
         raise InputError(f"{agent}: trained on key frames {clips.frame_dt_s} s apart, not {FRAME_DT_S} s")
-    seeing = not agent.startswith(EGO_MLP)
+    seeing = not agent.startswith((EGO_MLP, "true:"))
     lidar = not is_driver(folder)
     return AgentInputs(seeing, lidar, past_frames=clips.past_frames, camera_names=clips.cameras)
 
@@ -185,6 +188,10 @@ def make_agent(
         if not is_driver(folder):
             raise InputError(f"{folder}: {IDM_BY_SIGHT}RUN needs the run of a driver, such as driver_small")
         return IdmAgent(_town(town), Perception(_driver(folder)))
+    for prefix, (lights, users) in PARTLY_TRUE.items():
+        if agent.startswith(prefix):
+            driver, truth = _driver(folder), TruePerception(_town(town))
+            return SightDriver(driver, PartlyTrue(Perception(driver), truth, lights=lights, users=users))
     if is_driver(folder):
         return SightDriver(_driver(folder))
     if agent.startswith((STUDENT, OLD_STUDENT)):
@@ -240,7 +247,12 @@ def _town(town: TownSimulator | None) -> TownSimulator:
 
 def _run_folder(agent: str) -> Path:
     prefix = next(
-        (known for known in (EGO_MLP, STUDENT, OLD_STUDENT, IDM_BY_SIGHT) if agent.startswith(known)), ""
+        (
+            known
+            for known in (EGO_MLP, STUDENT, OLD_STUDENT, IDM_BY_SIGHT, *PARTLY_TRUE)
+            if agent.startswith(known)
+        ),
+        "",
     )
     folder = run_folder(Path(agent.removeprefix(prefix)))
     if not folder.is_dir():

@@ -17,7 +17,7 @@ from foredrive.errors import InputError
 from foredrive.evaluation.task_priors import fit_task_priors
 from foredrive.files import atomic_path
 from foredrive.models.agent import PlanningAgent
-from foredrive.recipes.config import Recipe, load_recipe, save_recipe
+from foredrive.recipes.config import Recipe, load_recipe, read_values, save_recipe
 from foredrive.runs.build import build_agent, build_objective
 from foredrive.runs.folder import CONFIG, LOGS, WEIGHTS, RunFolder
 from foredrive.runs.open_clips import open_clips
@@ -86,6 +86,9 @@ def open_run(folder: Path) -> Run:
     """
     if not (folder / CONFIG).is_file():
         raise InputError(f"{folder}: not a run folder (no {CONFIG})")
+    values = read_values(folder / CONFIG)
+    if isinstance(values, dict) and values.get("kind") == "driver":
+        raise InputError(f"{folder}: the run of a driver, which has no world model; it can drive")
     recipe = load_recipe(folder / CONFIG)
     try:
         written = json.loads((folder / LOGS).read_text())

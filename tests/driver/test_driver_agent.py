@@ -1,0 +1,122 @@
+"""What a driver remembers between plans, and the path that it is given."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+from conftest import synthetic_example
+from test_eyes import SPEC
+
+from foredrive.driver.agent import CREEPS, WAITS, Driver, LightMemory, PartlyTrue, Perception, given_path
+from foredrive.driver.eyes import CameraEyes, CameraEyesConfig
+from foredrive.driver.sight import Sight
+from foredrive.driver.speed_planner import SpeedPlanner, SpeedPlannerConfig
+from foredrive.scene import Clip
+from foredrive.scene.affordances import CELLS, TIMES, PathEstimate
+from foredrive.scene.clip import ROUTE_M
+from foredrive.scene.traffic_light import LightState
+
+
+def estimate(light: LightState, light_m: float = 0.0, p: float = 0.97) -> PathEstimate:
+    states = torch.full((1, 4), (1 - p) / 3)
+    states[0, light] = p
+    return PathEstimate(states, torch.tensor([light_m]), torch.zeros(1, TIMES, CELLS))
+
+
+def state(view: PathEstimate) -> LightState:
+    return LightState(int(view.light[0].argmax()))
+
+
+def test_a_red_light_is_remembered_at_its_line_and_forgotten_beyond_it() -> None:
+    memory = LightMemory()
+    assert state(memory.update(estimate(LightState.RED, 9.0), 0.0)) is LightState.RED
+    view = memory.update(estimate(LightState.NONE), 4.0)  # at 5 m the lamps are out of the image
+    assert state(view) is LightState.RED
+    assert float(view.light_m) == pytest.approx(5.0)
+    for _ in range(20):  # it waits
+        view = memory.update(estimate(LightState.NONE), 0.0)
+    assert state(view) is LightState.RED
+    assert state(memory.update(estimate(LightState.GREEN, 5.0), 0.0)) is LightState.GREEN
+    assert state(memory.update(estimate(LightState.NONE), 12.0)) is LightState.NONE  # beyond the line
+
+
+def test_a_light_that_was_seen_far_away_and_vanishes_fades() -> None:
+    memory = LightMemory()
+    memory.update(estimate(LightState.RED, 30.0, p=0.7), 0.0)
+    views = [memory.update(estimate(LightState.NONE), 0.0) for _ in range(6)]
+    stops = [float(view.light[0, LightState.RED]) for view in views]
+    assert (np.diff(stops) < 0).all()
+    assert stops[-1] == pytest.approx(0.5, abs=0.02)
+
+
+def test_one_wrong_frame_does_not_turn_a_light() -> None:
+    memory = LightMemory()
+    for _ in range(4):
+        memory.update(estimate(LightState.RED, 12.0), 0.0)
+    assert state(memory.update(estimate(LightState.GREEN, 12.0, p=0.6), 0.0)) is LightState.RED
+    for _ in range(4):
+        view = memory.update(estimate(LightState.GREEN, 12.0), 0.0)
+    assert state(view) is LightState.GREEN
+
+
+class Fixed(Driver):
+    """A driver that always sees the same."""
+
+    def __init__(self, sight: Sight) -> None:
+        super().__init__(CameraEyes(CameraEyesConfig()), SpeedPlanner(SpeedPlannerConfig(hidden=4)))
+        self.sight = sight
+
+    def see(self, clip: Clip) -> Sight:
+        return self.sight
+
+
+def sight(light: LightState, p_there: float) -> Sight:
+    logits = torch.zeros(1, TIMES, CELLS)
+    logits[...] = torch.logit(torch.tensor(p_there))
+    light_logits = torch.full((1, 4), -5.0)
+    light_logits[0, light] = 5.0
+    return Sight(light_logits, torch.zeros(1, 2, 3, 2, 2), torch.full((1, 2, 2, 2), -1.0), logits)
+
+
+def standing() -> Clip:
+    clip = synthetic_example(spec=SPEC, batch=1, past=1, future=0, cameras=2).clip
+    still = clip.T_world_ego[:, :1].expand_as(clip.T_world_ego)
+    return dataclasses.replace(clip, ego_speed_mps=torch.zeros_like(clip.ego_speed_mps), T_world_ego=still)
+
+
+@pytest.mark.parametrize(
+    ("light", "p_there", "frees"), [("NONE", 0.8, True), ("NONE", 0.97, False), ("RED", 0.8, False)]
+)
+def test_who_stands_for_long_creeps_unless_it_is_sure(light: str, p_there: float, frees: bool) -> None:
+    perception = Perception(Fixed(sight(LightState[light], p_there)))
+    free = [not bool((perception(standing()).occupied > 0.5).any()) for _ in range(WAITS + CREEPS)]
+    assert not any(free[:WAITS])
+    assert all(free[WAITS:]) is frees
+
+
+def test_parts_of_the_truth_take_the_place_of_what_is_seen() -> None:
+    seen, true = estimate(LightState.RED, 9.0), estimate(LightState.GREEN, 7.0)
+    true = dataclasses.replace(true, occupied=torch.ones(1, TIMES, CELLS))
+    clip = standing()
+    for lights, users in ((True, True), (True, False), (False, True)):
+        view = PartlyTrue(lambda _: seen, lambda _: true, lights=lights, users=users)(clip)
+        assert (state(view) is LightState.GREEN) is lights
+        assert float(view.light_m) == (7.0 if lights else 9.0)
+        assert bool(view.occupied.any()) is users
+
+
+def test_the_path_goes_through_the_points_of_the_route() -> None:
+    """The vehicle is a metre beside a route that turns right; it ends after 20 m."""
+    clip = standing()
+    angle = torch.tensor(ROUTE_M) / 30.0
+    xy = torch.stack([30 * angle.sin(), 30 * (angle.cos() - 1) - 1.0], -1)
+    valid = torch.tensor([True] * 5 + [False] * 2)
+    path = given_path(dataclasses.replace(clip, route_xy=xy[None], route_valid=valid[None]))
+    assert int(path.valid.sum()) == 21
+    for k, along in enumerate(ROUTE_M[:5]):
+        torch.testing.assert_close(path.xy[int(along)], xy[k], atol=1e-4, rtol=0)
+    assert float(path.xy[0, 1]) == pytest.approx(-1.0, abs=0.2)
+    without = given_path(dataclasses.replace(clip, route_valid=torch.zeros(1, 7, dtype=torch.bool)))
+    assert not without.xy[:, 1].any()
+    assert int(without.valid.sum()) == 41

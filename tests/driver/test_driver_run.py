@@ -1,0 +1,115 @@
+"""Training a driver from logs: packed clips, a run that is continued, figures, and drives."""
+
+import dataclasses
+from pathlib import Path
+
+import pytest
+import torch
+
+from foredrive.data import ClipDataset
+from foredrive.data.log_paths import LogPath
+from foredrive.driver.judging import judge_sight
+from foredrive.driver.packed import PackedClips, join
+from foredrive.driver.recipe import DriverRecipe, driver_small
+from foredrive.errors import InputError
+from foredrive.recipes.known import find_driver_recipe, find_recipe
+from foredrive.runs.drive.agents import inputs_of, make_agent
+from foredrive.runs.train.driver import load_driver, open_driver, train_driver
+from foredrive.runs.train.run import open_run
+from foredrive.sensors.rigs import FRONT_TELE, camera_rig
+from foredrive.towns import virtual_egos
+from foredrive.towns.sensing.capture import SensorSuite
+from foredrive.towns.world import World
+from foredrive.training.metrics_log import read_metrics
+
+
+@pytest.fixture(scope="module")
+def logs(world02: World, tmp_path_factory: pytest.TempPathFactory) -> list[LogPath]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(virtual_egos, "World", lambda town, seed, conditions: world02)
+        sensors = SensorSuite(camera_rig(plan=FRONT_TELE.of_size((32, 64))), None)
+        return virtual_egos.record_virtual_egos("Town02", 3, 4, tmp_path_factory.mktemp("egos"), sensors)
+
+
+def recipe() -> DriverRecipe:
+    small = driver_small()
+    return dataclasses.replace(
+        small,
+        clips=dataclasses.replace(small.clips, image_hw=(32, 64)),
+        see=dataclasses.replace(small.see, batch_size=4, epochs=None, steps=4, checkpoint_every=2),
+        plan=dataclasses.replace(small.plan, steps=20, clips=10, speeds=2),
+    )
+
+
+@pytest.fixture(scope="module")
+def dataset(logs: list[LogPath]) -> ClipDataset:
+    return ClipDataset(logs, recipe().clips, None)
+
+
+def test_packed_clips_are_those_of_the_logs(dataset: ClipDataset, tmp_path: Path) -> None:
+    clips = PackedClips(dataset, tmp_path)
+    with pytest.raises(InputError, match="a packed clip cannot be read"):
+        clips[0]
+    clips.pack()
+    written = {file: file.stat().st_mtime_ns for file in tmp_path.rglob("*.safetensors")}
+    assert len(written) == clips.logs == 4
+    batch = join([clips[0], clips[7]])
+    for row, index in enumerate((0, 7)):
+        clip, truth = dataset.clip(index), dataset.truth(index)
+        assert torch.equal(batch.clip.images[row], clip.images)
+        assert torch.equal(batch.clip.T_world_ego[row], clip.T_world_ego)
+        assert torch.equal(batch.clip.route_xy[row], clip.route_xy)
+        assert truth is not None
+        assert truth.affordances is not None
+        assert torch.equal(batch.truth.occupied[row], truth.affordances.occupied)
+        assert int(batch.truth.light[row]) == int(truth.affordances.light)
+        lamps = len(truth.affordances.lamp_xyz)
+        assert torch.equal(batch.truth.lamp_xyz[row, :lamps], truth.affordances.lamp_xyz)
+        assert batch.key[row] == dataset.key(index)
+    damaged = next(iter(written))
+    damaged.write_bytes(b"damaged")
+    PackedClips(dataset, tmp_path).pack()
+    again = {file: file.stat().st_mtime_ns for file in written}
+    assert {file for file in written if again[file] != written[file]} == {damaged}
+
+
+def test_a_run_is_continued_and_drives(logs: list[LogPath], dataset: ClipDataset, tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    run = train_driver(recipe(), logs, folder, tmp_path / "cache")
+    assert [step["step"] for step in read_metrics(folder / "see/metrics.jsonl")] == [1, 2, 3, 4]
+    driver = load_driver(open_driver(folder))
+    (folder / "plan/model.safetensors").unlink()
+    eyes = (folder / "see/model.safetensors").stat().st_mtime_ns
+    train_driver(recipe(), logs, folder, tmp_path / "cache")
+    assert (folder / "see/model.safetensors").stat().st_mtime_ns == eyes
+    for name, weight in load_driver(run).state_dict().items():
+        torch.testing.assert_close(weight, driver.state_dict()[name])
+    with pytest.raises(InputError, match="another recipe"):
+        train_driver(dataclasses.replace(recipe(), precision="32-true"), logs, folder, tmp_path / "cache")
+    with pytest.raises(InputError, match="the run of a driver"):
+        open_run(folder)
+
+    figures = judge_sight(driver, PackedClips(dataset, tmp_path / "cache/packed"))
+    assert figures["frames"] == len(dataset)
+    assert 0 <= figures["conflict_false"] <= 1
+
+    agent = make_agent(str(folder), lambda: 0.0)
+    plan = agent.act(join([PackedClips(dataset, tmp_path / "cache/packed")[0]]).clip)
+    assert plan.xy.shape == (1, 1, 6, 2)
+    assert bool(plan.xy.isfinite().all())
+    inputs = inputs_of(str(folder))
+    assert (inputs.cameras, inputs.lidar, inputs.past_frames) == (True, False, 1)
+    assert inputs.camera_names == ("pcam_f0", "ftcam_tele_f0")
+
+
+def test_recipes_of_drivers_are_found_by_name_and_file(tmp_path: Path) -> None:
+    from foredrive.recipes.config import save_recipe
+
+    assert find_driver_recipe("nemo_tiny") is None
+    changed = find_driver_recipe("driver_small", ["see.epochs=1"])
+    assert changed is not None
+    assert changed.see.epochs == 1
+    save_recipe(changed, tmp_path / "mine.yaml")
+    assert find_driver_recipe(str(tmp_path / "mine.yaml")) == changed
+    with pytest.raises(InputError, match="driver_small"):
+        find_recipe("driver_smal")

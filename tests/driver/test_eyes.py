@@ -1,0 +1,144 @@
+"""The eyes of a driver: frames are read at places fixed in the world, and losses see what is known alone."""
+
+import dataclasses
+
+import pytest
+import torch
+from conftest import synthetic_example
+
+from foredrive.driver.eyes import CameraEyes, CameraEyesConfig
+from foredrive.driver.losses import SightWeights, lamp_places, sight_losses
+from foredrive.driver.sight import Sight, line_m, scaled_line
+from foredrive.errors import InputError
+from foredrive.geometry.se3 import inverse_se3, transform_points
+from foredrive.scene import VoxelSpec
+from foredrive.scene.affordances import CELLS, TIMES, Affordances
+from foredrive.scene.traffic_light import LightState
+
+SPEC = VoxelSpec((-4.0, -4.0, -1.0), 4.0, (1, 2, 2))
+
+
+def truth(batch: int = 2) -> Affordances:
+    """A red light whose lamp is 12 m ahead, and a road user on the path from one second on."""
+    occupied = torch.zeros(batch, TIMES, CELLS, dtype=torch.bool)
+    occupied[:, 2:, 4] = True
+    none, zero = torch.zeros(batch, dtype=torch.bool), torch.zeros(batch)
+    return Affordances(
+        path_xy=torch.zeros(batch, 72, 2),
+        path_valid=torch.zeros(batch, 72, dtype=torch.bool),
+        light=torch.full((batch,), int(LightState.RED)),
+        light_m=torch.full((batch,), 5.0),
+        light_known=~none,
+        light_later=torch.zeros(batch, 6, dtype=torch.long),
+        lamp_xyz=torch.tensor([[[12.0, 0.4, 1.9], [12.0, 40.0, 3.0]]]).expand(batch, 2, 3),
+        lamp=torch.tensor([[True, True]]).expand(batch, 2),
+        lamps_known=~none,
+        lead=none,
+        lead_m=zero,
+        lead_mps=zero,
+        lead_known=~none,
+        crossing_xy=torch.zeros(batch, 0, 2),
+        crossing=torch.zeros(batch, 0, dtype=torch.bool),
+        crossing_known=~none,
+        occupied=occupied,
+        occupied_known=torch.ones(batch, TIMES, CELLS, dtype=torch.bool),
+    )
+
+
+def eyes(frames: int = 2) -> CameraEyes:
+    torch.manual_seed(0)
+    return CameraEyes(CameraEyesConfig(frames=frames)).eval()
+
+
+@torch.no_grad()
+def test_past_frames_are_read_where_the_cells_were_then() -> None:
+    """Features of a past frame do not depend on where the vehicle has gone since, in the world's places."""
+    clip = synthetic_example(spec=SPEC, batch=2, past=1, future=0, cameras=2).clip
+    network = eyes()
+    fine, coarse = network._features(clip)
+    cells = torch.tensor([[[[5.0, 0.5], [8.0, -1.0]], [[7.0, 1.0], [12.0, 2.0]]]]).expand(2, -1, -1, -1)
+    read = network._read(clip, cells, fine, coarse)
+    of_frame = read.shape[1] // 2
+    # The same places, in the frame before, read as if that were now.
+    T = inverse_se3(clip.T_world_ego[:, 0]) @ clip.T_world_ego[:, 1]
+    before = clip.frames([0])
+    for row, height in enumerate((0.4, 1.3)):
+        z = torch.full((2, 4, 1), height)
+        moved = transform_points(T.float(), torch.cat([cells.flatten(1, 2), z], dim=-1))[..., :2]
+        again = network._read(before, moved.view(2, 2, 2, 2), fine[:, :1], coarse[:, :1])
+        by_height = read[:, :of_frame].view(2, 2, 2, -1, 2, 2)[:, :, row]
+        expected = again.view(2, 2, 2, -1, 2, 2)[:, :, row]
+        torch.testing.assert_close(by_height, expected, atol=1e-4, rtol=1e-4)
+        assert by_height.abs().amax() > 0.1
+
+
+@torch.no_grad()
+def test_sight_depends_on_images_route_and_speed_and_blind_eyes_on_no_image() -> None:
+    clip = synthetic_example(spec=SPEC, batch=2, past=1, future=0, cameras=2).clip
+    black = dataclasses.replace(clip, images=torch.zeros_like(clip.images))
+    elsewhere = dataclasses.replace(clip, route_xy=clip.route_xy.flip(0))
+    faster = dataclasses.replace(clip, ego_speed_mps=clip.ego_speed_mps + 3)
+    for blind in (False, True):
+        torch.manual_seed(0)
+        network = CameraEyes(CameraEyesConfig(blind=blind)).eval()
+        sight = network(clip)
+        assert sight.light_logits.shape == (2, 4)
+        assert torch.equal(sight.light_logits[:, 1:], sight.lamp_logits.amax((1, 3, 4)))
+        assert torch.equal(network(black).occupied_logits, sight.occupied_logits) is blind
+        for other in (elsewhere, faster):
+            assert not torch.allclose(network(other).occupied_logits, sight.occupied_logits)
+            assert not torch.allclose(network(other).lamp_logits, sight.lamp_logits)
+
+
+def test_a_clip_of_other_cameras_or_too_few_frames_is_refused() -> None:
+    clip = synthetic_example(spec=SPEC, batch=1, past=0, future=0, cameras=2).clip
+    with pytest.raises(InputError, match="2 key frames cannot see a clip of 2 cameras and 1 key frames"):
+        eyes()(clip)
+
+
+def test_the_distance_of_a_line_is_read_at_the_lamp() -> None:
+    distance_m = torch.tensor([-2.9, 0.0, 10.0, 60.0])
+    torch.testing.assert_close(line_m(scaled_line(distance_m)), distance_m)
+    lamps, lines = torch.full((1, 2, 3, 2, 3), -4.0), torch.zeros(1, 2, 2, 3)
+    lamps[0, 1, 2, 1, 0] = 3.0  # green, in the second camera
+    lines[0, 1, 1, 0] = scaled_line(torch.tensor(17.0))
+    sight = Sight(torch.zeros(1, 4), lamps, lines, torch.zeros(1, TIMES, CELLS))
+    torch.testing.assert_close(sight.light_m, torch.tensor([17.0]))
+
+
+def test_lamps_are_learned_in_place_and_unknown_cells_not_at_all() -> None:
+    clip = synthetic_example(spec=SPEC, batch=2, past=1, future=0, cameras=2).clip
+    rig, known = clip.rig[:, clip.now], truth()
+    hidden = known.occupied_known.clone()
+    hidden[0] = False
+    known = dataclasses.replace(known, occupied_known=hidden)
+    h, w = 8, 16
+    sight = Sight(
+        torch.zeros(2, 4, requires_grad=True),
+        torch.zeros(2, 2, 3, h, w, requires_grad=True),
+        torch.zeros(2, 2, h, w, requires_grad=True),
+        torch.zeros(2, TIMES, CELLS, requires_grad=True),
+    )
+    places = lamp_places(known, rig, (h, w))
+    assert places.inside.nonzero().tolist() == [[0, 0, 0], [1, 0, 0]]  # the front camera sees the first lamp
+    losses = sight_losses(sight, known, rig, SightWeights())
+    torch.testing.assert_close(losses["loss"], sum(v for k, v in losses.items() if k != "loss"))
+    losses["loss"].backward()
+    wanted = (sight.lamp_logits.grad < 0).nonzero().tolist()
+    row, column = int(places.row[0, 0, 0]), int(places.column[0, 0, 0])
+    assert wanted == [[item, 0, LightState.RED - 1, row, column] for item in (0, 1)]
+    assert (sight.lamp_line.grad != 0).nonzero().tolist() == [[item, 0, row, column] for item in (0, 1)]
+    assert not sight.occupied_logits.grad[0].any()
+    now, later = sight.occupied_logits.grad[1, 0, 4], sight.occupied_logits.grad[1, 2, 4]
+    assert later < 0 < now
+    assert float(-later / now) == pytest.approx(5.0)  # occupied, and later only: 2.5 × 2
+
+
+def test_a_light_that_no_image_shows_is_not_learned() -> None:
+    clip = synthetic_example(spec=SPEC, batch=2, past=1, future=0, cameras=2).clip
+    known = dataclasses.replace(truth(), lamp=torch.tensor([[False, True], [True, True]]))
+    logits = torch.zeros(2, 4, requires_grad=True)
+    sight = Sight(logits, torch.zeros(2, 2, 3, 8, 16), torch.zeros(2, 2, 8, 16), torch.zeros(2, TIMES, CELLS))
+    sight_losses(sight, known, clip.rig[:, clip.now], SightWeights())["light"].backward()
+    assert not logits.grad[0].any()
+    assert logits.grad[1, LightState.RED] < 0
