@@ -2,15 +2,17 @@
 
 An agent that learns from recordings learns that a standing vehicle goes on standing, and drives begin at rest
 (inertia in Codevilla et al. 2019, "Exploring the Limitations of Behavior Cloning"). TransFuser (Chitta et al.
-2022) therefore lets a vehicle that has stood for long creep forward if its lidar sees no obstacle ahead. This
-module does the same.
+2022) therefore lets a vehicle that has stood for long creep forward if its lidar sees no obstacle ahead. Here
+the agent's own volume of what its cameras see takes the place of the lidar.
 """
 
 from collections.abc import Callable
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
-from foredrive.scene import Agent, Clip, Trajectory
+from foredrive.scene import Agent, Clip, Trajectory, VoxelSpec
 from foredrive.simulation.dynamics import EGO
 from foredrive.simulation.observation import FRAME_DT_S, HORIZON_STEPS
 
@@ -21,7 +23,7 @@ AT_START_S, STUCK_S = 1.0, 20.0
 may be the reason for the stop."""
 CREEPS_S, CREEPS_MPS, CREEPS_MPS2 = 2.0, 4.0, 1.5
 FREE_M, FREE_HALF_WIDTH_M, FREE_HEIGHT_M = 6.0, 1.3, (0.3, 2.2)
-"""Box ahead of the bumper that must contain no lidar return."""
+"""Box ahead of the bumper that must be free."""
 
 
 class RestartingAgent:
@@ -30,10 +32,14 @@ class RestartingAgent:
     Args:
         agent: agent that drives; it observes a batch of one clip.
         clock: returns the time of the drive, s.
+        is_free: returns whether the way is free in an observation. An agent that sees nothing has none: its
+            way always counts as free.
     """
 
-    def __init__(self, agent: Agent, clock: Callable[[], float]) -> None:
-        self._agent, self._clock = agent, clock
+    def __init__(
+        self, agent: Agent, clock: Callable[[], float], is_free: Callable[[Clip], bool] = lambda _: True
+    ) -> None:
+        self._agent, self._clock, self._is_free = agent, clock, is_free
         self._stands_since_s: float | None = None
         self._has_moved = False
         self._creeps_until_s = -1.0
@@ -51,22 +57,23 @@ class RestartingAgent:
         patience_s = STUCK_S if self._has_moved else AT_START_S
         if t_s - since_s >= patience_s:
             self._creeps_until_s, self._stands_since_s = t_s + CREEPS_S, None
-        if t_s < self._creeps_until_s and is_free_ahead(observation):
+        if t_s < self._creeps_until_s and self._is_free(observation):
             return _creeping(speed_mps).to(plan.xy.device)
         return plan
 
 
-def is_free_ahead(observation: Clip) -> bool:
-    """Return whether lidar sees nothing in the box ahead of the bumper now. False without lidar."""
-    now = observation.now
-    if not bool(observation.sweep_valid[0, now]):
-        return False
-    sweep = observation.sweeps[0, now]
-    x, y, z = sweep.points_ego.unbind(dim=-1)
-    bumper_m = EGO.axle_to_centre_m + 0.5 * EGO.length_m
-    inside = sweep.valid & sweep.returned & (x > bumper_m) & (x < bumper_m + FREE_M)
-    inside &= (y.abs() < FREE_HALF_WIDTH_M) & (z > FREE_HEIGHT_M[0]) & (z < FREE_HEIGHT_M[1])
-    return not bool(inside.any())
+def is_free_ahead(occupancy_logit: Float[Tensor, "Z Y X"], spec: VoxelSpec) -> bool:
+    """Return whether no voxel in the box ahead of the bumper is probably occupied.
+
+    A volume that has no voxel there does not tell: the way is not free.
+    """
+    x, y, z = spec.centres_m().unbind(-1)
+    bumper_m, half_m = EGO.axle_to_centre_m + 0.5 * EGO.length_m, 0.5 * spec.voxel_m
+    # Voxels that reach into the box from its sides, and those whose middle is at its heights.
+    inside = (x > bumper_m) & (x - half_m < bumper_m + FREE_M) & (y.abs() - half_m < FREE_HALF_WIDTH_M)
+    inside &= (z > FREE_HEIGHT_M[0]) & (z < FREE_HEIGHT_M[1])
+    inside = inside.to(occupancy_logit.device)
+    return bool(inside.any()) and not bool((occupancy_logit[inside] > 0).any())
 
 
 def _creeping(speed_mps: float) -> Trajectory:

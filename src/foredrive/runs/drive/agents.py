@@ -57,9 +57,6 @@ class AgentInputs:
 
     cameras: bool
     lidar: bool
-    """Whether the agent requires lidar. A learned agent starts again after a halt only where lidar shows free
-    space (`RestartingAgent`).
-    """
     past_frames: int
     camera_names: tuple[str, ...] | None = None
     """Names of the required cameras; None: all cameras."""
@@ -114,8 +111,7 @@ def inputs_of(agent: str) -> AgentInputs:
     if abs(clips.frame_dt_s - FRAME_DT_S) > 1e-6:
         raise InputError(f"{agent}: trained on key frames {clips.frame_dt_s} s apart, not {FRAME_DT_S} s")
     seeing = not agent.startswith((EGO_MLP, "true:"))
-    lidar = not is_driver(folder)
-    return AgentInputs(seeing, lidar, past_frames=clips.past_frames, camera_names=clips.cameras)
+    return AgentInputs(seeing, lidar=False, past_frames=clips.past_frames, camera_names=clips.cameras)
 
 
 def rig_of(agent: str) -> RigPlan:
@@ -196,8 +192,9 @@ def make_agent(
         return SightDriver(_driver(folder))
     if agent.startswith((STUDENT, OLD_STUDENT)):
         return AlternatingStudent(following(_seeing(folder), clock), _expert(town), clock, seed)
-    student = _fitted(folder) if agent.startswith(EGO_MLP) else following(_seeing(folder), clock)
-    return RestartingAgent(student, clock)
+    if agent.startswith(EGO_MLP):
+        return RestartingAgent(_fitted(folder), clock)
+    return RestartingAgent(following(_seeing(folder), clock), clock, _seeing(folder).is_free)
 
 
 def is_remote(agent: str) -> bool:

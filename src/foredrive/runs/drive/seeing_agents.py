@@ -11,6 +11,7 @@ from foredrive.evaluation.frame_keys import MAX_GAP_S
 from foredrive.models.agent import PlanningAgent
 from foredrive.models.tasks.following import AgentFollower
 from foredrive.scene import Agent, Clip, Trajectory
+from foredrive.simulation.restarts import is_free_ahead
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,6 +30,13 @@ class SeeingAgent:
     def act(self, observation: Clip) -> Trajectory:
         """Return the plan."""
         return self.agent.act(self.seen(observation))
+
+    @torch.no_grad()
+    def is_free(self, observation: Clip) -> bool:
+        """Return whether the world model sees nothing right ahead, for an observation of a batch of one."""
+        world = self.agent.world_model
+        decoded = world.decode(self.agent.rollout(self.seen(observation), 0)[0])
+        return is_free_ahead(decoded.occupancy_logit[0], world.spec)
 
 
 class FollowingAgent:
