@@ -10,12 +10,13 @@ from foredrive.data import ClipDataset
 from foredrive.data.log_paths import LogPath
 from foredrive.driver.judging import judge_sight
 from foredrive.driver.packed import PackedClips, join
-from foredrive.driver.recipe import DriverRecipe, driver_small
 from foredrive.errors import InputError
+from foredrive.recipes.driver import DriverRecipe, driver_nemo, driver_small
 from foredrive.recipes.known import find_driver_recipe, find_recipe
 from foredrive.runs.drive.agents import inputs_of, make_agent
+from foredrive.runs.shipped import run_folder
 from foredrive.runs.train.driver import load_driver, open_driver, train_driver
-from foredrive.runs.train.run import open_run
+from foredrive.runs.train.run import load_agent, open_run
 from foredrive.sensors.rigs import FRONT_TELE, camera_rig
 from foredrive.towns import virtual_egos
 from foredrive.towns.sensing.capture import SensorSuite
@@ -100,6 +101,23 @@ def test_a_run_is_continued_and_drives(logs: list[LogPath], dataset: ClipDataset
     inputs = inputs_of(str(folder))
     assert (inputs.cameras, inputs.lidar, inputs.past_frames) == (True, False, 1)
     assert inputs.camera_names == ("pcam_f0", "ftcam_tele_f0")
+
+
+def test_eyes_that_read_a_volume_start_from_a_pretrained_run(logs: list[LogPath], tmp_path: Path) -> None:
+    nemo, start = driver_nemo(), run_folder(Path("embedded:nemo_town"))
+    short = dataclasses.replace(recipe().see, steps=0)
+    small = dataclasses.replace(recipe(), eyes=nemo.eyes, see=short)
+    fresh = load_driver(train_driver(small, logs, tmp_path / "fresh", tmp_path / "cache"))
+    started = load_driver(train_driver(small, logs, tmp_path / "started", tmp_path / "cache", start))
+    weights = load_agent(open_run(start)).world_model.state_dict()
+    for name, weight in started.eyes.state_dict().items():
+        if not name.startswith("reader"):
+            torch.testing.assert_close(weight, weights[name])
+    pairs = zip(fresh.eyes.encoder.parameters(), started.eyes.encoder.parameters(), strict=True)
+    assert any(not torch.equal(one, other) for one, other in pairs)
+    cameras = dataclasses.replace(recipe(), see=short)
+    with pytest.raises(InputError, match="only eyes that read a volume"):
+        train_driver(cameras, logs, tmp_path / "x", tmp_path / "cache", start)
 
 
 def test_recipes_of_drivers_are_found_by_name_and_file(tmp_path: Path) -> None:

@@ -9,8 +9,10 @@ from conftest import synthetic_example
 from foredrive.driver.eyes import CameraEyes, CameraEyesConfig
 from foredrive.driver.losses import SightWeights, lamp_places, sight_losses
 from foredrive.driver.sight import Sight, line_m, scaled_line
+from foredrive.driver.volume_eyes import VolumeEyes, VolumeEyesConfig
 from foredrive.errors import InputError
 from foredrive.geometry.se3 import inverse_se3, transform_points
+from foredrive.recipes.nemo import nemo_town
 from foredrive.scene import VoxelSpec
 from foredrive.scene.affordances import CELLS, TIMES, Affordances
 from foredrive.scene.traffic_light import LightState
@@ -70,6 +72,40 @@ def test_past_frames_are_read_where_the_cells_were_then() -> None:
         expected = again.view(2, 2, 2, -1, 2, 2)[:, :, row]
         torch.testing.assert_close(by_height, expected, atol=1e-4, rtol=1e-4)
         assert by_height.abs().amax() > 0.1
+
+
+@torch.no_grad()
+def test_a_volume_is_read_in_the_cells_of_its_frame() -> None:
+    """The features are the places themselves: x, y and z of the volume's own frame."""
+    town, spec = nemo_town().model, VoxelSpec((-8.0, -10.0, -1.5), 1.0, (5, 20, 32))
+    config = VolumeEyesConfig(dataclasses.replace(town, unseen="zero"), spec)
+    network = VolumeEyes(config).eval()
+    clip = synthetic_example(spec=SPEC, batch=2, past=1, future=0, cameras=2).clip
+    places = spec.centres_m().permute(3, 0, 1, 2).expand(2, 2, -1, -1, -1, -1)
+    cells = torch.tensor([[[[5.0, 0.5], [8.0, -1.0]], [[7.0, 1.0], [90.0, 2.0]]]]).expand(2, -1, -1, -1)
+    read = network._read(clip, cells, places).view(2, 2, 3, 4, 2, 2)  # [b T height channel G L]
+    T = inverse_se3(clip.T_world_ego[:, 0]) @ clip.T_world_ego[:, 1]
+    for t, T_frame_now in enumerate((T, torch.eye(4).expand_as(T))):
+        for row, height in enumerate((0.0, 1.0, 2.0)):
+            points = torch.cat([cells.flatten(1, 2), torch.full((2, 4, 1), height)], dim=-1)
+            moved = transform_points(T_frame_now.float(), points)
+            inside = (moved[..., 0] < 24) & (moved[..., 1].abs() < 10)
+            values = read[:, t, row].flatten(-2).transpose(1, 2)
+            assert torch.equal(values[..., 3] > 0, inside)
+            torch.testing.assert_close(values[inside][:, :3], moved[inside], atol=1e-3, rtol=0)
+    assert not read[..., -1, -1].any()  # 90 m ahead
+
+
+def test_frozen_eyes_train_what_reads_them_alone() -> None:
+    spec = VoxelSpec((-8.0, -10.0, -1.5), 2.0, (3, 10, 16))
+    network = VolumeEyes(VolumeEyesConfig(nemo_town().model, spec, frozen=True)).train()
+    clip = synthetic_example(spec=SPEC, batch=2, past=1, future=0, cameras=2).clip
+    sight_losses(network(clip), truth(), clip.rig[:, clip.now], SightWeights())["loss"].backward()
+    assert not network.backbone.training
+    moved = {
+        name.split(".")[0] for name, p in network.named_parameters() if p.grad is not None and p.grad.any()
+    }
+    assert moved == {"reader"}
 
 
 @torch.no_grad()

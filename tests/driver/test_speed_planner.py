@@ -7,7 +7,7 @@ import pytest
 import torch
 from test_eyes import truth
 
-from foredrive.driver.objective import rule_of, true_estimate
+from foredrive.driver.planner_fit import rule_of, true_estimate
 from foredrive.driver.speed_planner import (
     BRAKING,
     PROFILES,

@@ -16,8 +16,8 @@ def recipes(
         name: Print this recipe; without a name, all recipes are listed.
     """
     with importing():
-        from foredrive.driver.recipe import DRIVER_RECIPES
         from foredrive.recipes.config import recipe_yaml
+        from foredrive.recipes.driver import DRIVER_RECIPES
         from foredrive.recipes.known import RECIPES, find_driver_recipe, find_recipe
         from foredrive.recipes.rebuilding import REBUILD_RECIPES, find_rebuild_recipe
 

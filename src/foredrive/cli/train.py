@@ -1,11 +1,13 @@
 """`foredrive train`."""
 
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 
 import tyro
 
 from foredrive.cli.arguments import OptionalPath, Settings, SomePaths, check_out_folder, check_run, rank
+from foredrive.cli.progress import job_progress
 from foredrive.data.log_paths import find_all_logs
 from foredrive.errors import InputError
 from foredrive.lazy import importing
@@ -70,9 +72,10 @@ def train(
 
     driver = find_driver_recipe(recipe, set)
     if driver is not None:
-        if tasks or start is not None or rank() is not None:
-            raise InputError(f"{driver.name} trains a driver: leave out --tasks, --start and torchrun")
-        train_driver(driver, found, out, cache)
+        if tasks or rank() is not None:
+            raise InputError(f"{driver.name} trains a driver: leave out --tasks and torchrun")
+        packing = partial(job_progress, "packing clips")
+        train_driver(driver, found, out, cache, start, packing)
         print(f"trained {driver.name}: {out}")
         print(f"next: foredrive drive --agent {out} --routes town05-short --out {out / 'short'}")
         return

@@ -12,6 +12,7 @@ from foredrive.data.affordances import PASSED_M, POINTS, PathAhead
 from foredrive.driver.eyes import CameraEyes
 from foredrive.driver.sight import Sight
 from foredrive.driver.speed_planner import SpeedPlanner, profile_progress
+from foredrive.driver.volume_eyes import VolumeEyes
 from foredrive.models.ego_mlp import ego_speeds
 from foredrive.scene import Clip, Trajectory
 from foredrive.scene.affordances import PathEstimate
@@ -47,7 +48,7 @@ class Driver(nn.Module):
         planner: what scores speeds.
     """
 
-    def __init__(self, eyes: CameraEyes, planner: SpeedPlanner) -> None:
+    def __init__(self, eyes: CameraEyes | VolumeEyes, planner: SpeedPlanner) -> None:
         super().__init__()
         self.eyes, self.planner = eyes, planner
 

@@ -1,24 +1,22 @@
 """Eyes of a driver: a small convolutional network on two cameras and some key frames."""
 
+import dataclasses
 from dataclasses import dataclass
+from typing import Literal
 
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from foredrive.driver.route_cells import BESIDE_M, HEIGHTS_M, route_cells, sample_cameras
-from foredrive.driver.sight import LampHead, OccupancyHead, Sight, conv_block
+from foredrive.driver.route_cells import HEIGHTS_M, route_cells, sample_cameras
+from foredrive.driver.sight import RouteReader, Sight, conv_block
 from foredrive.errors import InputError
 from foredrive.geometry.se3 import compose_se3, inverse_se3, transform_points
-from foredrive.models.ego_mlp import ego_speeds
 from foredrive.scene import Clip
-from foredrive.scene.clip import ROUTE_M
 
 FINE, COARSE, FINE_READ = 32, 48, 16
 """Channels of the features at strides 4 and 8, and how many of the former the cells read."""
-CONTEXT = 64
-SPEED_SCALE_MPS, ROUTE_SCALE_M = 8.0, 20.0
 MEAN_GREY, SPREAD_GREY = 0.45, 0.25
 
 
@@ -31,6 +29,7 @@ class CameraEyesConfig:
     cameras: int = 2
     blind: bool = False
     """Images are black: what the route and the speed alone tell."""
+    kind: Literal["cameras"] = "cameras"
 
 
 class Trunk(nn.Module):
@@ -54,6 +53,25 @@ class Trunk(nn.Module):
         return fine, F.relu(coarse + deep)
 
 
+def blacked(clip: Clip) -> Clip:
+    """Return the clip with black images."""
+    return dataclasses.replace(clip, images=torch.zeros_like(clip.images))
+
+
+def seen_frames(clip: Clip, frames: int, cameras: int) -> Clip:
+    """Return the last key frames of a clip, now included.
+
+    Raises:
+        InputError: the clip has another number of cameras, or fewer frames.
+    """
+    if clip.images.shape[2] != cameras or clip.now + 1 < frames:
+        raise InputError(
+            f"a driver with {cameras} cameras and {frames} key frames cannot see a clip of "
+            f"{clip.images.shape[2]} cameras and {clip.now + 1} key frames"
+        )
+    return clip.frames(slice(clip.now + 1 - frames, clip.now + 1))
+
+
 class CameraEyes(nn.Module):
     """A convolutional trunk for each camera, features sampled along the route in each key frame, two heads.
 
@@ -69,12 +87,8 @@ class CameraEyes(nn.Module):
         self.config = config
         self.trunks = nn.ModuleList([Trunk() for _ in range(config.cameras)])
         self.narrow = nn.ModuleList([nn.Conv2d(FINE, FINE_READ, 1) for _ in range(config.cameras)])
-        self.context = nn.Sequential(
-            nn.Linear(3 * len(ROUTE_M) + 1, CONTEXT), nn.ReLU(), nn.Linear(CONTEXT, CONTEXT), nn.ReLU()
-        )
-        self.lamps = LampHead(FINE + COARSE, COARSE, CONTEXT, config.cameras)
         of_frame = config.cameras * len(HEIGHTS_M) * (COARSE + FINE_READ + 1)
-        self.occupancy = OccupancyHead(config.frames * of_frame + 4)
+        self.reader = RouteReader(config.frames * of_frame, FINE + COARSE, COARSE, config.cameras)
 
     def forward(self, clip: Clip) -> Sight:
         """Return what is seen of the route at now.
@@ -82,34 +96,16 @@ class CameraEyes(nn.Module):
         Raises:
             InputError: the clip has other cameras or fewer frames.
         """
-        now, config = clip.now, self.config
-        if clip.images.shape[2] != config.cameras or now + 1 < config.frames:
-            raise InputError(
-                f"a driver with {config.cameras} cameras and {config.frames} key frames cannot see a clip "
-                f"of {clip.images.shape[2]} cameras and {now + 1} key frames"
-            )
-        frames = clip.frames(slice(now + 1 - config.frames, now + 1))
-        speed = ego_speeds(clip.observed())[:, now] / SPEED_SCALE_MPS
-        route = clip.route_xy / ROUTE_SCALE_M
-        route = torch.cat([route, clip.route_valid[..., None].to(route)], dim=-1)
-        context = self.context(torch.cat([route.flatten(1), speed[:, None]], dim=-1))
-        cells = route_cells(clip.route_xy, clip.route_valid)
+        clip = blacked(clip) if self.config.blind else clip
+        frames = seen_frames(clip, self.config.frames, self.config.cameras)
         fine, coarse = self._features(frames)
-        mean = coarse[:, -1].mean((-2, -1))
         wide = F.interpolate(coarse[:, -1].flatten(0, 1), size=fine.shape[-2:], mode="nearest")
-        wide = wide.unflatten(0, (len(cells), config.cameras))
-        lamps = self.lamps(torch.cat([fine[:, -1], wide], dim=2), mean, context)
-        read = self._read(frames, cells, fine, coarse)
-        place = torch.cat(
-            [
-                cells.permute(0, 3, 1, 2) / ROUTE_SCALE_M,
-                cells.new_tensor(BESIDE_M).div(10.0).expand(len(cells), 1, *cells.shape[1:3]),
-                speed.to(cells)[:, None, None, None].expand(-1, 1, *cells.shape[1:3]),
-            ],
-            dim=1,
+        wide = wide.unflatten(0, coarse.shape[:1] + coarse.shape[2:3])
+        cells = self._read(frames, route_cells(clip.route_xy, clip.route_valid), fine, coarse)
+        sight: Sight = self.reader(
+            clip, cells, torch.cat([fine[:, -1], wide], dim=2), coarse[:, -1].mean((-2, -1))
         )
-        light, lamp_logits, lamp_line = lamps
-        return Sight(light, lamp_logits, lamp_line, self.occupancy(torch.cat([read.to(place), place], dim=1)))
+        return sight
 
     def _features(
         self, frames: Clip
@@ -117,8 +113,6 @@ class CameraEyes(nn.Module):
         """Return the features of all images at strides 4 and 8."""
         b, t = frames.images.shape[:2]
         images = (frames.images.float() / 255 - MEAN_GREY) / SPREAD_GREY
-        if self.config.blind:
-            images = torch.zeros_like(images)
         fine, coarse = [], []
         for c, trunk in enumerate(self.trunks):
             one = images[:, :, c].flatten(0, 1).contiguous(memory_format=torch.channels_last)

@@ -1,28 +1,15 @@
 """Training of a driver: its eyes on logs, its planner by the rule."""
 
 import dataclasses
-from collections.abc import Callable
 
-import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from foredrive.data.affordances import PathAhead
-from foredrive.data.batches import stack_records
-from foredrive.driver.agent import Driver
 from foredrive.driver.eyes import CameraEyes
 from foredrive.driver.losses import SightWeights, sight_losses
-from foredrive.driver.packed import PackedClips, RouteExample, join
-from foredrive.driver.recipe import PlanFit
-from foredrive.driver.speed_planner import chosen_labels, profile_numbers, profile_progress
-from foredrive.errors import InputError
-from foredrive.models.ego_mlp import ego_speeds
-from foredrive.scene.affordances import Affordances, PathEstimate
-from foredrive.scene.traffic_light import LightState
-from foredrive.simulation.observation import HORIZON_STEPS
-from foredrive.simulation.speed_rule import FRONT_M, Obstacle, PathView, curve_speed, rule_progress
-from foredrive.training.in_memory_fit import fit_in_memory
+from foredrive.driver.packed import RouteExample
+from foredrive.driver.volume_eyes import VolumeEyes
 
 FASTEST_MPS = 9.0
 BRIGHTNESS, CONTRAST, COLOUR = 0.06, 0.2, 0.03
@@ -38,7 +25,7 @@ class SightObjective(nn.Module):
         weights: of the losses.
     """
 
-    def __init__(self, eyes: CameraEyes, weights: SightWeights) -> None:
+    def __init__(self, eyes: CameraEyes | VolumeEyes, weights: SightWeights) -> None:
         super().__init__()
         self.eyes, self.weights = eyes, weights
 
@@ -64,92 +51,3 @@ def _recoloured(example: RouteExample, generator: torch.Generator) -> RouteExamp
     changed = changed + 255 * BRIGHTNESS * normal(1, 1, 1, 1, 1) + 255 * COLOUR * normal(1, 1, 3, 1, 1)
     clip = dataclasses.replace(example.clip, images=changed.clamp(0, 255).to(torch.uint8))
     return dataclasses.replace(example, clip=clip)
-
-
-def true_estimate(truth: Affordances) -> PathEstimate:
-    """Return the truth as an estimate. What is not known is not there."""
-    none = torch.full_like(truth.light, int(LightState.NONE))
-    light = torch.where(truth.light_known, truth.light, none).long()
-    return PathEstimate(torch.eye(4)[light], truth.light_m, (truth.occupied & truth.occupied_known).float())
-
-
-def rule_of(truth: Affordances, speed_mps: float) -> tuple[Float[np.ndarray, "S"], float]:
-    """Return the progress by the rule on the truth at a speed, and the highest speed of the path.
-
-    Args:
-        truth: unbatched.
-        speed_mps: m/s.
-    """
-    count = len(truth.path_xy)
-    path = PathAhead(truth.path_xy, np.zeros(count), truth.path_valid, FRONT_M, True)
-    lead = None
-    if bool(truth.lead & truth.lead_known):
-        lead_mps = float(truth.lead_mps)
-        lead = Obstacle(float(truth.lead_m), max(lead_mps, 0.0) if np.isfinite(lead_mps) else 0.0)
-    light = LightState(int(truth.light)) if bool(truth.light_known) else LightState.NONE
-    occupied = (truth.occupied & truth.occupied_known).numpy()
-    progress_m = rule_progress(path, speed_mps, PathView(light, float(truth.light_m), lead, occupied))
-    return progress_m, curve_speed(path)
-
-
-def fit_planner(
-    driver: Driver, clips: PackedClips, fit: PlanFit, seed: int, tick: Callable[[], None] = lambda: None
-) -> None:
-    """Fit the planner of a driver whose eyes are trained.
-
-    Args:
-        driver: in evaluation mode; its planner is changed.
-        clips: of training.
-        fit: schedule.
-        seed: seed of the choice of clips and speeds.
-        tick: called after each batch of clips that is seen.
-
-    Raises:
-        InputError: no clip has a route.
-    """
-    draws = np.random.default_rng(seed)
-    chosen = draws.permutation(len(clips))[: fit.clips]
-    truths: list[PathEstimate] = []
-    seen: list[PathEstimate] = []
-    speeds: list[float] = []
-    limits: list[float] = []
-    labels: list[Float[np.ndarray, S]] = []
-    for start in range(0, len(chosen), BATCH):
-        batch = join([clips[int(index)] for index in chosen[start : start + BATCH]])
-        truth, own = true_estimate(batch.truth), ego_speeds(batch.clip)[:, batch.clip.now]
-        sight = driver.see(batch.clip).estimate() if fit.seen_share > 0 else truth
-        for row in range(len(own)):
-            if int(batch.truth.path_valid[row].sum()) < 2:
-                continue
-            others = draws.uniform(0.0, FASTEST_MPS, fit.speeds - 1).tolist()
-            for speed_mps in (float(own[row]), *others):
-                progress_by_rule_m, limit_mps = rule_of(batch.truth[row], speed_mps)
-                truths.append(truth[row])
-                seen.append(sight[row])
-                speeds.append(speed_mps)
-                limits.append(limit_mps)
-                labels.append(progress_by_rule_m)
-        tick()
-    if not labels:
-        raise InputError("no clip has a route: a planner of speeds has nothing to learn from")
-    speed, limit = torch.tensor(speeds), torch.tensor(limits)
-    both = {
-        by_sight: torch.cat(
-            [
-                profile_numbers(stack_records(views[k : k + ROWS]), speed[k : k + ROWS], limit[k : k + ROWS])
-                for k in range(0, len(views), ROWS)
-            ]
-        )
-        for by_sight, views in ((False, truths), (True, seen))
-    }
-    rule_m = torch.from_numpy(np.stack(labels)).float()
-    progress_m = profile_progress(speed, limit, HORIZON_STEPS)
-    target = chosen_labels(progress_m, rule_m)
-    generator = torch.Generator().manual_seed(seed)
-
-    def loss(rows: Tensor) -> Tensor:
-        by_sight = bool(torch.rand((), generator=generator) < fit.seen_share)
-        logits = driver.planner.logits(both[by_sight][rows])
-        return -(target[rows] * logits.log_softmax(-1)).sum(-1).mean()
-
-    fit_in_memory(driver.planner, len(rule_m), loss, fit, seed)

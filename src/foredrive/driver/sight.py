@@ -6,12 +6,17 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from foredrive.driver.route_cells import BESIDE_M
+from foredrive.driver.route_cells import BESIDE_M, route_cells
+from foredrive.models.ego_mlp import ego_speeds
+from foredrive.scene import Clip
 from foredrive.scene.affordances import CELLS, TIMES, PathEstimate
+from foredrive.scene.clip import ROUTE_M
 from foredrive.scene.record import Record
 from foredrive.scene.traffic_light import LightState
 
 COLOURS = (LightState.RED, LightState.YELLOW, LightState.GREEN)
+CONTEXT = 64
+SPEED_SCALE_MPS, ROUTE_SCALE_M = 8.0, 20.0
 RARE_LOGIT, NONE_LOGIT = -4.0, -2.0
 LIGHT_SCALE_M, LINE_BEFORE_LAMP_M = 20.0, 4.0
 """The distance of a stop line is read at the lamp, as a logarithm from some metres before the line."""
@@ -48,6 +53,57 @@ def line_m(scaled: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
 def scaled_line(light_m: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
     """Return the inverse of `line_m`."""
     return ((light_m + LINE_BEFORE_LAMP_M).clamp_min(1.0) / LIGHT_SCALE_M).log()
+
+
+class RouteReader(nn.Module):
+    """Reads the route from features of any eyes: who is on it, and its light.
+
+    Args:
+        cells: channels of the features in the cells along and beside the route.
+        fine: channels of the fine image features, in which lamps are read.
+        wide: channels of the features whose mean tells that there is no light.
+        cameras: number of cameras.
+    """
+
+    def __init__(self, cells: int, fine: int, wide: int, cameras: int) -> None:
+        super().__init__()
+        self.context = nn.Sequential(
+            nn.Linear(3 * len(ROUTE_M) + 1, CONTEXT), nn.ReLU(), nn.Linear(CONTEXT, CONTEXT), nn.ReLU()
+        )
+        self.lamps = LampHead(fine, wide, CONTEXT, cameras)
+        self.occupancy = OccupancyHead(cells + 4)
+
+    def forward(
+        self,
+        clip: Clip,
+        cells: Float[Tensor, "b F G L"],
+        fine: Float[Tensor, "b C K h w"],
+        mean: Float[Tensor, "b C W"],
+    ) -> Sight:
+        """Return what is on the route.
+
+        Args:
+            clip: its route and speed at now are read.
+            cells: features in the cells of `route_cells`.
+            fine: image features at now.
+            mean: mean image features at now.
+        """
+        speed = ego_speeds(clip.observed())[:, clip.now] / SPEED_SCALE_MPS
+        route = clip.route_xy / ROUTE_SCALE_M
+        route = torch.cat([route, clip.route_valid[..., None].to(route)], dim=-1)
+        context = self.context(torch.cat([route.flatten(1), speed[:, None]], dim=-1))
+        light, lamps, lines = self.lamps(fine, mean, context)
+        middles = route_cells(clip.route_xy, clip.route_valid)
+        shape = (-1, 1, *middles.shape[1:3])
+        place = torch.cat(
+            [
+                middles.permute(0, 3, 1, 2) / ROUTE_SCALE_M,
+                middles.new_tensor(BESIDE_M).div(10.0).expand(len(middles), *shape[1:]),
+                speed.to(middles)[:, None, None, None].expand(*shape),
+            ],
+            dim=1,
+        )
+        return Sight(light, lamps, lines, self.occupancy(torch.cat([cells.to(place), place], dim=1)))
 
 
 class LampHead(nn.Module):

@@ -6,7 +6,6 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from foredrive.driver.recipe import DRIVER_RECIPES, DriverRecipe
 from foredrive.errors import InputError
 from foredrive.recipes.config import (
     Recipe,
@@ -17,6 +16,7 @@ from foredrive.recipes.config import (
     recipe_from,
     validated,
 )
+from foredrive.recipes.driver import DRIVER_RECIPES, DriverRecipe
 from foredrive.recipes.driveworld import (
     driveworld_base,
     driveworld_drive_tele,

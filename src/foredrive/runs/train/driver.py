@@ -1,7 +1,8 @@
 """Runs of drivers: the folder with the recipe, the eyes' training and the weights of the whole driver."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -10,22 +11,26 @@ from safetensors.torch import save_file
 
 from foredrive.data import ClipDataset, LogPath
 from foredrive.driver.agent import Driver
-from foredrive.driver.eyes import CameraEyes
-from foredrive.driver.objective import SightObjective, fit_planner
+from foredrive.driver.eyes import CameraEyes, CameraEyesConfig
+from foredrive.driver.objective import SightObjective
 from foredrive.driver.packed import PackedClips, join
-from foredrive.driver.recipe import DriverRecipe
+from foredrive.driver.planner_fit import fit_planner
 from foredrive.driver.speed_planner import SpeedPlanner
+from foredrive.driver.volume_eyes import VolumeEyes
 from foredrive.errors import InputError
 from foredrive.files import atomic_path
 from foredrive.recipes.config import read_values, save_recipe, validated
+from foredrive.recipes.driver import DriverRecipe
 from foredrive.runs.folder import CONFIG, LOGS, WEIGHTS, RunFolder
 from foredrive.runs.open_clips import open_clips
 from foredrive.runs.train.rigs import RIGS, trained_rigs, write_rigs
-from foredrive.runs.train.run import read_log, written_log
+from foredrive.runs.train.run import pretrained_weights, read_log, written_log
 from foredrive.training import load_weights, train
 
 SEE, PLAN = "see", "plan"
 """Folders of the stages."""
+Packing = Callable[[int], AbstractContextManager[Callable[[], None]]]
+"""Shows the progress of a number of logs, each of which calls the function."""
 
 
 @dataclass(frozen=True)
@@ -35,6 +40,8 @@ class DriverRun:
     folder: Path
     recipe: DriverRecipe
     logs: tuple[LogPath, ...]
+    start: Path | None = None
+    """The run that gave the pre-trained encoder."""
 
 
 def is_driver(folder: Path) -> bool:
@@ -56,7 +63,9 @@ def open_driver(folder: Path) -> DriverRun:
     recipe: DriverRecipe = validated(DriverRecipe, read_values(folder / CONFIG), str(folder / CONFIG))
     try:
         written = json.loads((folder / LOGS).read_text())
-        return DriverRun(folder, recipe, tuple(read_log(entry) for entry in written["logs"]))
+        start = written.get("start")
+        logs = tuple(read_log(entry) for entry in written["logs"])
+        return DriverRun(folder, recipe, logs, None if start is None else Path(start))
     except (OSError, ValueError, LookupError, TypeError, RecursionError) as error:
         raise InputError(f"{folder / LOGS}: cannot be read as paths of logs: {error}") from error
 
@@ -67,7 +76,7 @@ def load_driver(run: DriverRun) -> Driver:
     Raises:
         InputError: its training has not finished.
     """
-    driver = Driver(CameraEyes(run.recipe.eyes), SpeedPlanner(run.recipe.planner))
+    driver = build_driver(run.recipe)
     weights = run.folder / PLAN / WEIGHTS
     if not weights.is_file():
         raise InputError(f"{run.folder}: training has not finished; continue it with `foredrive train`")
@@ -75,8 +84,33 @@ def load_driver(run: DriverRun) -> Driver:
     return driver.eval()
 
 
+def build_driver(recipe: DriverRecipe) -> Driver:
+    """Build a driver with fresh weights."""
+    config = recipe.eyes
+    eyes = CameraEyes(config) if isinstance(config, CameraEyesConfig) else VolumeEyes(config)
+    return Driver(eyes, SpeedPlanner(recipe.planner))
+
+
+def _load_encoder(driver: Driver, start: Path) -> None:
+    """Load the pre-trained backbone and encoder of a run into eyes that read a volume.
+
+    Raises:
+        InputError: the eyes have none, or the run's are of another architecture.
+    """
+    if not isinstance(driver.eyes, VolumeEyes):
+        raise InputError("only eyes that read a volume start from a run: leave out --start")
+    weights = pretrained_weights(start)
+    load_weights(driver.eyes.backbone, weights, "world_model.backbone")
+    load_weights(driver.eyes.encoder, weights, "world_model.encoder")
+
+
 def train_driver(
-    recipe: DriverRecipe, logs: Sequence[LogPath], folder: Path, cache_dir: Path | None = None
+    recipe: DriverRecipe,
+    logs: Sequence[LogPath],
+    folder: Path,
+    cache_dir: Path | None = None,
+    start: Path | None = None,
+    packing: Packing = lambda count: nullcontext(lambda: None),
 ) -> DriverRun:
     """Train the eyes, then fit the planner. It continues where an earlier call stopped.
 
@@ -85,22 +119,28 @@ def train_driver(
         logs: logs with boxes and routes, and with lights to learn them.
         folder: folder of the run.
         cache_dir: folder of packed clips; by default in `folder`.
+        start: a run whose pre-trained encoder the eyes start from.
+        packing: shows the progress of packing.
 
     Raises:
         InputError: the folder holds another run, another process trains it, or a log cannot be read.
     """
     from foredrive.training import make_fabric  # the import takes seconds
 
-    run = DriverRun(folder, recipe, tuple(log.absolute() for log in logs))
+    start = None if start is None else start.absolute()
+    run = DriverRun(folder, recipe, tuple(log.absolute() for log in logs), start)
     claim = RunFolder(folder, _asked(run), lambda: _read(folder), lambda: _write(run))
     claim.check()
     dataset = open_clips(run.logs, recipe.clips, cache_dir or folder / "cache")
     clips = PackedClips(dataset, (cache_dir or folder / "cache") / "packed")
     with claim.claimed():
         _write_rigs(run, dataset)
-        clips.pack()
+        with packing(clips.logs) as tick:
+            clips.pack(tick)
         torch.manual_seed(recipe.see.seed)
-        driver = Driver(CameraEyes(recipe.eyes), SpeedPlanner(recipe.planner))
+        driver = build_driver(recipe)
+        if start is not None:
+            _load_encoder(driver, start)
         eyes = folder / SEE / WEIGHTS
         if not eyes.is_file():
             fabric = make_fabric(recipe.precision)
@@ -128,6 +168,7 @@ def _asked(run: DriverRun) -> dict[str, object]:
     return {
         "a run with another recipe": asdict(run.recipe) | {"about": ""},
         "a run with other logs": run.logs,
+        "a run with another start": run.start,
     }
 
 
@@ -137,5 +178,7 @@ def _read(folder: Path) -> dict[str, object] | None:
 
 def _write(run: DriverRun) -> None:
     with atomic_path(run.folder / LOGS) as temporary:
-        temporary.write_text(json.dumps({"logs": [written_log(log) for log in run.logs]}, indent=1))
+        start = None if run.start is None else str(run.start)
+        entries = {"logs": [written_log(log) for log in run.logs], "start": start}
+        temporary.write_text(json.dumps(entries, indent=1))
     save_recipe(run.recipe, run.folder / CONFIG)

@@ -142,7 +142,7 @@ def train_run(
     dataset = open_clips(run.logs, recipe.clips, run.cache_dir)
     if recipe.tasks is not None and kept is None:
         check_truth(recipe.tasks.heads, run.logs)
-    pretrained = None if start is None or kept is not None else _pretrained(start)
+    pretrained = None if start is None or kept is not None else pretrained_weights(start)
     if recipe.planner.attends or recipe.tasks is not None:
         build_agent(recipe, fetch=False)  # heads that do not fit the rest must not create a run
     fabric = make_fabric(recipe.precision, sharing)
@@ -237,7 +237,7 @@ def _fit_path(run: Run, fit: PathFit, fabric: "Fabric") -> None:
     fabric.barrier()
 
 
-def _pretrained(start: Path) -> Path:
+def pretrained_weights(start: Path) -> Path:
     """Return the pre-trained weights of a run, or its last ones if only those were kept."""
     weights = start / "pretrain" / WEIGHTS
     if weights.is_file():

@@ -1,33 +1,19 @@
 """Recipes of drivers."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 from foredrive.data import ClipConfig
 from foredrive.data.task_truth import TaskTruthConfig
 from foredrive.driver.eyes import CameraEyesConfig
 from foredrive.driver.losses import SightWeights
+from foredrive.driver.planner_fit import PlanFit
 from foredrive.driver.speed_planner import SpeedPlannerConfig
+from foredrive.driver.volume_eyes import VolumeEyesConfig
+from foredrive.recipes.nemo import nemo_town
 from foredrive.scene import VoxelSpec
 from foredrive.sensors.rigs import FRONT_TELE
 from foredrive.training import Schedule
-from foredrive.training.in_memory_fit import FitSchedule
-
-
-@dataclass(frozen=True)
-class PlanFit(FitSchedule):
-    """Fit of the planner to the rule, on the truth of the training clips and on what the eyes see of them."""
-
-    steps: int = 6000
-    batch_size: int = 256
-    lr: float = 2e-3
-    weight_decay: float = 1e-3
-    speeds: int = 3
-    """Speeds at which each clip is driven: its own and random ones."""
-    clips: int = 6000
-    """Most clips that are used."""
-    seen_share: float = 0.5
-    """Share of the rows in which the planner reads what the eyes see, in place of the truth."""
 
 
 @dataclass(frozen=True)
@@ -36,7 +22,7 @@ class DriverRecipe:
 
     name: str
     clips: ClipConfig
-    eyes: CameraEyesConfig
+    eyes: CameraEyesConfig | VolumeEyesConfig
     planner: SpeedPlannerConfig
     see: Schedule
     """Training of the eyes."""
@@ -82,4 +68,20 @@ def driver_small() -> DriverRecipe:
     )
 
 
-DRIVER_RECIPES: dict[str, DriverRecipe] = {recipe.name: recipe for recipe in (driver_small(),)}
+def driver_nemo() -> DriverRecipe:
+    """Return a driver that reads NeMo's volume and features along the route, both trained on.
+
+    `foredrive train driver_nemo --start RUN` starts from the pre-trained encoder of a run with the same world
+    model, such as the one that comes with the package.
+    """
+    small, town = driver_small(), nemo_town()
+    return replace(
+        small,
+        name="driver_nemo",
+        about="driver_small with NeMo's backbone and volume as its eyes",
+        eyes=VolumeEyesConfig(world=town.model, voxels=town.clips.voxels, frames=small.eyes.frames),
+        see=replace(small.see, lr=1e-3),
+    )
+
+
+DRIVER_RECIPES: dict[str, DriverRecipe] = {recipe.name: recipe for recipe in (driver_small(), driver_nemo())}
