@@ -141,18 +141,21 @@ def record_virtual_egos(
         InputError: there is no such town.
         OSError: the disk is full.
     """
+    split = split_of(town)
+    folders = [out / "logs" / split / f"{town}_seed{seed}_ego{number:04d}" for number in range(count)]
+    if all((folder / "sync.arrow").is_file() for folder in folders):  # without growing the town again
+        return [LogPath(folder, out / "maps") for folder in folders]
     town_map = load_town_map(town)
     rng = np.random.default_rng((seed, 5))
     first = World(town_map, seed, conditions[0] if conditions else None)
     others = conditions[1:] if conditions else [draw_daylight(rng) for _ in range(WORLDS - 1)]
     worlds = [first, *map(first.under, others)]
     maps = write_town_map(town, out)
-    split = split_of(town)
     logs: list[LogPath] = []
     for window, egos in _windows(town_map, seed, rng):
         for ego in egos[: count - len(logs)]:
             of_log = np.random.default_rng((seed, 6, len(logs)))  # whether the logs before are there or not
-            path = LogPath(out / "logs" / split / f"{town}_seed{seed}_ego{len(logs):04d}", maps)
+            path = LogPath(folders[len(logs)], maps)
             if not (path.folder / "sync.arrow").is_file():  # logs get their names when they are whole
                 world = worlds[int(of_log.integers(len(worlds)))]
                 inserted = _insert_all(window, ego, of_log)

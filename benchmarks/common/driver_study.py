@@ -1,0 +1,72 @@
+"""Drivers of a study: the same virtual egos for all arms, training, and figures of what they see."""
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from foredrive.data import LogPath
+from foredrive.driver.judging import judge_sight
+from foredrive.driver.packed import PackedClips
+from foredrive.errors import InputError
+from foredrive.recipes.driver import DRIVER_RECIPES, DriverRecipe
+from foredrive.runs.drive.recording import EgosPlan, record_egos
+from foredrive.runs.open_clips import open_clips
+from foredrive.runs.shipped import run_folder
+from foredrive.runs.train.driver import DriverRun, load_driver, train_driver
+from foredrive.sensors.rigs import FRONT_TELE
+from foredrive.towns.map.names import TEST_TOWNS, TOWNS
+
+TRAINING_TOWNS = tuple(town for town in TOWNS if town not in TEST_TOWNS)
+EGOS, TEST_EGOS = 60, 300
+"""Logs of virtual egos of each training town and seed, and of Town05: five clips each."""
+PRETRAINED = "embedded:nemo_town"
+
+
+def egos(seeds: Sequence[int], folder: Path, workers: int) -> list[LogPath]:
+    """Return the virtual egos of the training towns, by seed and then by town; record those that are missing.
+
+    Raises:
+        InputError: some failed: all arms must have the same data.
+    """
+    return _recorded(
+        [EgosPlan(town, seed, EGOS) for seed in seeds for town in TRAINING_TOWNS], folder, workers
+    )
+
+
+def test_egos(folder: Path, workers: int) -> list[LogPath]:
+    """Return the virtual egos of the held-out town."""
+    return _recorded([EgosPlan(town, 0, TEST_EGOS) for town in TEST_TOWNS], folder, workers)
+
+
+def _recorded(plans: list[EgosPlan], folder: Path, workers: int) -> list[LogPath]:
+    logs, failed = record_egos(plans, folder, FRONT_TELE, workers)
+    if failed:
+        raise InputError(f"{len(failed)} recordings failed: {next(iter(failed.values()))}")
+    return sorted(logs, key=lambda log: _order(log.folder.name))
+
+
+def _order(name: str) -> tuple[int, str]:
+    """Return the seed of a log, then its name."""
+    return int(name.split("_seed")[1].split("_")[0]), name
+
+
+def recipe_of(
+    name: str, seed: int, change: Callable[[DriverRecipe], DriverRecipe] = lambda recipe: recipe
+) -> DriverRecipe:
+    """Return a recipe of a driver with a seed and other changes."""
+    recipe = change(DRIVER_RECIPES[name])
+    return dataclasses.replace(recipe, see=dataclasses.replace(recipe.see, seed=seed))
+
+
+def trained(
+    recipe: DriverRecipe, logs: Sequence[LogPath], folder: Path, cache: Path, *, pretrained: bool = False
+) -> DriverRun:
+    """Return a trained driver; train what is missing."""
+    return train_driver(recipe, logs, folder, cache, run_folder(Path(PRETRAINED)) if pretrained else None)
+
+
+def sight_figures(run: DriverRun, logs: Sequence[LogPath], cache: Path) -> dict[str, float]:
+    """Return how well a driver sees the clips of some logs."""
+    clips = PackedClips(open_clips(logs, run.recipe.clips, cache), cache / "packed")
+    clips.pack()
+    return judge_sight(load_driver(run), clips)
