@@ -1,14 +1,17 @@
 """Speed of closed-loop driving, with and without sensors, and growth of its memory.
 
-`foredrive bench drive-speed`.
+`foredrive bench drive-speed`. `demonstration_N` records with N cameras and without lidar.
 
 The expert drives Town05's long routes among 40 vehicles and 20 pedestrians; only the simulator's steps are
 timed.
 """
 
+import tempfile
 import time
 from collections.abc import Iterator, Mapping
+from functools import partial
 from itertools import cycle
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -19,9 +22,11 @@ from foredrive.data.resizing import shrink_images
 from foredrive.evaluation.bench import Benchmark
 from foredrive.recipes import find_recipe
 from foredrive.runs.build import build_agent
+from foredrive.runs.drive.in_towns import TownRoutes
+from foredrive.runs.drive.suite import DriveSuite, drive_one
 from foredrive.scene import Clip
 from foredrive.scene.conditions import BackgroundTraffic
-from foredrive.sensors.rigs import camera_rig
+from foredrive.sensors.rigs import DRIVING, TELE, RigPlan, camera_rig
 from foredrive.sensors.vehicle import roof_lidar
 from foredrive.simulation.controller import ControllerState, follow
 from foredrive.simulation.dynamics import STEP_S
@@ -37,6 +42,13 @@ TRAFFIC = BackgroundTraffic(vehicles=40, pedestrians=20)
 ROUTES = "town05-long"
 SECONDS, HOUR_S, WARM_UP_S = 60.0, 3600.0, 300.0
 PLANS = 20
+RIGS = (
+    ("PCAM_F0",),
+    ("PCAM_F0", TELE),
+    ("PCAM_F0", "PCAM_L0", "PCAM_R0"),
+    tuple(DRIVING.cameras),
+)
+"""Cameras of the demonstrations."""
 
 
 def _suite() -> SensorSuite:
@@ -96,6 +108,21 @@ def bare(seed: int) -> Mapping[str, float]:
     return {"bare_realtime_factor": SECONDS / took, "step_ms": 1000 * took * STEP_S / SECONDS}
 
 
+def demonstration(seed: int, cameras: tuple[str, ...]) -> Mapping[str, float]:
+    """Return the computing time of a second of the disturbed expert's demonstrations by day, log included."""
+    plan = RigPlan(DRIVING.image_hw, {name: DRIVING.cameras[name] for name in cameras})
+    source = TownRoutes("training-short", seed=seed, rig=plan)
+    suite = DriveSuite("disturbed", source, lidar=False)
+    figures = {"cpu_s_a_second": 0.0, "driven_s": 0.0}
+    with tempfile.TemporaryDirectory() as folder:
+        drive_one(suite.jobs()[0], suite, Path(folder, "warm_up"))  # grows the town, compiles
+        began_s = time.process_time()
+        record = drive_one(suite.jobs()[1], suite, Path(folder))
+        figures["driven_s"] = record.score.duration_s
+        figures["cpu_s_a_second"] = (time.process_time() - began_s) / record.score.duration_s
+    return figures
+
+
 def hour(seed: int) -> Mapping[str, float]:
     """Return the growth of memory over an hour of driving with sensors, after the first minutes, MiB."""
     t_s, before, most = 0.0, 0.0, 0.0
@@ -110,7 +137,8 @@ def hour(seed: int) -> Mapping[str, float]:
 
 BENCHMARK = Benchmark(
     question="How fast is closed-loop driving in a town, and does its memory stay?",
-    arms={"sensors": sensors, "bare": bare, "hour": hour},
+    arms={"sensors": sensors, "bare": bare, "hour": hour}
+    | {f"demonstration_{len(cameras)}": partial(demonstration, cameras=cameras) for cameras in RIGS},
     seeds=(0,),
     config={"routes": ROUTES, "vehicles": 40, "people": 20, "seconds": SECONDS, "hour_s": HOUR_S},
 )

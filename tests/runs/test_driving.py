@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import shutil
+from collections import Counter
 from pathlib import Path
 from typing import Any
 from xml.sax.saxutils import quoteattr
@@ -12,8 +13,11 @@ import pytest
 import torch
 
 from foredrive.cli.main import main
+from foredrive.data.cameras import pinhole_cameras, read_camera
 from foredrive.data.clips import ClipConfig, ClipDataset
+from foredrive.data.lidar import read_sweep
 from foredrive.data.log_paths import LogPath, find_logs
+from foredrive.data.logs import Log
 from foredrive.errors import InputError
 from foredrive.evaluation.summary import read_summary
 from foredrive.files import atomic_path
@@ -21,8 +25,9 @@ from foredrive.runs.drive.agents import _run_folder, inputs_of
 from foredrive.runs.drive.in_towns import TownRoutes
 from foredrive.runs.drive.records import read_drive, suite_title, summarise
 from foredrive.runs.drive.route_source import job_of
-from foredrive.runs.drive.suite import DriveJob, DriveSuite, SuiteResult, drive_suite, folder_of
+from foredrive.runs.drive.suite import DriveJob, DriveSuite, SuiteResult, drive_one, drive_suite, folder_of
 from foredrive.scene import VoxelSpec
+from foredrive.scene.conditions import CONDITIONS
 from foredrive.sensors.rigs import SURROUND
 from foredrive.simulation.route_sets import RouteWaypoints
 from foredrive.simulation.routes import snap_route
@@ -123,6 +128,27 @@ def test_a_route_whose_id_cannot_name_a_file_is_refused(name: str, routes: Path,
             DriveSuite("stop", TownRoutes(str(file), vehicles=0, people=0), sensors=False), out, workers=1
         )
     assert [path.name for path in tmp_path.rglob("*")] == ["deep", "routes.xml"]
+
+
+def test_a_log_has_the_sensors_that_were_asked_for(suite: DriveSuite, tmp_path: Path) -> None:
+    """Images do not depend on whether a lidar turns beside them."""
+    images = {}
+    for lidar in (True, False):
+        some = dataclasses.replace(changed(suite, only=("b",)), lidar=lidar)
+        drive_one(some.jobs()[0], some, tmp_path / str(lidar))
+        log = Log(find_logs(tmp_path / str(lidar))[0])
+        assert (read_sweep(log, 0) is not None) is lidar
+        camera = pinhole_cameras(log)["PCAM_F0"]
+        images[lidar] = read_camera(log, 1, camera, (18, 32), with_image=True).image
+    assert torch.equal(images[True], images[False])
+
+
+def test_foggy_nights_are_drawn_seldom(suite: DriveSuite) -> None:
+    source = changed(suite, conditions="any").source
+    drawn = Counter(source.conditions_of("a", seed) for seed in range(2000))
+    assert set(drawn) == set(CONDITIONS.values())
+    others = [drawn[kind] for name, kind in CONDITIONS.items() if name != "night_fog"]
+    assert min(others) > 2 * drawn[CONDITIONS["night_fog"]]
 
 
 def test_only_some_routes_of_a_set_are_driven(suite: DriveSuite) -> None:

@@ -57,7 +57,9 @@ def drive(
     source = rebuilt.source() or towns.source(name)
     rig = getattr(source, "rig", None)
     faults = inputs.faults(() if rig is None else tuple(rig.cameras))
-    suite = DriveSuite(name, source, planning.sensors, planning.period, planning.latency, faults)
+    suite = DriveSuite(
+        name, source, planning.sensors, planning.lidar, planning.period, planning.latency, faults
+    )
     workers = towns.workers or len(os.sched_getaffinity(0))
     with DrivesProgress(len(suite.jobs())) as progress:
         driven = drive_suite(

@@ -32,11 +32,13 @@ class Planning:
     Args:
         sensors: Log cameras and lidar even if the agent does not need them; without them, drives are much
             faster.
+        lidar: Log the lidar too, in towns. Without it a demonstration costs less.
         period: Time between two plans, s.
         latency: Time from an observation until the plan made from it takes effect, s.
     """
 
     sensors: bool = True
+    lidar: bool = True
     period: Annotated[float, tyro.conf.arg(metavar="S")] = 0.5
     latency: Annotated[float, tyro.conf.arg(metavar="S")] = 0.1
 

@@ -62,13 +62,14 @@ class TownRoutes(RouteSource):
         """Return the set-up of one drive."""
         inputs, seed = inputs_of(suite.agent), self.seed + repetition
         sensed = inputs.cameras or inputs.lidar or suite.sensors
+        lidar = roof_lidar() if inputs.lidar or (suite.sensors and suite.lidar) else None
         return TownScenario(
             town=route.town,
             route_xyz=route.xyz,
             seed=seed,
             background_traffic=BackgroundTraffic(self.vehicles, self.people),
             conditions=self.conditions_of(route.id, seed),
-            sensors=SensorSuite(camera_rig(plan=self.rig), roof_lidar()) if sensed else None,
+            sensors=SensorSuite(camera_rig(plan=self.rig), lidar) if sensed else None,
             past_frames=inputs.past_frames,
             limit_s=timeout_s(route.length_m),
             lanes=route.lanes,

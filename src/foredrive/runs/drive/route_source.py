@@ -14,6 +14,7 @@ from foredrive.runs.drive.suite import DriveJob
 from foredrive.scene.conditions import (
     ANY_CONDITIONS,
     CONDITIONS,
+    DRAWN,
     BackgroundTraffic,
     Conditions,
     find_conditions,
@@ -95,7 +96,7 @@ class RouteSource:
             return None
         if self.conditions != ANY_CONDITIONS:
             return find_conditions(self.conditions)
-        return list(CONDITIONS.values())[drive_hash(seed, route) % len(CONDITIONS)]
+        return CONDITIONS[DRAWN[drive_hash(seed, route) % len(DRAWN)]]
 
 
 def _check_towns(name: str, routes: Sequence[RouteWaypoints]) -> None:

@@ -105,6 +105,8 @@ class DriveSuite:
     source: DriveSource
     sensors: bool = True
     """Whether cameras and lidar are logged even if the agent does not need them."""
+    lidar: bool = True
+    """Whether the lidar is among these sensors; in towns alone."""
     period_s: float = PlanningTiming.period_s
     latency_s: float = PlanningTiming.latency_s
     faults: Faults = NO_FAULTS
