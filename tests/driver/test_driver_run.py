@@ -103,6 +103,14 @@ def test_a_run_is_continued_and_drives(logs: list[LogPath], dataset: ClipDataset
     assert inputs.camera_names == ("pcam_f0", "ftcam_tele_f0")
 
 
+def test_a_run_goes_on_from_another_drivers_weights(logs: list[LogPath], tmp_path: Path) -> None:
+    first = train_driver(recipe(), logs, tmp_path / "first", tmp_path / "cache")
+    none = dataclasses.replace(recipe(), see=dataclasses.replace(recipe().see, steps=0))
+    second = load_driver(train_driver(none, logs, tmp_path / "second", tmp_path / "cache", first.folder))
+    for name, weight in load_driver(first).eyes.state_dict().items():
+        torch.testing.assert_close(second.eyes.state_dict()[name], weight)
+
+
 def test_eyes_that_read_a_volume_start_from_a_pretrained_run(logs: list[LogPath], tmp_path: Path) -> None:
     nemo, start = driver_nemo(), run_folder(Path("embedded:nemo_town"))
     short = dataclasses.replace(recipe().see, steps=0)

@@ -37,9 +37,10 @@ def train(
             that towns record, visible or not. A run with recorded labels is evaluated with them, others with
             those of the frame's sweep.
         start: Another run's folder, or a model that comes with the package (embedded:nemo_town): use its
-            pre-trained weights and begin with fine-tuning. With --probe, use its world model and planner as
-            they are. With --set transfer=frozen, keep its world model and its heads as they are and train the
-            planner alone.
+            pre-trained weights and begin with fine-tuning. For a driver, the run of another: go on from its
+            weights, and draw clips in which it is wrong more often. With --probe, use its world model and
+            planner as they are. With --set transfer=frozen, keep its world model and its heads as they are
+            and train the planner alone.
         tasks: Tasks to train heads for, separated by commas: detection, tracking, map, motion, occupancy.
             Fine-tuning trains them together with the world model, and also affordances: the next light, the
             lead vehicle and who will cross. With --probe also instances: the vehicles' cells now and in

@@ -1,11 +1,12 @@
 """How well a driver sees: figures over packed clips, before any planning."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
+from torch import Tensor
 
 from foredrive.data.affordances import PathAhead
 from foredrive.driver.agent import Driver
@@ -47,6 +48,19 @@ class Moment(NamedTuple):
     crossing: bool
     """The conflict is with somebody who is not in the path now."""
 
+    @property
+    def judged(self) -> bool:
+        """Return whether there is a light within `LIGHT_M` whose lamps an image shows."""
+        lit = self.lit and self.visible and self.state != LightState.NONE
+        return lit and self.light_m <= LIGHT_M
+
+    @property
+    def missed(self) -> bool:
+        """Return whether somebody who would be met is not seen, or whether to stop for the light is wrong."""
+        stops = (LightState.RED, LightState.YELLOW)
+        wrong = self.judged and (self.state in stops) != (self.named in stops)
+        return wrong or (self.conflict and not bool(self.conflict_seen[THRESHOLDS.index(0.5)]))
+
 
 def judge_sight(
     driver: Driver, clips: PackedClips, tick: Callable[[], None] = lambda: None
@@ -65,7 +79,23 @@ def judge_sight(
         clips: with known truth.
         tick: called after each batch.
     """
-    moments: list[Moment] = []
+    return _figures(list(_moments(driver, clips, tick)))
+
+
+def missed_by(
+    driver: Driver, clips: PackedClips, tick: Callable[[], None] = lambda: None
+) -> Bool[Tensor, "N"]:
+    """Return the clips in which a driver misses somebody whom it would meet, or takes a light for another.
+
+    Args:
+        driver: in evaluation mode.
+        clips: N clips.
+        tick: called after each batch.
+    """
+    return torch.tensor([moment.missed for moment in _moments(driver, clips, tick)])
+
+
+def _moments(driver: Driver, clips: PackedClips, tick: Callable[[], None]) -> Iterator[Moment]:
     for start in range(0, len(clips), BATCH):
         batch = join([clips[index] for index in range(start, min(start + BATCH, len(clips)))])
         sight = driver.see(batch.clip)
@@ -73,9 +103,8 @@ def judge_sight(
         size = (sight.lamp_logits.shape[-2], sight.lamp_logits.shape[-1])
         lamps = lamp_places(batch.truth, batch.clip.rig[:, batch.clip.now], size).inside.flatten(1).any(1)
         for row in range(len(speed)):
-            moments.append(_moment(batch.truth[row], estimate[row], float(speed[row]), bool(lamps[row])))
+            yield _moment(batch.truth[row], estimate[row], float(speed[row]), bool(lamps[row]))
         tick()
-    return _figures(moments)
 
 
 def _moment(truth: Affordances, estimate: PathEstimate, speed_mps: float, visible: bool) -> Moment:
@@ -110,9 +139,7 @@ def _first(occupied: Bool[np.ndarray, "G"]) -> int:
 
 def _figures(moments: list[Moment]) -> dict[str, float]:
     state, named = (np.array([getattr(m, name) for m in moments]) for name in ("state", "named"))
-    light_m, lit = np.array([m.light_m for m in moments]), np.array([m.lit for m in moments])
-    visible = np.array([m.visible for m in moments])
-    near = lit & visible & (state != LightState.NONE) & (light_m <= LIGHT_M)
+    near, lit = np.array([m.judged for m in moments]), np.array([m.lit for m in moments])
     stops = np.isin(named, [LightState.RED, LightState.YELLOW])
     red, green, none = (
         near & (state == LightState.RED),

@@ -28,6 +28,8 @@ class DriverRecipe:
     """Training of the eyes."""
     weights: SightWeights = field(default_factory=SightWeights)
     plan: PlanFit = field(default_factory=PlanFit)
+    emphasis: float = 3.0
+    """How often clips are drawn in which the driver that the training starts from is wrong; others: 1."""
     precision: Literal["32-true", "bf16-mixed"] = "bf16-mixed"
     kind: Literal["driver"] = "driver"
     about: str = field(default="", compare=False)

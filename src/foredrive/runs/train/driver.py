@@ -7,11 +7,14 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import torch
+from jaxtyping import Float
 from safetensors.torch import save_file
+from torch import Tensor
 
 from foredrive.data import ClipDataset, LogPath
 from foredrive.driver.agent import Driver
 from foredrive.driver.eyes import CameraEyes, CameraEyesConfig
+from foredrive.driver.judging import missed_by
 from foredrive.driver.objective import SightObjective
 from foredrive.driver.packed import PackedClips, join
 from foredrive.driver.planner_fit import fit_planner
@@ -41,7 +44,19 @@ class DriverRun:
     recipe: DriverRecipe
     logs: tuple[LogPath, ...]
     start: Path | None = None
-    """The run that gave the pre-trained encoder."""
+    """The run that the training started from."""
+
+    @property
+    def weights(self) -> Path:
+        """Return the path of the weights.
+
+        Raises:
+            InputError: training has not finished.
+        """
+        weights = self.folder / PLAN / WEIGHTS
+        if not weights.is_file():
+            raise InputError(f"{self.folder}: training has not finished; continue it with `foredrive train`")
+        return weights
 
 
 def is_driver(folder: Path) -> bool:
@@ -77,10 +92,7 @@ def load_driver(run: DriverRun) -> Driver:
         InputError: its training has not finished.
     """
     driver = build_driver(run.recipe)
-    weights = run.folder / PLAN / WEIGHTS
-    if not weights.is_file():
-        raise InputError(f"{run.folder}: training has not finished; continue it with `foredrive train`")
-    load_weights(driver, weights)
+    load_weights(driver, run.weights)
     return driver.eval()
 
 
@@ -89,6 +101,11 @@ def build_driver(recipe: DriverRecipe) -> Driver:
     config = recipe.eyes
     eyes = CameraEyes(config) if isinstance(config, CameraEyesConfig) else VolumeEyes(config)
     return Driver(eyes, SpeedPlanner(recipe.planner))
+
+
+def _drawn(driver: Driver, clips: PackedClips, emphasis: float) -> Float[Tensor, "N"]:
+    """Return how often each clip is drawn: more often where a driver is wrong."""
+    return torch.where(missed_by(driver, clips), emphasis, 1.0)
 
 
 def _load_encoder(driver: Driver, start: Path) -> None:
@@ -119,7 +136,8 @@ def train_driver(
         logs: logs with boxes and routes, and with lights to learn them.
         folder: folder of the run.
         cache_dir: folder of packed clips; by default in `folder`.
-        start: a run whose pre-trained encoder the eyes start from.
+        start: a run to start from. A driver's run gives its weights, and clips in which it is wrong are drawn
+            more often (`DriverRecipe.emphasis`); a world model's run gives its pre-trained encoder.
         packing: shows the progress of packing.
 
     Raises:
@@ -138,14 +156,17 @@ def train_driver(
         with packing(clips.logs) as tick:
             clips.pack(tick)
         torch.manual_seed(recipe.see.seed)
-        driver = build_driver(recipe)
-        if start is not None:
-            _load_encoder(driver, start)
+        driver, drawn = build_driver(recipe), None
         eyes = folder / SEE / WEIGHTS
+        if start is not None and is_driver(start):
+            load_weights(driver, open_driver(start).weights)
+            drawn = None if eyes.is_file() else _drawn(driver.eval(), clips, recipe.emphasis)
+        elif start is not None:
+            _load_encoder(driver, start)
         if not eyes.is_file():
             fabric = make_fabric(recipe.precision)
             objective = SightObjective(driver.eyes, recipe.weights)
-            train(objective, clips, join, recipe.see, folder / SEE, fabric)
+            train(objective, clips, join, recipe.see, folder / SEE, fabric, drawn)
             with atomic_path(eyes) as temporary:
                 save_file(driver.eyes.state_dict(), temporary)
         if not (folder / PLAN / WEIGHTS).is_file():

@@ -1,0 +1,89 @@
+"""Figures of what a driver sees, counted by hand."""
+
+import math
+
+import numpy as np
+import pytest
+
+from foredrive.driver.judging import THRESHOLDS, Moment, _figures
+from foredrive.scene.traffic_light import LightState
+
+PLAIN = Moment(
+    state=LightState.NONE,
+    named=LightState.NONE,
+    light_m=0.0,
+    light_error_m=0.0,
+    visible=False,
+    lit=True,
+    first=-1,
+    first_seen=np.full(len(THRESHOLDS), -1.0),
+    conflict=False,
+    conflict_seen=np.zeros(len(THRESHOLDS), dtype=bool),
+    crossing=False,
+)
+
+
+def light(state: LightState, named: LightState, light_m: float = 20.0, visible: bool = True) -> Moment:
+    return PLAIN._replace(state=state, named=named, light_m=light_m, light_error_m=2.0, visible=visible)
+
+
+def conflict(probability: float, true: bool, crossing: bool = False) -> Moment:
+    seen = np.array([probability >= threshold for threshold in THRESHOLDS])
+    return PLAIN._replace(conflict=true, conflict_seen=seen, crossing=crossing)
+
+
+def obstacle(first: int, first_seen: int) -> Moment:
+    return PLAIN._replace(first=first, first_seen=np.full(len(THRESHOLDS), float(first_seen)))
+
+
+def test_lights_within_forty_metres_whose_lamps_are_seen_are_counted() -> None:
+    red, green, yellow, none = LightState.RED, LightState.GREEN, LightState.YELLOW, LightState.NONE
+    figures = _figures(
+        [
+            light(red, red),
+            light(red, yellow),  # wrong, but it stops
+            light(red, none),  # missed
+            light(green, green),
+            light(green, red),
+            light(red, green, light_m=45.0),  # too far
+            light(red, green, visible=False),
+            light(none, red),
+        ]
+    )
+    assert figures["lights"] == 5
+    assert figures["light_accuracy_40m"] == pytest.approx(2 / 5)
+    assert figures["red_missed_40m"] == pytest.approx(1 / 3)
+    assert figures["green_stopped_40m"] == pytest.approx(1 / 2)
+    assert figures["none_stopped"] == 1.0
+    assert figures["light_error_m"] == 2.0
+
+
+def test_recall_counts_at_the_threshold_that_is_seldom_wrong() -> None:
+    """Of ten free moments one has 0.65 and one 0.35: at 0.4 a tenth is false, at 0.3 a fifth."""
+    free = [conflict(p, true=False) for p in (0.65, 0.35, *[0.1] * 8)]
+    met = [conflict(0.9, true=True), conflict(0.45, true=True, crossing=True), conflict(0.25, true=True)]
+    figures = _figures(free + met)
+    assert figures["threshold"] == 0.4
+    assert figures["conflict_false"] == pytest.approx(0.1)
+    assert figures["conflict_recall"] == pytest.approx(2 / 3)
+    assert figures["crossing_recall"] == 1.0
+    assert (figures["conflicts"], figures["crossings"], figures["frames"]) == (3, 1, 13)
+
+
+def test_the_error_of_the_first_obstacle_counts_a_missed_one_as_the_rest_of_the_way() -> None:
+    figures = _figures([obstacle(3, 4), obstacle(5, 5), obstacle(10, -1), obstacle(20, 1), obstacle(-1, 2)])
+    assert figures["first_obstacle_error_m"] == 2.0  # of 2, 0 and 10 m; the fourth is too far
+    assert figures["first_obstacle_missed"] == pytest.approx(1 / 3)
+    assert figures["first_obstacle_false"] == 1.0
+    assert math.isnan(figures["conflict_recall"])
+
+
+def test_a_clip_is_missed_if_the_driver_would_act_wrongly() -> None:
+    red, green, yellow = LightState.RED, LightState.GREEN, LightState.YELLOW
+    assert light(red, green).missed
+    assert not light(red, yellow).missed
+    assert light(green, red).missed
+    assert not light(red, green, light_m=45.0).missed
+    assert conflict(0.45, true=True).missed
+    assert not conflict(0.55, true=True).missed
+    assert not conflict(0.9, true=False).missed
