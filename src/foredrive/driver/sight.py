@@ -7,7 +7,6 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from foredrive.driver.route_cells import BESIDE_M, route_cells
-from foredrive.models.ego_mlp import ego_speeds
 from foredrive.scene import Clip
 from foredrive.scene.affordances import CELLS, TIMES, PathEstimate
 from foredrive.scene.clip import ROUTE_M
@@ -16,7 +15,7 @@ from foredrive.scene.traffic_light import LightState
 
 COLOURS = (LightState.RED, LightState.YELLOW, LightState.GREEN)
 CONTEXT = 64
-SPEED_SCALE_MPS, ROUTE_SCALE_M = 8.0, 20.0
+ROUTE_SCALE_M = 20.0
 RARE_LOGIT, NONE_LOGIT = -4.0, -2.0
 LIGHT_SCALE_M, LINE_BEFORE_LAMP_M = 20.0, 4.0
 """The distance of a stop line is read at the lamp, as a logarithm from some metres before the line."""
@@ -58,6 +57,8 @@ def scaled_line(light_m: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
 class RouteReader(nn.Module):
     """Reads the route from features of any eyes: who is on it, and its light.
 
+    It is not told the speed. Who stands mostly stands at a red light, and eyes that know it see one.
+
     Args:
         cells: channels of the features in the cells along and beside the route.
         fine: channels of the fine image features, in which lamps are read.
@@ -68,10 +69,10 @@ class RouteReader(nn.Module):
     def __init__(self, cells: int, fine: int, wide: int, cameras: int) -> None:
         super().__init__()
         self.context = nn.Sequential(
-            nn.Linear(3 * len(ROUTE_M) + 1, CONTEXT), nn.ReLU(), nn.Linear(CONTEXT, CONTEXT), nn.ReLU()
+            nn.Linear(3 * len(ROUTE_M), CONTEXT), nn.ReLU(), nn.Linear(CONTEXT, CONTEXT), nn.ReLU()
         )
         self.lamps = LampHead(fine, wide, CONTEXT, cameras)
-        self.occupancy = OccupancyHead(cells + 4)
+        self.occupancy = OccupancyHead(cells + 3)
 
     def forward(
         self,
@@ -83,23 +84,20 @@ class RouteReader(nn.Module):
         """Return what is on the route.
 
         Args:
-            clip: its route and speed at now are read.
+            clip: its route is read.
             cells: features in the cells of `route_cells`.
             fine: image features at now.
             mean: mean image features at now.
         """
-        speed = ego_speeds(clip.observed())[:, clip.now] / SPEED_SCALE_MPS
         route = clip.route_xy / ROUTE_SCALE_M
         route = torch.cat([route, clip.route_valid[..., None].to(route)], dim=-1)
-        context = self.context(torch.cat([route.flatten(1), speed[:, None]], dim=-1))
+        context = self.context(route.flatten(1))
         light, lamps, lines = self.lamps(fine, mean, context)
         middles = route_cells(clip.route_xy, clip.route_valid)
-        shape = (-1, 1, *middles.shape[1:3])
         place = torch.cat(
             [
                 middles.permute(0, 3, 1, 2) / ROUTE_SCALE_M,
-                middles.new_tensor(BESIDE_M).div(10.0).expand(len(middles), *shape[1:]),
-                speed.to(middles)[:, None, None, None].expand(*shape),
+                middles.new_tensor(BESIDE_M).div(10.0).expand(len(middles), 1, *middles.shape[1:3]),
             ],
             dim=1,
         )
@@ -114,7 +112,7 @@ class LampHead(nn.Module):
     Args:
         channels: channels of the fine features of each of C cameras.
         wide: channels of features whose mean tells that there is no light.
-        context: length of the vector of route and speed.
+        context: length of the vector of the route.
         cameras: C.
         hidden: width.
     """
