@@ -25,7 +25,7 @@ from foredrive.evaluation.summary import read_summary
 from foredrive.metrics.bootstrap import bootstrap_mean
 from foredrive.recipes import find_recipe
 from foredrive.recipes.config import rescheduled
-from foredrive.runs.drive.agents import IDM, IDM_BY_SIGHT
+from foredrive.runs.drive.agents import IDM
 from foredrive.runs.drive.compare import values_of
 from foredrive.runs.drive.in_towns import TownRoutes
 from foredrive.runs.drive.recording import record_drives
@@ -201,16 +201,6 @@ def blind_mlp(rounds: int) -> Arm:
     return measure
 
 
-def idm_by_sight(rounds: int) -> Arm:
-    """Return an arm of the rule-based agent with what NeMo tells of lights, lead vehicle and people."""
-
-    def measure(seed: int, routes: str) -> Mapping[str, float]:
-        run = trained(FULL, f"dagger_{rounds}", seed, rounds)
-        return scores(f"{IDM_BY_SIGHT}{run.folder.absolute()}", f"idm_by_sight_{rounds}_seed{seed}", routes)
-
-    return measure
-
-
 def without_training(agent: str, name: str) -> Arm:
     """Return an arm of an agent that learns nothing: all seeds are the same drives."""
     return lambda seed, routes: scores(agent, name, routes)
@@ -226,7 +216,6 @@ ARMS: Mapping[str, Arm] = {
         for name, arm in (
             ("dagger", learned(f"dagger_{rounds}", FULL, rounds)),
             ("blind_mlp", blind_mlp(rounds)),
-            ("idm_by_sight", idm_by_sight(rounds)),
         )
     },
     **{name: learned(name, recipe) for name, recipe in RECIPES.items()},

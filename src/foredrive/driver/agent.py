@@ -63,8 +63,10 @@ class LightMemory:
     """What was seen of the next light in the plans before: near its line, its lamps are out of view."""
 
     def __init__(self) -> None:
-        self._evidence, self._line_m, self._unseen = 0.0, None, 0  # type: float, float | None, int
-        self._yellow = False
+        self._evidence = 0.0
+        """Logarithm of the odds that the light stops the vehicle."""
+        self._line_m: float | None = None
+        self._unseen, self._yellow = 0, False
 
     def update(self, view: PathEstimate, moved_m: float) -> PathEstimate:
         """Return the view with the light that is seen or remembered.
@@ -94,7 +96,7 @@ class LightMemory:
         if self._line_m is None:
             light = torch.eye(4)[LightState.NONE]
             return PathEstimate(light[None].to(view.light), torch.zeros_like(view.light_m), view.occupied)
-        stop = 1 / (1 + float(np.exp(-2 * self._evidence)))
+        stop = 1 / (1 + float(np.exp(-self._evidence)))
         light = torch.zeros(4)
         light[LightState.YELLOW if self._yellow else LightState.RED] = stop
         light[LightState.GREEN] = 1 - stop
