@@ -12,6 +12,7 @@ from arrow_surgery import rewrite_column, rewrite_metadata
 from py123d.datatypes.detections.box_detection_label import BOX_DETECTION_LABEL_REGISTRY
 
 from foredrive.data.boxes import category_of, read_boxes
+from foredrive.data.log_check import check_log
 from foredrive.data.log_paths import LogPath, find_logs
 from foredrive.data.logs import Log
 from foredrive.data.written_boxes import LABEL_OF_CATEGORY
@@ -97,6 +98,23 @@ def test_the_ego_vehicles_own_box_is_left_out(flat_log: Path, tmp_path: Path) ->
     own = lambda rows: [["ego_vehicle", "11"] for _ in rows]  # noqa: E731
     rewrite_column(path.folder / f"{BOXES}.arrow", f"{BOXES}.track_token", own)
     assert len(read_boxes(Log(path), 5).centre) == 1
+
+
+def test_boxes_without_size_are_left_out_and_counted(flat_log: Path, tmp_path: Path) -> None:
+    """One of two boxes has no height at one of the frames: its attributes stay those of the other."""
+    path = copy_of(flat_log, tmp_path)
+
+    def flattened(rows: list) -> list:
+        rows[20][0][9] = 0.0
+        return rows
+
+    rewrite_column(path.folder / f"{BOXES}.arrow", f"{BOXES}.bounding_box_se3", flattened)
+    log = Log(path)
+    assert [read_boxes(log, frame).track_id.tolist() for frame in (19, 20)] == [[7, 11], [11]]
+    (finding,) = [each for each in check_log(path).findings if each.subject == "boxes"]
+    count = 2 * len(log)
+    assert finding.text == f"1 of {count} have no length, width or height, and are left out"
+    assert finding.level == "note"
 
 
 def test_no_boxes_and_no_annotation_are_two_things(tmp_path: Path) -> None:

@@ -107,6 +107,34 @@ def write_results(path: Path, task: str, frames: dict[str, list[tuple[float, str
     return path
 
 
+def test_boxes_without_size_are_left_out(
+    tables: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """As if they were not there, in tables, in a file of truth and in results; each file has a line."""
+    results = write_results(tmp_path / "found.json", "tracking", {"s0": [(5.0, "a")], "s1": [(7.0, "a")]})
+    figures = score_tracks(*read_objects(results, tables, "tracking"))
+    found = json.loads(results.read_text())
+    found["results"]["s1"].append({**found["results"]["s1"][0], "tracking_id": "flat", "size": [2.0, 4.0, 0]})
+    results.write_text(json.dumps(found))
+    file = tables / "sample_annotation.json"
+    flat = annotation(1, "car", 8.0, token="flat", instance_token="bike", size=[0.0, 4.0, 1.5])
+    file.write_text(json.dumps([*json.loads(file.read_text()), flat]))
+    assert score_tracks(*read_objects(results, tables, "tracking")) == figures
+    assert caplog.messages == [
+        f"{tables}: left out of 7: 1 boxes without size",
+        f"{results}: left out of 3: 1 boxes without size",
+    ]
+    detection = {"translation": [3.0, 0.0, 1.0], "rotation": rotation(0.0), "detection_name": "car"}
+    sized, flat = ({**detection, "size": size} for size in ([2.0, 4.0, 1.5], [2.0, 4.0, 0.0]))
+    (tmp_path / "gt.json").write_text(json.dumps({"s0": [flat, sized], "s1": []}))
+    (tmp_path / "boxes.json").write_text(json.dumps({"s0": [{**sized, "detection_score": 0.5}]}))
+    read = read_objects(tmp_path / "boxes.json", tmp_path / "gt.json", "detection")
+    assert score_detections(*read)["detection.nuscenes.car.ap"] == pytest.approx(1.0)
+    (tmp_path / "gt.json").write_text(json.dumps({"s0": [flat], "s1": []}))
+    with pytest.raises(InputError, match="left out of 1: 1 boxes without size: nothing remains"):
+        read_objects(tmp_path / "boxes.json", tmp_path / "gt.json", "detection")
+
+
 def test_tables_of_nuscenes(tables: Path, tmp_path: Path) -> None:
     """All of the scene that results are of. A stroller is no pedestrian; the bicycle in the rack, and the
     truck without points, do not count.

@@ -72,7 +72,7 @@ def read_instances(log: Log, frame: int, steps: int, dt_s: float, spec: PlaneSpe
     if tracks is None or box_row(log, frame) is None:
         return InstanceRaster(spec, torch.from_numpy(drawn).long(), _no(steps + 1), dt_s)
     t_us = _now_us(log, frame, tracks) + np.round(np.arange(steps + 1) * dt_s * 1e6).astype(np.int64)
-    vehicles = np.isin(tracks.category, [int(kind) for kind in VEHICLES]) & ~tracks.is_ego
+    vehicles = np.isin(tracks.category, [int(kind) for kind in VEHICLES]) & tracks.is_object
     ids = np.unique(tracks.track_id[vehicles])
     states = track_states(tracks, log.T_world_ego[frame], ids, t_us)
     valid = annotated_at(tracks, t_us)

@@ -86,7 +86,8 @@ class Tracks:
     """Velocity, m/s. NaN where neither the log nor the track gives one."""
     track_id: Int64[np.ndarray, "N"]
     category: Int64[np.ndarray, "N"]
-    is_ego: Bool[np.ndarray, "N"]
+    is_object: Bool[np.ndarray, "N"]
+    """False for the ego vehicle, and for boxes without length, width or height, which are left out."""
     num_points: Int64[np.ndarray, "N"]
     """Number of lidar returns, `UNKNOWN` where the log has none."""
     t_us: Int64[np.ndarray, "N"]
@@ -95,7 +96,9 @@ class Tracks:
 
 
 def read_boxes(log: Log, frame: int) -> Boxes | None:
-    """Read the boxes at a frame, unbatched, in its ego frame, without the ego vehicle.
+    """Read the boxes of objects at a frame, unbatched, in its ego frame.
+
+    The ego vehicle and boxes without length, width or height are left out.
 
     `num_points` is as logged. It is not counted here (`with_counted_points`). The visibility is the level of
     the logged share. Attributes are known where a recording or conversion has written them.
@@ -114,7 +117,8 @@ def read_boxes(log: Log, frame: int) -> Boxes | None:
     if tracks is None or row is None:
         return None
     row_range = slice(tracks.first_row[row], tracks.first_row[row + 1])
-    rows = np.arange(row_range.start, row_range.stop)[~tracks.is_ego[row_range]]
+    is_object = tracks.is_object[row_range]
+    rows = np.arange(row_range.start, row_range.stop)[is_object]
     T_ego_world = np.linalg.inv(log.T_world_ego[frame])
     R_ego_box = T_ego_world[:3, :3] @ tracks.R_world_box[rows]
     centre = tracks.centre[rows] @ T_ego_world[:3, :3].T + T_ego_world[:3, 3]
@@ -128,12 +132,12 @@ def read_boxes(log: Log, frame: int) -> Boxes | None:
         category=torch.from_numpy(tracks.category[rows]),
         valid=torch.ones(len(rows), dtype=torch.bool),
         num_points=torch.from_numpy(tracks.num_points[rows]),
-        **_recorded_labels(log, frame, ~tracks.is_ego[row_range]),
+        **_recorded_labels(log, frame, is_object),
     )
 
 
 def read_tracks(log: Log) -> Tracks | None:
-    """Read all boxes of a log, the ego vehicle's included. Return None if it has none.
+    """Read all boxes of a log, those that are no objects included. Return None if it has none.
 
     Raises:
         InputError: the boxes cannot be read or are not finite.
@@ -257,7 +261,7 @@ def _tracks(log: Log, _mtime_ns: int) -> Tracks:
         velocity=np.where(np.isfinite(logged), logged, difference),
         track_id=track_id,
         category=category[kind],
-        is_ego=is_ego[kind] | (tokens == EGO_TRACK_TOKEN),
+        is_object=~is_ego[kind] & (tokens != EGO_TRACK_TOKEN) & (box[:, 7:] > 0).all(-1),
         num_points=_num_points(column.get("num_lidar_points"), len(tokens)),
         t_us=t_us.astype(np.int64),
         row_t_us=column["timestamp_us"].to_numpy().astype(np.int64),

@@ -277,7 +277,7 @@ def _boxes_without_points(log: Log, frame: int, sweep: LidarSweep) -> tuple[int,
 
 
 def _tracks(log: Log) -> Iterator[Finding]:
-    """Find boxes with impossible speeds, and tracks that stand twice in a frame."""
+    """Find boxes without size, with impossible speeds, and tracks that stand twice in a frame."""
     try:
         tracks = read_tracks(log)
     except InputError as error:
@@ -285,6 +285,10 @@ def _tracks(log: Log) -> Iterator[Finding]:
         return
     if tracks is None:
         return
+    sizeless = int((tracks.size_lwh <= 0).any(axis=-1).sum())
+    if sizeless:
+        text = f"{sizeless} of {len(tracks.size_lwh)} have no length, width or height, and are left out"
+        yield Finding("note", "boxes", text)
     speed = np.linalg.norm(tracks.velocity, axis=-1)
     fast = np.isfinite(speed) & (speed > MAX_BOX_MPS)
     if fast.any():

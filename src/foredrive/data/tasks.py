@@ -52,7 +52,7 @@ def tasks_of(log: Log) -> tuple[TaskSupport, ...]:
 
 
 def _detection(log: Log, tracks: Tracks | None) -> TaskSupport:
-    if tracks is None or tracks.is_ego.all():
+    if tracks is None or not tracks.is_object.any():
         return TaskSupport("detection", False, "it has no boxes")
     lacks = []
     if not log.file(f"custom.{BOX_ATTRIBUTE}").is_file():
@@ -67,7 +67,7 @@ def _detection(log: Log, tracks: Tracks | None) -> TaskSupport:
 
 
 def _tracking(tracks: Tracks | None, lasting_s: float) -> TaskSupport:
-    if tracks is None or tracks.is_ego.all():
+    if tracks is None or not tracks.is_object.any():
         return TaskSupport("tracking", False, "it has no boxes")
     if lasting_s == 0.0:
         return TaskSupport("tracking", False, "no track has two boxes")
@@ -95,10 +95,10 @@ def _longest_s(tracks: Tracks) -> float:
     """Return the longest time between the first and the last box of a track."""
     if not len(tracks.track_id):
         return 0.0
-    _, number = np.unique(tracks.track_id[~tracks.is_ego], return_inverse=True)
+    _, number = np.unique(tracks.track_id[tracks.is_object], return_inverse=True)
     if not len(number):
         return 0.0
-    t_us = tracks.t_us[~tracks.is_ego]
+    t_us = tracks.t_us[tracks.is_object]
     first, last = np.full(number.max() + 1, np.inf), np.full(number.max() + 1, -np.inf)
     np.minimum.at(first, number, t_us)
     np.maximum.at(last, number, t_us)

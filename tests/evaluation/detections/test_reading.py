@@ -29,6 +29,8 @@ def test_nuscenes_boxes_around_the_ego_vehicle(tmp_path: Path) -> None:
         "frames_without_detections": 1,
         "boxes_without_covariance": 0,
         "frames_without_ego": 1,  # the empty one
+        "boxes_without_size_left_out": 0,
+        "true_boxes_without_size_left_out": 0,
     }
     frame, empty = read.frames
     assert (frame.name, frame.sequence, empty.name) == ("a", "s", "b")
@@ -57,6 +59,20 @@ def test_files_as_the_devkit_serialises_boxes(tmp_path: Path) -> None:
     assert [frame.name for frame in read.frames] == ["a", "b"]
     assert read.counts["frames_without_ego"] == 2
     assert read.frames[0].objects.state[0, :2].tolist() == [0.0, 0.0]  # around the frame's boxes
+
+
+def test_nuscenes_boxes_without_size_are_left_out(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """The first true box, which tells where the ego vehicle is, has no height."""
+    flat = box(1001.0, 500.0, ego_translation=[1.0, 0.0, 1.0], size=[2.0, 4.0, 0.0])
+    truth = write_nuscenes(tmp_path / "gt.json", {"a": [flat, box(1003.0, 504.0)], "b": []})
+    said = [box(1003.0, 504.0, detection_score=0.5), box(1009.0, 504.0, detection_score=0.4, size=[0, 0, 0])]
+    read = read_detections(write_nuscenes(tmp_path / "found.json", {"a": said}), truth)
+    assert read.frames[0].objects.state[:, :2].tolist() == [[3.0, 4.0]]
+    assert read.frames[0].detected.boxes.mean[:, :2].tolist() == [[3.0, 4.0]]
+    assert read.counts["boxes_without_size_left_out"] == read.counts["true_boxes_without_size_left_out"] == 1
+    assert caplog.messages == [
+        f"{tmp_path / name}: left out of 2: 1 boxes without size" for name in ("found.json", "gt.json")
+    ]
 
 
 def test_coco_boxes_and_class_probabilities(tmp_path: Path) -> None:
@@ -105,7 +121,7 @@ def test_kitti_boxes_forward_left_up(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"size": [0.0, 4.0, 1.5]}, r"frame a, box 1 has the size"),
+        ({"size": [-2.0, 4.0, 1.5]}, r"frame a, box 1 has the size"),
         ({"size": [2.0, 4.0]}, r"box 1 has no size of 3"),
         ({"translation": [float("nan"), 0.0, 0.0]}, r"frame a, box 1: its translation is not finite"),
         ({"rotation": [0.0, 0.0, 0.0, 0.0]}, r"frame a, box 1 has the rotation"),
@@ -135,7 +151,8 @@ def test_wrong_boxes_are_named(tmp_path: Path, change: dict, message: str) -> No
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"size": [0.0, 4.0, 1.5]}, r"gt\.json: frame a, box 0 has the size"),
+        ({"size": [-2.0, 4.0, 1.5]}, r"gt\.json: frame a, box 0 has the size"),
+        ({"size": [0.0, 4.0, 1.5]}, r"left out of 1: 1 boxes without size: nothing remains"),
         ({"ego_translation": "x"}, r"gt\.json: frame a, box 0 has no ego_translation of 3"),
         (
             {"ego_translation": [1.0, math.nan, 0.0]},
@@ -156,6 +173,7 @@ def test_wrong_truth_is_named(tmp_path: Path, change: dict, message: str) -> Non
     ("change", "message"),
     [
         ({"images": [{"id": 1, "width": 9, "height": 0}]}, r"image 1 has the size 9 x 0"),
+        ({"images": [{"id": 1, "width": 9}]}, r"image 1 has no height: .* needs `width` and `height` \(px\)"),
         ({"images": [{"id": 1}, {"id": 1}]}, r"images 1 has the id 1 again"),
         ({"images": [{"id": [1]}]}, r"images 0 has no id"),
         ({"categories": [{"name": "car"}]}, r"categories 0 has no id"),

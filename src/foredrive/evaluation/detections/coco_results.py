@@ -119,6 +119,12 @@ def _frame(
     covariance = read_covariances(records, _defaults(corners), names)
     score = read_number_rows(records, "score", 1, names)[:, 0]
     true_label = [label_of[record["category_id"]] for _, record in true]
+    for key in ("height", "width"):
+        if key not in image:
+            raise InputError(
+                f"{where} has no {key}: the likelihood of missed objects needs `width` and `height` (px) of "
+                "each record under `images`"
+            )
     height, width = (read_numbers(image, key, 1, where)[0] for key in ("height", "width"))
     if not (height > 0 and width > 0):
         raise InputError(f"{where} has the size {width:g} x {height:g}")

@@ -2,7 +2,7 @@
 
 A file has lists of boxes by sample token: under `results`, or alone, as the devkit's `EvalBoxes.serialize`
 writes them. A box has `translation` (m, global), `size` (w, l, h in m), `rotation` (quaternion w x y z),
-`detection_name` and `detection_score`.
+`detection_name` and `detection_score`. Boxes without length, width or height are left out.
 
 Beyond the format, a detection may have `covariance` (of centre and log l, w, h in m), `yaw_std` (rad) and
 `class_probabilities` (by name). Truth may have `num_pts` and `ego_translation`, as the devkit writes them,
@@ -36,6 +36,7 @@ from foredrive.evaluation.detections.frames import (
     read_number_rows,
     read_numbers,
     read_relevance,
+    tell_left_out,
 )
 from foredrive.metrics.detection_protocols import DETECTION_PROTOCOLS
 from foredrive.metrics.object_rows import ObjectRows, counted, make_rows
@@ -68,24 +69,30 @@ def read_nuscenes(
     )
     classes, true_classes = order_classes(true_names - {BICYCLE_RACK}, names)
     frames = []
+    sizeless, true_sizeless = 0, 0
     for token, boxes in true.items():
         predicted = _Boxes.of(found.get(token, ()), f"{path}: frame {token}")
-        frames.append(
-            _frame(token, predicted, _Boxes.of(boxes, f"{truth_path}: frame {token}"), classes, family)
-        )
+        objects = _Boxes.of(boxes, f"{truth_path}: frame {token}")
+        sizeless += len(found.get(token, ())) - len(predicted.records)
+        true_sizeless += len(boxes) - len(objects.records)
+        frames.append(_frame(token, predicted, objects, classes, family))
+    for where, given, left_out in ((path, found, sizeless), (truth_path, true, true_sizeless)):
+        tell_left_out(where, {"boxes without size": left_out}, sum(map(len, given.values())))
     counts = {
         "frames_without_detections": len(set(true) - set(found)),
         "boxes_without_covariance": sum(
             box.get("covariance") is None for boxes in found.values() for box in boxes
         ),
         "frames_without_ego": sum(frame.range_m is None for frame in frames),
+        "boxes_without_size_left_out": sizeless,
+        "true_boxes_without_size_left_out": true_sizeless,
     }
     return DetectionSet(frames, classes, True, counts, true_classes)
 
 
 @dataclass(frozen=True)
 class _Boxes:
-    """Boxes of one frame, with the ego vehicle's place if they tell it."""
+    """Boxes of one frame that have a size, with the ego vehicle's place if they tell it."""
 
     records: Sequence[Box]
     names: Sequence[str]
@@ -98,8 +105,10 @@ class _Boxes:
     def of(cls, records: Sequence[Box], where: str) -> "_Boxes":
         names = [f"{where}, box {n}" for n in range(len(records))]
         centre, size_lwh, yaw = read_geometry(records, names)
-        state = np.concatenate([centre, np.log(size_lwh)], axis=1)
-        return cls(records, names, state, yaw, _ego(records, state, names))
+        sized = (size_lwh > 0).all(1)
+        state = np.concatenate([centre[sized], np.log(size_lwh[sized])], axis=1)
+        ego = _ego(records, centre, names)
+        return cls(list(compress(records, sized)), list(compress(names, sized)), state, yaw[sized], ego)
 
     def __getitem__(self, which: Bool[ndarray, "n"]) -> "_Boxes":
         records, names = list(compress(self.records, which)), list(compress(self.names, which))
@@ -200,16 +209,16 @@ def _by_frame(content: Mapping[str, Any], path: Path) -> dict[str, Sequence[Box]
 def read_geometry(
     boxes: Sequence[Box], names: Sequence[str]
 ) -> tuple[Float[ndarray, "n 3"], Float[ndarray, "n 3"], Float[ndarray, "n"]]:
-    """Return centre (m, global), length, width, height (m), and heading (rad).
+    """Return centre (m, global), length, width, height (m, 0 where a box has none), and heading (rad).
 
     Raises:
-        InputError: a box has no size or no rotation, or a number that is not finite.
+        InputError: a box has a size below 0 or no rotation, or a number that is not finite.
     """
     centre, size, rotation = (
         read_number_rows(boxes, key, count, names)
         for key, count in (("translation", 3), ("size", 3), ("rotation", 4))
     )
-    wrong = np.flatnonzero(~(size > 0).all(1))
+    wrong = np.flatnonzero((size < 0).any(1))
     if len(wrong):
         raise InputError(f"{names[wrong[0]]} has the size {size[wrong[0]].tolist()}")
     wrong = np.flatnonzero(~(np.linalg.norm(rotation, axis=1) > 0))
@@ -221,10 +230,10 @@ def read_geometry(
 
 
 def _ego(
-    boxes: Sequence[Box], state: Float[ndarray, "n 6"], names: Sequence[str]
+    boxes: Sequence[Box], centre: Float[ndarray, "n 3"], names: Sequence[str]
 ) -> Float[ndarray, "3"] | None:
     """Return the ego vehicle's place if the first box tells it. The devkit writes zeros if it is unknown."""
     if not boxes or "ego_translation" not in boxes[0]:
         return None
     offset = read_numbers(boxes[0], "ego_translation", 3, names[0])
-    return state[0, :3] - offset if offset.any() else None
+    return centre[0] - offset if offset.any() else None

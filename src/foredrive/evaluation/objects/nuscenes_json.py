@@ -6,9 +6,9 @@ returns them). A box has `translation` (m, global), `size` (w, l, h in m), `rota
 `tracking_name`, `tracking_score` and `tracking_id`.
 
 Truth may have either name, and `num_pts`, `ego_translation` and `tracking_id`. Boxes with the name of a
-bicycle rack are no objects. Tracking needs the scene and the time of each sample: `scene_token` and
-`timestamp` (µs), in its boxes or under `samples`, an object by sample token. There `ego_translation` is the
-place of the ego vehicle; in a box it is the box's offset from it.
+bicycle rack are no objects. Boxes without length, width or height are left out. Tracking needs the scene and
+the time of each sample: `scene_token` and `timestamp` (µs), in its boxes or under `samples`, an object by
+sample token. There `ego_translation` is the place of the ego vehicle; in a box it is the box's offset from it.
 """
 
 import itertools
@@ -22,7 +22,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from foredrive.errors import InputError
-from foredrive.evaluation.detections.frames import read_numbers
+from foredrive.evaluation.detections.frames import read_numbers, tell_left_out
 from foredrive.evaluation.detections.nuscenes_results import read_geometry
 from foredrive.evaluation.frames_of_results import check_known_frames
 from foredrive.evaluation.objects.nuscenes_columns import (
@@ -92,12 +92,13 @@ def read_results(
     missing = len(number) - len(found)
     if task == "detection":
         columns["attribute"] = read_attributes(boxes, names)
-        return FoundObjects(make_rows(frame, label, centre, size_lwh, yaw, **columns), missing)
+        rows = make_rows(frame, label, centre, size_lwh, yaw, **columns)
+        return FoundObjects(_with_size([rows], path)[0], missing)
     identities = read_texts(boxes, "tracking_id", names)
     columns["track"] = number_names(identities)
     rows = make_rows(frame, label, centre, size_lwh, yaw, **columns)
     check_tracks(rows, identities, names)
-    return FoundObjects(rows, missing)
+    return FoundObjects(_with_size([rows], path)[0], missing)
 
 
 def read_json_truth(path: Path, task: ObjectTask, classes: Sequence[str]) -> ObjectTruth:
@@ -138,12 +139,12 @@ def make_truth(
     )
     ego = np.array([(np.nan, np.nan) if (at := samples[name].ego) is None else at for name in content])
     ego = ego.reshape(-1, 2).astype(np.float64)
-    boxes = _true_rows(objects, ego, path, task, classes)
+    boxes, rack_boxes = _with_size(
+        [_true_rows(objects, ego, path, task, classes), _true_rows(racks, ego, path, "detection", ())], path
+    )
     times = np.array([samples[name].time_us or 0 for name in content], dtype=np.int64)
     frames = Frames(number_names(samples[name].scene or name for name in content), times)
-    return ObjectTruth(
-        list(content), boxes, _true_rows(racks, ego, path, "detection", ()), frames, ego, lacking(boxes)
-    )
+    return ObjectTruth(list(content), boxes, rack_boxes, frames, ego, lacking(boxes))
 
 
 def boxes_by_frame(path: Path, content: Mapping[str, Any]) -> dict[str, Sequence[Box]]:
@@ -198,6 +199,18 @@ def _true_rows(
     if task == "tracking":
         check_tracks(rows, identities, names)
     return rows
+
+
+def _with_size(groups: Sequence[ObjectRows], path: Path) -> list[ObjectRows]:
+    """Return the groups of a file's boxes without those that lack a size, which are counted in one line.
+
+    Raises:
+        InputError: no box has a size.
+    """
+    sized = [(rows.size_lwh > 0).all(1) for rows in groups]
+    given = sum(map(len, sized))
+    tell_left_out(path, {"boxes without size": given - sum(int(each.sum()) for each in sized)}, given)
+    return [rows[each] for rows, each in zip(groups, sized, strict=True)]
 
 
 def _name(box: Box) -> object:

@@ -33,7 +33,7 @@ def annotations_at(
     points_world = _points_world(sweep, log.T_world_ego[frame])
     all_rows = np.arange(tracks.first_row[row], tracks.first_row[row + 1])
     found = []
-    for at, box in enumerate(all_rows[~tracks.is_ego[all_rows]].tolist()):
+    for at, box in enumerate(all_rows[tracks.is_object[all_rows]].tolist()):
         labels = (boxes.track_id, boxes.attribute, boxes.visibility, boxes.num_points)
         track, attribute, level, points = (int(values[at]) for values in labels)
         length, width, height = tracks.size_lwh[box].tolist()
