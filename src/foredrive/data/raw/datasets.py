@@ -5,10 +5,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from py123d.parser.av2.av2_map_parser import Av2MapParser
-from py123d.parser.av2.av2_sensor_parser import Av2SensorLogParser
-from py123d.parser.base_dataset_parser import BaseLogParser
 
-from foredrive.data.av2_partial import Av2PartialParser, WithoutBoxes
+from foredrive.data.av2_sensor import Av2SensorParser
 from foredrive.data.kitti_object import KittiObjectParser
 from foredrive.data.kitti_raw import KittiRawParser
 from foredrive.data.nuscenes_keyframe import NuScenesKeyframeParser
@@ -39,14 +37,7 @@ def _av2(source: Path) -> Iterator[RawLog]:
     for folder in folders_with(source, "city_SE3_egovehicle.feather"):
         kind = folder.parent.name if folder.parent.name in ("train", "val", "test") else "val"
         split = f"av2-sensor_{kind}"
-        yield RawLog(folder, _av2_log(folder, split), Av2MapParser(folder, split))
-
-
-def _av2_log(folder: Path, split: str) -> BaseLogParser:
-    if not (folder / "sensors" / "cameras").is_dir():
-        return Av2PartialParser(folder, split)
-    whole = Av2SensorLogParser(folder, split, "sweep")
-    return whole if (folder / "annotations.feather").is_file() else WithoutBoxes(whole)
+        yield RawLog(folder, Av2SensorParser(folder, split), Av2MapParser(folder, split))
 
 
 def _nuscenes_keyframe(source: Path) -> Iterator[RawLog]:

@@ -8,7 +8,8 @@ returns them). A box has `translation` (m, global), `size` (w, l, h in m), `rota
 Truth may have either name, and `num_pts`, `ego_translation` and `tracking_id`. Boxes with the name of a
 bicycle rack are no objects. Boxes without length, width or height are left out. Tracking needs the scene and
 the time of each sample: `scene_token` and `timestamp` (µs), in its boxes or under `samples`, an object by
-sample token. There `ego_translation` is the place of the ego vehicle; in a box it is the box's offset from it.
+sample token. There `ego_translation` is the place of the ego vehicle; in a box it is the box's offset from
+it.
 """
 
 import itertools
