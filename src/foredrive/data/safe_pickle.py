@@ -151,7 +151,10 @@ def load_table(file: Path) -> "pd.DataFrame":
     table = _load(file, gzip.open, _TABLE)
     if not isinstance(table, pd.DataFrame):
         raise InputError(f"{file}: not a table but a {type(table).__name__}")
-    return pd.DataFrame(table, copy=False)
+    try:
+        return pd.DataFrame(table, copy=False)
+    except AttributeError as error:  # a pickle can make a table without its content
+        raise InputError(f"{file}: a table without content") from error
 
 
 def load_records(file: Path, schema: str, moved: Mapping[str, str]) -> Any:

@@ -1,10 +1,10 @@
 """Logs from bags: the frames are the sweeps, or the images of the first camera in a bag without lidar."""
 
 import functools
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, overload
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float64, UInt8
@@ -36,7 +36,7 @@ from foredrive.data.raw.bag_topics import (
     topics_file,
 )
 from foredrive.data.raw.frame_tree import FrameTree
-from foredrive.data.raw.guard import PartReader
+from foredrive.data.raw.guard import PartSequence
 from foredrive.data.raw.images import check_size
 from foredrive.data.raw.raw_log import RawLog
 from foredrive.errors import InputError
@@ -243,7 +243,7 @@ def _image(
     return check_size(read_image(message, value_range), size_hw)
 
 
-class _Stream(Sequence[Any]):
+class _Stream(PartSequence):
     """The messages of a topic nearest to each frame, read when they are asked for, best in their order.
 
     Frames without a readable message within half of the frames' usual period have None.
@@ -257,6 +257,7 @@ class _Stream(Sequence[Any]):
         times_us: np.ndarray,
         decode: Callable[[Any], Any],
     ) -> None:
+        super().__init__(topic, "messages", len(times_us))
         numbers, stamps_us = np.array(stamps, np.int64).reshape(-1, 2).T
         for row in np.flatnonzero(np.diff(stamps_us) < 0) + 1:
             place = f"message {numbers[row]}, {stamps_us[row] * 1e-6:.3f} s"
@@ -273,7 +274,6 @@ class _Stream(Sequence[Any]):
         self._numbers = numbers[nearest]
         frames = np.flatnonzero(self._exists)
         self._last_frame = dict(zip(self._numbers[frames].tolist(), frames.tolist(), strict=True))
-        self._read = PartReader(topic, "messages")
         self._bag, self._topic, self._decode = bag, topic, decode
         self._rewind()
 
@@ -292,31 +292,17 @@ class _Stream(Sequence[Any]):
                 self._ahead[self._position] = message
         return self._ahead[number]
 
-    def __len__(self) -> int:
-        return len(self.t_us)
-
-    @overload
-    def __getitem__(self, frame: int) -> Any: ...
-    @overload
-    def __getitem__(self, frame: slice) -> Sequence[Any]: ...
-    def __getitem__(self, frame: int | slice) -> Any:
-        assert isinstance(frame, int)
-        part = None
-        if self._exists[frame]:
-            number = int(self._numbers[frame])
-            message = self._message(number)
-            if self._last_frame[number] == frame:
-                del self._ahead[number]
-            place = f"message {number}, {self.t_us[frame] * 1e-6:.3f} s"
-            part = self._read(place, lambda: self._decode(message.decode()))
-        return part
+    def _part(self, frame: int) -> Any:
+        if not self._exists[frame]:
+            return None
+        number = int(self._numbers[frame])
+        message = self._message(number)
+        if self._last_frame[number] == frame:
+            del self._ahead[number]
+        place = f"message {number}, {self.t_us[frame] * 1e-6:.3f} s"
+        return self._read(place, lambda: self._decode(message.decode()))
 
     def check(self) -> None:
-        """Check that one of the messages can be read.
-
-        Raises:
-            InputError: none can.
-        """
-        if any(self[frame] is not None for frame in range(len(self))):
-            self._rewind()
-        self._read.check()
+        """Check that one of the messages can be read, and begin anew."""
+        super().check()
+        self._rewind()

@@ -4,9 +4,10 @@ import contextlib
 import os
 import re
 import sys
-from collections.abc import Callable, Iterator
+from abc import abstractmethod
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, overload
 
 import numpy as np
 from PIL import Image
@@ -26,6 +27,8 @@ T = TypeVar("T")
 
 _NAME = re.compile(r"[\w-][\w.+-]*")
 _READ_MODES = ("r", "rb", "rt", None)
+_MISTAKES = (TypeError, AttributeError, NameError, ImportError)
+"""Errors of code. Decoders of images, messages, sweeps and pickles raise none of them for damaged bytes."""
 
 
 class _LastOpened:
@@ -59,6 +62,8 @@ def reading_raw(source: Path) -> Iterator[None]:
 class PartReader:
     """Reads parts of one kind. Damaged ones are left out with a notice, unless all are damaged.
 
+    Decoders raise errors of many classes. Only those that a mistake in code raises are not taken for damage.
+
     Args:
         subject: what the parts belong to: a topic, camera or folder.
         parts: their plural noun, such as "messages".
@@ -79,7 +84,9 @@ class PartReader:
         """
         try:
             part = read()
-        except Exception as error:  # damaged files make foreign decoders raise errors of any class
+        except _MISTAKES:
+            raise
+        except Exception as error:  # libraries have errors of their own, such as rosbags' SerdeError
             if isinstance(error, OSError) and error.errno in REFUSES_WRITING:
                 raise
             fault = f"{place}: {_reason(error)}"
@@ -99,6 +106,37 @@ class PartReader:
         """
         if self._first is not None and not self._whole:
             raise InputError(f"{self._subject}: none of its {self._parts} can be read; {self._first}")
+
+
+class PartSequence(Sequence[Any]):
+    """The parts of a sensor, one a frame, read when they are asked for; None where none can be read."""
+
+    def __init__(self, subject: str, parts: str, frames: int) -> None:
+        self._read, self._frames = PartReader(subject, parts), frames
+
+    def __len__(self) -> int:
+        return self._frames
+
+    @overload
+    def __getitem__(self, frame: int) -> Any: ...
+    @overload
+    def __getitem__(self, frame: slice) -> Sequence[Any]: ...
+    def __getitem__(self, frame: int | slice) -> Any:
+        assert isinstance(frame, int)
+        return self._part(frame)
+
+    @abstractmethod
+    def _part(self, frame: int) -> Any:
+        """Return the part of a frame, read by `self._read`, or None."""
+
+    def check(self) -> None:
+        """Check that one of the parts can be read.
+
+        Raises:
+            InputError: none can.
+        """
+        _ = any(self[frame] is not None for frame in range(len(self)))
+        self._read.check()
 
 
 class SensorFiles:

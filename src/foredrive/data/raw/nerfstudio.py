@@ -9,11 +9,11 @@ image is of which camera is found by `camera_split`.
 import json
 import os
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, overload
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float64, Int64, UInt8
@@ -25,7 +25,7 @@ from foredrive.data.log_paths import LogPath
 from foredrive.data.notices import note
 from foredrive.data.own_logs import write_log
 from foredrive.data.raw.camera_split import PosedImage, RigCamera, split_into_cameras
-from foredrive.data.raw.guard import PartReader
+from foredrive.data.raw.guard import PartReader, PartSequence
 from foredrive.data.raw.images import check_size, decoded, read_rgb
 from foredrive.data.raw.raw_log import RawLog, folders_with
 from foredrive.errors import InputError
@@ -107,34 +107,17 @@ class NerfstudioLog:
         ]
 
 
-class _ImageFiles(Sequence[Any]):
+class _ImageFiles(PartSequence):
     """The images of a camera, read when they are asked for. One that cannot be read is None."""
 
     def __init__(self, folder: Path, spec: CameraSpec, files: list[Path | None]) -> None:
+        super().__init__(spec.name, "images", len(files))
         self._folder, self._size_hw, self._files = folder, spec.size_hw, files
-        self._read = PartReader(spec.name, "images")
         self._range = self._value_range(spec.name)
 
-    def __len__(self) -> int:
-        return len(self._files)
-
-    @overload
-    def __getitem__(self, frame: int) -> Any: ...
-    @overload
-    def __getitem__(self, frame: slice) -> Sequence[Any]: ...
-    def __getitem__(self, frame: int | slice) -> Any:
-        assert isinstance(frame, int)
+    def _part(self, frame: int) -> Any:
         file = self._files[frame]
         return None if file is None else self._read(self._name(file), lambda: self._image(file))
-
-    def check(self) -> None:
-        """Check that one of the images can be read.
-
-        Raises:
-            InputError: none can.
-        """
-        _ = any(self[frame] is not None for frame in range(len(self)))
-        self._read.check()
 
     def _image(self, file: Path) -> UInt8[np.ndarray, "H W 3"]:
         return check_size(read_rgb(file, self._range), self._size_hw)
