@@ -58,9 +58,12 @@ def test_a_scratch_folder_of_a_living_process_number_is_removed_if_nobody_holds_
     assert [path.name for path in tmp_path.iterdir()] == ["a"]
 
 
-def test_a_folder_whose_replacement_was_killed_between_two_renames_is_replaced(tmp_path: Path) -> None:
-    left = tmp_path / f".log.{files._HOST}-{DEAD}-abc.part"
-    for name, text in (("replaced", "old"), ("log", "new")):
+@pytest.mark.parametrize("written", ["log", "together"])
+def test_a_folder_whose_replacement_was_killed_between_two_renames_is_replaced(
+    written: str, tmp_path: Path
+) -> None:
+    left = tmp_path / f".{written}.{files._HOST}-{DEAD}-abc.part"
+    for name, text in (("replaced/log", "old"), ("log", "new")):
         (left / name).mkdir(parents=True)
         (left / name / "a").write_text(text)
     remove_abandoned(tmp_path)
@@ -124,6 +127,21 @@ def test_files_of_one_folder_appear_together(tmp_path: Path) -> None:
     assert first.read_text() == second.read_text() == "whole"
     assert sorted(path.name for path in first.parent.iterdir()) == ["1", "2", "cache"]
     assert latest(first) == first
+
+
+def test_folders_appear_together_with_files(tmp_path: Path) -> None:
+    """Two folders take the places of others, whole; while they are written, the others are there."""
+    for name in ("a", "b"):
+        (tmp_path / name / "old").mkdir(parents=True)
+    with together(tmp_path):
+        for name in ("a", "b"):
+            with atomic_path(tmp_path / name) as folder:
+                write(folder / "new", name)
+        write(tmp_path / "c", "c")
+        assert sorted(path.name for path in tmp_path.glob("[abc]*")) == ["a", "b"]
+        assert (tmp_path / "a" / "old").is_dir()
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a", "b", "c"]
+    assert [[path.name for path in (tmp_path / name).iterdir()] for name in ("a", "b")] == [["new"]] * 2
 
 
 def test_files_of_one_folder_stay_away_together(tmp_path: Path) -> None:

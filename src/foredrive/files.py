@@ -25,7 +25,7 @@ _SCRATCH = re.compile(rf"\.(?P<final>.+)\.{_HOST}-(?P<process>\d+)-[^.]*\.part")
 _TOGETHER, _CLAIMED = "together", " (claimed)"
 """Name of the scratch folder of files that appear together, and end of the name of one that is a claim."""
 _REPLACED = "replaced"
-"""Name that a folder gets in the scratch folder of the one that replaces it."""
+"""Folder in a scratch folder into which the folders are moved that are replaced by what lies beside it."""
 _writing: set[Path] = set()
 """Scratch folders of this process."""
 _tidied: set[Path] = set()
@@ -95,9 +95,7 @@ def atomic_path(final: Path, *, alone: bool = False, durable: bool = True) -> It
             yield temporary
             if durable:
                 _flush(temporary)
-            if temporary.is_dir() and final.is_dir():
-                final.rename(scratch / _REPLACED)
-            os.replace(temporary, final)
+            _put_in_place(scratch, final)
             if durable:
                 _flush_entry(final.parent)
         finally:
@@ -106,7 +104,7 @@ def atomic_path(final: Path, *, alone: bool = False, durable: bool = True) -> It
 
 @contextlib.contextmanager
 def together(folder: Path) -> Iterator[None]:
-    """Let the files that the block writes directly into a folder appear together, at its end.
+    """Let the files and folders that the block writes directly into a folder appear together, at its end.
 
     If the block raises, none of them appears. Within the block `latest` says where such a file can be read.
     Threads and processes that are started in the block write at once.
@@ -121,10 +119,10 @@ def together(folder: Path) -> Iterator[None]:
     try:
         yield
         for final in held_back.names:
-            if (folder / final).is_dir():
+            if (folder / final).is_dir() and not (scratch / final).is_dir():
                 raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(folder / final))
         for name in held_back.names:
-            os.replace(scratch / name, folder / name)
+            _put_in_place(scratch, folder / name)
         _flush_entry(folder)
     finally:
         _held_back.reset(before)
@@ -139,18 +137,26 @@ def latest(final: Path) -> Path:
     return final
 
 
+def _put_in_place(scratch: Path, final: Path) -> None:
+    """Move what was written from its scratch folder to its final name. A folder replaces a folder."""
+    if (scratch / final.name).is_dir() and final.is_dir():
+        (scratch / _REPLACED).mkdir(exist_ok=True)
+        final.rename(scratch / _REPLACED / final.name)
+    os.replace(scratch / final.name, final)
+
+
 @dataclass
 class _HeldBack:
-    """Files that will appear in a folder together."""
+    """Files and folders that will appear in a folder together."""
 
     folder: Path
     scratch: Path
     names: list[str] = field(default_factory=list)
-    """Names of the files that are whole, in the order in which they were written first."""
+    """Names of those that are whole, in the order in which they were written first."""
 
     @contextlib.contextmanager
     def written(self, name: str) -> Iterator[Path]:
-        """Yield a path for a file, which is held back if the block succeeds."""
+        """Yield a path for a file or folder, which is held back if the block succeeds."""
         half = Path(tempfile.mkdtemp(dir=self.scratch))
         try:
             yield half / name
@@ -274,9 +280,10 @@ def _remove_abandoned(folder: Path, *, again: bool = False) -> None:
         except (BlockingIOError, FileNotFoundError):  # it is being written, or has just been finished
             continue
         if lock is not None or not _lives(int(name["process"])):
-            final = folder / name["final"]
-            if (scratch / _REPLACED).exists() and not final.exists():  # killed between two renames
-                os.replace(scratch / name["final"], final)
+            for replaced in (scratch / _REPLACED).glob("*"):
+                final = folder / replaced.name
+                if not final.exists():  # killed between two renames
+                    os.replace(scratch / replaced.name, final)
             shutil.rmtree(scratch, ignore_errors=True)
         _unlock(lock)
 

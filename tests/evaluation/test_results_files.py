@@ -23,6 +23,7 @@ from foredrive.evaluation.objects.score import read_objects, score_detections, s
 from foredrive.evaluation.predictor import Prediction
 from foredrive.evaluation.results_files import ResultsFiles
 from foredrive.evaluation.voxels.log_results import score_against_logs
+from foredrive.files import together
 from foredrive.scene import Example, VoxelSpec
 
 
@@ -36,13 +37,11 @@ def example(logs: Path) -> Example:
     return read_batch(logs)
 
 
-def write(folder: Path, prediction: Prediction, example: Example) -> ResultsFiles:
+def write(folder: Path, prediction: Prediction, example: Example) -> None:
     """Add the batch in two parts, as an evaluation does."""
-    files = ResultsFiles(folder)
-    for part in (slice(0, 2), slice(2, None)):
-        files.add(prediction[part], dataclasses.replace(example[part], key=example.key[part]))
-    files.write()
-    return files
+    with ResultsFiles.written_to(folder) as files:
+        for part in (slice(0, 2), slice(2, None)):
+            files.add(prediction[part], dataclasses.replace(example[part], key=example.key[part]))
 
 
 def evaluated(metric: type, prediction: Prediction, example: Example) -> Figures:
@@ -184,11 +183,27 @@ def test_files_of_an_earlier_evaluation_are_removed(example: Example, tmp_path: 
     (tmp_path / "notes.json").write_text("{}")
     assert prediction.agents is not None
     none = dataclasses.replace(prediction.agents, track_id=prediction.agents.track_id * 0 - 1)
-    files = ResultsFiles(tmp_path)
     few = dataclasses.replace(prediction, agents=none)[:2]
-    files.add(few, dataclasses.replace(example[:2], key=example.key[:2]))
-    files.write()
+    with together(tmp_path.parent), ResultsFiles.written_to(tmp_path) as files:
+        files.add(few, dataclasses.replace(example[:2], key=example.key[:2]))
+        assert (tmp_path / "tracking.json").exists()
     found = {path.relative_to(tmp_path / "occupancy").as_posix() for path in tmp_path.rglob("*.npz")}
     assert found == {f"{key}.npz" for key in example.key[:2]}
     assert not (tmp_path / "tracking.json").exists()
     assert (tmp_path / "notes.json").exists()
+
+
+def test_files_of_an_interrupted_evaluation_do_not_appear(example: Example, tmp_path: Path) -> None:
+    """Neither beside those of an earlier evaluation nor in their place, and without a trace."""
+    prediction, folder = near_truth(example), tmp_path / "results"
+    write(folder, prediction[:2], dataclasses.replace(example[:2], key=example.key[:2]))
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+
+    def interrupted() -> None:
+        with ResultsFiles.written_to(folder) as files:
+            files.add(prediction, example)
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        interrupted()
+    assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before

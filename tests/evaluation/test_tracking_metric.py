@@ -124,9 +124,8 @@ def test_figures_are_those_of_the_results_file(logs: Path, example: Example, tmp
     """The world frame turns, pitches and rolls under the vehicle; identities change every third frame."""
     prediction = near_truth(example)
     printed = evaluated(prediction, example)
-    files = ResultsFiles(tmp_path)
-    files.add(prediction, example)
-    files.write()
+    with ResultsFiles.written_to(tmp_path) as files:
+        files.add(prediction, example)
     assert json.loads((tmp_path / "tracking.json").read_text())["results"]
     scored = score_tracks(*read_objects(tmp_path / "tracking.json", logs, "tracking"))
     both = [key for key in printed if key in scored and "frames" not in key]

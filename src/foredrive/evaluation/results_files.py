@@ -9,7 +9,9 @@
 Frames are named LOG@T_US, and the world frame is that of the log.
 """
 
-from collections.abc import Mapping, Sequence
+import contextlib
+import shutil
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +32,7 @@ from foredrive.evaluation.objects.in_world import (
 from foredrive.evaluation.predictor import Prediction
 from foredrive.evaluation.summary import write_json
 from foredrive.evaluation.voxels.log_results import GRID_FILE, VoxelGridOfResults, write_grid, write_voxels
+from foredrive.files import atomic_path
 from foredrive.metrics.detection_protocols import CLASSES
 from foredrive.metrics.maps.protocols import HALF_XY_M
 from foredrive.metrics.tracking.protocols import TRACKING_PROTOCOLS
@@ -67,21 +70,37 @@ class ResultsFiles:
     else then.
 
     Args:
-        folder: folder of the files. Voxels are written to it at once, and the files of an earlier evaluation
-            are removed from it with the first batch: scored with these, they would count as predictions.
+        folder: an empty folder for the files. Voxels are written to it at once.
     """
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self._frames: dict[str, dict[str, tuple[bool, list[Record]]]] = {}
         self._voxels: dict[Path, bool] = {}
-        self._begun = False
+
+    @classmethod
+    @contextlib.contextmanager
+    def written_to(cls, folder: Path) -> Iterator["ResultsFiles"]:
+        """Collect predictions in a block, and let all their files appear at its end, or none if it raises.
+
+        The files of an earlier evaluation are removed then: scored with the new ones, they would count as
+        predictions. Other files in the folder stay.
+        """
+        with atomic_path(folder) as scratch:
+            scratch.mkdir()
+            files = cls(scratch)
+            yield files
+            files._write()
+            earlier = {folder / f"{task}.json" for task in TASKS} | {folder / OCCUPANCY / GRID_FILE}
+            earlier |= set((folder / OCCUPANCY).rglob("*@*.npz"))
+            for other in (path for path in folder.rglob("*") if path.is_file() and path not in earlier):
+                kept = scratch / other.relative_to(folder)
+                kept.parent.mkdir(parents=True, exist_ok=True)
+                shutil.copy2(other, kept)
 
     def add(self, prediction: Prediction, truth: Example) -> None:
         """Add a batch of b predictions with their truth."""
-        if not self._begun:
-            self._remove_earlier()
-        self._begun, clip = True, truth.clip
+        clip = truth.clip
         for item, token in enumerate(truth.key):
             annotated = bool(clip.boxes_valid[item, clip.now])
             if prediction.agents is not None:
@@ -98,13 +117,6 @@ class ResultsFiles:
             if prediction.semantics is not None and semantics is not None:
                 flow = None if prediction.flow_mps is None else prediction.flow_mps[item, 0, :2]
                 self._add_voxels(token, prediction.semantics[item], flow, semantics[item], clip.rig.names)
-
-    def _remove_earlier(self) -> None:
-        """Remove the files that an earlier evaluation has written to the folder, and no others."""
-        voxels = self.folder / OCCUPANCY
-        files = [self.folder / f"{task}.json" for task in TASKS]
-        for file in (*files, voxels / GRID_FILE, *voxels.rglob("*@*.npz")):
-            file.unlink(missing_ok=True)
 
     def _add_voxels(
         self,
@@ -123,9 +135,8 @@ class ResultsFiles:
         write_voxels(path, labels.cpu().numpy(), flow, truth.taxonomy)
         self._voxels[path] = bool(truth.known.any())
 
-    def write(self) -> list[Path]:
-        """Write the files of the tasks that the model predicts, and return their paths."""
-        written = []
+    def _write(self) -> None:
+        """Write the files of the tasks that the model predicts."""
         for task, frames in self._frames.items():
             if task == "tracking" and not any(records for _, records in frames.values()):
                 continue  # the model gives no identities
@@ -137,12 +148,10 @@ class ResultsFiles:
                     {"sample_token": token, "vectors": each} for token, each in _judged(frames).items()
                 ]
                 content = {"meta": meta | {"area_m": area_m}, "results": vectors}
-            written.append(self.folder / f"{task}.json")
-            write_json(written[-1], content, indent=None)
+            write_json(self.folder / f"{task}.json", content, indent=None)
         if any(self._voxels.values()):
             for path in (path for path, known in self._voxels.items() if not known):
                 path.unlink()
-        return written + ([self.folder / OCCUPANCY] if self._voxels else [])
 
 
 def _judged(frames: Mapping[str, tuple[bool, list[Record]]]) -> dict[str, list[Record]]:

@@ -86,7 +86,6 @@ def evaluate_run(
     dataset, trained, clips = inputs.dataset, inputs.heads, run.recipe.clips
     if results_files and trained is None:
         raise InputError(f"{run.folder}: has no task heads whose results could be written")
-    files = ResultsFiles(out / RESULTS)
     prior, ego_mlp = run_baselines(run.folder, run.logs, run.recipe, run.cache_dir, clips.past_frames)
     steps, dt_s = clips.horizon_steps, clips.horizon_dt_s
     planned, asked = plan_batches(dataset, batch_size), parts_needed()
@@ -95,7 +94,8 @@ def evaluate_run(
     else:
         device = inputs.device
         batches = predict_batches(inputs.predictor, Batches(dataset, planned), asked, device)
-    with Progress() as progress, contextlib.closing(batches):
+    writing = ResultsFiles.written_to(out / RESULTS) if results_files else contextlib.nullcontext()
+    with writing as files, Progress() as progress, contextlib.closing(batches):
         task = progress.add_task("evaluate", total=len(dataset))
         result = judge(
             batches,
@@ -110,10 +110,8 @@ def evaluate_run(
             command_source=dataset.command_source,
             device=device,
             on_items=lambda items: progress.advance(task, items),
-            on_prediction=files.add if results_files else lambda prediction, truth: None,
+            on_prediction=(lambda prediction, truth: None) if files is None else files.add,
         )
-    if results_files:
-        files.write()
     origin = {"recipe": run.recipe.name, "run": str(run.folder)}
     write_summary(out / SUMMARY, result.summary | collect_provenance() | run.conditions | origin)
     return result
