@@ -32,6 +32,8 @@ MAX_GROUND_M, NEAR_GROUND_M = 0.3, (4.0, 12.0)
 MIN_GROUND_POINTS = 200
 NEAR_BOX_M, MAX_EMPTY_SHARE = 25.0, 0.3
 MAX_BOX_MPS = 60.0
+MIN_MOVING_MPS = 1.0
+"""Speed from which an image differs from the one before."""
 DARK, SAME = 4.0, 0.5
 """An image is black below this mean value; two images are the same below this mean difference (of 255)."""
 
@@ -181,7 +183,8 @@ def _images(log: Log) -> Iterator[Finding]:
         for frame in _sampled(frames):
             try:
                 shown = read(frame=int(frame))
-                following = read(frame=int(frame) + 1) if int(frame) + 1 < len(log) else None
+                moves = log.speed_mps[frame] > MIN_MOVING_MPS and int(frame) + 1 < len(log)
+                following = read(frame=int(frame) + 1) if moves else None
             except InputError as error:
                 yield Finding("problem", name, str(error))
                 continue
@@ -189,7 +192,7 @@ def _images(log: Log) -> Iterator[Finding]:
                 continue
             dark.append(float(shown.image.float().mean()) < DARK)
             offset_s.append(shown.exposed_dt_s)
-            if following is not None and following.image is not None and log.speed_mps[frame] > 1.0:
+            if following is not None and following.image is not None:
                 frozen.append(float((following.image.float() - shown.image.float()).abs().mean()) < SAME)
         if any(dark):
             yield Finding("note", name, f"{sum(dark)} of {len(dark)} sampled images are black")

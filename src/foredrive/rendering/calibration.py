@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from foredrive.geometry.projection import project
@@ -348,29 +348,35 @@ def _sweep_edges(sweep: SweepView, tracks: ActorTracks) -> SweepEdges:
     column = (azimuth / _COLUMN_RAD).round().long()
     elevation_row = (elevation / _ROW_RAD).round().long() - 10_000
     channel = torch.where(beams.beam >= 0, beams.beam.long(), elevation_row)
-    rows = [
-        _rows_before_farther(beams.range_m, channel, azimuth, _BESIDE_RAD),
-        _rows_before_farther(beams.range_m, column, elevation, _ABOVE_RAD),
+    pairs = [
+        _pairs_before_farther(beams.range_m, channel, azimuth, _BESIDE_RAD),
+        _pairs_before_farther(beams.range_m, column, elevation, _ABOVE_RAD),
     ]
-    horizontal = torch.cat([torch.full_like(row, kind, dtype=torch.bool) for kind, row in enumerate(rows)])
-    points = beams[torch.cat(rows)]
-    static = _static(points, sweep, tracks)
-    return SweepEdges(sweep.t_s, sweep.T_scene_ego, points.points_ego[static], horizontal[static])
+    horizontal = torch.cat(
+        [torch.full((len(pair),), kind, dtype=torch.bool) for kind, pair in enumerate(pairs)]
+    )
+    near, far = torch.cat(pairs).T
+    static = _static(beams[near], sweep, tracks)
+    near, far = near[static], far[static]
+    # The edge lies between the two beams; all near beams lie inside of the outlines of what they hit.
+    middle = F.normalize(beams.dir_ego[near] + beams.dir_ego[far], dim=-1)
+    points_ego = beams.origin_ego[near] + beams.range_m[near, None] * middle
+    return SweepEdges(sweep.t_s, sweep.T_scene_ego, points_ego, horizontal[static])
 
 
-def _rows_before_farther(
+def _pairs_before_farther(
     range_m: Float[Tensor, "N"], line: Tensor, angle_rad: Float[Tensor, "N"], max_apart_rad: float
-) -> Tensor:
-    """Return the beams whose neighbour in angle on the same line hit something farther."""
+) -> Int64[Tensor, "E 2"]:
+    """Return each beam and its neighbour in angle on the same line, where that hit something farther."""
     order = (line.double() * 10 + angle_rad).argsort()
     line, angle_rad, sorted_m = line[order], angle_rad[order], range_m[order]
     near = (line[1:] == line[:-1]) & ((angle_rad[1:] - angle_rad[:-1]) < max_apart_rad)
     farther_m = sorted_m[1:] - sorted_m[:-1]
     min_jump_m = _JUMP_M + _JUMP_SHARE * torch.minimum(sorted_m[1:], sorted_m[:-1])
-    edge = torch.zeros(len(sorted_m), dtype=torch.bool)
-    edge[:-1] |= near & (farther_m > min_jump_m)
-    edge[1:] |= near & (-farther_m > min_jump_m)
-    return order[edge]
+    forwards = torch.stack([order[:-1], order[1:]], dim=-1)
+    return torch.cat(
+        [forwards[near & (farther_m > min_jump_m)], forwards.flip(-1)[near & (-farther_m > min_jump_m)]]
+    )
 
 
 def _static(beams: LidarSweep, sweep: SweepView, tracks: ActorTracks) -> Bool[Tensor, "N"]:
