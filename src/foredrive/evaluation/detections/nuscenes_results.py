@@ -105,7 +105,7 @@ class _Boxes:
     def of(cls, records: Sequence[Box], where: str) -> "_Boxes":
         names = [f"{where}, box {n}" for n in range(len(records))]
         centre, size_lwh, yaw = read_geometry(records, names)
-        sized = (size_lwh > 0).all(1)
+        sized = np.min(size_lwh, axis=1) > 0
         state = np.concatenate([centre[sized], np.log(size_lwh[sized])], axis=1)
         ego = _ego(records, centre, names)
         return cls(list(compress(records, sized)), list(compress(names, sized)), state, yaw[sized], ego)

@@ -208,7 +208,7 @@ def _with_size(groups: Sequence[ObjectRows], path: Path) -> list[ObjectRows]:
     Raises:
         InputError: no box has a size.
     """
-    sized = [(rows.size_lwh > 0).all(1) for rows in groups]
+    sized = [np.min(rows.size_lwh, axis=1) > 0 for rows in groups]
     given = sum(map(len, sized))
     tell_left_out(path, {"boxes without size": given - sum(int(each.sum()) for each in sized)}, given)
     return [rows[each] for rows, each in zip(groups, sized, strict=True)]
