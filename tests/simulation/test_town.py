@@ -2,6 +2,7 @@
 
 import dataclasses
 import pickle
+import weakref
 
 import numpy as np
 import pytest
@@ -12,15 +13,17 @@ from foredrive.scene import Category, Clip, Command, Control, Event, Trajectory
 from foredrive.scene.conditions import BackgroundTraffic
 from foredrive.sensors.rigs import camera_rig
 from foredrive.sensors.vehicle import roof_lidar
+from foredrive.simulation import town
 from foredrive.simulation.collisions import Contacts
 from foredrive.simulation.controller import ControllerState, follow
 from foredrive.simulation.dynamics import STEP_S
 from foredrive.simulation.plans import fixed_in_world
 from foredrive.simulation.road_users import RoadUsers
 from foredrive.simulation.town import TownScenario, TownSimulator
-from foredrive.towns.map.town_map import load_town_map
+from foredrive.towns.map.town_map import TownMap, load_town_map
 from foredrive.towns.sensing.capture import SensorSuite
 from foredrive.towns.traffic.traffic import Traffic
+from foredrive.towns.world import World
 
 SEED = 3
 CROWD = BackgroundTraffic(vehicles=12, pedestrians=8)
@@ -247,3 +250,19 @@ def test_a_route_that_begins_nowhere_is_refused(simulator: TownSimulator, scenar
         simulator.reset(dataclasses.replace(scenario, route_xyz=np.add(scenario.route_xyz, 500.0)))
     with pytest.raises(InputError, match="longer"):
         simulator.reset(dataclasses.replace(scenario, route_xyz=scenario.route_xyz[:2]))
+
+
+def test_a_world_is_freed_before_the_next_is_built(monkeypatch: pytest.MonkeyPatch) -> None:
+    """And kept while drives are in the same town with the same seed."""
+
+    class Built(World):
+        def __init__(self, town_map: TownMap, seed: int) -> None:
+            assert all(world() is None for world in built)
+            built.append(weakref.ref(self))
+
+    built = list[weakref.ref[Built]]()
+    monkeypatch.setattr(town, "World", Built)
+    monkeypatch.setattr(town, "_grown", {})
+    for seed in (1, 1, 2, 2, 1):
+        town.grow("Town02", seed)
+    assert len(built) == 3

@@ -318,10 +318,15 @@ class TownSimulator:
         return self._route.observe(state.frames, state.progress, None if sensors is None else sensors.rig)
 
 
-@lru_cache(maxsize=1)  # consecutive drives are often in one town
+_grown: dict[tuple[str, int], World] = {}
+
+
 def grow(town: str, seed: int) -> World:
-    """Build the world of a town and a seed, in bright daylight."""
-    return World(load_town_map(town), seed)
+    """Build the world of a town and a seed, in bright daylight. The last one is kept for the next drives."""
+    if (town, seed) not in _grown:
+        _grown.clear()  # first: with two at a time, each new one would leave memory scattered
+        _grown[town, seed] = World(load_town_map(town), seed)
+    return _grown[town, seed]
 
 
 @lru_cache(maxsize=1)
