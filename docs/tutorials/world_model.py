@@ -39,10 +39,9 @@ import numpy as np
 from foredrive.training import read_metrics
 
 lines = read_metrics(Path("runs/tiny/pretrain/metrics.jsonl"))
-for name in ("occ", "recon"):
-    # Every second step imagines the future and renders images; the others lack that loss.
-    steps, values = np.array([(line["step"], line[name]) for line in lines if name in line]).T
-    plt.plot(steps[9:], np.convolve(values / values[0], np.ones(10) / 10, "valid"), label=name)
+for name in ("occ", "l1"):  # of occupancy, and of rendered images
+    values = np.array([line[name] for line in lines])
+    plt.plot(np.convolve(values / values[0], np.ones(10) / 10, "valid"), label=name)
 plt.xlabel("step")
 plt.ylabel("loss, relative to the first step")
 plt.legend()
