@@ -29,6 +29,7 @@ from benchmarks.common.program_server import ProgramServer
 MEASURED = {
     *("wall_s", "act_s", "plan_ms", "step_s", "cpu_s", "computing_s"),
     *("minutes", "computing_minutes", "peak_memory_gib", "peak_rss_gib"),
+    *("camera_mp_per_s", "lidar_mrays_per_s"),
 }
 """Fields that differ between any two runs."""
 PATIENCE_S = 900.0
