@@ -159,7 +159,7 @@ def _shrunk_model(model: NemoConfig | DriveWorldConfig) -> NemoConfig | DriveWor
     )
     if isinstance(model, NemoConfig):
         return dataclasses.replace(
-            miniature().model, backbone=backbone, encoder=_shrunk_encoder(model.encoder), unseen=model.unseen
+            miniature().model, backbone=backbone, encoder=_shrunk_encoder(model.encoder)
         )
     small = miniature_driveworld().model
     parts = {"memory_bank": model.states.memory_bank, "motion_norm": model.states.motion_norm}

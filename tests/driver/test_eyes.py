@@ -78,7 +78,7 @@ def test_past_frames_are_read_where_the_cells_were_then() -> None:
 def test_a_volume_is_read_in_the_cells_of_its_frame() -> None:
     """The features are the places themselves: x, y and z of the volume's own frame."""
     town, spec = nemo_town().model, VoxelSpec((-8.0, -10.0, -1.5), 1.0, (5, 20, 32))
-    config = VolumeEyesConfig(dataclasses.replace(town, unseen="zero"), spec)
+    config = VolumeEyesConfig(town, spec)
     network = VolumeEyes(config).eval()
     clip = synthetic_example(spec=SPEC, batch=2, past=1, future=0, cameras=2).clip
     places = spec.centres_m().permute(3, 0, 1, 2).expand(2, 2, -1, -1, -1, -1)

@@ -274,16 +274,6 @@ def test_a_carried_plane_shows_what_lies_there() -> None:
     assert carried.sum() == pytest.approx(1.0)
 
 
-def test_what_comes_into_view_has_the_feature_of_places_outside() -> None:
-    """Two metres straight on: the last two of ten columns lie beyond the edge. Half a metre: half a cell."""
-    plane, outside = torch.ones(1, 1, *SPEC.shape_zyx[1:]), torch.tensor([5.0])
-    for ahead_m, last in ((2.0, [1.0, 1.0, 5.0, 5.0]), (0.5, [1.0, 1.0, 1.0, 3.0])):
-        T_src_dst = motion_of(torch.tensor([[ahead_m, 0.0]]), 1.0)
-        carried = warp_plane(plane, T_src_dst, SPEC, outside)
-        expected = torch.tensor([1.0] * 6 + last).expand(12, 10)
-        torch.testing.assert_close(carried[0, 0], expected, atol=1e-5, rtol=0)
-
-
 def test_carried_statics_move_under_the_actions_alone(model: DriveWorld, clip: Clip) -> None:
     now = model.observe(clip)
     stand, go = torch.zeros(2, 2, 2), torch.tensor([4.0, 0.0]).expand(2, 2, 2)

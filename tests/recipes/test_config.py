@@ -116,7 +116,7 @@ def as_it_was(recipe: Any) -> Any:
         if stage.kind == "nemo":
             stages[name] = dataclasses.replace(stages[name], pixels="thinned")
     planner = dataclasses.replace(recipe.planner, final_norm=False)
-    model, whole = dataclasses.replace(recipe.of_pretraining.model, unseen="zero"), "world_model"
+    model, whole = recipe.of_pretraining.model, "world_model"
     if model.kind == "driveworld" and model.prompt is not None:
         prompts = ("occupancy", "forecast", "planning")
         model = dataclasses.replace(model, prompt=dataclasses.replace(model.prompt, prompts=prompts))
@@ -182,10 +182,3 @@ def test_recipes_of_reconstructions_take_files_and_settings(tmp_path: Path) -> N
         find_rebuild_recipe("gaussians_tiny", ("schedule.steps=7",))
     with pytest.raises(InputError, match="near: gaussians_tiny"):
         find_rebuild_recipe("gaussian_tiny")
-
-
-def test_what_comes_into_view_has_a_learned_feature_in_every_recipe_that_warps() -> None:
-    for name, recipe in RECIPES.items():
-        for model in (recipe.model, recipe.of_pretraining.model):
-            warps = model.kind == "nemo" or model.warp_statics
-            assert model.unseen == ("learned" if warps else "zero"), name

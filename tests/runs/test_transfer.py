@@ -1,22 +1,19 @@
-"""What a run starts from: the encoder alone in the rows of DriveWorld's Table 1; weights that lack a part."""
+"""From pre-training to fine-tuning by the encoder alone: the rows of DriveWorld's Table 1."""
 
 import dataclasses
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 import torch
-from miniature import miniature, miniature_driveworld, with_steps
+from miniature import miniature_driveworld, with_steps
 from safetensors.torch import load_file
 
 from foredrive.data import LogPath
 from foredrive.errors import InputError
-from foredrive.recipes import RECIPES, Recipe
+from foredrive.recipes import RECIPES
 from foredrive.recipes.driveworld_ablations import driveworld_ablations
 from foredrive.runs import train_run
 from foredrive.runs.train.run import fresh_agent
-from foredrive.scene import Example
-from foredrive.training import load_weights, save_weights
 
 ROWS = driveworld_ablations(with_steps(miniature_driveworld(), pretrain=2, finetune=0))
 NAMES = {row.removeprefix("miniature_driveworld_"): row for row in ROWS}
@@ -84,37 +81,3 @@ def test_the_rows_of_table_1_differ_in_pretraining_alone(size: str) -> None:
     ]
     assert [sum(row) for row in parts] == [0, 1, 2, 3, 4]
     assert parts == sorted(parts)
-
-
-@pytest.mark.parametrize("recipe", [miniature(), ROWS[NAMES["carried"]]], ids=["nemo", "driveworld"])
-def test_weights_without_a_feature_of_what_comes_into_view_start_a_model_that_learns_one(
-    recipe: Recipe, tmp_path: Path, make_example: Callable[..., Example]
-) -> None:
-    """At first it imagines the same. Nothing else may be missing, and no other part may be left over."""
-    agents = {
-        unseen: fresh_agent(
-            dataclasses.replace(recipe, model=dataclasses.replace(recipe.model, unseen=unseen))
-        )
-        for unseen in ("zero", "learned")
-    }
-    torch.manual_seed(1)
-    for parameter in agents["zero"].parameters():
-        torch.nn.init.normal_(parameter, std=0.05)
-    file = tmp_path / "model.safetensors"
-    save_weights(agents["zero"], file)
-    load_weights(agents["learned"].world_model, file, "world_model")
-    spec, past = recipe.clips.voxels, recipe.clips.past_frames
-    clip = make_example(past=past, future=0, spec=spec).clip
-    with torch.no_grad():
-        worlds = [agent.eval().world_model for agent in agents.values()]
-        futures = [world.imagine(world.observe(clip), 2)[-1] for world in worlds]
-        torch.testing.assert_close(futures[0].volume, futures[1].volume)
-        worlds[1].unseen.fill_(1.0)
-        changed = worlds[1].imagine(worlds[1].observe(clip), 2)[-1]
-    assert not torch.allclose(changed.volume, futures[0].volume)
-    save_weights(agents["learned"], file)
-    with pytest.raises(InputError, match=r"another architecture: unseen \(1 entries"):
-        load_weights(agents["zero"].world_model, file, "world_model")
-    save_weights(torch.nn.Module(), file)
-    with pytest.raises(InputError, match="another architecture"):
-        load_weights(agents["learned"].world_model, file, "world_model")

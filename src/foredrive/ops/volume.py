@@ -58,28 +58,23 @@ def warp_volume(
     T_src_dst: Float[Tensor, "b 4 4"],
     lower_m: tuple[float, float, float],
     voxel_m: float,
-    outside: Float[Tensor, "D"] | None = None,
 ) -> Float[Tensor, "b D Z Y X"]:
     """Move a volume by a flow on its own grid, then by a rigid motion, in one gather (NeMo eq. 7-8).
 
     out[z] = volume[y + f(y)] with y = `T_src_dst` z, at every voxel centre z of the result. The given volume
-    and the flow are in the frame src (now), the result is in the frame dst (the future).
+    and the flow are in the frame src (now), the result is in the frame dst (the future). It is zero at places
+    outside of the given volume.
 
     Args:
         volume: grid in the frame src. No copy is made if it is channels-last in memory.
         flow: f, metres along x y z of src: the content at y came from y + f(y). It is zero outside the grid.
         T_src_dst: maps points of dst to src.
         lower_m, voxel_m: lower corner (x y z) and voxel size of the grid, equal in both frames.
-        outside: feature of places outside the volume; zero if None.
     """
     with full_precision(volume, flow, T_src_dst) as (volume, flow, T_src_dst):
         points = source_points(T_src_dst, volume.shape[2:], lower_m, voxel_m)
         points = points + read_grid(flow, points).permute(0, 2, 3, 4, 1) / voxel_m
-        read = read_grid(volume, points)
-        if outside is None:
-            return read
-        beyond = 1 - coverage(points, volume.shape[2:])
-        return read + beyond[:, None] * outside[:, None, None, None]
+        return read_grid(volume, points)
 
 
 def compose_flows(
@@ -111,13 +106,6 @@ def source_points(
     centres_m = (centres * voxel_m + lower).flatten(0, 2)
     source_m = transform_points(T_src_dst, centres_m.expand(len(T_src_dst), -1, -1))
     return ((source_m - lower) / voxel_m).unflatten(1, centres.shape[:3])
-
-
-def coverage(points: Float[Tensor, "b Z Y X 3"], shape_zyx: Sequence[int]) -> Float[Tensor, "b Z Y X"]:
-    """Return the share of trilinear interpolation at each point that reads voxels of the grid, 0 to 1."""
-    size_xyz = points.new_tensor(list(shape_zyx)[::-1])
-    per_axis = torch.minimum(points + 0.5, size_xyz - points + 0.5).clamp(0, 1)
-    return per_axis.prod(dim=-1)
 
 
 def _centres(grid: Float[Tensor, "b D Z Y X"]) -> Float[Tensor, "Z Y X 3"]:

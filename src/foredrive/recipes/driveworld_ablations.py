@@ -39,7 +39,7 @@ def driveworld_ablations(full: DriveWorldRecipe) -> dict[str, DriveWorldRecipe]:
         ),
         "prompts": (alone, "mln with task prompts (Table 1)"),
         "carried": (
-            replace(full, model=replace(size, warp_statics=True, unseen="learned")),
+            replace(full, model=replace(size, warp_statics=True)),
             "latent statics warped by the ego motion; not in the paper",
         ),
     }

@@ -63,7 +63,6 @@ def nemo_tiny() -> NemoRecipe:
             renderer=RendererConfig(near_m=1.0, far_m=34.0, samples=32, hidden=64),
             channels=32,
             occupancy_hidden=32,
-            unseen="learned",
         ),
         planner=PlannerConfig(width=128, layers=3, heads=4, pool=(2, 4, 4), final_norm=True),
         pretrain=NemoStage(
@@ -245,7 +244,6 @@ def nemo_base() -> NemoRecipe:
             renderer=RendererConfig(near_m=1.0, far_m=72.0, samples=96, hidden=128),
             channels=64,
             occupancy_hidden=64,
-            unseen="learned",
         ),
         planner=PlannerConfig(width=256, layers=3, heads=8, pool=(4, 8, 8), final_norm=True),
         pretrain=NemoStage(

@@ -86,6 +86,8 @@ _FLAT_PARTS = {"plane", "observation_hidden", "expanded", "volume_hidden", "stat
 def _with_module_configs(written: Mapping[str, Any]) -> Any:
     """Convert the first nested format. DriveWorld's parts had no configs, and entries had other names."""
     model = dict(written["model"])
+    if model.get("unseen") == "zero":  # what comes into view has a feature of 0, without an option
+        del model["unseen"]
     if model.keys() >= _FLAT_PARTS:
         model["plane_channels"] = model.pop("plane")
         model["to_vector"] = {"hidden": model.pop("observation_hidden")}

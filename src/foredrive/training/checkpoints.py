@@ -89,8 +89,6 @@ def save_weights(model: nn.Module, path: Path) -> None:
 def load_weights(model: nn.Module, path: Path, part: str = "") -> None:
     """Load weights into a model of the same architecture, from `save_weights` or `save_small`.
 
-    Parameters that a module names in `may_lack` stay as they are if the file does not have them.
-
     Args:
         part: prefix of the model in the file, such as "world_model"; "" is the whole file.
 
@@ -104,19 +102,12 @@ def load_weights(model: nn.Module, path: Path, part: str = "") -> None:
         raise InputError(f"{path}: weights cannot be read: {error}") from error
     state = {name.removeprefix(prefix): value for name, value in saved.items() if name.startswith(prefix)}
     own = model.state_dict()
-    may_lack = {
-        f"{name}.{parameter}".lstrip(".")
-        for name, module in model.named_modules()
-        for parameter in getattr(module, "may_lack", ())
-    }
-    own = {name: value for name, value in own.items() if name in state or name not in may_lack}
     wrong = sorted(set(own) ^ set(state)) + [
         name for name in sorted(set(own) & set(state)) if own[name].shape != state[name].shape
     ]
     if wrong:
         raise InputError(f"{path}: weights of another architecture: {wrong[0]} ({len(wrong)} entries differ)")
-    placed = {name: placed_like(value, own[name]) for name, value in state.items()}
-    model.load_state_dict(placed, strict=False)  # names are compared above
+    model.load_state_dict({name: placed_like(value, own[name]) for name, value in state.items()})
 
 
 def _flatten_optimizer(optimizer: Optimizer) -> tuple[dict[str, Tensor], dict[str, Any]]:

@@ -138,19 +138,15 @@ class StaticScene(nn.Module):
 
 
 def warp_plane(
-    plane: Float[Tensor, "b C Y X"],
-    T_src_dst: Float[Tensor, "b 4 4"],
-    spec: VoxelSpec,
-    outside: Float[Tensor, "C"] | None = None,
+    plane: Float[Tensor, "b C Y X"], T_src_dst: Float[Tensor, "b 4 4"], spec: VoxelSpec
 ) -> Float[Tensor, "b C Y X"]:
     """Warp a plane from the frame src to the frame dst.
 
-    Each cell of dst is read bilinearly at its place in src.
+    Each cell of dst is read bilinearly at its place in src; it is 0 beyond the edge.
 
     Args:
         plane: features over the ground of `spec`, in the frame src.
         T_src_dst: transform of points dst -> src; only its motion over the ground is used.
-        outside: feature of places beyond the edge; zero if None.
     """
     with full_precision(plane, T_src_dst.float()) as (plane, T):
         size_xy = plane.new_tensor(spec.shape_zyx[:0:-1])
@@ -159,11 +155,7 @@ def warp_plane(
         cells_m = torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1) * spec.voxel_m + lower
         read_m = torch.einsum("bij,yxj->byxi", T[:, :2, :2], cells_m) + T[:, None, None, :2, 3]
         grid = 2 * (read_m - lower) / (spec.voxel_m * size_xy) - 1
-        read = F.grid_sample(plane, grid, align_corners=False)
-        if outside is None:
-            return read
-        inside = F.grid_sample(torch.ones_like(plane[:, :1]), grid, align_corners=False)
-        return read + (1 - inside) * outside.to(read)[:, None, None]
+        return F.grid_sample(plane, grid, align_corners=False)
 
 
 @dataclass(frozen=True)

@@ -69,8 +69,6 @@ class DriveWorldConfig:
     warp_statics: bool = False
     """Warp the latent statics by the ego motion: the driven path and, in imagination, the actions. The paper
     passes them on without warping."""
-    unseen: Literal["zero", "learned"] = "zero"
-    """Feature of warped statics at places that come into view: 0, or learned from 0 on."""
     occupied_prior: float = 0.02
     """Initial occupancy probability. It is small because most space is free."""
     kind: Literal["driveworld"] = "driveworld"
@@ -124,8 +122,6 @@ class DriveWorld(nn.Module):
     max_steps = None
     samples_futures = True
     renderer = None
-    may_lack = ("unseen",)
-    """Parameters that weights to start from may lack: at their first value, 0, they change nothing."""
 
     def __init__(
         self, config: DriveWorldConfig, spec: VoxelSpec, *, past_frames: int, dt_s: float, fetch: bool = True
@@ -151,9 +147,6 @@ class DriveWorld(nn.Module):
         planes += 0 if config.prompt is None else config.prompt.expand.widths[-1]
         self.to_volume = PlanesToVolume(config.to_volume, channels=planes, out=channels, height=height)
         self.statics = None if config.statics is None else StaticScene(config.statics, channels=plane)
-        self.unseen: nn.Parameter | None = None
-        if config.statics is not None and config.warp_statics and config.unseen == "learned":
-            self.unseen = nn.Parameter(torch.zeros(config.statics.channels))
         self.prompt: TaskPrompt | None = None
         if config.prompt is not None:
             encodings = torch.zeros(len(config.prompt.prompts), config.prompt.encoding)
@@ -338,7 +331,7 @@ class DriveWorld(nn.Module):
         """Return the statics in the frame of another belief: warped if `warp_statics`, else unchanged."""
         if not self.warp_statics or T_source_ego is None:
             return statics
-        return warp_plane(statics, T_source_ego, self.spec, self.unseen)
+        return warp_plane(statics, T_source_ego, self.spec)
 
     def _belief(
         self,

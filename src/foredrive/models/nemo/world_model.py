@@ -47,9 +47,6 @@ class NemoConfig:
     occupied_prior: float = 0.02
     """Initial occupancy probability of f_occ. It is small because most space is free and an opaque volume
     would hide what is behind."""
-    unseen: Literal["zero", "learned"] = "zero"
-    """Feature of voxels that come into view in imagined frames: 0, or learned from 0 on. The paper does not
-    say which."""
     step_features: bool = False
     """Add a learned feature to all voxels of an imagined volume, one for each step. Warped features are
     smoother than observed ones; so the decoder knows. Not in the paper."""
@@ -69,8 +66,6 @@ class Nemo(nn.Module):
     """
 
     samples_futures = False
-    may_lack = ("unseen",)
-    """Parameters that weights to start from may lack: at their first value, 0, they change nothing."""
 
     def __init__(
         self,
@@ -93,7 +88,6 @@ class Nemo(nn.Module):
         self.encoder = ENCODERS[type(config.encoder)](config.encoder, spec, channels=channels, levels=levels)
         self.motion = MotionFlow(config.motion, channels=channels, frames=past_frames + 1, steps=max_steps)
         self.renderer = VolumeRenderer(config.renderer, spec, channels=channels)
-        self.unseen = nn.Parameter(torch.zeros(channels)) if config.unseen == "learned" else None
         self.step_features = nn.Parameter(torch.zeros(max_steps, channels)) if config.step_features else None
         to_logit = nn.Linear(config.occupancy_hidden, 1)
         nn.init.constant_(to_logit.bias, math.log(config.occupied_prior / (1 - config.occupied_prior)))
@@ -101,8 +95,8 @@ class Nemo(nn.Module):
 
     def imagination(self) -> list[nn.Parameter]:
         """Return the parameters that only imagined frames depend on."""
-        learned = (self.unseen, self.step_features)
-        return [*self.motion.parameters(), *(parameter for parameter in learned if parameter is not None)]
+        learned = [] if self.step_features is None else [self.step_features]
+        return [*self.motion.parameters(), *learned]
 
     def observe(self, clip: Clip) -> Belief:
         """Encode the last T_p + 1 frames, each in its own ego frame (V_t of eq. 1).
@@ -157,7 +151,7 @@ class Nemo(nn.Module):
                 T_now_ego = compose_se3(T_now_ego, belief.T_prev_next[:, k])
             T_now_ego = compose_se3(T_now_ego, motion.T_prev_next[:, k])
             since_now_m = compose_flows(motion.flow[:, k], since_now_m, self.spec.voxel_m)
-            volume = self._warped(belief.volume, since_now_m, T_now_ego, self.unseen)
+            volume = self._warped(belief.volume, since_now_m, T_now_ego)
             if self.step_features is not None:
                 volume = volume + self.step_features[k].view(-1, 1, 1, 1)
             futures.append(
@@ -174,15 +168,14 @@ class Nemo(nn.Module):
         volume: Float[Tensor, "b D Z Y X"],
         flow_m: Float[Tensor, "b 3 Z Y X"],
         T_now_ego: Float[Tensor, "b 4 4"],
-        outside: Float[Tensor, "D"] | None,
     ) -> Float[Tensor, "b D Z Y X"]:
-        return warp_volume(volume, flow_m, T_now_ego, self.spec.lower_m, self.spec.voxel_m, outside)
+        return warp_volume(volume, flow_m, T_now_ego, self.spec.lower_m, self.spec.voxel_m)
 
     def _velocity(
         self, flow_m: Float[Tensor, "b 3 Z Y X"], T_now_ego: Float[Tensor, "b 4 4"]
     ) -> Float[Tensor, "b 3 Z Y X"]:
         """Return the velocity (m/s, axes of the imagined ego frame) of one step's flow on the grid of now."""
-        at_ego = self._warped(flow_m, torch.zeros_like(flow_m), T_now_ego, None)
+        at_ego = self._warped(flow_m, torch.zeros_like(flow_m), T_now_ego)
         along_ego = rotate_vectors(inverse_se3(T_now_ego), at_ego.flatten(2).transpose(1, 2))
         return -along_ego.transpose(1, 2).unflatten(2, self.spec.shape_zyx) / self.dt_s
 
