@@ -13,7 +13,7 @@ from foredrive.models.tasks.motion import MotionConfig
 from foredrive.recipes import Recipe
 from foredrive.recipes.task_heads import TaskHeadsRecipe, town_heads, with_joint_heads
 from foredrive.scene import Example
-from foredrive.scene.affordances import LATER_STEPS, Affordances
+from foredrive.scene.affordances import CELLS, LATER_STEPS, TIMES, Affordances
 from foredrive.scene.agent_futures import AgentFutures
 from foredrive.scene.map_elements import MapElements, MapRaster, RasterLayer
 from foredrive.scene.semantics import SemanticVoxels
@@ -98,4 +98,6 @@ def arbitrary_affordances(batch: int) -> Affordances:
         crossing_xy=torch.tensor([10.0, 2.0]).expand(batch, 1, 2),
         crossing=torch.ones(batch, 1, dtype=torch.bool),
         crossing_known=known,
+        occupied=torch.zeros(batch, TIMES, CELLS, dtype=torch.bool),
+        occupied_known=torch.ones(batch, TIMES, CELLS, dtype=torch.bool),
     )

@@ -16,7 +16,7 @@ from foredrive.models.tasks.heads import TaskHeads, TaskVolume
 from foredrive.models.tasks.plane import Plane, PlanePyramid
 from foredrive.models.tasks.scene_tokens import SceneTokens
 from foredrive.scene import CameraRig, VoxelSpec
-from foredrive.scene.affordances import AffordanceEstimate, Affordances
+from foredrive.scene.affordances import CELLS, TIMES, AffordanceEstimate, Affordances
 from foredrive.scene.image_features import ImageFeatures
 from foredrive.scene.task_truth import TaskTruth
 from foredrive.scene.traffic_light import LightState
@@ -47,6 +47,8 @@ def truth(light: list[int], known: bool = True) -> Affordances:
         crossing_xy=torch.tensor([[[6.2, 1.3], [0.0, 0.0]]]).expand(b, 2, 2),
         crossing=torch.tensor([True, False]).expand(b, 2),
         crossing_known=yes,
+        occupied=torch.zeros(b, TIMES, CELLS, dtype=torch.bool),
+        occupied_known=torch.ones(b, TIMES, CELLS, dtype=torch.bool),
     )
 
 

@@ -12,7 +12,7 @@ from foredrive.models.plan_scorer import SUB_SCORES, ChoiceWeights, PlanScorer, 
 from foredrive.models.plan_vocabulary import Candidates, VocabularyConfig, plan_vocabulary, turn_rates
 from foredrive.models.planner import PlannerConfig, VolumePlanner
 from foredrive.scene import Boxes, Category, Example, VoxelSpec
-from foredrive.scene.affordances import Affordances
+from foredrive.scene.affordances import CELLS, TIMES, Affordances
 from foredrive.scene.agent_futures import AgentFutures
 from foredrive.scene.boxes import unlabelled
 from foredrive.scene.map_elements import MapRaster, PlaneSpec, RasterLayer
@@ -83,6 +83,8 @@ def street(
         crossing_xy=torch.zeros(1, 0, 2),
         crossing=torch.zeros(1, 0, dtype=torch.bool),
         crossing_known=yes,
+        occupied=torch.zeros(1, TIMES, CELLS, dtype=torch.bool),
+        occupied_known=torch.ones(1, TIMES, CELLS, dtype=torch.bool),
     )
     driven = straight([expert_mps])
     future = dataclasses.replace(
