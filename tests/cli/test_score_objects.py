@@ -168,7 +168,7 @@ WRONG: list[tuple[str, str, Edit]] = [
     ("tracking", f"{FIRST} has no tracking_name", drop("tracking_name")),
     ("tracking", f"{FIRST}: its translation is not finite", put(translation=[math.nan, 0, 0])),
     ("tracking", f"{FIRST} has no size of 3 number(s)", put(size=[1, 2])),
-    ("tracking", f"{FIRST} has the size [0.0, 2.0, 1.0]", put(size=[0, 2, 1])),
+    ("tracking", f"{FIRST} has the size [-1.0, 2.0, 1.0]", put(size=[-1, 2, 1])),
     ("tracking", f"{FIRST} has the tracking_score 1.5, which is not in [0, 1]", put(tracking_score=1.5)),
     ("tracking", f"{FIRST} has no tracking_id", drop("tracking_id")),
     ("tracking", f"{FIRST} is no object", lambda content: content["a1"].__setitem__(0, "car")),  # type: ignore[call-overload]

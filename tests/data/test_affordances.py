@@ -128,7 +128,9 @@ def test_cells_of_the_path_are_occupied_over_time(log: Log) -> None:
 
 
 def test_lights_behind_and_far_ahead_do_not_count(log: Log) -> None:
-    late = read_affordances(log, 7)  # the axle is at x = 17.5, the bumper 3.6 m beyond the line
+    near = read_affordances(log, 7)  # the axle is at x = 17.5, the bumper 3.6 m beyond the line
+    assert int(near.light) == LightState.GREEN  # the point that is judged has not crossed it
+    late = read_affordances(log, 8)
     assert (bool(late.light_known), int(late.light)) == (True, LightState.NONE)
     assert not bool(late.crossing_known)  # the log ends within four seconds
 

@@ -1,18 +1,18 @@
 """What a driver remembers between plans, and the path that it is given."""
 
 import dataclasses
+from collections.abc import Callable
 
 import numpy as np
 import pytest
 import torch
-from conftest import synthetic_example
-from test_eyes import SPEC
+from path_truth import SPEC
 
 from foredrive.driver.agent import CREEPS, WAITS, Driver, LightMemory, PartlyTrue, Perception, given_path
 from foredrive.driver.eyes import CameraEyes, CameraEyesConfig
 from foredrive.driver.sight import Sight
 from foredrive.driver.speed_planner import SpeedPlanner, SpeedPlannerConfig
-from foredrive.scene import Clip
+from foredrive.scene import Clip, Example
 from foredrive.scene.affordances import CELLS, TIMES, PathEstimate
 from foredrive.scene.clip import ROUTE_M
 from foredrive.scene.traffic_light import LightState
@@ -79,8 +79,9 @@ def sight(light: LightState, p_there: float) -> Sight:
     return Sight(light_logits, torch.zeros(1, 2, 3, 2, 2), torch.full((1, 2, 2, 2), -1.0), logits)
 
 
-def standing() -> Clip:
-    clip = synthetic_example(spec=SPEC, batch=1, past=1, future=0, cameras=2).clip
+@pytest.fixture
+def standing(make_example: Callable[..., Example]) -> Clip:
+    clip = make_example(spec=SPEC, batch=1, past=1, future=0, cameras=2).clip
     still = clip.T_world_ego[:, :1].expand_as(clip.T_world_ego)
     return dataclasses.replace(clip, ego_speed_mps=torch.zeros_like(clip.ego_speed_mps), T_world_ego=still)
 
@@ -88,17 +89,19 @@ def standing() -> Clip:
 @pytest.mark.parametrize(
     ("light", "p_there", "frees"), [("NONE", 0.8, True), ("NONE", 0.97, False), ("RED", 0.8, False)]
 )
-def test_who_stands_for_long_creeps_unless_it_is_sure(light: str, p_there: float, frees: bool) -> None:
+def test_who_stands_for_long_creeps_unless_it_is_sure(
+    light: str, p_there: float, frees: bool, standing: Clip
+) -> None:
     perception = Perception(Fixed(sight(LightState[light], p_there)))
-    free = [not bool((perception(standing()).occupied > 0.5).any()) for _ in range(WAITS + CREEPS)]
+    free = [not bool((perception(standing).occupied > 0.5).any()) for _ in range(WAITS + CREEPS)]
     assert not any(free[:WAITS])
     assert all(free[WAITS:]) is frees
 
 
-def test_parts_of_the_truth_take_the_place_of_what_is_seen() -> None:
+def test_parts_of_the_truth_take_the_place_of_what_is_seen(standing: Clip) -> None:
     seen, true = estimate(LightState.RED, 9.0), estimate(LightState.GREEN, 7.0)
     true = dataclasses.replace(true, occupied=torch.ones(1, TIMES, CELLS))
-    clip = standing()
+    clip = standing
     for lights, users in ((True, True), (True, False), (False, True)):
         view = PartlyTrue(lambda _: seen, lambda _: true, lights=lights, users=users)(clip)
         assert (state(view) is LightState.GREEN) is lights
@@ -106,9 +109,9 @@ def test_parts_of_the_truth_take_the_place_of_what_is_seen() -> None:
         assert bool(view.occupied.any()) is users
 
 
-def test_the_path_goes_through_the_points_of_the_route() -> None:
+def test_the_path_goes_through_the_points_of_the_route(standing: Clip) -> None:
     """The vehicle is a metre beside a route that turns right; it ends after 20 m."""
-    clip = standing()
+    clip = standing
     angle = torch.tensor(ROUTE_M) / 30.0
     xy = torch.stack([30 * angle.sin(), 30 * (angle.cos() - 1) - 1.0], -1)
     valid = torch.tensor([True] * 5 + [False] * 2)

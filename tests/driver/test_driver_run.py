@@ -112,7 +112,7 @@ def test_a_run_goes_on_from_another_drivers_weights(logs: list[LogPath], tmp_pat
 
 
 def test_eyes_that_read_a_volume_start_from_a_pretrained_run(logs: list[LogPath], tmp_path: Path) -> None:
-    nemo, start = driver_nemo(), run_folder(Path("embedded:nemo_town"))
+    nemo, start = driver_nemo(), run_folder(Path("embedded:nemo_town"), tmp_path)
     short = dataclasses.replace(recipe().see, steps=0)
     small = dataclasses.replace(recipe(), eyes=nemo.eyes, see=short)
     fresh = load_driver(train_driver(small, logs, tmp_path / "fresh", tmp_path / "cache"))

@@ -1,10 +1,11 @@
 """The eyes of a driver: frames are read at places fixed in the world, and losses see what is known alone."""
 
 import dataclasses
+from collections.abc import Callable
 
 import pytest
 import torch
-from conftest import synthetic_example
+from path_truth import SPEC, truth
 
 from foredrive.driver.eyes import CameraEyes, CameraEyesConfig
 from foredrive.driver.losses import SightWeights, lamp_places, sight_losses
@@ -13,38 +14,9 @@ from foredrive.driver.volume_eyes import VolumeEyes, VolumeEyesConfig
 from foredrive.errors import InputError
 from foredrive.geometry.se3 import inverse_se3, transform_points
 from foredrive.recipes.nemo import nemo_town
-from foredrive.scene import VoxelSpec
-from foredrive.scene.affordances import CELLS, TIMES, Affordances
+from foredrive.scene import Example, VoxelSpec
+from foredrive.scene.affordances import CELLS, TIMES
 from foredrive.scene.traffic_light import LightState
-
-SPEC = VoxelSpec((-4.0, -4.0, -1.0), 4.0, (1, 2, 2))
-
-
-def truth(batch: int = 2) -> Affordances:
-    """A red light whose lamp is 12 m ahead, and a road user on the path from one second on."""
-    occupied = torch.zeros(batch, TIMES, CELLS, dtype=torch.bool)
-    occupied[:, 2:, 4] = True
-    none, zero = torch.zeros(batch, dtype=torch.bool), torch.zeros(batch)
-    return Affordances(
-        path_xy=torch.zeros(batch, 72, 2),
-        path_valid=torch.zeros(batch, 72, dtype=torch.bool),
-        light=torch.full((batch,), int(LightState.RED)),
-        light_m=torch.full((batch,), 5.0),
-        light_known=~none,
-        light_later=torch.zeros(batch, 6, dtype=torch.long),
-        lamp_xyz=torch.tensor([[[12.0, 0.4, 1.9], [12.0, 40.0, 3.0]]]).expand(batch, 2, 3),
-        lamp=torch.tensor([[True, True]]).expand(batch, 2),
-        lamps_known=~none,
-        lead=none,
-        lead_m=zero,
-        lead_mps=zero,
-        lead_known=~none,
-        crossing_xy=torch.zeros(batch, 0, 2),
-        crossing=torch.zeros(batch, 0, dtype=torch.bool),
-        crossing_known=~none,
-        occupied=occupied,
-        occupied_known=torch.ones(batch, TIMES, CELLS, dtype=torch.bool),
-    )
 
 
 def eyes(frames: int = 2) -> CameraEyes:
@@ -53,9 +25,9 @@ def eyes(frames: int = 2) -> CameraEyes:
 
 
 @torch.no_grad()
-def test_past_frames_are_read_where_the_cells_were_then() -> None:
+def test_past_frames_are_read_where_the_cells_were_then(make_example: Callable[..., Example]) -> None:
     """Features of a past frame do not depend on where the vehicle has gone since, in the world's places."""
-    clip = synthetic_example(spec=SPEC, batch=2, past=1, future=0, cameras=2).clip
+    clip = make_example(spec=SPEC, batch=2, past=1, future=0, cameras=2).clip
     network = eyes()
     fine, coarse = network._features(clip)
     cells = torch.tensor([[[[5.0, 0.5], [8.0, -1.0]], [[7.0, 1.0], [12.0, 2.0]]]]).expand(2, -1, -1, -1)
@@ -75,12 +47,12 @@ def test_past_frames_are_read_where_the_cells_were_then() -> None:
 
 
 @torch.no_grad()
-def test_a_volume_is_read_in_the_cells_of_its_frame() -> None:
+def test_a_volume_is_read_in_the_cells_of_its_frame(make_example: Callable[..., Example]) -> None:
     """The features are the places themselves: x, y and z of the volume's own frame."""
     town, spec = nemo_town().model, VoxelSpec((-8.0, -10.0, -1.5), 1.0, (5, 20, 32))
     config = VolumeEyesConfig(town, spec)
     network = VolumeEyes(config).eval()
-    clip = synthetic_example(spec=SPEC, batch=2, past=1, future=0, cameras=2).clip
+    clip = make_example(spec=SPEC, batch=2, past=1, future=0, cameras=2).clip
     places = spec.centres_m().permute(3, 0, 1, 2).expand(2, 2, -1, -1, -1, -1)
     cells = torch.tensor([[[[5.0, 0.5], [8.0, -1.0]], [[7.0, 1.0], [90.0, 2.0]]]]).expand(2, -1, -1, -1)
     read = network._read(clip, cells, places).view(2, 2, 3, 4, 2, 2)  # [b T height channel G L]
@@ -96,10 +68,10 @@ def test_a_volume_is_read_in_the_cells_of_its_frame() -> None:
     assert not read[..., -1, -1].any()  # 90 m ahead
 
 
-def test_frozen_eyes_train_what_reads_them_alone() -> None:
+def test_frozen_eyes_train_what_reads_them_alone(make_example: Callable[..., Example]) -> None:
     spec = VoxelSpec((-8.0, -10.0, -1.5), 2.0, (3, 10, 16))
     network = VolumeEyes(VolumeEyesConfig(nemo_town().model, spec, frozen=True)).train()
-    clip = synthetic_example(spec=SPEC, batch=2, past=1, future=0, cameras=2).clip
+    clip = make_example(spec=SPEC, batch=2, past=1, future=0, cameras=2).clip
     sight_losses(network(clip), truth(), clip.rig[:, clip.now], SightWeights())["loss"].backward()
     assert not network.backbone.training
     moved = {
@@ -109,8 +81,8 @@ def test_frozen_eyes_train_what_reads_them_alone() -> None:
 
 
 @torch.no_grad()
-def test_sight_depends_on_images_and_route_but_not_on_the_speed() -> None:
-    clip = synthetic_example(spec=SPEC, batch=2, past=1, future=0, cameras=2).clip
+def test_sight_depends_on_images_and_route_but_not_on_the_speed(make_example: Callable[..., Example]) -> None:
+    clip = make_example(spec=SPEC, batch=2, past=1, future=0, cameras=2).clip
     black = dataclasses.replace(clip, images=torch.zeros_like(clip.images))
     elsewhere = dataclasses.replace(clip, route_xy=clip.route_xy.flip(0))
     faster = dataclasses.replace(clip, ego_speed_mps=clip.ego_speed_mps + 3)
@@ -127,8 +99,8 @@ def test_sight_depends_on_images_and_route_but_not_on_the_speed() -> None:
         assert torch.equal(network(faster).light_logits, sight.light_logits)
 
 
-def test_a_clip_of_other_cameras_or_too_few_frames_is_refused() -> None:
-    clip = synthetic_example(spec=SPEC, batch=1, past=0, future=0, cameras=2).clip
+def test_a_clip_of_other_cameras_or_too_few_frames_is_refused(make_example: Callable[..., Example]) -> None:
+    clip = make_example(spec=SPEC, batch=1, past=0, future=0, cameras=2).clip
     with pytest.raises(InputError, match="2 key frames cannot see a clip of 2 cameras and 1 key frames"):
         eyes()(clip)
 
@@ -143,8 +115,10 @@ def test_the_distance_of_a_line_is_read_at_the_lamp() -> None:
     torch.testing.assert_close(sight.light_m, torch.tensor([17.0]))
 
 
-def test_lamps_are_learned_in_place_and_unknown_cells_not_at_all() -> None:
-    clip = synthetic_example(spec=SPEC, batch=2, past=1, future=0, cameras=2).clip
+def test_lamps_are_learned_in_place_and_unknown_cells_not_at_all(
+    make_example: Callable[..., Example],
+) -> None:
+    clip = make_example(spec=SPEC, batch=2, past=1, future=0, cameras=2).clip
     rig, known = clip.rig[:, clip.now], truth()
     hidden = known.occupied_known.clone()
     hidden[0] = False
@@ -171,8 +145,8 @@ def test_lamps_are_learned_in_place_and_unknown_cells_not_at_all() -> None:
     assert float(-later / now) == pytest.approx(5.0)  # occupied, and later only: 2.5 × 2
 
 
-def test_a_light_that_no_image_shows_is_not_learned() -> None:
-    clip = synthetic_example(spec=SPEC, batch=2, past=1, future=0, cameras=2).clip
+def test_a_light_that_no_image_shows_is_not_learned(make_example: Callable[..., Example]) -> None:
+    clip = make_example(spec=SPEC, batch=2, past=1, future=0, cameras=2).clip
     known = dataclasses.replace(truth(), lamp=torch.tensor([[False, True], [True, True]]))
     logits = torch.zeros(2, 4, requires_grad=True)
     sight = Sight(logits, torch.zeros(2, 2, 3, 8, 16), torch.zeros(2, 2, 8, 16), torch.zeros(2, TIMES, CELLS))

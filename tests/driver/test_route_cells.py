@@ -1,19 +1,18 @@
 """Cells along a route, and image features there, by hand."""
 
 import math
+from collections.abc import Callable
 
 import torch
-from conftest import synthetic_example
+from path_truth import SPEC
 
 from foredrive.driver.route_cells import BESIDE_M, route_cells, sample_cameras
 from foredrive.geometry.projection import project
 from foredrive.geometry.se3 import inverse_se3, transform_points
-from foredrive.scene import VoxelSpec
+from foredrive.scene import Example
 from foredrive.scene.affordances import CELL_M, CELLS
 from foredrive.scene.clip import ROUTE_M
 from foredrive.simulation.speed_rule import FRONT_M
-
-SPEC = VoxelSpec((-4.0, -4.0, -1.0), 4.0, (1, 2, 2))
 
 
 def straight(heading_rad: float) -> torch.Tensor:
@@ -45,9 +44,9 @@ def test_cells_turn_with_the_route() -> None:
     )
 
 
-def test_features_are_read_where_a_camera_sees_a_point() -> None:
+def test_features_are_read_where_a_camera_sees_a_point(make_example: Callable[..., Example]) -> None:
     """The features are the places in the image themselves, at half its resolution."""
-    clip = synthetic_example(spec=SPEC, batch=2).clip
+    clip = make_example(spec=SPEC, batch=2).clip
     rig = clip.rig[:, clip.now]
     h, w = rig.size_hw[0] // 2, rig.size_hw[1] // 2
     y, x = torch.meshgrid(2 * torch.arange(h) + 1.0, 2 * torch.arange(w) + 1.0, indexing="ij")

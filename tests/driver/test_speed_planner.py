@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 import torch
-from test_eyes import truth
+from path_truth import truth
 
 from foredrive.driver.planner_fit import rule_of, true_estimate
 from foredrive.driver.speed_planner import (

@@ -22,6 +22,7 @@ from foredrive.data.batches import stack_records
 from foredrive.errors import InputError
 from foredrive.json_server import Address
 from foredrive.scene import Clip, Command, Trajectory
+from foredrive.scene.clip import TARGET
 from foredrive.simulation.remote.alpasim_client import GrpcDriver, check_driver, points_of
 from foredrive.simulation.remote.alpasim_server import AlpasimDriver, route_of, serve_alpasim
 from foredrive.simulation.remote.planner_server import PlannerNeeds
@@ -165,8 +166,10 @@ def test_nobody_listens() -> None:
 
 def test_routes_give_command_and_target() -> None:
     left = np.array([[-5.0, 0, 0], [0, 0, 0], [10, 0, 0], [20, 8, 0], [30, 20, 0]], dtype=float)
-    command, target = route_of(left)
+    command, route = route_of(left)
     assert command is Command.LEFT
-    assert target is not None
-    assert float(np.hypot(*(target - [10.0, 0.0]))) == pytest.approx(10.0)
+    assert route is not None
+    np.testing.assert_allclose(route.xy[:3], [[2.0, 0.0], [5.0, 0.0], [10.0, 0.0]])
+    assert float(np.hypot(*(route.xy[TARGET] - [10.0, 0.0]))) == pytest.approx(10.0)
+    assert route.valid.tolist() == [True] * 6 + [False]  # it is 38.4 m long
     assert route_of(np.zeros((0, 3))) == (Command.STRAIGHT, None)

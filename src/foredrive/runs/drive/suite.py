@@ -127,6 +127,8 @@ class DriveSuite:
         """Return the contents of the suite's file."""
         of_all = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
         del of_all["source"]
+        if self.lidar:  # as in folders from before it could be left out
+            del of_all["lidar"]
         if self.faults == NO_FAULTS:  # as in folders from before there were faults
             del of_all["faults"]
         else:

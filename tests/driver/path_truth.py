@@ -1,0 +1,36 @@
+"""A made-up truth of what is on a path."""
+
+import torch
+
+from foredrive.scene import VoxelSpec
+from foredrive.scene.affordances import CELLS, TIMES, Affordances
+from foredrive.scene.traffic_light import LightState
+
+SPEC = VoxelSpec((-4.0, -4.0, -1.0), 4.0, (1, 2, 2))
+
+
+def truth(batch: int = 2) -> Affordances:
+    """A red light whose lamp is 12 m ahead, and a road user on the path from one second on."""
+    occupied = torch.zeros(batch, TIMES, CELLS, dtype=torch.bool)
+    occupied[:, 2:, 4] = True
+    none, zero = torch.zeros(batch, dtype=torch.bool), torch.zeros(batch)
+    return Affordances(
+        path_xy=torch.zeros(batch, 72, 2),
+        path_valid=torch.zeros(batch, 72, dtype=torch.bool),
+        light=torch.full((batch,), int(LightState.RED)),
+        light_m=torch.full((batch,), 5.0),
+        light_known=~none,
+        light_later=torch.zeros(batch, 6, dtype=torch.long),
+        lamp_xyz=torch.tensor([[[12.0, 0.4, 1.9], [12.0, 40.0, 3.0]]]).expand(batch, 2, 3),
+        lamp=torch.tensor([[True, True]]).expand(batch, 2),
+        lamps_known=~none,
+        lead=none,
+        lead_m=zero,
+        lead_mps=zero,
+        lead_known=~none,
+        crossing_xy=torch.zeros(batch, 0, 2),
+        crossing=torch.zeros(batch, 0, dtype=torch.bool),
+        crossing_known=~none,
+        occupied=occupied,
+        occupied_known=torch.ones(batch, TIMES, CELLS, dtype=torch.bool),
+    )
