@@ -8,7 +8,16 @@ import pytest
 import torch
 from path_truth import SPEC
 
-from foredrive.driver.agent import CREEPS, WAITS, Driver, LightMemory, PartlyTrue, Perception, given_path
+from foredrive.driver.agent import (
+    CREEPS,
+    IMPATIENT,
+    WAITS,
+    Driver,
+    LightMemory,
+    PartlyTrue,
+    Perception,
+    given_path,
+)
 from foredrive.driver.eyes import CameraEyes, CameraEyesConfig
 from foredrive.driver.sight import Sight
 from foredrive.driver.speed_planner import SpeedPlanner, SpeedPlannerConfig
@@ -96,6 +105,13 @@ def test_who_stands_for_long_creeps_unless_it_is_sure(
     free = [not bool((perception(standing).occupied > 0.5).any()) for _ in range(WAITS + CREEPS)]
     assert not any(free[:WAITS])
     assert all(free[WAITS:]) is frees
+
+
+def test_a_light_that_never_changes_stops_nobody_for_ever(standing: Clip) -> None:
+    perception = Perception(Fixed(sight(LightState.RED, 0.8)))
+    lights = [state(perception(standing)) for _ in range(IMPATIENT + 2)]
+    assert lights[:IMPATIENT].count(LightState.RED) == IMPATIENT
+    assert lights[IMPATIENT:] == [LightState.NONE] * 2
 
 
 def test_parts_of_the_truth_take_the_place_of_what_is_seen(standing: Clip) -> None:

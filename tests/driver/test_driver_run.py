@@ -74,6 +74,19 @@ def test_packed_clips_are_those_of_the_logs(dataset: ClipDataset, tmp_path: Path
     assert {file for file in written if again[file] != written[file]} == {damaged}
 
 
+def test_another_part_of_a_log_has_files_of_its_own(logs: list[LogPath], tmp_path: Path) -> None:
+    """Its clips are at other rows; the rows of the whole log are others' clips."""
+    keys = []
+    for part_s in (None, (1.0, 2.6)):
+        dataset = ClipDataset(logs, dataclasses.replace(recipe().clips, part_s=part_s), None)
+        clips = PackedClips(dataset, tmp_path)
+        clips.pack()
+        for index in range(len(clips)):
+            assert torch.equal(clips[index].clip.T_world_ego, dataset.clip(index).T_world_ego)
+        keys.append([clips[index].key for index in range(len(clips))])
+    assert set(keys[1]) < set(keys[0])
+
+
 def test_a_run_is_continued_and_drives(logs: list[LogPath], dataset: ClipDataset, tmp_path: Path) -> None:
     folder = tmp_path / "run"
     run = train_driver(recipe(), logs, folder, tmp_path / "cache")

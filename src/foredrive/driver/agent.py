@@ -60,7 +60,7 @@ class Driver(nn.Module):
 
 
 class LightMemory:
-    """What was seen of the next light in the plans before: near its line, its lamps are out of view."""
+    """Remembers what was seen of the next light: near its line, its lamps are out of view."""
 
     def __init__(self) -> None:
         self._evidence = 0.0
@@ -110,7 +110,9 @@ class LightMemory:
 
 
 class Perception:
-    """What a driver knows of its route in one drive: its sight, and its memory of lights and of standing.
+    """Returns what a driver knows of its route in one drive, by its sight and its memory.
+
+    It remembers lights, and for how long it has stood.
 
     Args:
         driver: eyes and planner.
@@ -119,7 +121,7 @@ class Perception:
     def __init__(self, driver: Driver) -> None:
         self._driver, self._lights = driver, LightMemory()
         self._before: Tensor | None = None
-        self._stood, self._creeping = 0, 0
+        self._stood, self._creeping, self._impatient = 0, 0, False
 
     def __call__(self, observation: Clip) -> PathEstimate:
         """Return what is on the route of an observation of a batch of one."""
@@ -135,13 +137,12 @@ class Perception:
         self._stood = self._stood + 1 if speed_mps < STANDS_MPS else 0
         stopped_by_light = float(view.light[0, [LightState.RED, LightState.YELLOW]].sum()) > 0.5
         if (self._stood > WAITS and not stopped_by_light) or self._stood > IMPATIENT:
-            self._creeping = CREEPS
-            if self._stood > IMPATIENT:
-                self._lights.forget()
+            self._creeping, self._impatient = CREEPS, self._stood > IMPATIENT
         if self._creeping == 0:
             return view
         self._creeping -= 1
-        return PathEstimate(view.light, view.light_m, (view.occupied > SURE).to(view.occupied))
+        light = torch.eye(4)[[LightState.NONE]].to(view.light) if self._impatient else view.light
+        return PathEstimate(light, view.light_m, (view.occupied > SURE).to(view.occupied))
 
 
 class SightDriver:

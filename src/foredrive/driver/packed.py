@@ -15,16 +15,15 @@ from torch.utils.data import Dataset
 
 from foredrive.data import ClipDataset
 from foredrive.data.batches import stack_records
+from foredrive.data.maps import map_file
 from foredrive.errors import InputError
 from foredrive.files import atomic_path
 from foredrive.scene import Clip
 from foredrive.scene.affordances import Affordances
 from foredrive.scene.record import Record
 
-PACK_VERSION = 1
+PACK_VERSION = 2
 """Version in every name. Increase it when the content of the files changes."""
-LAMPS, PEOPLE = 12, 8
-"""Entries to which lamps and people are padded or cut, so that clips stack."""
 R = TypeVar("R", bound=Record)
 
 
@@ -38,7 +37,7 @@ class RouteExample(Record):
 
 
 def join(examples: Sequence[RouteExample]) -> RouteExample:
-    """Return a batch."""
+    """Return a batch. Lamps and people are padded to the maximum in it."""
     keys = tuple(key for example in examples for key in example.key)
     batch = stack_records([dataclasses.replace(example, key=()) for example in examples])
     return dataclasses.replace(batch, key=keys)
@@ -62,14 +61,14 @@ class PackedClips(Dataset[RouteExample]):
         if dataset.config.tasks is None or not dataset.config.tasks.affordances:
             raise InputError("a driver learns from affordances: set clips.tasks.affordances to true")
         self._dataset, self._folder = dataset, folder
-        self._rows: list[tuple[Path, int]] = []
-        """File of each clip, and its row there."""
-        self._first: dict[Path, list[int]] = {}
+        of_log: dict[int, list[int]] = {}
         for index in range(len(dataset)):
-            file = self._file(index)
-            rows = self._first.setdefault(file, [])
-            self._rows.append((file, len(rows)))
-            rows.append(index)
+            of_log.setdefault(dataset.frames_of(index)[0], []).append(index)
+        self._files = {self._file(log, clips): clips for log, clips in of_log.items()}
+        """Clips of each file, in the order of its rows. A file has those of one log."""
+        self._rows = {
+            index: (file, row) for file, clips in self._files.items() for row, index in enumerate(clips)
+        }
         self._template = self._read(0)
 
     def __len__(self) -> int:
@@ -82,7 +81,7 @@ class PackedClips(Dataset[RouteExample]):
             InputError: data cannot be read.
             OSError: the disk is full.
         """
-        for file, clips in self._first.items():
+        for file, clips in self._files.items():
             if not _is_whole(file):
                 self._write(file, clips)
             tick()
@@ -90,7 +89,7 @@ class PackedClips(Dataset[RouteExample]):
     @property
     def logs(self) -> int:
         """Return the number of logs."""
-        return len(self._first)
+        return len(self._files)
 
     def __getitem__(self, index: int) -> RouteExample:
         """Read one clip.
@@ -115,11 +114,13 @@ class PackedClips(Dataset[RouteExample]):
             example, clip=dataclasses.replace(example.clip, images=seen), key=(self._dataset.key(index),)
         )
 
-    def _file(self, index: int) -> Path:
-        number, _ = self._dataset.frames_of(index)
-        log = self._dataset.logs[number]
-        config = dataclasses.replace(self._dataset.config, part_s=None)
-        key = (PACK_VERSION, log.fingerprint, config, self._dataset.camera_names)
+    def _file(self, number: int, clips: Sequence[int]) -> Path:
+        """Return the file of the clips of a log."""
+        log, dataset = self._dataset.logs[number], self._dataset
+        frames = [dataset.frames_of(index)[1] for index in clips]
+        road = map_file(log)
+        stat = None if road is None else (str(road), road.stat().st_size, road.stat().st_mtime_ns)
+        key = (PACK_VERSION, log.fingerprint, stat, dataset.config, dataset.camera_names, frames)
         name = hashlib.blake2b(repr(key).encode(), digest_size=16).hexdigest()
         return self._folder / name[:2] / f"{name}.safetensors"
 
@@ -143,22 +144,7 @@ class PackedClips(Dataset[RouteExample]):
         clip, truth = self._dataset.clip(index), self._dataset.truth(index)
         assert truth is not None
         assert truth.affordances is not None
-        boxes = clip.boxes[:, :0]
-        known = truth.affordances
-        padded = dataclasses.replace(
-            known,
-            lamp_xyz=_padded(known.lamp_xyz, LAMPS),
-            lamp=_padded(known.lamp, LAMPS),
-            crossing_xy=_padded(known.crossing_xy, PEOPLE),
-            crossing=_padded(known.crossing, PEOPLE),
-        )
-        return RouteExample(dataclasses.replace(clip, boxes=boxes), padded, ())
-
-
-def _padded(values: Tensor, count: int) -> Tensor:
-    rows = values.new_zeros(count, *values.shape[1:])
-    rows[: len(values)] = values[:count]
-    return rows
+        return RouteExample(dataclasses.replace(clip, boxes=clip.boxes[:, :0]), truth.affordances, ())
 
 
 def _without_images(example: RouteExample) -> RouteExample:
