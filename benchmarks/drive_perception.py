@@ -1,4 +1,4 @@
-"""What drivers see of Town05 before any planning: `foredrive bench drive-perception`, hours on two cores.
+"""Measures what drivers see of Town05 before any planning: `foredrive bench drive-perception`, hours.
 
 Virtual egos of the seven training towns teach the eyes of a driver; 1,500 clips of Town05 judge them, by day.
 `N_seeds` is the learning curve: 2,100 clips for each seed of the towns, and as many epochs. `history_K` reads

@@ -33,14 +33,15 @@ def drive(
 
     Args:
         agent: A run folder; embedded, the driver that comes with the package; expert (it has privileged
-            information); idm (the intelligent driver model on the route, which knows lights and leader) or
-            idm:RUN (which is told them by a run); constant-velocity (straight on at 5 m/s); stop (stands
-            still); or ego-mlp:RUN, the MLP that sees only the ego status, fitted to the training data of a
-            run. http://HOST:PORT is a
-            planner in another process that speaks neuro-ncap's model server protocol; ?timeout=S behind it
-            changes the 60 s in which it has to answer. Two more record DAgger demonstrations, with the
-            expert's plan at each key frame in the logs. disturbed is the expert while it is steered aside and
-            slowed. student:RUN is a run in alternation with the expert.
+            information); idm (the intelligent driver model on the route, which knows lights and road users)
+            or idm:RUN (which knows what a driver sees of them); true:RUN, true-lights:RUN or true-users:RUN
+            (a driver to which both, or one of them, are told as they are); constant-velocity (straight on at
+            5 m/s); stop (stands still); or ego-mlp:RUN, the MLP that sees only the ego status, fitted to the
+            training data of a run. http://HOST:PORT is a planner in another process that speaks neuro-ncap's
+            model server protocol; ?timeout=S behind it changes the 60 s in which it has to answer. Two more
+            record DAgger demonstrations, with the expert's plan at each key frame in the logs. disturbed is
+            the expert while it is steered aside and slowed. student:RUN is a run in alternation with the
+            expert.
         out: Folder of the suite: summary.json, report.html, drives, logs.
     """
     check_out_folder(out)

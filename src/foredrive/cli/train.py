@@ -1,6 +1,5 @@
 """`foredrive train`."""
 
-from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -75,8 +74,7 @@ def train(
     if driver is not None:
         if tasks or rank() is not None:
             raise InputError(f"{driver.name} trains a driver: leave out --tasks and torchrun")
-        packing = partial(job_progress, "packing clips")
-        train_driver(driver, found, out, cache, start, packing)
+        train_driver(driver, found, out, cache, start, job_progress)
         print(f"trained {driver.name}: {out}")
         print(f"next: foredrive drive --agent {out} --routes town05-short --out {out / 'short'}")
         return

@@ -281,6 +281,7 @@ def _occupied(
         torch.cat([boxes.valid[:, None], future.valid], dim=1),
         path,
     )
+    # A road user that no sensor shows cannot be learned: its cells are left open, not free.
     seen = torch.ones(len(boxes.yaw), dtype=torch.bool)
     if (share := read_visibility(log, frame)) is not None:
         seen = share > 0
@@ -289,8 +290,8 @@ def _occupied(
     inside = reach_m <= float(path.valid.sum()) - 1.0
     t_us = log.t_us[frame] + np.round(np.arange(TIMES) * LATER_DT_S * 1e6).astype(np.int64)
     annotated = torch.from_numpy(annotated_at(tracks, t_us))
-    known = annotated[:, None] & inside & (occupied | ~by_user[~seen].any(0))
-    return occupied & known, known
+    judged = annotated[:, None] & inside & (occupied | ~by_user[~seen].any(0))
+    return occupied & judged, judged
 
 
 def occupied_by(

@@ -28,7 +28,7 @@ class CameraEyesConfig:
     """Key frames that are read, now included."""
     cameras: int = 2
     blind: bool = False
-    """Images are black: what the route and the speed alone tell."""
+    """Images are black: what the route alone tells."""
     kind: Literal["cameras"] = "cameras"
 
 
@@ -133,6 +133,7 @@ class CameraEyes(nn.Module):
         z = cells.new_tensor(HEIGHTS_M)[:, None, None, None].expand(count, *cells.shape[1:3], 1)
         points = torch.cat([cells[:, None].expand(-1, count, -1, -1, -1), z.expand(b, *z.shape)], dim=-1)
         points = points.flatten(1, 3)
+        # Places of now in the ego frame of each key frame: features are read where the cameras were then.
         T_frame_now = compose_se3(inverse_se3(frames.T_world_ego), frames.T_world_ego[:, -1:]).float()
         read = []
         for t in range(frames.images.shape[1]):

@@ -1,4 +1,4 @@
-"""How well a driver sees: figures over packed clips, before any planning."""
+"""Judges how well a driver sees, over packed clips and before any planning."""
 
 from collections.abc import Callable, Iterator
 from typing import NamedTuple
@@ -11,7 +11,7 @@ from torch import Tensor
 from foredrive.data.affordances import PathAhead
 from foredrive.driver.agent import Driver
 from foredrive.driver.losses import lamp_places
-from foredrive.driver.packed import PackedClips, join
+from foredrive.driver.packed import BATCH, PackedClips, join
 from foredrive.models.ego_mlp import ego_speeds
 from foredrive.scene.affordances import CELL_M, LATER_DT_S, TIMES, Affordances, PathEstimate
 from foredrive.scene.traffic_light import LightState
@@ -21,11 +21,10 @@ LIGHT_M, OBSTACLE_M = 40.0, 30.0
 """Distances up to which lights and the first obstacle are judged."""
 THRESHOLDS = (0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8)
 FALSE_AT_MOST = 0.1
-BATCH = 32
 
 
 class Moment(NamedTuple):
-    """What counts of one clip."""
+    """Holds what counts of one clip."""
 
     state: int
     """True `LightState`."""
@@ -34,15 +33,15 @@ class Moment(NamedTuple):
     light_m: float
     light_error_m: float
     visible: bool
-    """Whether a lamp of the light is in an image."""
+    """True if a lamp of the light is in an image."""
     lit: bool
-    """Whether the truth knows the light."""
+    """True if the log tells the light."""
     first: int
     """First cell of the path that is occupied now; -1 without."""
     first_seen: Float[np.ndarray, "K"]
     """The same of the estimate at each of `THRESHOLDS`."""
     conflict: bool
-    """Whether somebody is met who drives on freely."""
+    """True if the vehicle would meet somebody if it drove on freely."""
     conflict_seen: Bool[np.ndarray, "K"]
     """The same by the estimate at each of `THRESHOLDS`."""
     crossing: bool
@@ -68,11 +67,12 @@ def judge_sight(
     """Return how well a driver sees lights and road users on its route.
 
     `light_accuracy_40m` and `red_missed_40m` count lights within 40 m with a lamp in an image; a red light is
-    missed if neither red nor yellow is named. `conflict_recall` is the share of the moments in which somebody
-    would be met who drives on freely, that are seen, at the threshold with at most 10 % of the other moments
-    taken for such; `crossing_recall` counts those with somebody who is not in the path yet.
-    `first_obstacle_error_m` is the median error of the first occupied cell now, a missed one counted as the
-    distance to the end of the range.
+    missed if neither red nor yellow is named. `conflict_recall` is the share that is seen of the moments in
+    which the vehicle would meet somebody if it drove on freely. It counts at the lowest threshold at which
+    at most 10 % of the other moments are taken for such, or at the highest one; `conflict_false` is this
+    share. `crossing_recall` counts those with somebody who is not in the path yet. `first_obstacle_error_m`
+    is the median error of the first occupied cell now, a missed one counted as the distance to the end of the
+    range.
 
     Args:
         driver: in evaluation mode.
@@ -109,9 +109,8 @@ def _moments(driver: Driver, clips: PackedClips, tick: Callable[[], None]) -> It
 
 def _moment(truth: Affordances, estimate: PathEstimate, speed_mps: float, visible: bool) -> Moment:
     path = PathAhead(truth.path_xy, np.zeros(len(truth.path_xy)), truth.path_valid, FRONT_M, True)
-    known = truth.occupied_known
-    occupied = (truth.occupied & known).numpy()
-    p = torch.where(known, estimate.occupied, 0.0).numpy()
+    occupied = (truth.occupied & truth.occupied_known).numpy()
+    p = torch.where(truth.occupied_known, estimate.occupied, 0.0).numpy()
     # Driving on freely, for as long as the truth reaches.
     free_m = drive_along(path, speed_mps, [])
     times = LATER_DT_S * np.arange(1, TIMES)
@@ -141,17 +140,14 @@ def _figures(moments: list[Moment]) -> dict[str, float]:
     state, named = (np.array([getattr(m, name) for m in moments]) for name in ("state", "named"))
     near, lit = np.array([m.judged for m in moments]), np.array([m.lit for m in moments])
     stops = np.isin(named, [LightState.RED, LightState.YELLOW])
-    red, green, none = (
-        near & (state == LightState.RED),
-        near & (state == LightState.GREEN),
-        lit & (state == 0),
-    )
+    red, green = near & (state == LightState.RED), near & (state == LightState.GREEN)
+    none = lit & (state == LightState.NONE)
     right = near & (named == state)
     conflict = np.array([m.conflict for m in moments])
     crossing = np.array([m.crossing for m in moments])
     seen = np.stack([m.conflict_seen for m in moments])
-    # The lowest threshold that is seldom wrong.
-    false = seen[~conflict].mean(0)
+    # The lowest threshold that is seldom wrong; where every moment has a conflict, none can be.
+    false = seen[~conflict].mean(0) if not conflict.all() else np.zeros(len(THRESHOLDS))
     chosen = next((k for k in range(len(THRESHOLDS)) if false[k] <= FALSE_AT_MOST), len(THRESHOLDS) - 1)
     first = np.array([m.first for m in moments])
     first_seen = np.stack([m.first_seen for m in moments])[:, THRESHOLDS.index(0.5)]

@@ -24,7 +24,7 @@ class SightWeights:
     lamps: float = 0.5
     light_m: float = 1.0
     occupied: float = 5.0
-    there: float = 2.5
+    occupied_cells: float = 2.5
     """Weight of occupied cells in the last term: a missed road user is worse than a false one."""
     crossing: float = 2.0
     """Factor for cells that are free now and occupied later: who crosses or cuts in."""
@@ -46,9 +46,9 @@ def sight_losses(
     is_none = truth.light == LightState.NONE
     # A light whose lamps are in no image cannot be named, and neither can "none" be learned from it.
     judged = truth.light_known & (is_none | visible)
-    each = F.cross_entropy(sight.light_logits, truth.light.long(), reduction="none")
+    error = F.cross_entropy(sight.light_logits, truth.light.long(), reduction="none")
     losses = {
-        "light": weights.light * masked_mean(each, judged),
+        "light": weights.light * masked_mean(error, judged),
         "lamps": weights.lamps * _lamp_loss(sight, truth, lamps),
         "light_m": weights.light_m * _line_loss(sight, truth, lamps),
         "occupied": weights.occupied * _occupancy_loss(sight, truth, weights),
@@ -72,10 +72,10 @@ def lamp_places(truth: Affordances, rig: CameraRig, size: tuple[int, int]) -> La
     uv, _, inside = project(
         transform_points(inverse_se3(rig.T_ego_cam), points), rig.K, rig.dist, rig.size_hw
     )
-    known = truth.lamp & (truth.lamps_known & (truth.light != LightState.NONE))[:, None]
+    lamps = truth.lamp & (truth.lamps_known & (truth.light != LightState.NONE))[:, None]
     column = (uv[..., 0] * size[1] / rig.size_hw[1]).floor().long().clamp(0, size[1] - 1)
     row = (uv[..., 1] * size[0] / rig.size_hw[0]).floor().long().clamp(0, size[0] - 1)
-    return LampPlaces(row, column, inside & known[:, None])
+    return LampPlaces(row, column, inside & lamps[:, None])
 
 
 def _lamp_loss(sight: Sight, truth: Affordances, lamps: LampPlaces) -> Float[Tensor, ""]:
@@ -84,11 +84,11 @@ def _lamp_loss(sight: Sight, truth: Affordances, lamps: LampPlaces) -> Float[Ten
     item, camera, lamp = lamps.inside.nonzero(as_tuple=True)
     colour = truth.light[item].long() - 1
     target[item, camera, colour, lamps.row[item, camera, lamp], lamps.column[item, camera, lamp]] = 1.0
-    each = F.binary_cross_entropy_with_logits(sight.lamp_logits, target, reduction="none")
+    error = F.binary_cross_entropy_with_logits(sight.lamp_logits, target, reduction="none")
     p = sight.lamp_logits.sigmoid()
     wrong = torch.where(target > 0, 1 - p, p)
     of_item = truth.lamps_known[:, None, None, None, None]
-    return (wrong.square() * each * of_item).sum() / target.sum().clamp_min(1)
+    return (wrong.square() * error * of_item).sum() / target.sum().clamp_min(1)
 
 
 def _line_loss(sight: Sight, truth: Affordances, lamps: LampPlaces) -> Float[Tensor, ""]:
@@ -103,6 +103,6 @@ def _occupancy_loss(sight: Sight, truth: Affordances, weights: SightWeights) -> 
     """Return the weighted cross-entropy of the cells that are known."""
     occupied = truth.occupied
     later = occupied & ~occupied[:, :1]
-    weight = torch.where(occupied, weights.there, 1.0) * torch.where(later, weights.crossing, 1.0)
-    each = F.binary_cross_entropy_with_logits(sight.occupied_logits, occupied.float(), reduction="none")
-    return masked_mean(weight * each, truth.occupied_known)
+    weight = torch.where(occupied, weights.occupied_cells, 1.0) * torch.where(later, weights.crossing, 1.0)
+    error = F.binary_cross_entropy_with_logits(sight.occupied_logits, occupied.float(), reduction="none")
+    return masked_mean(weight * error, truth.occupied_known)

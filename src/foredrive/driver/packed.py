@@ -22,6 +22,8 @@ from foredrive.scene import Clip
 from foredrive.scene.affordances import Affordances
 from foredrive.scene.record import Record
 
+BATCH = 32
+"""Clips that are looked at together where none is trained on."""
 PACK_VERSION = 2
 """Version in every name. Increase it when the content of the files changes."""
 R = TypeVar("R", bound=Record)
@@ -41,6 +43,11 @@ def join(examples: Sequence[RouteExample]) -> RouteExample:
     keys = tuple(key for example in examples for key in example.key)
     batch = stack_records([dataclasses.replace(example, key=()) for example in examples])
     return dataclasses.replace(batch, key=keys)
+
+
+def batches(clips: int) -> int:
+    """Return the number of batches of `BATCH` clips."""
+    return -(-clips // BATCH)
 
 
 class PackedClips(Dataset[RouteExample]):

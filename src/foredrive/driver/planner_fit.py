@@ -11,7 +11,7 @@ from torch import Tensor
 from foredrive.data.affordances import PathAhead
 from foredrive.data.batches import stack_records
 from foredrive.driver.agent import Driver
-from foredrive.driver.packed import PackedClips, join
+from foredrive.driver.packed import BATCH, PackedClips, join
 from foredrive.driver.speed_planner import chosen_labels, profile_numbers, profile_progress
 from foredrive.errors import InputError
 from foredrive.models.ego_mlp import ego_speeds
@@ -22,7 +22,8 @@ from foredrive.simulation.speed_rule import FRONT_M, Obstacle, PathView, curve_s
 from foredrive.training.in_memory_fit import FitSchedule, fit_in_memory
 
 FASTEST_MPS = 9.0
-BATCH, ROWS = 32, 512
+ROWS = 512
+"""Rows whose numbers are computed together."""
 
 
 @dataclass(frozen=True)

@@ -38,11 +38,13 @@ def route_cells(
         ahead = torch.where(valid & moved, direction[:, k - 1], ahead)
         along.append(torch.where(valid, points[:, k], along[-1] + (given_m[k] - given_m[k - 1]) * ahead))
     line = torch.stack(along, dim=1)
+    # Middles lie on the straight piece between the two points around them.
     middle_m = FRONT_M + CELL_M * (torch.arange(CELLS, device=line.device) + 0.5)
     before = (torch.searchsorted(given_m, middle_m) - 1).clamp(0, len(given_m) - 2)
     share = (middle_m - given_m[before]) / (given_m[before + 1] - given_m[before])
     step = line[:, before + 1] - line[:, before]
     middle = line[:, before] + share[:, None] * step
+    # To the left of the way: (-y, x).
     left = _unit(step)[..., [1, 0]] * step.new_tensor([-1.0, 1.0])
     beside = step.new_tensor(BESIDE_M)
     return middle[:, :, None] + beside[:, None] * left[:, :, None]

@@ -25,6 +25,8 @@ PROFILES = (
 """Speed profiles: the speed that each goes to, m/s, and how fast it changes, m/s². The first eleven brake to
 it, or go on as fast as now (0); the others speed up to it."""
 BRAKING = 11
+TO_LIMIT_MPS2 = 2.0
+"""Braking of a profile without any, where it is faster than the path allows, m/s²."""
 MARGINS_M = (0.5, 2.5, 6.0)
 """Distances before the front bumper up to which a profile's way is looked at."""
 NEAR_LINE_M = 3.0
@@ -55,9 +57,8 @@ def profile_progress(
     brakes = torch.arange(len(PROFILES), device=v.device) < BRAKING
     target = torch.where(brakes, torch.minimum(table[:, 0], v), torch.maximum(table[:, 0], v))
     target = torch.minimum(target, limit_mps[:, None])
-    rate = table[:, 1].clamp_min(
-        2.0 * (table[:, 1] == 0).to(v)
-    )  # a profile without braking still slows to the limit
+    # A profile that goes on as fast as now slows down to the limit all the same.
+    rate = torch.where(table[:, 1] > 0, table[:, 1], TO_LIMIT_MPS2)
     changed_s = ((target - v).abs() / rate)[..., None]
     within_s = torch.minimum(t_s, changed_s)
     signed = torch.where(target < v, -rate, rate)[..., None]
@@ -104,12 +105,17 @@ class SpeedPlanner(nn.Module):
 def profile_numbers(
     view: PathEstimate, speed_mps: Float[Tensor, "b"], limit_mps: Float[Tensor, "b"]
 ) -> Float[Tensor, "b P N"]:
-    """Return what a score depends on, for each profile."""
+    """Return what a score depends on, for each profile.
+
+    N numbers: at each time, how probably road users are met at each of `MARGINS_M` and half a second off, and
+    where front and tail are to the line of a light that stops; then the light, the speed and the progress.
+    """
     progress_m = profile_progress(speed_mps, limit_mps, TIMES - 1)  # [b P T]
     b, profiles, times = progress_m.shape
     start_m = CELL_M * torch.arange(CELLS).to(progress_m)
     occupied = view.occupied.to(progress_m)[:, None, 1:]  # [b 1 T G]
     ends_m = progress_m[..., None]
+    # The vehicle reaches from its rear to a margin before its front: the most probable cell there counts.
     inside = start_m + CELL_M > ends_m - EGO.length_m
     met = [
         torch.where(inside & (start_m < ends_m + margin_m), occupied, 0.0).amax(-1) for margin_m in MARGINS_M
@@ -119,6 +125,7 @@ def profile_numbers(
     before = view.occupied.to(progress_m)[:, None, :-1]
     loose = torch.maximum(occupied, torch.maximum(sooner, before))
     met.append(torch.where(inside & (start_m < ends_m + MARGINS_M[1]), loose, 0.0).amax(-1))
+    # Within some metres of the line, the side on which the front and the judged point are.
     stops = view.light[:, [LightState.RED, LightState.YELLOW]].sum(-1)
     line_m = view.light_m[:, None, None]
     over = ((progress_m - line_m) / NEAR_LINE_M).clamp(-1, 1)
@@ -133,6 +140,7 @@ def profile_numbers(
         ],
         dim=-1,
     )
+    # Speed, limit and progress, as shares of a usual speed.
     own = torch.stack(
         [
             (speed_mps / SPEED_SCALE_MPS)[:, None].expand(b, profiles),

@@ -64,12 +64,14 @@ def rule_progress(path: PathAhead, speed_mps: float, view: PathView) -> Float64[
     obstacles = [] if view.lead is None else [view.lead]
     if must_stop(view.light, view.light_m, speed_mps):
         obstacles.append(Obstacle(_stop_m(view.light_m), 0.0))
+    # What it would do behind the vehicle ahead and for the light alone.
     nominal_m = drive_along(path, speed_mps, obstacles)
     t_s = FRAME_DT_S * np.arange(1, HORIZON_STEPS + 1)
     later_s = LATER_DT_S * np.arange(1, TIMES)
     followed_m = _prolonged(nominal_m, t_s, later_s)
     if not meets_somebody(followed_m, view.occupied):
         return nominal_m
+    # Somebody comes into its way: the fastest slower profile that meets nobody, at last full braking.
     for target_mps, braking_mps2 in SLOWER:
         if target_mps == 0 or target_mps < max(speed_mps, 1.0):
             slower_m = np.minimum(slowed_m(speed_mps, target_mps, braking_mps2, later_s), followed_m)

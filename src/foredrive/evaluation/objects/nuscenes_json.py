@@ -210,8 +210,8 @@ def _with_size(groups: Sequence[ObjectRows], path: Path) -> list[ObjectRows]:
     """
     sized = [np.min(rows.size_lwh, axis=1) > 0 for rows in groups]
     given = sum(map(len, sized))
-    tell_left_out(path, {"boxes without size": given - sum(int(each.sum()) for each in sized)}, given)
-    return [rows[each] for rows, each in zip(groups, sized, strict=True)]
+    tell_left_out(path, {"boxes without size": given - sum(int(kept.sum()) for kept in sized)}, given)
+    return [rows[kept] for rows, kept in zip(groups, sized, strict=True)]
 
 
 def _name(box: Box) -> object:

@@ -16,7 +16,7 @@ from foredrive.driver.agent import Driver
 from foredrive.driver.eyes import CameraEyes, CameraEyesConfig
 from foredrive.driver.judging import missed_by
 from foredrive.driver.objective import SightObjective
-from foredrive.driver.packed import PackedClips, join
+from foredrive.driver.packed import PackedClips, batches, join
 from foredrive.driver.planner_fit import fit_planner
 from foredrive.driver.speed_planner import SpeedPlanner
 from foredrive.driver.volume_eyes import VolumeEyes
@@ -32,8 +32,8 @@ from foredrive.training import load_weights, train
 
 SEE, PLAN = "see", "plan"
 """Folders of the stages."""
-Packing = Callable[[int], AbstractContextManager[Callable[[], None]]]
-"""Shows the progress of a number of logs, each of which calls the function."""
+Progress = Callable[[str, int], AbstractContextManager[Callable[[], None]]]
+"""Shows what is done, and how far a number of parts is; the function is called after each part."""
 
 
 @dataclass(frozen=True)
@@ -103,9 +103,11 @@ def build_driver(recipe: DriverRecipe) -> Driver:
     return Driver(eyes, SpeedPlanner(recipe.planner))
 
 
-def _drawn(driver: Driver, clips: PackedClips, emphasis: float) -> Float[Tensor, "N"]:
+def _drawn(
+    driver: Driver, clips: PackedClips, emphasis: float, tick: Callable[[], None]
+) -> Float[Tensor, "N"]:
     """Return how often each clip is drawn: more often where a driver is wrong."""
-    return torch.where(missed_by(driver, clips), emphasis, 1.0)
+    return torch.where(missed_by(driver, clips, tick), emphasis, 1.0)
 
 
 def _load_encoder(driver: Driver, start: Path) -> None:
@@ -127,7 +129,7 @@ def train_driver(
     folder: Path,
     cache_dir: Path | None = None,
     start: Path | None = None,
-    packing: Packing = lambda count: nullcontext(lambda: None),
+    progress: Progress = lambda what, count: nullcontext(lambda: None),
 ) -> DriverRun:
     """Train the eyes, then fit the planner. It continues where an earlier call stopped.
 
@@ -138,7 +140,7 @@ def train_driver(
         cache_dir: folder of packed clips; by default in `folder`.
         start: a run to start from. A driver's run gives its weights, and clips in which it is wrong are drawn
             more often (`DriverRecipe.emphasis`); a world model's run gives its pre-trained encoder.
-        packing: shows the progress of packing.
+        progress: shows how far packing and looking at the clips are.
 
     Raises:
         InputError: the folder holds another run, another process trains it, or a log cannot be read.
@@ -153,14 +155,16 @@ def train_driver(
     clips = PackedClips(dataset, (cache_dir or folder / "cache") / "packed")
     with claim.claimed():
         _write_rigs(run, dataset)
-        with packing(clips.logs) as tick:
+        with progress("packing clips", clips.logs) as tick:
             clips.pack(tick)
         torch.manual_seed(recipe.see.seed)
         driver, drawn = build_driver(recipe), None
         eyes = folder / SEE / WEIGHTS
         if start is not None and is_driver(start):
             load_weights(driver, open_driver(start).weights)
-            drawn = None if eyes.is_file() else _drawn(driver.eval(), clips, recipe.emphasis)
+            if not eyes.is_file():
+                with progress("looking for mistakes", batches(len(clips))) as tick:
+                    drawn = _drawn(driver.eval(), clips, recipe.emphasis, tick)
         elif start is not None:
             _load_encoder(driver, start)
         if not eyes.is_file():
@@ -172,7 +176,8 @@ def train_driver(
         if not (folder / PLAN / WEIGHTS).is_file():
             load_weights(driver.eyes, eyes)
             driver.eval()
-            fit_planner(driver, clips, recipe.plan, recipe.see.seed)
+            with progress("driving the clips by rule", batches(min(len(clips), recipe.plan.clips))) as tick:
+                fit_planner(driver, clips, recipe.plan, recipe.see.seed, tick)
             with atomic_path(folder / PLAN / WEIGHTS) as temporary:
                 save_file(driver.state_dict(), temporary)
     return run
