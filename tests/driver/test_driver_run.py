@@ -8,6 +8,7 @@ import torch
 
 from foredrive.data import ClipDataset
 from foredrive.data.log_paths import LogPath
+from foredrive.driver.agent import SightDriver
 from foredrive.driver.judging import judge_sight
 from foredrive.driver.packed import PackedClips, join
 from foredrive.errors import InputError
@@ -18,6 +19,8 @@ from foredrive.runs.shipped import run_folder
 from foredrive.runs.train.driver import load_driver, open_driver, train_driver
 from foredrive.runs.train.run import load_agent, open_run
 from foredrive.sensors.rigs import FRONT_TELE, camera_rig
+from foredrive.simulation.demonstrations import AlternatingStudent
+from foredrive.simulation.town import TownSimulator
 from foredrive.towns import virtual_egos
 from foredrive.towns.sensing.capture import SensorSuite
 from foredrive.towns.world import World
@@ -111,6 +114,14 @@ def test_a_run_is_continued_and_drives(logs: list[LogPath], dataset: ClipDataset
     plan = agent.act(join([PackedClips(dataset, tmp_path / "cache/packed")[0]]).clip)
     assert plan.xy.shape == (1, 1, 6, 2)
     assert bool(plan.xy.isfinite().all())
+    town = TownSimulator()
+    assert isinstance(make_agent(f"student:{folder}", lambda: 0.0, town), AlternatingStudent)
+    for other in ("ego-mlp:", "idm:"):
+        with pytest.raises(InputError):  # it has no fitted MLP; the rule needs a town
+            make_agent(f"{other}{folder}", lambda: 0.0)
+    assert isinstance(make_agent(f"true-lights:{folder}", lambda: 0.0, town), SightDriver)
+    with pytest.raises(InputError, match="true-lights:RUN"):
+        make_agent(f"true-light:{folder}", lambda: 0.0, town)
     inputs = inputs_of(str(folder))
     assert (inputs.cameras, inputs.lidar, inputs.past_frames) == (True, False, 1)
     assert inputs.camera_names == ("pcam_f0", "ftcam_tele_f0")

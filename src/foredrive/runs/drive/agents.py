@@ -188,12 +188,13 @@ def make_agent(
         if agent.startswith(prefix):
             driver, truth = _driver(folder), TruePerception(_town(town))
             return SightDriver(driver, PartlyTrue(Perception(driver), truth, lights=lights, users=users))
-    if is_driver(folder):
-        return SightDriver(_driver(folder))
-    if agent.startswith((STUDENT, OLD_STUDENT)):
-        return AlternatingStudent(following(_seeing(folder), clock), _expert(town), clock, seed)
     if agent.startswith(EGO_MLP):
         return RestartingAgent(_fitted(folder), clock)
+    if agent.startswith((STUDENT, OLD_STUDENT)):
+        driven = SightDriver(_driver(folder)) if is_driver(folder) else following(_seeing(folder), clock)
+        return AlternatingStudent(driven, _expert(town), clock, seed)
+    if is_driver(folder):
+        return SightDriver(_driver(folder))
     return RestartingAgent(following(_seeing(folder), clock), clock, _seeing(folder).is_free)
 
 
@@ -253,10 +254,11 @@ def _run_folder(agent: str) -> Path:
     )
     folder = run_folder(Path(agent.removeprefix(prefix)))
     if not folder.is_dir():
+        partly_true = ", ".join(f"{truth}RUN" for truth in PARTLY_TRUE)
         known = (
             f"{EXPERT}, {STOP}, {CONSTANT_VELOCITY}, a run folder, {EGO_MLP}RUN, {HTTP}HOST:PORT, "
-            f"{GRPC}HOST:PORT, {IDM}, {IDM_BY_SIGHT}RUN, {DISTURBED} or {STUDENT}RUN, and in a "
-            f"reconstruction {REPLAY} or {CORRIDOR}"
+            f"{GRPC}HOST:PORT, {IDM}, {IDM_BY_SIGHT}RUN, {partly_true}, "
+            f"{DISTURBED} or {STUDENT}RUN, and in a reconstruction {REPLAY} or {CORRIDOR}"
         )
         raise InputError(f"unknown agent {agent!r}; the agents are {known}")
     return folder
