@@ -22,8 +22,9 @@ from foredrive.view.video import write_video
 
 SPEEDUP = 2.0
 """Speed of the video relative to real time."""
-FRONT = ("pcam_l0", "pcam_f0", "pcam_r0")
-CAMERA_WH = (256, 144)
+FRONT = ("pcam_l0", "pcam_f0", "pcam_r0", "ftcam_tele_f0")
+SHOWN = 3
+"""The cameras that are shown, side by side over the whole width, and how many of them at most."""
 ABOVE_WH = (768, 288)
 PX_PER_M, EGO_AT_X = 5.0, 0.3
 """Scale of the view from above, px per metre, and the ego's place as a part of the width. The ego faces
@@ -54,15 +55,18 @@ def _frame(log: Log, index: int, drive: DriveRecord) -> Image.Image:
     )
     _caption(ImageDraw.Draw(above), log, index, drive)
     cameras = pinhole_cameras(log)
-    shown = [camera for name in FRONT if (camera := find_camera(cameras, name)) is not None]
-    if not shown:
+    front = [camera for name in FRONT if (camera := find_camera(cameras, name)) is not None][:SHOWN]
+    if not front:
         return above
-    frame = Image.new("RGB", (ABOVE_WH[0], ABOVE_WH[1] + CAMERA_WH[1]), palette.GROUND)
-    frame.paste(above, (0, CAMERA_WH[1]))
-    for number, camera in enumerate(shown):
-        image = read_camera(log, index, camera, CAMERA_WH[::-1], with_image=True).image
+    # All cameras of a row have the shape of the first.
+    width = ABOVE_WH[0] // len(front)
+    height = round(width * front[0].height / front[0].width)
+    frame = Image.new("RGB", (ABOVE_WH[0], ABOVE_WH[1] + height), palette.GROUND)
+    frame.paste(above, (0, height))
+    for number, camera in enumerate(front):
+        image = read_camera(log, index, camera, (height, width), with_image=True).image
         if image is not None:
-            frame.paste(Image.fromarray(image.permute(1, 2, 0).numpy()), (number * CAMERA_WH[0], 0))
+            frame.paste(Image.fromarray(image.permute(1, 2, 0).numpy()), (number * width, 0))
     return frame
 
 
