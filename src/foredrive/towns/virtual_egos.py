@@ -51,9 +51,9 @@ LIGHT_M, AT_LIGHT_SHARE = 45.0, 2 / 3
 """Egos with a light within this distance ahead, m, fill this share of a window if there are enough."""
 STANDING_MPS, STANDING_SHARE = 0.5, 0.25
 """Egos that are slower than this, m/s, are at most this share of a window: half of all traffic waits."""
-INSERTED_SHARES = (0.25, 0.35, 0.25, 0.15)
+INSERTED_SHARES = (0.1, 0.35, 0.35, 0.2)
 """Shares of the logs with 0, 1, 2 and 3 inserted people or cyclists."""
-MEETING_SHARE, MEETING_S = 0.5, 1.5
+MEETING_SHARE, MEETING_S = 0.75, 1.5
 """Share of them who cross at most this long before or after the ego comes by, s, if it does."""
 MIN_PATH_M, AHEAD_M = 12.0, 150.0
 """Least length of a route, and its length beyond the distance that is driven, m."""
@@ -273,7 +273,7 @@ def _insert(window: _Window, ego: _Ego, track_id: int, rng: np.random.Generator)
     heading = float(np.arctan2(*(further - place)[1::-1]))
     cycles = rng.random() < 0.6
     side = float(rng.choice([-1.0, 1.0]))
-    beside_m = rng.uniform(3.0, 15.0 if cycles else 12.0)
+    beside_m = rng.uniform(2.0, 15.0 if cycles else 12.0)
     foot_m = place + side * beside_m * np.array([-np.sin(heading), np.cos(heading), 0.0])
     yaw = heading - side * 0.5 * np.pi + rng.normal(0.0, 0.25)
     if rng.random() < 0.15:  # along the road in place of across it
