@@ -2,11 +2,26 @@
 
 import torch
 
+from foredrive.driver.road_user_targets import USERS
+from foredrive.driver.route_cells import BESIDE_M
+from foredrive.driver.sight import Sight
 from foredrive.scene import VoxelSpec
 from foredrive.scene.affordances import CELLS, TIMES, Affordances
 from foredrive.scene.traffic_light import LightState
 
 SPEC = VoxelSpec((-4.0, -4.0, -1.0), 4.0, (1, 2, 2))
+
+
+def sight_of(batch: int, light: torch.Tensor | None = None, size: tuple[int, int] = (8, 16)) -> Sight:
+    """A sight of two cameras that sees nothing: all numbers 0."""
+    return Sight(
+        torch.zeros(batch, 4) if light is None else light,
+        torch.zeros(batch, 2, 3, *size),
+        torch.zeros(batch, 2, *size),
+        torch.zeros(batch, TIMES, CELLS),
+        torch.zeros(batch, 2, len(USERS), *size),
+        torch.zeros(batch, len(USERS) + 2, CELLS, len(BESIDE_M)),
+    )
 
 
 def truth(batch: int = 2) -> Affordances:

@@ -6,7 +6,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 import torch
-from path_truth import SPEC
+from path_truth import SPEC, sight_of
 
 from foredrive.driver.agent import (
     CREEPS,
@@ -85,7 +85,10 @@ def sight(light: LightState, p_there: float) -> Sight:
     logits[...] = torch.logit(torch.tensor(p_there))
     light_logits = torch.full((1, 4), -5.0)
     light_logits[0, light] = 5.0
-    return Sight(light_logits, torch.zeros(1, 2, 3, 2, 2), torch.full((1, 2, 2, 2), -1.0), logits)
+    nothing = sight_of(1, light_logits)
+    return dataclasses.replace(
+        nothing, lamp_line=torch.full_like(nothing.lamp_line, -1.0), occupied_logits=logits
+    )
 
 
 @pytest.fixture

@@ -5,17 +5,16 @@ from collections.abc import Callable
 
 import pytest
 import torch
-from path_truth import SPEC, truth
+from path_truth import SPEC, sight_of, truth
 
 from foredrive.driver.eyes import CameraEyes, CameraEyesConfig
 from foredrive.driver.losses import SightWeights, lamp_places, sight_losses
-from foredrive.driver.sight import Sight, line_m, scaled_line
+from foredrive.driver.sight import line_m, scaled_line
 from foredrive.driver.volume_eyes import VolumeEyes, VolumeEyesConfig
 from foredrive.errors import InputError
 from foredrive.geometry.se3 import inverse_se3, transform_points
 from foredrive.recipes.nemo import nemo_town
 from foredrive.scene import Example, VoxelSpec
-from foredrive.scene.affordances import CELLS, TIMES
 from foredrive.scene.traffic_light import LightState
 
 
@@ -72,7 +71,7 @@ def test_frozen_eyes_train_what_reads_them_alone(make_example: Callable[..., Exa
     spec = VoxelSpec((-8.0, -10.0, -1.5), 2.0, (3, 10, 16))
     network = VolumeEyes(VolumeEyesConfig(nemo_town().model, spec, frozen=True)).train()
     clip = make_example(spec=SPEC, batch=2, past=1, future=0, cameras=2).clip
-    sight_losses(network(clip), truth(), clip.rig[:, clip.now], SightWeights())["loss"].backward()
+    sight_losses(network(clip), truth(), clip, SightWeights())["loss"].backward()
     assert not network.backbone.training
     moved = {
         name.split(".")[0] for name, p in network.named_parameters() if p.grad is not None and p.grad.any()
@@ -111,7 +110,7 @@ def test_the_distance_of_a_line_is_read_at_the_lamp() -> None:
     lamps, lines = torch.full((1, 2, 3, 2, 3), -4.0), torch.zeros(1, 2, 2, 3)
     lamps[0, 1, 2, 1, 0] = 3.0  # green, in the second camera
     lines[0, 1, 1, 0] = scaled_line(torch.tensor(17.0))
-    sight = Sight(torch.zeros(1, 4), lamps, lines, torch.zeros(1, TIMES, CELLS))
+    sight = dataclasses.replace(sight_of(1, size=(2, 3)), lamp_logits=lamps, lamp_line=lines)
     torch.testing.assert_close(sight.light_m, torch.tensor([17.0]))
 
 
@@ -124,15 +123,12 @@ def test_lamps_are_learned_in_place_and_unknown_cells_not_at_all(
     hidden[0] = False
     known = dataclasses.replace(known, occupied_known=hidden)
     h, w = 8, 16
-    sight = Sight(
-        torch.zeros(2, 4, requires_grad=True),
-        torch.zeros(2, 2, 3, h, w, requires_grad=True),
-        torch.zeros(2, 2, h, w, requires_grad=True),
-        torch.zeros(2, TIMES, CELLS, requires_grad=True),
-    )
+    sight = sight_of(2, size=(h, w))
+    for field in dataclasses.fields(sight):
+        getattr(sight, field.name).requires_grad_()
     places = lamp_places(known, rig, (h, w))
     assert places.inside.nonzero().tolist() == [[0, 0, 0], [1, 0, 0]]  # the front camera sees the first lamp
-    losses = sight_losses(sight, known, rig, SightWeights())
+    losses = sight_losses(sight, known, clip, SightWeights())
     torch.testing.assert_close(losses["loss"], sum(v for k, v in losses.items() if k != "loss"))
     losses["loss"].backward()
     wanted = (sight.lamp_logits.grad < 0).nonzero().tolist()
@@ -149,7 +145,6 @@ def test_a_light_that_no_image_shows_is_not_learned(make_example: Callable[..., 
     clip = make_example(spec=SPEC, batch=2, past=1, future=0, cameras=2).clip
     known = dataclasses.replace(truth(), lamp=torch.tensor([[False, True], [True, True]]))
     logits = torch.zeros(2, 4, requires_grad=True)
-    sight = Sight(logits, torch.zeros(2, 2, 3, 8, 16), torch.zeros(2, 2, 8, 16), torch.zeros(2, TIMES, CELLS))
-    sight_losses(sight, known, clip.rig[:, clip.now], SightWeights())["light"].backward()
+    sight_losses(sight_of(2, logits), known, clip, SightWeights())["light"].backward()
     assert not logits.grad[0].any()
     assert logits.grad[1, LightState.RED] < 0

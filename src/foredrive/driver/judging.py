@@ -15,7 +15,7 @@ from foredrive.driver.packed import BATCH, PackedClips, join
 from foredrive.models.ego_mlp import ego_speeds
 from foredrive.scene.affordances import CELL_M, LATER_DT_S, TIMES, Affordances, PathEstimate
 from foredrive.scene.traffic_light import LightState
-from foredrive.simulation.speed_rule import FRONT_M, drive_along, meets_somebody
+from foredrive.simulation.speed_rule import FRONT_M, PathView, meets_somebody, rule_progress
 
 LIGHT_M, OBSTACLE_M = 40.0, 30.0
 """Distances up to which lights and the first obstacle are judged."""
@@ -41,7 +41,7 @@ class Moment(NamedTuple):
     first_seen: Float[np.ndarray, "K"]
     """The same of the estimate at each of `THRESHOLDS`."""
     conflict: bool
-    """True if the vehicle would meet somebody if it drove on freely."""
+    """True if the vehicle would meet somebody if it drove on, minding its light alone."""
     conflict_seen: Bool[np.ndarray, "K"]
     """The same by the estimate at each of `THRESHOLDS`."""
     crossing: bool
@@ -68,11 +68,11 @@ def judge_sight(
 
     `light_accuracy_40m` and `red_missed_40m` count lights within 40 m with a lamp in an image; a red light is
     missed if neither red nor yellow is named. `conflict_recall` is the share that is seen of the moments in
-    which the vehicle would meet somebody if it drove on freely. It counts at the lowest threshold at which
-    at most 10 % of the other moments are taken for such, or at the highest one; `conflict_false` is this
-    share. `crossing_recall` counts those with somebody who is not in the path yet. `first_obstacle_error_m`
-    is the median error of the first occupied cell now, a missed one counted as the distance to the end of the
-    range.
+    which the vehicle would meet somebody if it drove on and minded its true light alone. It counts at the
+    lowest threshold at which at most 10 % of the other moments are taken for such, or at the highest one;
+    `conflict_false` is this share. `crossing_recall` counts those with somebody who is not in the path yet.
+    `first_obstacle_error_m` is the median error of the first occupied cell now, a missed one counted as the
+    distance to the end of the range.
 
     Args:
         driver: in evaluation mode.
@@ -111,8 +111,11 @@ def _moment(truth: Affordances, estimate: PathEstimate, speed_mps: float, visibl
     path = PathAhead(truth.path_xy, np.zeros(len(truth.path_xy)), truth.path_valid, FRONT_M, True)
     occupied = (truth.occupied & truth.occupied_known).numpy()
     p = torch.where(truth.occupied_known, estimate.occupied, 0.0).numpy()
-    # Driving on freely, for as long as the truth reaches.
-    free_m = drive_along(path, speed_mps, [])
+    # Driving on but for the light, for as long as the truth reaches.
+    light = LightState(int(truth.light)) if bool(truth.light_known) else LightState.NONE
+    free_m = rule_progress(
+        path, speed_mps, PathView(light, float(truth.light_m), None, np.zeros_like(occupied))
+    )
     times = LATER_DT_S * np.arange(1, TIMES)
     free_m = np.interp(times, LATER_DT_S * np.arange(len(free_m) + 1), np.append(0.0, free_m))
     seen = np.array([meets_somebody(free_m, p >= threshold) for threshold in THRESHOLDS])

@@ -7,11 +7,12 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from foredrive.driver.sight import Sight, scaled_line
+from foredrive.driver.road_user_targets import USERS, road_user_cells, road_user_pixels
+from foredrive.driver.sight import VELOCITY_SCALE_MPS, Sight, scaled_line
 from foredrive.geometry.projection import project
 from foredrive.geometry.se3 import inverse_se3, transform_points
 from foredrive.losses.masked import masked_mean
-from foredrive.scene import CameraRig
+from foredrive.scene import CameraRig, Clip
 from foredrive.scene.affordances import Affordances
 from foredrive.scene.traffic_light import LightState
 
@@ -28,19 +29,23 @@ class SightWeights:
     """Weight of occupied cells in the last term: a missed road user is worse than a false one."""
     crossing: float = 2.0
     """Factor for cells that are free now and occupied later: who crosses or cuts in."""
+    user_pixels: float = 4.0
+    user_cells: float = 4.0
+    user_velocity: float = 1.0
 
 
 def sight_losses(
-    sight: Sight, truth: Affordances, rig: CameraRig, weights: SightWeights
+    sight: Sight, truth: Affordances, clip: Clip, weights: SightWeights
 ) -> dict[str, Float[Tensor, ""]]:
     """Return the losses by name; "loss" is their sum. What the truth does not know has none.
 
     Args:
         sight: of b items.
         truth: of b items.
-        rig: cameras at now, [b C].
+        clip: its cameras, route and boxes at now are read.
         weights: weights of the terms.
     """
+    rig = clip.rig[:, clip.now]
     lamps = lamp_places(truth, rig, (sight.lamp_logits.shape[-2], sight.lamp_logits.shape[-1]))
     visible = lamps.inside.any(-1).any(-1)
     is_none = truth.light == LightState.NONE
@@ -52,6 +57,7 @@ def sight_losses(
         "lamps": weights.lamps * _lamp_loss(sight, truth, lamps),
         "light_m": weights.light_m * _line_loss(sight, truth, lamps),
         "occupied": weights.occupied * _occupancy_loss(sight, truth, weights),
+        **_user_losses(sight, clip, weights),
     }
     return losses | {"loss": torch.stack(list(losses.values())).sum()}
 
@@ -106,3 +112,23 @@ def _occupancy_loss(sight: Sight, truth: Affordances, weights: SightWeights) -> 
     weight = torch.where(occupied, weights.occupied_cells, 1.0) * torch.where(later, weights.crossing, 1.0)
     error = F.binary_cross_entropy_with_logits(sight.occupied_logits, occupied.float(), reduction="none")
     return masked_mean(weight * error, truth.occupied_known)
+
+
+def _user_losses(sight: Sight, clip: Clip, weights: SightWeights) -> dict[str, Float[Tensor, ""]]:
+    """Return the losses of where road users are in images and cells, and of how they move."""
+    size = (sight.user_pixels.shape[-2], sight.user_pixels.shape[-1])
+    annotated = clip.boxes_valid[:, clip.now]
+    pixels, pixels_known = road_user_pixels(clip, size)
+    cells = road_user_cells(clip)
+    is_pixel = F.binary_cross_entropy_with_logits(sight.user_pixels, pixels.float(), reduction="none")
+    logits, velocity = sight.user_cells.split([len(USERS), 2], dim=1)
+    is_cell = F.binary_cross_entropy_with_logits(logits, cells.present.float(), reduction="none")
+    is_cell = torch.where(cells.present, weights.occupied_cells, 1.0) * is_cell
+    error = F.smooth_l1_loss(velocity, cells.velocity / VELOCITY_SCALE_MPS, reduction="none", beta=0.2).sum(1)
+    return {
+        "user_pixels": weights.user_pixels
+        * masked_mean(is_pixel, pixels_known & annotated[:, None, None, None, None]),
+        "user_cells": weights.user_cells * masked_mean(is_cell, cells.known & annotated[:, None, None, None]),
+        "user_velocity": weights.user_velocity
+        * masked_mean(error, cells.velocity_known & annotated[:, None, None]),
+    }

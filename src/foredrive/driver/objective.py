@@ -11,10 +11,8 @@ from foredrive.driver.losses import SightWeights, sight_losses
 from foredrive.driver.packed import RouteExample
 from foredrive.driver.volume_eyes import VolumeEyes
 
-FASTEST_MPS = 9.0
 BRIGHTNESS, CONTRAST, COLOUR = 0.06, 0.2, 0.03
 """Standard deviations of the changes of an image in training, as shares of its range."""
-BATCH, ROWS = 32, 512
 
 
 class SightObjective(nn.Module):
@@ -35,7 +33,7 @@ class SightObjective(nn.Module):
         if self.training:
             clip = _recoloured(example, generator).clip
         sight = self.eyes(clip)
-        return sight_losses(sight, example.truth, clip.rig[:, clip.now], self.weights)
+        return sight_losses(sight, example.truth, clip, self.weights)
 
 
 def _recoloured(example: RouteExample, generator: torch.Generator) -> RouteExample:

@@ -24,14 +24,14 @@ from foredrive.scene.record import Record
 
 BATCH = 32
 """Clips that are looked at together where none is trained on."""
-PACK_VERSION = 2
+PACK_VERSION = 3
 """Version in every name. Increase it when the content of the files changes."""
 R = TypeVar("R", bound=Record)
 
 
 @dataclass(frozen=True)
 class RouteExample(Record):
-    """A clip without boxes and sweeps, and what is on its route: one item of a driver's training."""
+    """A clip and what is on its route: one item of a driver's training."""
 
     clip: Clip
     truth: Affordances
@@ -151,7 +151,7 @@ class PackedClips(Dataset[RouteExample]):
         clip, truth = self._dataset.clip(index), self._dataset.truth(index)
         assert truth is not None
         assert truth.affordances is not None
-        return RouteExample(dataclasses.replace(clip, boxes=clip.boxes[:, :0]), truth.affordances, ())
+        return RouteExample(clip, truth.affordances, ())
 
 
 def _without_images(example: RouteExample) -> RouteExample:

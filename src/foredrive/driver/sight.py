@@ -6,6 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from foredrive.driver.road_user_targets import USERS
 from foredrive.driver.route_cells import BESIDE_M, route_cells
 from foredrive.scene import Clip
 from foredrive.scene.affordances import CELLS, TIMES, PathEstimate
@@ -15,7 +16,7 @@ from foredrive.scene.traffic_light import LightState
 
 COLOURS = (LightState.RED, LightState.YELLOW, LightState.GREEN)
 CONTEXT = 64
-ROUTE_SCALE_M = 20.0
+ROUTE_SCALE_M, VELOCITY_SCALE_MPS = 20.0, 5.0
 RARE_LOGIT, NONE_LOGIT = -4.0, -2.0
 LIGHT_SCALE_M, LINE_BEFORE_LAMP_M = 20.0, 4.0
 """The distance of a stop line is read at the lamp, as a logarithm from some metres before the line."""
@@ -32,6 +33,12 @@ class Sight(Record):
     lamp_line: Float[Tensor, "b C h w"]
     """The distance of the stop line as it is read at each place: log((m + 4) / 20)."""
     occupied_logits: Float[Tensor, "b T G"]
+    user_pixels: Float[Tensor, "b C K h w"]
+    """Whether a road user of each kind is at a place of an image. Training alone reads this and `user_cells`:
+    they teach the features where road users are and how they move."""
+    user_cells: Float[Tensor, "b U G L"]
+    """The same for the cells along and beside the route; then the velocity along the route and to its left,
+    in `VELOCITY_SCALE_MPS`."""
 
     @property
     def light_m(self) -> Float[Tensor, "b"]:
@@ -73,6 +80,9 @@ class RouteReader(nn.Module):
         )
         self.lamps = LampHead(fine, wide, CONTEXT, cameras)
         self.occupancy = OccupancyHead(cells + 3)
+        self.users = nn.Conv2d(fine, len(USERS), 1)
+        assert self.users.bias is not None
+        nn.init.constant_(self.users.bias, RARE_LOGIT)
 
     def forward(
         self,
@@ -101,7 +111,9 @@ class RouteReader(nn.Module):
             ],
             dim=1,
         )
-        return Sight(light, lamps, lines, self.occupancy(torch.cat([cells.to(place), place], dim=1)))
+        occupied, user_cells = self.occupancy(torch.cat([cells.to(place), place], dim=1))
+        pixels = self.users(fine.flatten(0, 1)).unflatten(0, fine.shape[:2])
+        return Sight(light, lamps, lines, occupied, pixels.float(), user_cells)
 
 
 class LampHead(nn.Module):
@@ -168,6 +180,9 @@ class OccupancyHead(nn.Module):
         super().__init__()
         self.cells = nn.Conv2d(channels, width, 1)
         self.plane = nn.Sequential(nn.ReLU(), *(conv_block(width, width, stride=1) for _ in range(3)))
+        self.users = nn.Conv2d(width, len(USERS) + 2, 1)
+        assert self.users.bias is not None
+        nn.init.constant_(self.users.bias[: len(USERS)], RARE_LOGIT + 1)
         last = nn.Conv1d(width, TIMES, 1)
         assert last.bias is not None
         nn.init.constant_(last.bias, RARE_LOGIT + 1.5)
@@ -180,11 +195,13 @@ class OccupancyHead(nn.Module):
             last,
         )
 
-    def forward(self, cells: Float[Tensor, "b F G L"]) -> Float[Tensor, f"b {TIMES} {CELLS}"]:
-        """Return the logits of occupancy."""
+    def forward(
+        self, cells: Float[Tensor, "b F G L"]
+    ) -> tuple[Float[Tensor, f"b {TIMES} {CELLS}"], Float[Tensor, "b U G L"]]:
+        """Return the logits of occupancy, and `Sight.user_cells`."""
         plane = self.plane(self.cells(cells))  # [b F G L]
         logits: Tensor = self.route(plane.permute(0, 1, 3, 2).flatten(1, 2))
-        return logits.float()
+        return logits.float(), self.users(plane).float()
 
 
 def conv_block(inputs: int, outputs: int, size: int = 3, stride: int = 2) -> nn.Sequential:
