@@ -32,8 +32,8 @@ def box(centre: list[float], velocity: list[float], kind: Category, shown: int, 
 def clip(make_example: Callable[..., Example]) -> Clip:
     """Two items: a route straight ahead, and one to the left.
 
-    A cyclist crosses each from its left at 3 m/s, a hidden man stands on the second cell, and a car of unknown
-    velocity beside the twentieth."""
+    A cyclist crosses each from its left at 3 m/s, a hidden man stands on the second cell, and a car whose
+    velocity is unknown is beside the twentieth."""
     made = make_example(spec=SPEC, batch=2, past=1, future=0, cameras=2).clip
     ahead = torch.tensor([[m, 0.0] for m in ROUTE_M])
     boxes, hidden = [], Visibility.V0_40
@@ -42,9 +42,7 @@ def clip(make_example: Callable[..., Example]) -> Clip:
         boxes.append(
             [
                 box([*turn([CYCLIST_M, 4.0]), 0.9], turn([0.0, -3.0]), Category.BICYCLE, UNKNOWN, yaw),
-                box(
-                    [*turn([FRONT_M + 3.0, 0.8]), 0.9], [0.0, 0.0], Category.PEDESTRIAN, Visibility.V0_40, yaw
-                ),
+                box([*turn([FRONT_M + 3.0, 0.8]), 0.9], [0.0, 0.0], Category.PEDESTRIAN, hidden, yaw),
                 box([*turn([FRONT_M + 39.0, -8.5]), 0.8], [torch.nan] * 2, Category.CAR, UNKNOWN, yaw),
                 box([*turn([CYCLIST_M, -6.0]), 0.5], [0.0, 0.0], Category.BARRIER, UNKNOWN, yaw),
             ]
