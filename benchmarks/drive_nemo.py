@@ -1,76 +1,78 @@
-"""Closed-loop driving on Town05: `foredrive bench drive-nemo`, days on two cores; `--arms` measures some.
+"""Closed-loop driving on Town05: `foredrive bench drive-nemo`, 16 core hours; `--arms` measures some.
 
-Demonstrations with the rig of `nemo_drive_tele` are driven in the training towns in all weathers: first by
-the disturbed expert, then in rounds of DAgger by the student of the round before. NeMo starts from the world
-model that comes with the package, which was trained with surround cameras. Arms ending in a number learn from
-the rounds up to it; the others learn from all. All drive the same routes in the same traffic by day; ARM@long
-drives the long routes. Seeds are those of fine-tuning.
+Drivers learn to see from virtual egos of the training towns, then in rounds of DAgger from what they meet
+when they drive the training routes themselves, in all weathers: `small_K` has learned from K rounds, driven
+by the driver of the round before with seed 0. `small_blind` learned from all of them with black images. The
+others of `driver_nemo` have NeMo's volume as their eyes and learn from the same rounds and fewer egos; `nemo`
+starts from the world model that comes with the package. `rules_by_sight` has the rule in place of the
+planner of `small`, `true*` is told road users, lights or both as they are. `regressing` is NeMo's own
+planner, which learns from an expert's demonstrations.
 
-All is kept in runs/drive_nemo, where an interrupted benchmark continues with the next drive, and
+All drive the same routes in the same traffic by day, and an interrupted benchmark goes on with the next
+drive; ARM@long drives the long routes. Seeds are those of training. All is kept in runs/drive_nemo, and
 `foredrive compare` reads the folders of drives.
 """
 
 import dataclasses
 import os
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
-from benchmarks.common.study import HEADLINE, JUDGED_EVERY_S, seeded
+from benchmarks.common.driver_study import (
+    EGOS,
+    PRETRAINED,
+    egos,
+    recipe_of,
+    sight_figures,
+    test_egos,
+    trained,
+)
+from benchmarks.common.study import seeded
 from foredrive.data import LogPath, find_all_logs
 from foredrive.errors import InputError
 from foredrive.evaluation.bench import Benchmark, study_identity
-from foredrive.evaluation.summary import read_summary
 from foredrive.metrics.bootstrap import bootstrap_mean
 from foredrive.recipes import find_recipe
 from foredrive.recipes.config import rescheduled
-from foredrive.runs.drive.agents import IDM
+from foredrive.recipes.driver import DRIVER_RECIPES, DriverRecipe
+from foredrive.runs.drive.agents import CONSTANT_VELOCITY, EXPERT, IDM, STOP, rig_of
 from foredrive.runs.drive.compare import values_of
 from foredrive.runs.drive.in_towns import TownRoutes
-from foredrive.runs.drive.recording import record_drives
 from foredrive.runs.drive.suite import DriveSuite, SuiteResult, drive_suite
-from foredrive.runs.evaluate.run import SUMMARY, evaluate_run
 from foredrive.runs.shipped import run_folder
-from foredrive.runs.train.run import Run, train_run
-from foredrive.sensors.rigs import DRIVING
+from foredrive.runs.train.driver import DriverRun
+from foredrive.runs.train.run import train_run
+from foredrive.sensors.rigs import DRIVING, FRONT_TELE
 from foredrive.simulation.drive_record import DriveRecord
-from foredrive.simulation.route_sets import load_route_set
-from foredrive.towns.campaign import Campaign, plan_drives
 
-FULL = "nemo_drive_tele"
-RECIPES = {
-    "present": f"{FULL}_present",
-    "scorer": f"{FULL}_scorer",
-    "scorer_present": f"{FULL}_scorer_present",
-    "driveworld": "driveworld_drive_tele",
-}
-"""With the last round's arm of `FULL`, the first three are 2 x 2: scorer, futures."""
-PRETRAINED = Path("embedded:nemo_town")
-FINETUNE_STEPS = 600
-"""Steps of fine-tuning, where the recipes have 1,500: they take half an hour on one core."""
-ROUNDS = 1
-"""Rounds of DAgger after the demonstrations of the disturbed expert."""
-DEMONSTRATIONS = "training-short"
-DEMONSTRATED = ("Town01", "Town02", "Town03", "Town04", "Town06")
-ROUTES_A_TOWN = 4
-"""Number of routes that are demonstrated in each of these towns, of eight. The others take hours more."""
+EGO_SEEDS, NEMO_EGO_SEEDS = 10, 3
+"""Seeds of the towns from which the small driver learns, and from which those with NeMo's volume do."""
+ROUNDS = 2
+ROUND_ROUTES, ROUND_LR = "training-short", 1e-3
+"""Routes of a round, and the learning rate of the one epoch in which a driver goes on."""
+NEMO_EPOCHS = 2
+REGRESSING, REGRESSING_STEPS = "nemo_drive_tele", 600
+DEMONSTRATED, ROUTES_A_TOWN = ("Town01", "Town02", "Town03", "Town04", "Town06"), 4
+"""Towns of the demonstrations, and the routes in each."""
 JUDGED = {"short": "town05-short", "long": "town05-long"}
-REPETITIONS = 1
-OPEN_LOOP = Campaign(("Town05",), seeds=(1, 2), seconds=60.0, rate_hz=2.0)
+REPETITIONS = 3
 CORES = len(os.sched_getaffinity(0))
 CONFIG = {
-    "recipes": {name: dataclasses.asdict(find_recipe(name)) for name in (FULL, *RECIPES.values())},
-    "pretraining": str(PRETRAINED),
-    "finetune_steps": FINETUNE_STEPS,
-    "demonstrations": [DEMONSTRATIONS, *DEMONSTRATED, ROUTES_A_TOWN],
-    "rounds": ROUNDS,
+    "recipes": {name: dataclasses.asdict(recipe) for name, recipe in DRIVER_RECIPES.items()}
+    | {REGRESSING: dataclasses.asdict(find_recipe(REGRESSING))},
+    "egos": [EGOS, EGO_SEEDS, NEMO_EGO_SEEDS, NEMO_EPOCHS],
+    "rounds": [ROUNDS, ROUND_ROUTES, ROUND_LR],
+    "demonstrations": [*DEMONSTRATED, ROUTES_A_TOWN, REGRESSING_STEPS],
     "routes": JUDGED,
     "repetitions": REPETITIONS,
 }
 DECIDED_BY = (
     "foredrive.simulation",
     "foredrive.towns",
+    "foredrive.driver",
     "foredrive.models",
     "foredrive.losses",
     "foredrive.training",
@@ -87,50 +89,82 @@ def _driven(suite: DriveSuite, out: Path) -> SuiteResult:
     return driven
 
 
-def demonstrations(rounds: int) -> tuple[LogPath, ...]:
-    """Return the logs of the disturbed expert and of the first rounds of DAgger; drive what is missing.
+def _agent(run: DriverRun) -> str:
+    return str(run.folder.absolute())
 
-    The student of a round is trained on the rounds before, with seed 0.
-    """
+
+def small(rounds: int, seed: int) -> DriverRun:
+    """Return the small driver after some rounds of DAgger; train and drive what is missing."""
+    recipe, folder = recipe_of("driver_small", seed), WORK / "runs" / f"small_{rounds}_seed{seed}"
+    if rounds == 0:
+        return trained(recipe, _egos(EGO_SEEDS), folder, WORK / "cache")
+    recipe = _once(recipe)
+    start = small(rounds - 1, seed).folder
+    return trained(recipe, [*_egos(EGO_SEEDS), *rounds_until(rounds)], folder, WORK / "cache", start)
+
+
+def _once(recipe: DriverRecipe) -> DriverRecipe:
+    see = dataclasses.replace(recipe.see, epochs=1, lr=ROUND_LR)
+    return dataclasses.replace(recipe, see=see)
+
+
+def rounds_until(last: int) -> list[LogPath]:
+    """Return the logs of the rounds of DAgger up to one; drive what is missing."""
     folders = []
-    for number in range(rounds + 1):
-        student = "disturbed" if number == 0 else f"student:{_student(number - 1).folder.absolute()}"
-        folder = WORK / "demonstrations" / f"round{number}"
-        source = TownRoutes(
-            DEMONSTRATIONS, seed=number, conditions="any", rig=DRIVING, only=demonstrated_routes()
-        )
-        _driven(DriveSuite(student, source), folder)
+    for number in range(1, last + 1):
+        source = TownRoutes(ROUND_ROUTES, seed=number, conditions="any", rig=FRONT_TELE)
+        folder = WORK / "rounds" / f"round{number}"
+        _driven(DriveSuite(_agent(small(number - 1, 0)), source, lidar=False), folder)
         folders.append(folder)
-    return find_all_logs(folders)
+    return list(find_all_logs(folders))
 
 
-def demonstrated_routes() -> tuple[str, ...]:
-    """Return the ids of the first routes of each town."""
-    routes = load_route_set(DEMONSTRATIONS)
-    return tuple(
-        route.id
+def _egos(seeds: int) -> list[LogPath]:
+    return egos(range(seeds), WORK / "egos", CORES)
+
+
+def blind(seed: int) -> DriverRun:
+    """Return the small driver that sees black images and learned from the same clips."""
+    recipe = recipe_of("driver_small", seed)
+    recipe = dataclasses.replace(recipe, eyes=dataclasses.replace(recipe.eyes, blind=True))
+    logs = [*_egos(EGO_SEEDS), *rounds_until(ROUNDS)]
+    return trained(recipe, logs, WORK / "runs" / f"small_blind_seed{seed}", WORK / "cache")
+
+
+def nemo(name: str, seed: int, pretrained: bool = True) -> DriverRun:
+    """Return a driver with NeMo's volume."""
+    recipe = recipe_of("driver_nemo", seed)
+    recipe = dataclasses.replace(recipe, see=rescheduled(recipe.see, epochs=NEMO_EPOCHS))
+    logs = [*_egos(NEMO_EGO_SEEDS), *rounds_until(ROUNDS)]
+    start = run_folder(Path(PRETRAINED)) if pretrained else None
+    return trained(recipe, logs, WORK / "runs" / f"{name}_seed{seed}", WORK / "cache", start)
+
+
+def regressing(seed: int) -> Path:
+    """Return the run of NeMo's own planner, trained on drives of the disturbed expert."""
+    recipe = seeded(find_recipe(REGRESSING), seed)
+    recipe = dataclasses.replace(recipe, finetune=rescheduled(recipe.finetune, steps=REGRESSING_STEPS))
+    source = TownRoutes(ROUND_ROUTES, conditions="any", rig=DRIVING)
+    shown = [
+        job.route
         for town in DEMONSTRATED
-        for route in [route for route in routes if route.town == town][:ROUTES_A_TOWN]
+        for job in [job for job in source.jobs(EXPERT) if source.route_of(job).town == town][:ROUTES_A_TOWN]
+    ]
+    folder = WORK / "demonstrations"
+    _driven(DriveSuite("disturbed", dataclasses.replace(source, only=tuple(shown))), folder)
+    run = train_run(
+        recipe,
+        find_all_logs([folder]),
+        WORK / "runs" / f"regressing_seed{seed}",
+        WORK / "cache",
+        run_folder(Path(PRETRAINED)),
     )
-
-
-def _student(rounds: int) -> Run:
-    return trained(FULL, f"dagger_{rounds}", 0, rounds)
-
-
-def trained(recipe: str, name: str, seed: int, rounds: int = ROUNDS, pretrained: bool = True) -> Run:
-    """Return a run on the demonstrations of some rounds, and train what is missing."""
-    chosen = seeded(find_recipe(recipe), seed)
-    chosen = dataclasses.replace(chosen, finetune=rescheduled(chosen.finetune, steps=FINETUNE_STEPS))
-    start = run_folder(PRETRAINED) if pretrained and recipe.startswith("nemo") else None
-    chosen = chosen if pretrained else dataclasses.replace(chosen, pretrain=None)
-    folder = WORK / "runs" / f"{name}_seed{seed}"
-    return train_run(chosen, demonstrations(rounds), folder, WORK / "cache", start)
+    return run.folder.absolute()
 
 
 def scores(agent: str, name: str, routes: str) -> dict[str, float]:
     """Return the figures of an agent on a set of routes, with 95 % intervals over routes."""
-    source = TownRoutes(JUDGED[routes], repetitions=REPETITIONS, rig=DRIVING)
+    source = TownRoutes(JUDGED[routes], repetitions=REPETITIONS, rig=rig_of(agent))
     drives = _driven(DriveSuite(agent, source, sensors=False), WORK / "drives" / f"{name}_{routes}").drives
     return {f"{key}_{routes}": value for key, value in _figures(list(drives.values())).items()}
 
@@ -164,62 +198,42 @@ Arm = Callable[[int, str], Mapping[str, float]]
 """An arm, of a seed and a set of routes."""
 
 
-def learned(name: str, recipe: str, rounds: int = ROUNDS, pretrained: bool = True) -> Arm:
-    """Return an arm of a recipe that learns from the demonstrations."""
+def by_sight(name: str, run_of: Callable[[int], DriverRun], prefix: str = "") -> Arm:
+    """Return an arm of a driver, or of an agent that is named by a prefix before the driver's run."""
 
     def measure(seed: int, routes: str) -> Mapping[str, float]:
-        run = trained(recipe, name, seed, rounds, pretrained)
-        return {**_open_loop(run), **scores(str(run.folder.absolute()), f"{name}_seed{seed}", routes)}
+        run = run_of(seed)
+        seen = {} if prefix else sight_figures(run, test_egos(WORK / "egos", CORES), WORK / "cache")
+        return {**seen, **scores(prefix + _agent(run), f"{name}_seed{seed}", routes)}
 
     return measure
 
 
-def _open_loop(run: Run) -> dict[str, float]:
-    """Return L2 and the accuracy of the affordances on recorded drives in Town05."""
-    if not (run.folder / SUMMARY).is_file():
-        recorded = record_drives(plan_drives(OPEN_LOOP), WORK / "towns", DRIVING, CORES)
-        evaluate_run(
-            run, tuple(recorded.logs.values()), run.folder, batch_size=8, views=False, stride_s=JUDGED_EVERY_S
-        )
-    summary = read_summary(run.folder / SUMMARY)
-    keys = {
-        "l2_avg_m": f"planning.{HEADLINE}.l2_avg_m",
-        "light_accuracy_40m": "affordances.light_accuracy_40m",
-        "lead_error_m": "affordances.lead_error_m",
-        "crossing_recall_20m": "affordances.crossing_recall_20m",
-    }
-    return {name: float(value) for name, key in keys.items() if (value := summary.get(key)) is not None}
-
-
-def blind_mlp(rounds: int) -> Arm:
-    """Return an arm of the MLP that is told the same as NeMo after a round, and sees nothing."""
-
-    def measure(seed: int, routes: str) -> Mapping[str, float]:
-        run = trained(FULL, f"dagger_{rounds}", seed, rounds)
-        return scores(f"ego-mlp:{run.folder.absolute()}", f"blind_mlp_{rounds}_seed{seed}", routes)
-
-    return measure
-
-
-def without_training(agent: str, name: str) -> Arm:
+def told(agent: str, name: str) -> Arm:
     """Return an arm of an agent that learns nothing: all seeds are the same drives."""
     return lambda seed, routes: scores(agent, name, routes)
 
 
+def _best(seed: int) -> DriverRun:
+    return small(ROUNDS, seed)
+
+
 ARMS: Mapping[str, Arm] = {
-    "expert": without_training("expert", "expert"),
-    "constant_velocity": without_training("constant-velocity", "constant_velocity"),
-    "idm": without_training(IDM, "idm"),
+    "expert": told(EXPERT, "expert"),
+    "idm": told(IDM, "idm"),
+    "stop": told(STOP, "stop"),
+    "constant_velocity": told(CONSTANT_VELOCITY, "constant_velocity"),
     **{
-        f"{name}_{rounds}": arm
-        for rounds in range(ROUNDS + 1)
-        for name, arm in (
-            ("dagger", learned(f"dagger_{rounds}", FULL, rounds)),
-            ("blind_mlp", blind_mlp(rounds)),
-        )
+        f"small_{rounds}": by_sight(f"small_{rounds}", partial(small, rounds)) for rounds in range(ROUNDS + 1)
     },
-    **{name: learned(name, recipe) for name, recipe in RECIPES.items()},
-    "scratch": learned("scratch", FULL, pretrained=False),
+    "small_blind": by_sight("small_blind", blind),
+    "nemo": by_sight("nemo", lambda seed: nemo("nemo", seed)),
+    "nemo_scratch": by_sight("nemo_scratch", lambda seed: nemo("nemo_scratch", seed, pretrained=False)),
+    "rules_by_sight": by_sight("rules_by_sight", _best, "idm:"),
+    "true": by_sight("true", _best, "true:"),
+    "true_lights": by_sight("true_lights", _best, "true-lights:"),
+    "true_users": by_sight("true_users", _best, "true-users:"),
+    "regressing": lambda seed, routes: scores(str(regressing(seed)), f"regressing_seed{seed}", routes),
 }
 
 
@@ -228,7 +242,7 @@ def _of_routes(arm: Arm, routes: str) -> Callable[[int], Mapping[str, float]]:
 
 
 BENCHMARK = Benchmark(
-    question="How well does NeMo drive Town05's routes by sight, and what does each part bring?",
+    question="How well do drivers drive Town05's routes by sight, and what does each part bring?",
     arms={name: _of_routes(arm, "short") for name, arm in ARMS.items()}
     | {f"{name}@long": _of_routes(arm, "long") for name, arm in ARMS.items()},
     config=CONFIG,

@@ -13,9 +13,19 @@ import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
-from benchmarks.common.driver_study import EGOS, TEST_EGOS, egos, recipe_of, sight_figures, test_egos, trained
+from benchmarks.common.driver_study import (
+    EGOS,
+    PRETRAINED,
+    TEST_EGOS,
+    egos,
+    recipe_of,
+    sight_figures,
+    test_egos,
+    trained,
+)
 from foredrive.evaluation.bench import Benchmark, study_identity
 from foredrive.recipes.driver import DRIVER_RECIPES, DriverRecipe
+from foredrive.runs.shipped import run_folder
 from foredrive.sensors.rigs import FRONT_TELE
 
 CURVE = (1, 2, 5, 10, 19)
@@ -49,7 +59,7 @@ def sees(
         logs,
         WORK / "runs" / f"{arm}_seed{seed}",
         WORK / "cache",
-        pretrained=pretrained,
+        run_folder(Path(PRETRAINED)) if pretrained else None,
     )
     return {**sight_figures(run, test_egos(WORK / "egos", CORES), WORK / "cache"), "logs": float(len(logs))}
 

@@ -11,7 +11,6 @@ from foredrive.errors import InputError
 from foredrive.recipes.driver import DRIVER_RECIPES, DriverRecipe
 from foredrive.runs.drive.recording import EgosPlan, record_egos
 from foredrive.runs.open_clips import open_clips
-from foredrive.runs.shipped import run_folder
 from foredrive.runs.train.driver import DriverRun, load_driver, train_driver
 from foredrive.sensors.rigs import FRONT_TELE
 from foredrive.towns.map.names import TEST_TOWNS, TOWNS
@@ -29,13 +28,13 @@ def egos(seeds: Sequence[int], folder: Path, workers: int) -> list[LogPath]:
         InputError: some failed: all arms must have the same data.
     """
     return _recorded(
-        [EgosPlan(town, seed, EGOS) for seed in seeds for town in TRAINING_TOWNS], folder, workers
+        [EgosPlan(town, seed, EGOS, ()) for seed in seeds for town in TRAINING_TOWNS], folder, workers
     )
 
 
 def test_egos(folder: Path, workers: int) -> list[LogPath]:
     """Return the virtual egos of the held-out town."""
-    return _recorded([EgosPlan(town, 0, TEST_EGOS) for town in TEST_TOWNS], folder, workers)
+    return _recorded([EgosPlan(town, 0, TEST_EGOS, ()) for town in TEST_TOWNS], folder, workers)
 
 
 def _recorded(plans: list[EgosPlan], folder: Path, workers: int) -> list[LogPath]:
@@ -59,10 +58,10 @@ def recipe_of(
 
 
 def trained(
-    recipe: DriverRecipe, logs: Sequence[LogPath], folder: Path, cache: Path, *, pretrained: bool = False
+    recipe: DriverRecipe, logs: Sequence[LogPath], folder: Path, cache: Path, start: Path | None = None
 ) -> DriverRun:
-    """Return a trained driver; train what is missing."""
-    return train_driver(recipe, logs, folder, cache, run_folder(Path(PRETRAINED)) if pretrained else None)
+    """Return a trained driver; train what is missing. `start` is a run to start from."""
+    return train_driver(recipe, logs, folder, cache, start)
 
 
 def sight_figures(run: DriverRun, logs: Sequence[LogPath], cache: Path) -> dict[str, float]:
