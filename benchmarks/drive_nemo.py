@@ -164,9 +164,17 @@ def regressing(seed: int) -> Path:
 
 def scores(agent: str, name: str, routes: str) -> dict[str, float]:
     """Return the figures of an agent on a set of routes, with 95 % intervals over routes."""
-    source = TownRoutes(JUDGED[routes], repetitions=REPETITIONS, rig=rig_of(agent))
-    drives = _driven(DriveSuite(agent, source, sensors=False), WORK / "drives" / f"{name}_{routes}").drives
+    drives = _judged(agent, name, routes).drives
     return {f"{key}_{routes}": value for key, value in _figures(list(drives.values())).items()}
+
+
+def _judged(agent: str, name: str, routes: str) -> SuiteResult:
+    source = TownRoutes(JUDGED[routes], repetitions=REPETITIONS, rig=rig_of(agent))
+    return _driven(DriveSuite(agent, source, sensors=False), _folder(name, routes))
+
+
+def _folder(name: str, routes: str) -> Path:
+    return WORK / "drives" / f"{name}_{routes}"
 
 
 def _figures(drives: Sequence[DriveRecord]) -> dict[str, float]:
@@ -199,12 +207,22 @@ Arm = Callable[[int, str], Mapping[str, float]]
 
 
 def by_sight(name: str, run_of: Callable[[int], DriverRun], prefix: str = "") -> Arm:
-    """Return an arm of a driver, or of an agent that is named by a prefix before the driver's run."""
+    """Return an arm of a driver, or of an agent that is named by a prefix before the driver's run.
+
+    A driver is also judged by what it saw of virtual egos and on its own way.
+    """
 
     def measure(seed: int, routes: str) -> Mapping[str, float]:
-        run = run_of(seed)
-        seen = {} if prefix else sight_figures(run, test_egos(WORK / "egos", CORES), WORK / "cache")
-        return {**seen, **scores(prefix + _agent(run), f"{name}_seed{seed}", routes)}
+        run, arm = run_of(seed), f"{name}_seed{seed}"
+        figures = scores(prefix + _agent(run), arm, routes)
+        if prefix:
+            return figures
+        cache, drives = WORK / "cache", _judged(_agent(run), arm, routes).drives
+        met = figures_on_its_way(
+            run, {job.name: drive for job, drive in drives.items()}, _folder(arm, routes), cache
+        )
+        seen = sight_figures(run, test_egos(WORK / "egos", CORES), cache)
+        return {**seen, **{f"{key}_{routes}": value for key, value in met.items()}, **figures}
 
     return measure
 

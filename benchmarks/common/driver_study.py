@@ -1,11 +1,12 @@
 """Drivers of a study: the same virtual egos for all arms, training, and figures of what they see."""
 
 import dataclasses
-from collections.abc import Callable, Sequence
+import math
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
-from foredrive.data import LogPath
-from foredrive.driver.judging import judge_sight
+from foredrive.data import LogPath, find_all_logs
+from foredrive.driver.judging import judge_sight, judge_sight_by
 from foredrive.driver.packed import PackedClips
 from foredrive.errors import InputError
 from foredrive.recipes.driver import DRIVER_RECIPES, DriverRecipe
@@ -13,12 +14,15 @@ from foredrive.runs.drive.recording import EgosPlan, record_egos
 from foredrive.runs.open_clips import open_clips
 from foredrive.runs.train.driver import DriverRun, load_driver, train_driver
 from foredrive.sensors.rigs import FRONT_TELE
+from foredrive.simulation.drive_record import DriveRecord
 from foredrive.towns.map.names import TEST_TOWNS, TOWNS
 
 TRAINING_TOWNS = tuple(town for town in TOWNS if town not in TEST_TOWNS)
 EGOS, TEST_EGOS = 60, 300
 """Logs of virtual egos of each training town and seed, and of Town05: five clips each."""
 PRETRAINED = "embedded:nemo_town"
+SCENARIO_S = 8.0
+ON_ITS_WAY = ("light_accuracy_40m", "red_missed_40m", "conflict_recall", "conflict_false", "conflicts")
 
 
 def egos(seeds: Sequence[int], folder: Path, workers: int) -> list[LogPath]:
@@ -69,3 +73,36 @@ def sight_figures(run: DriverRun, logs: Sequence[LogPath], cache: Path) -> dict[
     clips = PackedClips(open_clips(logs, run.recipe.clips, cache), cache / "packed")
     clips.pack()
     return judge_sight(load_driver(run), clips)
+
+
+def figures_on_its_way(
+    run: DriverRun, drives: Mapping[str, DriveRecord], folder: Path, cache: Path
+) -> dict[str, float]:
+    """Return what a driver missed on its own way, in all drives and during each kind of scenario.
+
+    A scenario counts for `SCENARIO_S` from its begin.
+
+    Args:
+        run: the driver.
+        drives: its drives by name.
+        folder: folder of the drives, with their logs.
+        cache: folder of packed clips.
+    """
+    dataset = open_clips(find_all_logs([folder]), run.recipe.clips, cache)
+    clips = PackedClips(dataset, cache / "packed")
+    clips.pack()
+    groups = []
+    for index in range(len(dataset)):
+        log = dataset.logs[dataset.frames_of(index)[0]]
+        t_s = (dataset.now_us(index) - int(log.t_us[0])) * 1e-6
+        scenarios = drives[log.path.folder.name].scenario_events
+        begun = [event for event in scenarios if 0 <= t_s - event.t_s < SCENARIO_S]
+        groups.append(begun[-1].what if begun else "no_scenario")
+    driver = load_driver(run)
+    by_group = judge_sight_by(driver, clips, groups) | {"way": judge_sight(driver, clips)}
+    return {
+        f"{group}_{name}": figures[name]
+        for group, figures in by_group.items()
+        for name in ON_ITS_WAY
+        if math.isfinite(figures[name])
+    }

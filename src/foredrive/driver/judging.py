@@ -1,6 +1,6 @@
 """Judges how well a driver sees, over packed clips and before any planning."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -80,6 +80,20 @@ def judge_sight(
         tick: called after each batch.
     """
     return _figures(list(_moments(driver, clips, tick)))
+
+
+def judge_sight_by(driver: Driver, clips: PackedClips, groups: Sequence[str]) -> dict[str, dict[str, float]]:
+    """Return the figures of `judge_sight` for each group of clips.
+
+    Args:
+        driver: in evaluation mode.
+        clips: with known truth.
+        groups: the group of each clip.
+    """
+    of_group: dict[str, list[Moment]] = {}
+    for group, moment in zip(groups, _moments(driver, clips, lambda: None), strict=True):
+        of_group.setdefault(group, []).append(moment)
+    return {group: _figures(moments) for group, moments in sorted(of_group.items())}
 
 
 def missed_by(
