@@ -25,6 +25,7 @@ from benchmarks.common.driver_study import (
     EGOS,
     PRETRAINED,
     egos,
+    figures_on_its_way,
     recipe_of,
     sight_figures,
     test_egos,
