@@ -46,7 +46,7 @@ from foredrive.runs.drive.suite import DriveSuite, SuiteResult, drive_suite
 from foredrive.runs.shipped import run_folder
 from foredrive.runs.train.driver import DriverRun
 from foredrive.runs.train.run import train_run
-from foredrive.sensors.rigs import DRIVING, FRONT_TELE
+from foredrive.sensors.rigs import FRONT_TELE, SURROUND
 from foredrive.simulation.drive_record import DriveRecord
 
 EGO_SEEDS, NEMO_EGO_SEEDS = 10, 3
@@ -55,7 +55,7 @@ ROUNDS = 2
 ROUND_ROUTES, ROUND_LR = "training-short", 1e-3
 """Routes of a round, and the learning rate of the one epoch in which a driver goes on."""
 NEMO_EPOCHS = 2
-REGRESSING, REGRESSING_STEPS = "nemo_drive_tele", 600
+REGRESSING, REGRESSING_STEPS = "nemo_drive", 600
 DEMONSTRATED, ROUTES_A_TOWN = ("Town01", "Town02", "Town03", "Town04", "Town06"), 4
 """Towns of the demonstrations, and the routes in each."""
 JUDGED = {"short": "town05-short", "long": "town05-long"}
@@ -145,7 +145,7 @@ def regressing(seed: int) -> Path:
     """Return the run of NeMo's own planner, trained on drives of the disturbed expert."""
     recipe = seeded(find_recipe(REGRESSING), seed)
     recipe = dataclasses.replace(recipe, finetune=rescheduled(recipe.finetune, steps=REGRESSING_STEPS))
-    source = TownRoutes(ROUND_ROUTES, conditions="any", rig=DRIVING)
+    source = TownRoutes(ROUND_ROUTES, conditions="any", rig=SURROUND)
     shown = [
         job.route
         for town in DEMONSTRATED

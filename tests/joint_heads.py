@@ -13,12 +13,10 @@ from foredrive.models.tasks.motion import MotionConfig
 from foredrive.recipes import Recipe
 from foredrive.recipes.task_heads import TaskHeadsRecipe, town_heads, with_joint_heads
 from foredrive.scene import Example
-from foredrive.scene.affordances import CELLS, LATER_STEPS, TIMES, Affordances
 from foredrive.scene.agent_futures import AgentFutures
 from foredrive.scene.map_elements import MapElements, MapRaster, RasterLayer
 from foredrive.scene.semantics import SemanticVoxels
 from foredrive.scene.task_truth import TaskTruth
-from foredrive.scene.traffic_light import LightState
 
 ALL = ("detection", "motion", "map", "occupancy")
 
@@ -72,32 +70,4 @@ def with_truth(example: Example, config: TaskTruthConfig) -> Example:
         seen = torch.ones(shape, dtype=torch.bool)
         semantics = SemanticVoxels(example.occupancy.spec, config.semantics, index, seen, seen, seen)
         truth = dataclasses.replace(truth, semantics=semantics)
-    if config.affordances:
-        truth = dataclasses.replace(truth, affordances=arbitrary_affordances(batch))
     return dataclasses.replace(example, truth=truth)
-
-
-def arbitrary_affordances(batch: int) -> Affordances:
-    """A red light 20 m ahead whose lamp is in view, a lead vehicle before it, and one person who crosses."""
-    known = torch.ones(batch, dtype=torch.bool)
-    path = torch.stack([torch.arange(60.0), torch.zeros(60)], -1)
-    return Affordances(
-        path_xy=path.expand(batch, 60, 2),
-        path_valid=torch.ones(batch, 60, dtype=torch.bool),
-        light=torch.full((batch,), int(LightState.RED)),
-        light_m=torch.full((batch,), 20.0),
-        light_known=known,
-        light_later=torch.full((batch, LATER_STEPS), int(LightState.RED)),
-        lamp_xyz=torch.tensor([24.0, 1.0, 5.0]).expand(batch, 1, 3),
-        lamp=torch.ones(batch, 1, dtype=torch.bool),
-        lamps_known=known,
-        lead=known,
-        lead_m=torch.full((batch,), 12.0),
-        lead_mps=torch.full((batch,), 3.0),
-        lead_known=known,
-        crossing_xy=torch.tensor([10.0, 2.0]).expand(batch, 1, 2),
-        crossing=torch.ones(batch, 1, dtype=torch.bool),
-        crossing_known=known,
-        occupied=torch.zeros(batch, TIMES, CELLS, dtype=torch.bool),
-        occupied_known=torch.ones(batch, TIMES, CELLS, dtype=torch.bool),
-    )

@@ -35,7 +35,6 @@ def truth(batch: int = 2) -> Affordances:
         light=torch.full((batch,), int(LightState.RED)),
         light_m=torch.full((batch,), 5.0),
         light_known=~none,
-        light_later=torch.zeros(batch, 6, dtype=torch.long),
         lamp_xyz=torch.tensor([[[12.0, 0.4, 1.9], [12.0, 40.0, 3.0]]]).expand(batch, 2, 3),
         lamp=torch.tensor([[True, True]]).expand(batch, 2),
         lamps_known=~none,
@@ -43,9 +42,6 @@ def truth(batch: int = 2) -> Affordances:
         lead_m=zero,
         lead_mps=zero,
         lead_known=~none,
-        crossing_xy=torch.zeros(batch, 0, 2),
-        crossing=torch.zeros(batch, 0, dtype=torch.bool),
-        crossing_known=~none,
         occupied=occupied,
         occupied_known=torch.ones(batch, TIMES, CELLS, dtype=torch.bool),
     )

@@ -88,7 +88,6 @@ def test_a_head_can_be_left_out(left_out: str) -> None:
         *missing,
         "lineage",
         "instances",
-        "affordances",
     ]
 
 

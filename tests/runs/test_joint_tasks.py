@@ -11,10 +11,8 @@ from miniature import STEPS, miniature, miniature_driveworld, with_map, with_ste
 from safetensors.torch import load_file
 
 from foredrive.data import LogPath, collate
-from foredrive.data.task_truth import UNIAD_RASTER
 from foredrive.errors import InputError
 from foredrive.export.graph import AgentGraph, GraphInputs
-from foredrive.models.plan_scorer import PlanScorerConfig
 from foredrive.recipes import Recipe
 from foredrive.recipes.config import load_recipe
 from foredrive.recipes.task_heads import base_heads, heads_for, with_joint_heads
@@ -207,33 +205,3 @@ def test_a_run_that_has_only_pre_trained_has_no_heads_yet(log: LogPath, tmp_path
     (tmp_path / "finetune" / "model.safetensors").unlink()
     assert load_agent(run).heads is None
     assert load_heads(run) is None
-
-
-def test_affordances_and_scored_plans_are_trained_and_evaluated(
-    trained: Run, log: LogPath, tmp_path: Path
-) -> None:
-    """With balanced clips. What the flat log does not tell, lights and the map, trains nothing."""
-    recipe = with_small_heads(trained.recipe, ("affordances",), attends=("affordances",))
-    planner = dataclasses.replace(
-        recipe.planner, target=True, ego_mlp=None, path=None, scorer=PlanScorerConfig()
-    )
-    recipe = dataclasses.replace(recipe, planner=planner, path=None, balance=0.5)
-    with pytest.raises(InputError, match="learns from the route, lights and the map"):
-        train_run(recipe, [log], tmp_path / "wrong", trained.cache_dir, trained.folder)
-    assert recipe.clips.tasks is not None
-    truth = dataclasses.replace(recipe.clips.tasks, raster=UNIAD_RASTER)
-    recipe = dataclasses.replace(recipe, clips=dataclasses.replace(recipe.clips, tasks=truth))
-    run = train_run(recipe, [log], tmp_path / "run", trained.cache_dir, trained.folder)
-    lines = read_metrics(run.folder / "finetune" / "metrics.jsonl")
-    assert {"task_light", "task_lamps", "score_no_collision", "score_imitation"} <= lines[0].keys()
-    assert lines[0]["task_light"] == 0
-    assert lines[0]["score_drivable"] == 0
-    assert max(line["score_no_collision"] for line in lines) > 0  # road users are followed in some clips
-    summary = evaluate_run(run, [log], tmp_path / "evaluated", views=False).summary
-    assert summary["failed"] == 0
-    assert summary["affordances.lights_counted"] == 0
-    with pytest.raises(InputError, match="leave out --probe"):
-        train_heads(
-            probe_run(trained.recipe, [log], tmp_path / "p", trained.cache_dir, trained.folder),
-            small_heads(("affordances",)),
-        )

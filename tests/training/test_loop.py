@@ -164,6 +164,13 @@ def test_every_item_once_an_epoch_in_an_order_of_its_own() -> None:
     assert [next(other) for _ in range(3)] != first
 
 
+def test_items_are_drawn_in_proportion_to_their_weights() -> None:
+    weights = torch.tensor([1.0] * 900 + [4.0] * 100)
+    drawn = list(itertools.chain(*itertools.islice(batch_order(1000, 10, 0, weights), 600)))
+    assert sum(index >= 900 for index in drawn) / len(drawn) == pytest.approx(400 / 1300, abs=0.02)
+    assert list(itertools.chain(*itertools.islice(batch_order(1000, 10, 0, weights), 600))) == drawn
+
+
 def test_learning_rate_by_hand() -> None:
     schedule = Schedule(batch_size=1, lr=1.0, steps=10, warmup_steps=2, final_lr_fraction=0.1)
     assert [schedule.lr_at(step, 10) for step in (0, 1, 2)] == [0.5, 1.0, 1.0]

@@ -41,9 +41,8 @@ def train(
             planner as they are. With --set transfer=frozen, keep its world model and its heads as they are
             and train the planner alone.
         tasks: Tasks to train heads for, separated by commas: detection, tracking, map, motion, occupancy.
-            Fine-tuning trains them together with the world model, and also affordances: the next light, the
-            lead vehicle and who will cross. With --probe also instances: the vehicles' cells now and in
-            imagined key frames.
+            Fine-tuning trains them together with the world model. With --probe also instances: the vehicles'
+            cells now and in imagined key frames.
         probe: Train the heads of --tasks on the frozen world model instead. Its volumes are computed once and
             kept.
         strategy: How the processes that torchrun started, or the GPUs of this machine, share the training:

@@ -1,4 +1,4 @@
-"""Reading of affordances: the light, the lead vehicle and the people on the path, from a log alone.
+"""Reading of affordances: the light of the path, and who is in the path over time, from a log alone.
 
 Logs of towns have the states of lights by the lanes behind their stop lines, so nothing else is recorded for
 this. Other logs have no lights, and their path is the driven one.
@@ -26,17 +26,14 @@ from foredrive.scene import Boxes
 from foredrive.scene.affordances import (
     CELL_M,
     CELLS,
-    CROSSING_RANGE_M,
-    CROSSING_S,
     HALF_WIDTH_M,
     LATER_DT_S,
-    LATER_STEPS,
     LEAD_RANGE_M,
     LIGHT_RANGE_M,
     TIMES,
     Affordances,
 )
-from foredrive.scene.boxes import VEHICLES, Category
+from foredrive.scene.boxes import VEHICLES
 from foredrive.scene.traffic_light import LightState
 
 POINTS = 72
@@ -52,8 +49,6 @@ height."""
 FOLLOWS_M, FOLLOWS_SLOPE = 2.0, 0.15
 """A road user behind the rear axle follows the ego vehicle if it is at most this far beside its axis: more
 the further behind it is."""
-ENTERED_M = 1.7
-"""A person has entered the path at this distance from it."""
 STATE_OF_STATUS = {
     TrafficLightStatus.RED: LightState.RED,
     TrafficLightStatus.YELLOW: LightState.YELLOW,
@@ -92,7 +87,6 @@ def read_affordances(log: Log, frame: int) -> Affordances:
     lamps, lamps_known = _lamps(log, frame, lane)
     boxes = read_boxes(log, frame)
     lead, lead_m, lead_mps, lead_known = lead_of(boxes, path)
-    crossing, crossing_known = _crossing(log, frame, boxes, path)
     occupied, occupied_known = _occupied(log, frame, boxes, path)
     return Affordances(
         path_xy=path.xy,
@@ -100,7 +94,6 @@ def read_affordances(log: Log, frame: int) -> Affordances:
         light=torch.tensor(int(light)),
         light_m=torch.tensor(light_m),
         light_known=torch.tensor(light_known),
-        light_later=torch.tensor(_later(log, frame, lane, light)),
         lamp_xyz=lamps,
         lamp=torch.ones(len(lamps), dtype=torch.bool),
         lamps_known=torch.tensor(lamps_known and light_known),
@@ -108,9 +101,6 @@ def read_affordances(log: Log, frame: int) -> Affordances:
         lead_m=torch.tensor(lead_m),
         lead_mps=torch.tensor(lead_mps),
         lead_known=torch.tensor(lead_known),
-        crossing_xy=crossing,
-        crossing=torch.ones(len(crossing), dtype=torch.bool),
-        crossing_known=torch.tensor(crossing_known),
         occupied=occupied,
         occupied_known=occupied_known,
     )
@@ -194,17 +184,6 @@ def _lamps(log: Log, frame: int, lane: int | None) -> tuple[Float[Tensor, "L 3"]
     return torch.from_numpy(_in_ego_frame(shown[lane], log, frame)).float(), True
 
 
-def _later(log: Log, frame: int, lane: int | None, light: LightState) -> list[int]:
-    """Return the later states of the light of a lane."""
-    states, state = [], light
-    t_us = log.t_us[frame] + 1e6 * LATER_DT_S * np.arange(1, LATER_STEPS + 1)
-    for later, there in zip(*log.nearest_frames(t_us), strict=True):
-        if lane is not None and there and (shown := read_traffic_lights(log, int(later))) is not None:
-            state = STATE_OF_STATUS.get(shown.get(lane, TrafficLightStatus.UNKNOWN), state)
-        states.append(int(state))
-    return states
-
-
 @functools.lru_cache(maxsize=64)
 def _stop_lines(log: Log) -> _StopLines | None:
     """Return the lanes that lights of the log guard. None without lights or map."""
@@ -246,23 +225,6 @@ def lead_of(boxes: Boxes | None, path: PathAhead) -> tuple[bool, float, float, b
         return True, max(gap, 0.0), speed_mps, True
     reach_m = float(path.valid.sum()) - 1.0 - path.front_m
     return False, 0.0, 0.0, path.given or reach_m >= LEAD_RANGE_M
-
-
-def _crossing(
-    log: Log, frame: int, boxes: Boxes | None, path: PathAhead
-) -> tuple[Float[Tensor, "K 2"], bool]:
-    """Return where people are who will cross the path, and whether the log tells."""
-    lasts_s = float(log.t_us[-1] - log.t_us[frame]) * 1e-6
-    if boxes is None or not bool(path.valid.any()) or lasts_s < CROSSING_S - 0.05:
-        return torch.zeros(0, 2), False
-    future = read_futures(log, frame, round(CROSSING_S / 0.5), 0.5)
-    at = torch.cat([boxes.centre[:, None, :2], future.xy], dim=1)  # [M S+1 2]
-    there = torch.cat([torch.ones_like(future.valid[:, :1]), future.valid], dim=1)
-    along_m, left_m = along_path(at.flatten(0, 1), path.xy, path.valid)
-    ahead_m = (along_m - path.front_m).view(there.shape)
-    entered = (left_m.view(there.shape).abs() < ENTERED_M) & (ahead_m > -1.0) & (ahead_m < CROSSING_RANGE_M)
-    person = (boxes.category == int(Category.PEDESTRIAN)) & boxes.valid
-    return boxes.centre[person & (entered & there).any(-1), :2], True
 
 
 def _occupied(

@@ -24,7 +24,7 @@ from foredrive.scene.record import Record
 
 BATCH = 32
 """Clips that are looked at together where none is trained on."""
-PACK_VERSION = 3
+PACK_VERSION = 4
 """Version in every name. Increase it when the content of the files changes."""
 R = TypeVar("R", bound=Record)
 
@@ -39,7 +39,7 @@ class RouteExample(Record):
 
 
 def join(examples: Sequence[RouteExample]) -> RouteExample:
-    """Return a batch. Lamps and people are padded to the maximum in it."""
+    """Return a batch. Lamps and boxes are padded to the maximum in it."""
     keys = tuple(key for example in examples for key in example.key)
     batch = stack_records([dataclasses.replace(example, key=()) for example in examples])
     return dataclasses.replace(batch, key=keys)

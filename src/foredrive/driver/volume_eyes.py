@@ -79,7 +79,7 @@ class VolumeEyes(nn.Module):
         seen = last_frames(clip.observed(), config.frames - 1)
         with torch.set_grad_enabled(torch.is_grad_enabled() and not config.frozen):
             volumes, images = lift_frames(seen, self.backbone, self.encoder)
-        fine = images.values.permute(0, 1, 4, 2, 3)
+        fine = images.permute(0, 1, 4, 2, 3)
         cells = self._read(frames, route_cells(clip.route_xy, clip.route_valid), volumes)
         sight: Sight = self.reader(clip, cells, fine, fine.mean((-2, -1)))
         return sight

@@ -8,7 +8,6 @@ from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 from foredrive.scene import Agent, Clip, Trajectory
-from foredrive.scene.affordances import AffordanceEstimate
 from foredrive.scene.agents import Agents, MapLines
 from foredrive.scene.record import Record
 
@@ -23,7 +22,6 @@ Part = Literal[
     "map_layers",
     "semantics",
     "instances",
-    "affordances",
 ]
 """A part of a `Prediction`, by the name of its field."""
 
@@ -54,7 +52,6 @@ class Prediction(Record):
     """Index of the class of each voxel, in the classes and on the grid of the truth."""
     instances: Int[Tensor, "b S _Y _X"] | None = None
     """Number + 1 of the vehicle at each cell now and later, the same over time, on the grid of the truth."""
-    affordances: AffordanceEstimate | None = None
     """The next light, the lead vehicle and people who will cross."""
     image_stride: int = 1
     """One pixel in `image_stride` along rows and columns is rendered, the first at `image_stride // 2`."""

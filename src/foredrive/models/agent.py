@@ -9,7 +9,6 @@ from torch import Tensor, nn
 
 from foredrive.geometry.precision import full_precision
 from foredrive.models.ego_mlp import ego_motion, route_target
-from foredrive.models.plan_scorer import ScoredPlans
 from foredrive.models.planner import VolumePlanner
 from foredrive.models.tasks.carried import CarriedAgents
 from foredrive.models.tasks.heads import HeadOutput, TaskHeads, volumes_of
@@ -113,11 +112,6 @@ class PlanningAgent(nn.Module, Generic[W]):
         """
         plan: Trajectory = self.planner(*self._told(clip, beliefs, found))
         return plan
-
-    def score(self, clip: Clip, beliefs: Sequence[Belief], found: HeadOutput | None = None) -> ScoredPlans:
-        """Return the scored plans of a planner with a vocabulary. The arguments are those of `plan`."""
-        plans: ScoredPlans = self.planner.score(*self._told(clip, beliefs, found))
-        return plans
 
     def _told(self, clip: Clip, beliefs: Sequence[Belief], found: HeadOutput | None) -> tuple[Any, ...]:
         """Return the arguments of the planner."""

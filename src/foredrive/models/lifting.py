@@ -11,13 +11,12 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
-from foredrive.geometry.projection import pixel_centres, pixels_to_rays, project
-from foredrive.geometry.se3 import inverse_se3, rotate_vectors, transform_points
+from foredrive.geometry.projection import project
+from foredrive.geometry.se3 import inverse_se3, transform_points
 from foredrive.models.plane_context import PlaneContextConfig, plane_context
 from foredrive.ops.attention3d import attend_volume
 from foredrive.ops.lifting import lift
 from foredrive.scene import CameraRig, Frames, VoxelSpec
-from foredrive.scene.image_features import ImageFeatures
 
 
 def directions_2d(heads: int) -> Float[Tensor, "H 2"]:
@@ -256,30 +255,14 @@ def project_to_cameras(
 
 def lift_frames(
     frames: Frames, backbone: nn.Module, encoder: nn.Module
-) -> tuple[Float[Tensor, "b T ..."], ImageFeatures]:
-    """Return the volume or plane of each frame in its own ego frame, and image features of the last one."""
+) -> tuple[Float[Tensor, "b T ..."], Float[Tensor, "b C h w D"]]:
+    """Return the volume or plane of each frame in its own ego frame, and the finest features of the images of
+    the last one."""
     b, t, c = frames.image_valid.shape
     features = [level.unflatten(0, (b * t, c)) for level in backbone(frames.images.flatten(0, 2))]
     rig = frames.rig.map_tensors(lambda tensor: tensor.flatten(0, 1))
     lifted: Tensor = encoder(features, rig, frames.image_valid.flatten(0, 1))
-    finest = features[0].unflatten(0, (b, t))[:, -1]
-    return lifted.unflatten(0, (b, t)), _with_rays(finest, frames.rig[:, -1], frames.image_valid[:, -1])
-
-
-def _with_rays(
-    values: Float[Tensor, "b C h w D"], rig: CameraRig, image_valid: Bool[Tensor, "b C"]
-) -> ImageFeatures:
-    """Return image features with the rays through their cells."""
-    b, c, h, w, _ = values.shape
-    stride = rig.size_hw[1] / w
-    uv = (stride * pixel_centres((h, w))).reshape(-1, 2).to(rig.K)
-    direction = rotate_vectors(rig.T_ego_cam, pixels_to_rays(uv.expand(b, c, -1, 2), rig.K, rig.dist))
-    return ImageFeatures(
-        values=values,
-        direction=direction.unflatten(2, (h, w)),
-        cell_rad=stride / rig.K[..., 0, 0],
-        valid=image_valid.to(values.dtype),
-    )
+    return lifted.unflatten(0, (b, t)), features[0].unflatten(0, (b, t))[:, -1]
 
 
 class LiftingEncoder(nn.Module):

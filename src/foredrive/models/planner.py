@@ -9,13 +9,10 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
-from foredrive.errors import InputError
 from foredrive.geometry.precision import full_precision
 from foredrive.models.ego_mlp import EgoMLP, EgoMLPConfig, status_vector
 from foredrive.models.few_queries import FewQueriesDecoderLayer
 from foredrive.models.path_correction import PathCorrection, PathCorrectionConfig, headings, set_to_zero
-from foredrive.models.plan_scorer import PlanScorer, PlanScorerConfig, ScoredPlans
-from foredrive.models.plan_vocabulary import plan_vocabulary
 from foredrive.models.tasks.heads import TaskHeadsConfig
 from foredrive.models.tasks.scene_tokens import Attended, SceneTokens
 from foredrive.scene import Command, Trajectory, VoxelSpec
@@ -47,8 +44,6 @@ class PlannerConfig:
     """Outputs of the task heads that the decoder attends to beside the plane, as in VAD and UniAD."""
     path: PathCorrectionConfig | None = None
     """Also sample the volume along the initial plan. Not in the paper."""
-    scorer: PlanScorerConfig | None = None
-    """Score a vocabulary of plans and choose one, in place of regressing waypoints. It needs the target."""
     feed_forward: float = 2.0
     """Hidden width of the feed-forward networks of the decoder, as a multiple of C."""
     dropout: float = 0.1
@@ -156,11 +151,7 @@ class VolumePlanner(nn.Module):
         self.speed = nn.Sequential(nn.Linear(inputs, width), nn.ReLU(), nn.Linear(width, width))
         self.plan = nn.Parameter(0.02 * torch.randn(width))
         self.fuse_query = nn.Sequential(nn.Linear(3 * width, width), nn.ReLU(), nn.Linear(width, width))
-        self.scorer: PlanScorer | None = None
-        if config.scorer is None:
-            self._build_regression(config, horizon_steps)
-        else:
-            self.scorer = self._scorer(config, config.scorer, spec, horizon_steps)
+        self._build_regression(config, horizon_steps)
         status = 0 if self.ego_mlp is None else len(self.ego_mlp.status_mean)
         self.path: PathCorrection | None = None
         if config.path is not None:
@@ -185,25 +176,6 @@ class VolumePlanner(nn.Module):
         )
         if self.ego_mlp is not None:  # the MLP's plan is good already: start from no correction
             set_to_zero(self.waypoints[-1])
-
-    @staticmethod
-    def _scorer(
-        config: PlannerConfig, scorer: PlanScorerConfig, spec: VoxelSpec, horizon_steps: int
-    ) -> PlanScorer:
-        if not config.target or config.path is not None or config.ego_mlp is not None:
-            raise InputError(
-                "planner.scorer scores plans to the target point: set planner.target to true, and "
-                "planner.path and planner.ego_mlp, which correct a regressed plan, to null"
-            )
-        return PlanScorer(
-            scorer,
-            spec,
-            width=config.width,
-            heads=config.heads,
-            feed_forward=round(config.feed_forward * config.width),
-            dropout=config.dropout,
-            steps=horizon_steps,
-        )
 
     @property
     def imagined_frames(self) -> int:
@@ -233,11 +205,6 @@ class VolumePlanner(nn.Module):
             target: see `route_target`; required if the config's `target` is set.
             tokens: output of `scene`; required if the config's `attends` is not empty.
         """
-        if self.scorer is not None:
-            chosen: Trajectory = self.score(
-                now, future, command, command_valid, speed_mps, speed_valid, past, target, tokens
-            ).best()
-            return chosen
         plane, query = self._read(
             now, future, command, command_valid, speed_mps, speed_valid, past, target, tokens
         )
@@ -260,30 +227,6 @@ class VolumePlanner(nn.Module):
             log_prob=torch.zeros_like(xy[..., 0, 0]),
             dt_s=self.dt_s,
         )
-
-    def score(
-        self,
-        now: Float[Tensor, "b D Z Y X"],
-        future: Float[Tensor, "b D Z Y X"] | None,
-        command: Int[Tensor, "b"],
-        command_valid: Bool[Tensor, "b"],
-        speed_mps: Float[Tensor, "b"],
-        speed_valid: Bool[Tensor, "b"],
-        past: Float[Tensor, "b P 4"],
-        target: Float[Tensor, "b 3"] | None = None,
-        tokens: Float[Tensor, "b _N C"] | None = None,
-    ) -> ScoredPlans:
-        """Return the plans of the vocabulary with their logits. The arguments are those of `forward`."""
-        assert self.scorer is not None, "this planner regresses"
-        assert target is not None, "this planner needs the target point of the route"
-        plane, query = self._read(
-            now, future, command, command_valid, speed_mps, speed_valid, past, target, tokens
-        )
-        config = self.scorer.config
-        with full_precision(speed_mps, target) as (speed, at):
-            plans = plan_vocabulary(config.vocabulary, speed, at, self.horizon_steps, self.dt_s)
-        logits = self.scorer(plans, query, plane, tokens)
-        return ScoredPlans(*plans, logits[..., :-1], logits[..., -1], self.dt_s, config.choice)
 
     def _read(
         self,

@@ -51,9 +51,6 @@ class Recipe(Generic[M, S]):
     path: PathFit | None = None
     """Separate fit of the planner's `PathCorrection` after fine-tuning, which then does not train it. None
     trains it in fine-tuning."""
-    balance: float = 0.0
-    """Balance of the demonstrations in fine-tuning (`training.balancing`): 0 draws waiting, starting,
-    stopping, braking and turning as often as they occur, 1 each of them equally often."""
     ego_mlp: EgoMLPFit = field(default_factory=EgoMLPFit)
     """Fit of the ego MLP: the baseline in the evaluation and, with `planner.ego_mlp`, the planner's base."""
     precision: Literal["32-true", "bf16-mixed"] = "32-true"
@@ -62,12 +59,12 @@ class Recipe(Generic[M, S]):
 
     @property
     def of_pretraining(self) -> "Recipe[M, S]":
-        """Return the recipe with the world model of pre-training, without task heads and scored plans."""
+        """Return the recipe with the world model of pre-training, without task heads."""
         return replace(
             self,
             model=self.pretrained_model or self.model,
             clips=replace(self.clips, tasks=None),
-            planner=replace(self.planner, attends=(), scorer=None),
+            planner=replace(self.planner, attends=()),
             tasks=None,
         )
 

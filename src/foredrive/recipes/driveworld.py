@@ -18,7 +18,7 @@ from foredrive.models.lifting import LiftingConfig
 from foredrive.models.pooled_lifting import PooledLiftingConfig
 from foredrive.models.text_encoder import PACKAGED_MODEL
 from foredrive.recipes.config import Recipe, rescheduled
-from foredrive.recipes.nemo import nemo_base, nemo_drive_tele, nemo_tiny, nemo_town
+from foredrive.recipes.nemo import nemo_base, nemo_tiny, nemo_town
 from foredrive.training import DriveWorldStage, DriveWorldWeights, Schedule
 
 DriveWorldRecipe = Recipe[DriveWorldConfig, DriveWorldStage]
@@ -98,21 +98,6 @@ def driveworld_town() -> DriveWorldRecipe:
         pretrain=rescheduled(pretrain, steps=500, warmup_steps=50),
         finetune=rescheduled(finetune, steps=150, warmup_steps=20),
         precision=nemo.precision,
-    )
-
-
-def driveworld_drive_tele() -> DriveWorldRecipe:
-    """Return `driveworld_town` for closed loop, with rig, heads and planner of `nemo_drive_tele`."""
-    town, nemo = driveworld_town(), nemo_drive_tele()
-    return replace(
-        town,
-        name="driveworld_drive_tele",
-        about="driveworld_town to drive in closed loop, as nemo_drive_tele does",
-        clips=_in_time(nemo.clips),
-        tasks=nemo.tasks,
-        planner=nemo.planner,
-        balance=nemo.balance,
-        finetune=rescheduled(town.finetune, steps=1500, warmup_steps=60),
     )
 
 

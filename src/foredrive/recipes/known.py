@@ -19,7 +19,6 @@ from foredrive.recipes.config import (
 from foredrive.recipes.driver import DRIVER_RECIPES, DriverRecipe
 from foredrive.recipes.driveworld import (
     driveworld_base,
-    driveworld_drive_tele,
     driveworld_tiny,
     driveworld_town,
 )
@@ -29,7 +28,6 @@ from foredrive.recipes.nemo import (
     TOWN_BEV,
     nemo_base,
     nemo_drive,
-    nemo_drive_rows,
     nemo_tiny,
     nemo_town,
 )
@@ -38,11 +36,9 @@ from foredrive.recipes.nemo_ablations import nemo_ablations
 RECIPES: dict[str, Recipe[Any, Any]] = {
     "nemo_tiny": nemo_tiny(),
     "nemo_drive": nemo_drive(),
-    **nemo_drive_rows(),
     **nemo_ablations(nemo_town(), TOWN_BEV),
     **nemo_ablations(nemo_base(), BASE_BEV),
     "driveworld_tiny": driveworld_tiny(),
-    "driveworld_drive_tele": driveworld_drive_tele(),
     **driveworld_ablations(driveworld_town()),
     **driveworld_ablations(driveworld_base()),
 }

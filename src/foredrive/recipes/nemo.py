@@ -3,23 +3,17 @@
 import dataclasses
 
 from foredrive.data import ClipConfig
-from foredrive.data.task_truth import UNIAD_RASTER, TaskTruthConfig
 from foredrive.models.backbone import BackboneConfig
 from foredrive.models.bev import BevConfig
 from foredrive.models.ego_mlp import EgoMLPConfig
 from foredrive.models.lifting import LiftingConfig
 from foredrive.models.nemo import MotionConfig, NemoConfig, RendererConfig
 from foredrive.models.path_correction import PathCorrectionConfig
-from foredrive.models.plan_scorer import PlanScorerConfig
 from foredrive.models.plane_context import PlaneContextConfig
 from foredrive.models.planner import PlannerConfig
-from foredrive.models.tasks.affordances import AffordanceHeadConfig
-from foredrive.models.tasks.heads import TaskHeadsConfig
-from foredrive.recipes.config import Recipe, named_after, rescheduled
+from foredrive.recipes.config import Recipe, rescheduled
 from foredrive.scene import VoxelSpec
-from foredrive.sensors.rigs import DRIVING
 from foredrive.training import AugmentConfig, NemoStage, NemoWeights, PathFit, Schedule
-from foredrive.training.joint_tasks import JointTasks
 
 NemoRecipe = Recipe[NemoConfig, NemoStage]
 
@@ -147,59 +141,6 @@ def nemo_drive() -> NemoRecipe:
         clips=dataclasses.replace(town.clips, future_source="expert"),
         planner=dataclasses.replace(town.planner, history=0, target=True),
     )
-
-
-def nemo_drive_tele() -> NemoRecipe:
-    """Return `nemo_drive` for the rig with a narrow front camera, with supervised affordances.
-
-    In towns the next light, the lead vehicle and people who cross are known, and the planner attends to what
-    the head has found of them. Images are as large as the rig records them: a lamp is 4 px wide at 40 m.
-    """
-    drive = nemo_drive()
-    heads = TaskHeadsConfig(
-        agents=None, elements=None, raster=None, voxels=None, affordances=AffordanceHeadConfig()
-    )
-    truth = TaskTruthConfig(elements_lw_m=None, raster=None, semantics=None, instances=None, affordances=True)
-    return dataclasses.replace(
-        drive,
-        name="nemo_drive_tele",
-        about="nemo_drive for the rig `driving`: sees lights, the lead vehicle and who will cross",
-        clips=dataclasses.replace(drive.clips, image_hw=DRIVING.image_hw, tasks=truth),
-        tasks=JointTasks(heads, weight=1.0),
-        planner=dataclasses.replace(drive.planner, attends=("affordances",)),
-        finetune=rescheduled(drive.finetune, steps=1500, warmup_steps=60),
-        balance=0.5,
-    )
-
-
-def nemo_drive_rows() -> dict[str, NemoRecipe]:
-    """Return `nemo_drive_tele` and three more by name: regressing or scoring, with futures or without.
-
-    Scorers are judged by sub-scores of a town's simulation. All have the same world model, heads and rig.
-    """
-    full = nemo_drive_tele()
-    assert full.clips.tasks is not None
-    of_scores = dataclasses.replace(full.clips.tasks, raster=UNIAD_RASTER)
-    scoring = dataclasses.replace(
-        full,
-        clips=dataclasses.replace(full.clips, tasks=of_scores),
-        planner=dataclasses.replace(full.planner, scorer=PlanScorerConfig(), ego_mlp=None, path=None),
-        path=None,
-    )
-    rows = {
-        "present": (_from_present(full), "plans from the present volume alone"),
-        "scorer": (scoring, "scores a vocabulary of plans"),
-        "scorer_present": (
-            _from_present(scoring),
-            "scores a vocabulary of plans from the present volume alone",
-        ),
-    }
-    return named_after(full, rows)
-
-
-def _from_present(recipe: NemoRecipe) -> NemoRecipe:
-    """Return the recipe with a planner that reads no imagined frame. Pre-training stays as it is."""
-    return dataclasses.replace(recipe, planner=dataclasses.replace(recipe.planner, future="none"))
 
 
 def nemo_base() -> NemoRecipe:

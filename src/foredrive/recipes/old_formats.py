@@ -11,7 +11,21 @@ def upgraded(written: Any) -> Any:
         return written
     nested = _nested(written) if "planner_width" in model else written
     stages = {name: _stage(nested[name]) for name in ("pretrain", "finetune") if name in nested}
-    return _with_module_configs({**nested, "tasks": upgraded_heads(nested.get("tasks")), **stages})
+    upgraded = _with_module_configs({**nested, "tasks": upgraded_heads(nested.get("tasks")), **stages})
+    return _without(upgraded, {"balance": 0.0, "planner.scorer": None, "tasks.heads.affordances": None})
+
+
+def _without(written: Any, unused: Mapping[str, Any]) -> Any:
+    """Return values without entries of parts that are gone, where they have the value for no such part."""
+    for name, value in unused.items():
+        head, _, rest = name.partition(".")
+        if not isinstance(written, Mapping) or head not in written:
+            continue
+        if rest:
+            written = {**written, head: _without(written[head], {rest: value})}
+        elif written[head] == value:
+            written = {key: entry for key, entry in written.items() if key != head}
+    return written
 
 
 def upgraded_heads(written: Any) -> Any:

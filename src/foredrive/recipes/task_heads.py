@@ -7,7 +7,6 @@ from typing import Any, TypeVar, get_args
 
 from foredrive.data.task_truth import TaskTruthConfig
 from foredrive.errors import InputError
-from foredrive.models.tasks.affordances import AffordanceHeadConfig
 from foredrive.models.tasks.agents import AgentHeadConfig, CarriedConfig
 from foredrive.models.tasks.decoder import DecoderConfig
 from foredrive.models.tasks.heads import TaskHeadsConfig
@@ -29,8 +28,6 @@ HEADED: tuple[Task, ...] = ("detection", "tracking", "map", "motion", "occupancy
 """Tasks that have a head."""
 INSTANCES = "instances"
 """Name of the head of instance occupancy, beside the tasks."""
-AFFORDANCES = "affordances"
-"""Name of the head of lights, lead vehicle and crossing people, beside the tasks."""
 
 
 @dataclass(frozen=True)
@@ -138,9 +135,9 @@ def _heads_of(tasks: Sequence[str], sizes: TaskHeadsConfig, schedule: Schedule) 
     if not tasks:
         raise InputError("name at least one task")
     for task in tasks:
-        if task not in (*HEADED, INSTANCES, AFFORDANCES):
+        if task not in (*HEADED, INSTANCES):
             known = "has no head" if task in get_args(Task) else "is unknown"
-            there = ", ".join((*HEADED, INSTANCES, AFFORDANCES))
+            there = ", ".join((*HEADED, INSTANCES))
             raise InputError(f"the task {task!r} {known}; heads can be trained for {there}")
     agents = sizes.agents if {"detection", "motion", "tracking", INSTANCES} & set(tasks) else None
     if agents is not None and "motion" not in tasks:
@@ -154,7 +151,6 @@ def _heads_of(tasks: Sequence[str], sizes: TaskHeadsConfig, schedule: Schedule) 
         raster=sizes.raster if "map" in tasks else None,
         voxels=sizes.voxels if "occupancy" in tasks else None,
         instances=InstanceHeadConfig() if INSTANCES in tasks else None,
-        affordances=AffordanceHeadConfig() if AFFORDANCES in tasks else None,
         volume_of="occupancy",
     )
     truth = TaskTruthConfig()
@@ -164,8 +160,6 @@ def _heads_of(tasks: Sequence[str], sizes: TaskHeadsConfig, schedule: Schedule) 
         truth = replace(truth, elements_lw_m=None, raster=None)
     if "occupancy" not in tasks:
         truth = replace(truth, semantics=None)
-    if AFFORDANCES in tasks:
-        truth = replace(truth, affordances=True)
     recipe = TaskHeadsRecipe(kept, truth, schedule)
     if agents is None or agents.carried is None:
         return recipe

@@ -22,12 +22,7 @@ def build_agent(recipe: Recipe[Any, Any], *, fetch: bool = True) -> PlanningAgen
         fetch: whether to download what the recipe names: weights of a backbone and encodings of texts. It is
             not needed where trained weights replace them.
     """
-    clips, truth = recipe.clips, recipe.clips.tasks
-    if recipe.planner.scorer is not None and (truth is None or not truth.affordances or truth.raster is None):
-        raise InputError(
-            f"{recipe.name}: planner.scorer learns from the route, lights and the map: set "
-            "clips.tasks.affordances to true, and clips.tasks.raster"
-        )
+    clips = recipe.clips
     world_model = WORLD_MODELS[recipe.model.kind].build(recipe.model, clips, fetch)
     planner = VolumePlanner(
         recipe.planner,

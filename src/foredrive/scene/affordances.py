@@ -1,4 +1,4 @@
-"""What a driver must see: the next traffic light, the lead vehicle, people who will cross."""
+"""What a driver must see of its path: the next traffic light, and who is in the path, now and later."""
 
 from dataclasses import dataclass
 
@@ -7,13 +7,9 @@ from torch import Tensor
 
 from foredrive.scene.record import Record
 
-LIGHT_RANGE_M = 60.0
-LEAD_RANGE_M = 50.0
-CROSSING_RANGE_M = 25.0
-"""Distances along the path up to which a light, a lead vehicle and people who cross are told, m."""
-CROSSING_S = 4.0
-"""Someone crosses who enters the path within this time, s."""
-LATER_STEPS, LATER_DT_S = 6, 0.5
+LIGHT_RANGE_M, LEAD_RANGE_M = 60.0, 50.0
+"""Distances along the path up to which a light and a lead vehicle count, m."""
+LATER_DT_S = 0.5
 CELLS, CELL_M = 24, 2.0
 """Cells of the path ahead of the front bumper, and their length, m."""
 TIMES = 9
@@ -39,9 +35,6 @@ class Affordances(Record):
     light_m: Float[Tensor, "*b"]
     """Distance of its stop line. It is negative while the bumper is up to 4.4 m beyond the line."""
     light_known: Bool[Tensor, "*b"]
-    light_later: Int[Tensor, "*b S"]
-    """`LightState` of the same light at `LATER_STEPS` times, `LATER_DT_S` apart; the last known one beyond
-    the end of the log."""
     lamp_xyz: Float[Tensor, "*b L 3"]
     """Places of the lamps of this light, ego frame, m."""
     lamp: Bool[Tensor, "*b L"]
@@ -54,33 +47,11 @@ class Affordances(Record):
     lead_mps: Float[Tensor, "*b"]
     """Its speed along the path. NaN where its box has no velocity."""
     lead_known: Bool[Tensor, "*b"]
-    crossing_xy: Float[Tensor, "*b K 2"]
-    """Positions at now of the people who enter the path within `CROSSING_S` and `CROSSING_RANGE_M`."""
-    crossing: Bool[Tensor, "*b K"]
-    """False for padding."""
-    crossing_known: Bool[Tensor, "*b"]
     occupied: Bool[Tensor, "*b T G"]
     """Whether a road user is in each of `CELLS` of the path at each of `TIMES`, by the recorded futures."""
     occupied_known: Bool[Tensor, "*b T G"]
     """False beyond the end of the route, where nobody annotated the time, and where only road users are that
     cannot be seen now."""
-
-
-@dataclass(frozen=True)
-class AffordanceEstimate(Record):
-    """The prediction of `Affordances`."""
-
-    light: Float[Tensor, "*b 4"]
-    """Probability of each `LightState`."""
-    light_m: Float[Tensor, "*b"]
-    lead: Float[Tensor, "*b"]
-    """Probability of a lead vehicle."""
-    lead_m: Float[Tensor, "*b"]
-    lead_mps: Float[Tensor, "*b"]
-    crossing_xy: Float[Tensor, "*b K 2"]
-    """Places of the K most probable people who cross, the first most probable."""
-    crossing: Float[Tensor, "*b K"]
-    """Their probabilities."""
 
 
 @dataclass(frozen=True)

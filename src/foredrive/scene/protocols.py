@@ -10,7 +10,6 @@ from torch import Tensor
 
 from foredrive.scene.clip import Clip
 from foredrive.scene.frames import Frames
-from foredrive.scene.image_features import ImageFeatures
 from foredrive.scene.record import Record
 from foredrive.scene.rig import CameraRig
 from foredrive.scene.sweep import LidarSweep
@@ -41,8 +40,6 @@ class Belief(Record):
     """Velocity over ground of the content of each voxel, in the ego axes. Given if imagining predicted it."""
     T_now_ego: Float[Tensor, "b 4 4"] | None = None
     """Predicted ego motion: ego frame of this belief -> ego frame at now. None for the belief at now."""
-    images: ImageFeatures | None = None
-    """Features of the images at now, for heads that read them. None for imagined beliefs."""
 
 
 @dataclass(frozen=True)

@@ -9,14 +9,13 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from foredrive.losses import masked_mean, occupancy_loss
+from foredrive.losses import masked_mean, occupancy_loss, waypoint_loss
 from foredrive.models.agent import PlanningAgent
 from foredrive.models.driveworld import DriveWorld, Unrolled, actions_of, balanced_kl
 from foredrive.scene import Belief, Boxes, Clip, Example, last_frames
 from foredrive.training.joint_tasks import TaskTerms
 from foredrive.training.loop import Schedule
 from foredrive.training.objective import set_planner_trainable
-from foredrive.training.plan_losses import plan_losses
 
 
 @dataclass(frozen=True)
@@ -108,9 +107,8 @@ class DriveWorldObjective(nn.Module):
             found = None if self.tasks is None else self.agent.perceive(now, clip)
             if stage.weights.wpts > 0:
                 future = world.imagine(now, 1) if self.agent.planner.imagined_frames else []
-                parts = plan_losses(self.agent, observed, [now, *future], found, example)
-                losses["wpts"] = parts.pop("wpts")
-                terms |= parts
+                plan = self.agent.plan(observed, [now, *future], found)
+                losses["wpts"] = waypoint_loss(plan, example.clip.future)
             if self.tasks is not None and found is not None:
                 terms |= self.tasks(found, example)
         weighted = [getattr(stage.weights, name) * value for name, value in losses.items()]

@@ -56,7 +56,6 @@ class TaskTerms(nn.Module):
             self.class_weight,
             self.config.weights,
             self.config.heads.frames,
-            clip.rig[:, clip.now],
         )
         total = losses.pop("loss")
         return {f"task_{name}": value for name, value in losses.items()} | {

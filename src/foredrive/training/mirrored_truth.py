@@ -40,19 +40,7 @@ def mirrored_truth(truth: TaskTruth, chosen: Bool[Tensor, "b"]) -> TaskTruth:
             camera_mask=_flipped(semantics.camera_mask, chosen),
             lidar_mask=_flipped(semantics.lidar_mask, chosen),
         )
-    affordances = truth.affordances
-    if affordances is not None:
-        affordances = dataclasses.replace(
-            affordances,
-            path_xy=_negated_y(affordances.path_xy, chosen),
-            crossing_xy=_negated_y(affordances.crossing_xy, chosen),
-            lamp_xyz=_pick(
-                chosen,
-                affordances.lamp_xyz * affordances.lamp_xyz.new_tensor([1.0, -1.0, 1.0]),
-                affordances.lamp_xyz,
-            ),
-        )
-    return TaskTruth(futures, elements, raster, semantics, instances, affordances=affordances)
+    return TaskTruth(futures, elements, raster, semantics, instances)
 
 
 def _negated_y(points: Shaped[Tensor, "b *n 2"], chosen: Bool[Tensor, "b"]) -> Tensor:

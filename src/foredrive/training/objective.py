@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from foredrive.errors import InputError
-from foredrive.losses import ego_motion_loss, l1_loss, occupancy_loss, perceptual_loss
+from foredrive.losses import ego_motion_loss, l1_loss, occupancy_loss, perceptual_loss, waypoint_loss
 from foredrive.losses.reconstruction import ImageFeatures
 from foredrive.models.agent import PlanningAgent
 from foredrive.models.lifting import lift_frames
@@ -18,7 +18,6 @@ from foredrive.scene import Belief, Clip, Example, last_frames
 from foredrive.training.augmentation import AugmentConfig, augmented
 from foredrive.training.joint_tasks import TaskTerms
 from foredrive.training.loop import Schedule
-from foredrive.training.plan_losses import plan_losses
 from foredrive.training.rays import averaged_rays, thinned_rays
 
 
@@ -176,7 +175,8 @@ class NemoObjective(nn.Module):
         if len(beliefs) == 1 and self.steps > 0:
             losses["loss"] = losses["loss"] + self._no_change()
         if weights.wpts > 0:
-            losses |= plan_losses(self.agent, observed, beliefs, found, example)
+            plan = self.agent.plan(observed, beliefs, found)
+            losses["wpts"] = waypoint_loss(plan, example.clip.future)
             losses["loss"] = losses["loss"] + weights.wpts * losses["wpts"]
         if self.tasks is not None and found is not None:
             losses |= self.tasks(found, example)
@@ -215,14 +215,14 @@ class NemoObjective(nn.Module):
         looks_back = self.tasks is not None  # heads read the past of all items
         items = slice(None if looks_back else stage.imagined_items)
         frames = last_frames(observed, world.past_frames if steps or looks_back else 0)
-        present, images = lift_frames(frames[:, -1:], world.backbone, world.encoder)
-        now = Belief(volume=present[:, -1], images=images)
+        present, _ = lift_frames(frames[:, -1:], world.backbone, world.encoder)
+        now = Belief(volume=present[:, -1])
         if steps == 0 and not looks_back:
             return [now]
         with torch.set_grad_enabled(stage.past_gradient and torch.is_grad_enabled()):
             past, _ = lift_frames(frames[items, :-1], world.backbone, world.encoder)
         history = torch.cat([past, present[items]], dim=1)
-        believed = world.believe(frames[items], history, images[items])
+        believed = world.believe(frames[items], history)
         imagined = world.imagine(believed, steps) if steps else []
         return [believed if looks_back else now, *imagined]
 

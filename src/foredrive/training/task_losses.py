@@ -10,11 +10,10 @@ from foredrive.losses.map_elements import MapLossWeights, map_element_losses
 from foredrive.losses.semantics import raster_loss, semantic_affinity, voxel_cross_entropy
 from foredrive.models.tasks.heads import HeadOutput
 from foredrive.models.tasks.maps import MapSet
-from foredrive.scene import Boxes, CameraRig, VoxelSpec
+from foredrive.scene import Boxes, VoxelSpec
 from foredrive.scene.map_elements import MapElements
 from foredrive.scene.semantics import SemanticVoxels
 from foredrive.scene.task_truth import TaskTruth
-from foredrive.training.affordance_losses import AffordanceLossWeights, affordance_losses
 from foredrive.training.agent_losses import AgentLossWeights, agent_losses
 from foredrive.training.instance_losses import instance_loss
 from foredrive.training.task_targets import map_targets
@@ -29,7 +28,6 @@ class TaskWeights:
     raster: float = 1.0
     voxels: float = 1.0
     instances: float = 1.0
-    affordances: AffordanceLossWeights = field(default_factory=AffordanceLossWeights)
     map: MapLossWeights = field(default_factory=MapLossWeights)
 
 
@@ -42,7 +40,6 @@ def task_losses(
     class_weight: Float[Tensor, "C"] | None,
     weights: TaskWeights,
     frames: int = 1,
-    rig: CameraRig | None = None,
 ) -> dict[str, Float[Tensor, ""]]:
     """Return the weighted losses of the heads by name; "loss" is their sum.
 
@@ -55,7 +52,6 @@ def task_losses(
         class_weight: weight of each class of semantic voxels.
         weights: weights of the losses.
         frames: items of a sequence, if the items are sequences.
-        rig: cameras at now, for heads that read images.
     """
     losses: dict[str, Float[Tensor, ""]] = {}
     if output.agents is not None:
@@ -90,8 +86,6 @@ def task_losses(
             spec,
             weights.agents.boxes,
         )
-    if output.affordances is not None and truth.affordances is not None:
-        losses |= affordance_losses(output.affordances, truth.affordances, weights.affordances, rig)
     return losses | {"loss": torch.stack(list(losses.values())).sum()}
 
 

@@ -72,12 +72,6 @@ TASK_FIGURES = (
     ("Instances", "UniAD, IoU far, %", "occupancy.uniad.iou_far_pct", "constant_velocity"),
     ("Instances", "UniAD, VPQ near, %", "occupancy.uniad.vpq_near_pct", "constant_velocity"),
     ("Instances", "UniAD, VPQ far, %", "occupancy.uniad.vpq_far_pct", "constant_velocity"),
-    ("Affordances", "state of the light within 40 m", "affordances.light_accuracy_40m", "commonest"),
-    ("Affordances", "lights where there is none", "affordances.false_lights", ""),
-    ("Affordances", "error of the lead vehicle's gap, m", "affordances.lead_error_m", ""),
-    ("Affordances", "recall of lead vehicles", "affordances.lead_recall", ""),
-    ("Affordances", "recall of crossing people, 20 m", "affordances.crossing_recall_20m", ""),
-    ("Affordances", "precision of crossing people, 20 m", "affordances.crossing_precision_20m", ""),
 )
 """Main figures of the task heads: task, title, key, and the baseline beside it."""
 _BASELINE = re.compile(r"occupancy\.iou_\w+\.(\w+)")

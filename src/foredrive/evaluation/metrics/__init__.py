@@ -1,7 +1,6 @@
 """The metrics of an evaluation, one file each. A new metric is a file here and a line in `METRICS`."""
 
 from foredrive.evaluation.metric import MetricFactory
-from foredrive.evaluation.metrics.affordances import AffordanceMetric
 from foredrive.evaluation.metrics.detection import DetectionMetric
 from foredrive.evaluation.metrics.flow import FlowMetric
 from foredrive.evaluation.metrics.futures import FuturesMetric
@@ -29,6 +28,5 @@ METRICS: tuple[MetricFactory, ...] = (
     MapLinesMetric,
     SemanticVoxelMetric,
     InstanceMetric,
-    AffordanceMetric,
 )
 """In the order of their figures in a summary."""

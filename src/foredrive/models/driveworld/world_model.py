@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Annotated, Literal
 
 import torch
@@ -33,7 +33,6 @@ from foredrive.models.lift_splat import LiftSplatConfig, LiftSplatEncoder
 from foredrive.models.lifting import lift_frames
 from foredrive.models.pooled_lifting import PooledLiftingConfig, PooledLiftingEncoder
 from foredrive.scene import Belief, Clip, Decoded, Frames, Task, VoxelSpec, last_frames
-from foredrive.scene.image_features import ImageFeatures
 from foredrive.scene.record import Record
 
 Encoder = LiftSplatEncoder | PooledLiftingEncoder
@@ -84,8 +83,6 @@ class LiftedFrames(Record):
     """Actions at each frame; zeros at the last."""
     T_now_ego: Float[Tensor, "b T 4 4"]
     """Transform from the ego frame of each frame to that of the last."""
-    images: ImageFeatures
-    """Image features of the last frame."""
 
 
 @dataclass(frozen=True)
@@ -173,14 +170,13 @@ class DriveWorld(nn.Module):
 
     def lift_frames(self, frames: Frames) -> LiftedFrames:
         """Lift each of the last T frames to a plane."""
-        planes, images = lift_frames(frames, self.backbone, self.encoder)
-        return LiftedFrames(planes, actions_in(frames), frames.T_now_ego.float(), images)
+        planes, _ = lift_frames(frames, self.backbone, self.encoder)
+        return LiftedFrames(planes, actions_in(frames), frames.T_now_ego.float())
 
     def belief_about_now(self, lifted: LiftedFrames) -> Belief:
         """Return the belief of `observe` from frames that are already lifted."""
         latents, *_ = self._filter(lifted, None)
-        now = self._belief(latents[-1], self._statics(lifted.planes[:, -1]), "occupancy", None)
-        return replace(now, images=lifted.images)
+        return self._belief(latents[-1], self._statics(lifted.planes[:, -1]), "occupancy", None)
 
     def imagine(
         self,

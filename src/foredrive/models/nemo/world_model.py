@@ -21,7 +21,6 @@ from foredrive.models.nemo.motion import MotionConfig, MotionFlow
 from foredrive.models.nemo.rendering import RendererConfig, VolumeRenderer
 from foredrive.ops.volume import compose_flows, warp_volume
 from foredrive.scene import Belief, Clip, Decoded, Frames, Task, VoxelSpec, last_frames
-from foredrive.scene.image_features import ImageFeatures
 
 Encoder = LiftingEncoder | BevEncoder | AveragingEncoder
 ENCODERS: Mapping[type, Callable[..., Encoder]] = {
@@ -108,17 +107,13 @@ class Nemo(nn.Module):
 
     def encode(self, frames: Frames) -> Belief:
         """Do the work of `observe`. No step depends on the values of the data."""
-        return self.believe(frames, *lift_frames(frames, self.backbone, self.encoder))
+        return self.believe(frames, lift_frames(frames, self.backbone, self.encoder)[0])
 
-    def believe(
-        self, frames: Frames, volumes: Float[Tensor, "b T D Z Y X"], images: ImageFeatures | None = None
-    ) -> Belief:
-        """Return the belief about now from the volumes of T_p + 1 frames and the images at now."""
+    def believe(self, frames: Frames, volumes: Float[Tensor, "b T D Z Y X"]) -> Belief:
+        """Return the belief about now from the volumes of T_p + 1 frames."""
         measured = continued_motion(frames, self.max_steps) if self.starts_from_measured else None
         T_past_now = inverse_se3(frames.T_now_ego[:, -2]).float() if volumes.shape[1] > 1 else None
-        return Belief(
-            volumes[:, -1], history=volumes, T_past_now=T_past_now, T_prev_next=measured, images=images
-        )
+        return Belief(volumes[:, -1], history=volumes, T_past_now=T_past_now, T_prev_next=measured)
 
     def imagine(
         self,

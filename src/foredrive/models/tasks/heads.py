@@ -7,7 +7,6 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor, nn
 
-from foredrive.models.tasks.affordances import AffordanceHead, AffordanceHeadConfig, AffordanceSet
 from foredrive.models.tasks.agents import AgentHead, AgentHeadConfig, AgentSet
 from foredrive.models.tasks.carried import (
     CarriedAgents,
@@ -23,7 +22,6 @@ from foredrive.models.tasks.plane import Plane, PlanePyramid, Planes
 from foredrive.models.tasks.proposals import CentreMap
 from foredrive.models.tasks.voxels import VoxelHead, VoxelHeadConfig
 from foredrive.scene import Belief, Task, VoxelSpec, WorldModel
-from foredrive.scene.image_features import ImageFeatures
 from foredrive.scene.map_elements import PlaneSpec
 from foredrive.scene.record import Record
 
@@ -43,7 +41,6 @@ class TaskHeadsConfig:
     voxels: VoxelHeadConfig | None = field(default_factory=VoxelHeadConfig)
     instances: InstanceHeadConfig | None = None
     """Needs agents, and beliefs that the world model imagines."""
-    affordances: AffordanceHeadConfig | None = None
     """Reads the image features of now, which only heads within an agent have."""
     volume_of: Task | None = None
     """Task whose volume all heads read. None: each head reads that of its own task. A frozen world model has
@@ -65,8 +62,6 @@ class TaskHeadsConfig:
             found.append("map")
         if self.voxels is not None:
             found.append("occupancy")
-        if self.affordances is not None:
-            found.append("planning")
         return tuple(found)
 
     def read_for(self, task: Task) -> Task:
@@ -112,8 +107,6 @@ class TaskVolume(Record):
     """Volumes of K imagined key frames, each in its own ego frame, for heads that read them."""
     T_now_later: Float[Tensor, "b K 4 4"] | None = None
     """The ego frames of these -> the ego frame at now."""
-    images: ImageFeatures | None = None
-    """Features of the images at now, for heads that read them."""
 
 
 def volumes_of(
@@ -135,7 +128,7 @@ def volumes_of(
         volume = world.volume_for(belief, task)
         found[task] = made.setdefault(
             id(volume),
-            TaskVolume(volume, past, belief.T_past_now, imagined, T_now_later, belief.images),
+            TaskVolume(volume, past, belief.T_past_now, imagined, T_now_later),
         )
     return found
 
@@ -170,7 +163,6 @@ class HeadOutput:
     """Origin of each agent in the frame before. Only heads that carry agents have it."""
     instances: InstanceSet | None = None
     """Occupancy of single vehicles, now and later; of sequences, that of the last frame of each."""
-    affordances: AffordanceSet | None = None
 
 
 class TaskHeads(nn.Module):
@@ -209,9 +201,6 @@ class TaskHeads(nn.Module):
         self.voxels: VoxelHead | None = None
         if config.voxels is not None:
             self.voxels = VoxelHead(planes, channels, spec.shape_zyx[0], config.voxels)
-        self.affordances: AffordanceHead | None = None
-        if config.affordances is not None:
-            self.affordances = AffordanceHead(planes, channels, config.affordances)
 
     def forward(
         self,
@@ -258,10 +247,7 @@ class TaskHeads(nn.Module):
                 volume_of(of_agents)[last],
                 planes_of(of_agents).fine[last],
             )
-        affordances = None
-        if self.affordances is not None:
-            affordances = self.affordances(volume_of("planning").images, planes_of("planning").fine)
-        return HeadOutput(agents, centres, elements, raster, voxels, lineage, instances, affordances)
+        return HeadOutput(agents, centres, elements, raster, voxels, lineage, instances)
 
     def _imagined(self, head: InstanceHead, agents: AgentSet, volume: TaskVolume, now: Plane) -> InstanceSet:
         """Return the instances on the planes of the imagined volumes; each has the one before as its past."""

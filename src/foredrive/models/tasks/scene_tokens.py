@@ -7,15 +7,13 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from foredrive.errors import InputError
-from foredrive.models.tasks.affordances import AffordanceSet
 from foredrive.models.tasks.agents import AGENT_CLASSES, AgentSet
 from foredrive.models.tasks.decoder import PlaceEmbedding
 from foredrive.models.tasks.heads import HeadOutput, TaskHeadsConfig
 from foredrive.models.tasks.maps import MapSet
 from foredrive.scene import VoxelSpec
-from foredrive.scene.traffic_light import LightState
 
-Attended = Literal["agents", "map", "affordances"]
+Attended = Literal["agents", "map"]
 """Outputs of the task heads that a planner can attend to."""
 
 SPEED_SCALE_MPS = 10.0
@@ -48,12 +46,8 @@ class SceneTokens(nn.Module):
         self, attends: tuple[Attended, ...], heads: TaskHeadsConfig | None, spec: VoxelSpec, width: int
     ) -> None:
         super().__init__()
-        there = {
-            "agents": heads and heads.agents,
-            "map": heads and heads.elements,
-            "affordances": heads and heads.affordances,
-        }
-        tasks = {"agents": "detection", "map": "map", "affordances": "affordances"}
+        there = {"agents": heads and heads.agents, "map": heads and heads.elements}
+        tasks = {"agents": "detection", "map": "map"}
         for name in attends:
             if heads is None or there[name] is None:
                 raise InputError(
@@ -71,11 +65,6 @@ class SceneTokens(nn.Module):
         if heads is not None and heads.elements is not None and "map" in attends:
             self.elements = _mlp(heads.width + heads.elements.kinds + 2 * heads.elements.points, width)
 
-        self.affordances = self.people = None
-        if heads is not None and heads.affordances is not None and "affordances" in attends:
-            self.affordances = _mlp(2 * heads.affordances.hidden + len(LightState) + 4, width)
-            self.people = _mlp(1, width)
-
     def forward(self, found: HeadOutput) -> Float[Tensor, "b N C"]:
         """Return a token for each query, agents first."""
         tokens = []
@@ -85,22 +74,7 @@ class SceneTokens(nn.Module):
         if self.elements is not None:
             assert found.elements is not None
             tokens.append(self._of_elements(self.elements, found.elements[-1]))
-        if self.affordances is not None and self.people is not None:
-            assert found.affordances is not None
-            tokens.append(self._of_affordances(self.affordances, self.people, found.affordances))
         return torch.cat(tokens, dim=1)
-
-    def _of_affordances(
-        self, mlp: nn.Module, people: nn.Module, found: AffordanceSet
-    ) -> Float[Tensor, "b N C"]:
-        """Return one token for light and lead vehicle, and one for each place where someone may cross."""
-        estimate = found.estimate()
-        numbers = [estimate.light_m / FUTURE_SCALE_M, estimate.lead, estimate.lead_m / FUTURE_SCALE_M]
-        numbers += [estimate.lead_mps / SPEED_SCALE_MPS]
-        known = torch.cat([estimate.light, torch.stack(numbers, dim=-1)], dim=-1).detach()
-        road = mlp(torch.cat([found.feature, known.to(found.feature)], dim=-1))
-        crossing = people(estimate.crossing.detach()[..., None].to(found.feature))
-        return torch.cat([road[:, None], crossing + self.place(self._share(estimate.crossing_xy))], dim=1)
 
     def _of_agents(self, mlp: nn.Module, agents: AgentSet) -> Float[Tensor, "b Q C"]:
         assert agents.query is not None

@@ -132,7 +132,6 @@ def _tasks(heads: TaskHeads, found: HeadOutput, track_id: Int[Tensor, "b Q"] | N
         agents=agents,
         map_lines=None if found.elements is None else found.elements[-1].lines(),
         map_layers=None if found.raster is None else found.raster.sigmoid(),
-        affordances=None if found.affordances is None else found.affordances.estimate(),
         semantics=None if found.voxels is None else found.voxels.argmax(dim=1).to(torch.uint8),
     )
 

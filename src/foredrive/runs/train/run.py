@@ -8,11 +8,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
-from jaxtyping import Float
 from safetensors.torch import save_file
 
 from foredrive.data import ClipDataset, LogPath, collate
-from foredrive.data.batches import stack_records
 from foredrive.errors import InputError
 from foredrive.evaluation.task_priors import fit_task_priors
 from foredrive.files import atomic_path
@@ -29,7 +27,6 @@ from foredrive.runs.train.sequences import in_sequences
 from foredrive.runs.train.task_priors import PRIORS, TASKS, check_truth, save_priors, semantic_weights
 from foredrive.scene.task_truth import TaskTruth
 from foredrive.training import CONDITIONS, PathFit, fit_path, load_weights, save_weights, train
-from foredrive.training.balancing import balanced_weights, manoeuvres
 from foredrive.training.checkpoints import whole_weights
 from foredrive.training.processes import entered_by_first, naming_lost_processes
 
@@ -267,31 +264,17 @@ def _train_stage(
         objective = build_objective(
             run.recipe, stage, agent, semantic_weights(_truths(dataset)) if voxels else None
         )
-        balanced = name == "finetune" and run.recipe.balance > 0
-        drawn = _balanced(dataset, run.recipe.balance) if balanced else None
         if tasks is None:
-            train(objective, dataset, collate, stage.schedule, run.folder / name, fabric, drawn)
+            train(objective, dataset, collate, stage.schedule, run.folder / name, fabric)
         else:
             keys = [dataset.key(index) for index in range(len(dataset))]
             items, join, schedule = in_sequences(dataset, keys, collate, tasks.heads, stage.schedule)
-            if drawn is not None and items is not dataset:
-                raise InputError("balance draws single clips: it does not go with heads that carry agents on")
-            train(objective, items, join, schedule, run.folder / name, fabric, drawn)
+            train(objective, items, join, schedule, run.folder / name, fabric)
         trained = whole_weights(agent)
         if fabric.is_global_zero:
             with atomic_path(weights) as temporary:
                 save_file(trained, temporary)
         fabric.barrier()
-
-
-def _balanced(dataset: ClipDataset, power: float) -> Float[torch.Tensor, "N"]:
-    """Return how often to draw each clip, by what the expert does there."""
-    read = [dataset.demonstration(index) for index in range(len(dataset))]
-    futures = stack_records([future for _, future in read])
-    kind = manoeuvres(
-        torch.tensor([speed for speed, _ in read]), futures.xy[:, 0], futures.valid[:, 0], futures.dt_s
-    )
-    return balanced_weights(kind, power)
 
 
 def _truths(dataset: ClipDataset) -> Iterator[TaskTruth]:

@@ -77,8 +77,6 @@ def train_heads(run: Run, heads: TaskHeadsRecipe) -> TrainedHeads:
     """
     from foredrive.training import make_fabric  # the import takes seconds
 
-    if heads.heads.affordances is not None:
-        raise InputError("affordances are read in images, which a probe does not keep: leave out --probe")
     folder = run.folder / TASKS
     if (folder / CONFIG).is_file() and load_task_heads(folder / CONFIG) != heads:
         raise InputError(f"{folder}: holds other heads; choose another folder for the run")
