@@ -14,11 +14,15 @@ from foredrive.driver.packed import PackedClips, join
 from foredrive.errors import InputError
 from foredrive.recipes.driver import DriverRecipe, driver_nemo, driver_small
 from foredrive.recipes.known import find_driver_recipe, find_recipe
-from foredrive.runs.drive.agents import inputs_of, make_agent
-from foredrive.runs.shipped import run_folder
+from foredrive.runs import model_card, shipped
+from foredrive.runs.drive.agents import inputs_of, make_agent, rig_of
+from foredrive.runs.drive.in_towns import TownRoutes
+from foredrive.runs.model_card import find_card, read_card, shipped_weights
+from foredrive.runs.ship import ship_driver
+from foredrive.runs.shipped import DRIVER, run_folder
 from foredrive.runs.train.driver import load_driver, open_driver, train_driver
 from foredrive.runs.train.run import load_agent, open_run
-from foredrive.sensors.rigs import FRONT_TELE, camera_rig
+from foredrive.sensors.rigs import FRONT_TELE, camera_rig, same_rig
 from foredrive.simulation.demonstrations import AlternatingStudent
 from foredrive.simulation.town import TownSimulator
 from foredrive.towns import virtual_egos
@@ -125,6 +129,28 @@ def test_a_run_is_continued_and_drives(logs: list[LogPath], dataset: ClipDataset
     inputs = inputs_of(str(folder))
     assert (inputs.cameras, inputs.lidar, inputs.past_frames) == (True, False, 1)
     assert inputs.camera_names == ("pcam_f0", "ftcam_tele_f0")
+
+
+@pytest.mark.slow
+def test_a_driver_becomes_a_model_of_the_package(
+    logs: list[LogPath], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = train_driver(recipe(), logs, tmp_path / "run", tmp_path / "cache")
+    rig = FRONT_TELE.of_size((32, 64))
+    route = TownRoutes("town05-short", rig=rig, only=("26",), vehicles=0, people=0, scenarios=False)
+    models = tmp_path / "models"
+    ship_driver(run, DRIVER, logs, route, tmp_path / "work", "Four logs.", "It has learned nothing.", models)
+    for module in (shipped, model_card):
+        monkeypatch.setattr(module, "MODELS", models)
+    monkeypatch.chdir(tmp_path)
+    assert same_rig(rig_of("embedded"), rig)
+    small = load_driver(open_driver(run_folder(Path("embedded"))))
+    for name, weight in load_driver(run).eyes.state_dict().items():
+        torch.testing.assert_close(small.eyes.state_dict()[name], weight, atol=0.02, rtol=0.02)
+    card = read_card(find_card(DRIVER))
+    assert card.figures["completion of routes, %"][0] <= 100
+    assert card.figures["recall of conflicts ahead"][1] <= 1
+    assert shipped_weights()[0].kind == "driver by sight"
 
 
 def test_a_run_goes_on_from_another_drivers_weights(logs: list[LogPath], tmp_path: Path) -> None:

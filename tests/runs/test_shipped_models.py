@@ -18,6 +18,7 @@ from foredrive.runs.drive.agents import inputs_of, rig_of
 from foredrive.runs.model_card import find_card, read_card, shipped_weights
 from foredrive.runs.ship import MAX_BYTES, ship
 from foredrive.runs.shipped import run_folder
+from foredrive.runs.train.driver import DriverRun, is_driver, load_driver, open_driver
 
 
 @pytest.fixture(scope="module")
@@ -138,10 +139,11 @@ def test_unknown_models_and_unevaluated_runs_are_one_line(
 
 @pytest.mark.parametrize("name", shipped.shipped_models())
 def test_the_models_of_the_package_open(name: str, tmp_path: Path) -> None:
-    run = open_run(run_folder(Path(f"embedded:{name}"), tmp_path))
+    folder = run_folder(Path(f"embedded:{name}"), tmp_path)
+    run: Run | DriverRun = open_driver(folder) if is_driver(folder) else open_run(folder)
     assert run.weights.stat().st_size <= MAX_BYTES
     assert (run.folder / "card.md").read_text().startswith(f"# {name}\n")
-    agent = load_agent(run)
+    agent = load_driver(run) if isinstance(run, DriverRun) else load_agent(run)
     assert all(tensor.isfinite().all() for tensor in agent.state_dict().values())
 
 

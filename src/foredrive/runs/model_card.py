@@ -92,8 +92,11 @@ def shipped_weights() -> list[ShippedWeights]:
     found = []
     for name in shipped_models():
         card, config = read_card(MODELS / name / CARD), read_yaml(MODELS / name / CONFIG)
-        kind = f"{config['model']['kind']} world model, planner"
-        kind += ", task heads" if config.get("tasks") else ""
+        if config.get("kind") == "driver":
+            kind = "driver by sight"
+        else:
+            kind = f"{config['model']['kind']} world model, planner"
+            kind += ", task heads" if config.get("tasks") else ""
         size = _size(MODELS / name)
         found.append(
             ShippedWeights(EMBEDDED + name, kind, card.recipe, card.commit[:7], card.data, size, card)

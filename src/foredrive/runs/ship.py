@@ -8,16 +8,26 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from torch import nn
+
 from foredrive.data import LogPath
+from foredrive.driver.judging import judge_sight
+from foredrive.driver.packed import PackedClips
 from foredrive.errors import InputError
+from foredrive.evaluation.provenance import collect_provenance
 from foredrive.evaluation.summary import read_summary
 from foredrive.files import atomic_path
 from foredrive.recipes.config import save_recipe
+from foredrive.runs.drive.compare import values_of
+from foredrive.runs.drive.in_towns import TownRoutes
+from foredrive.runs.drive.suite import DriveSuite, drive_suite
 from foredrive.runs.evaluate.run import evaluate_run
 from foredrive.runs.folder import CONFIG, LOGS, SUMMARY
 from foredrive.runs.model_card import ModelCard
+from foredrive.runs.open_clips import open_clips
 from foredrive.runs.shipped import CARD, MODELS
 from foredrive.runs.train.baselines import Baselines, baselines_file, run_baselines
+from foredrive.runs.train.driver import DriverRun, load_driver
 from foredrive.runs.train.rigs import RIGS
 from foredrive.runs.train.run import Run, load_agent
 from foredrive.runs.train.task_priors import PRIORS, TASKS
@@ -36,6 +46,20 @@ FIGURES = {
     "collisions of the plan by UniAD's protocol, %": "planning.uniad.collision_avg_pct",
 }
 """Rows of a card by their keys in a summary."""
+SIGHT_FIGURES = {
+    "state of the light within 40 m": "light_accuracy_40m",
+    "red lights missed within 40 m": "red_missed_40m",
+    "recall of conflicts ahead": "conflict_recall",
+    "— false ones": "conflict_false",
+    "error of the first obstacle, m": "first_obstacle_error_m",
+}
+DRIVE_FIGURES = {
+    "driving score of leaderboard 1.0": ("driving_score_1_0", 1),
+    "completion of routes, %": ("completion", 100),
+    "red lights in 100 routes": ("red_lights", 100),
+    "collisions in 100 routes": ("collisions", 100),
+}
+"""Rows of a driver's card by their keys, of what it sees, and of its drives with a factor."""
 
 
 def ship(run: Run, name: str, test: Sequence[LogPath], data: str, limits: str, models: Path = MODELS) -> Path:
@@ -58,10 +82,7 @@ def ship(run: Run, name: str, test: Sequence[LogPath], data: str, limits: str, m
     past = run.recipe.clips.past_frames
     with atomic_path(models / name) as temporary:
         weights = temporary / run.weights.relative_to(run.folder)
-        weights.parent.mkdir(parents=True)
-        save_small(load_agent(run), weights)
-        if weights.stat().st_size > MAX_BYTES:
-            raise InputError(f"{run.folder}: {weights.stat().st_size} bytes of weights; {MAX_BYTES} at most")
+        _save(load_agent(run), weights)
         baselines = Baselines(*run_baselines(run.folder, run.logs, run.recipe, run.cache_dir, past))
         save_small(baselines, temporary / baselines_file(past))
         for file in (RIGS, f"{TASKS}/{PRIORS}"):
@@ -77,6 +98,75 @@ def ship(run: Run, name: str, test: Sequence[LogPath], data: str, limits: str, m
         card = _card(name, run.recipe.name, read_summary(run.folder / SUMMARY), shipped, data, limits)
         (temporary / CARD).write_text(card.markdown())
     return models / name
+
+
+def ship_driver(
+    run: DriverRun,
+    name: str,
+    test: Sequence[LogPath],
+    routes: TownRoutes,
+    work: Path,
+    data: str,
+    limits: str,
+    models: Path = MODELS,
+) -> Path:
+    """Write a trained driver as a model of the package; return its folder.
+
+    Both the run and the model, whose weights have 8 bits, see the test logs and drive the routes; their
+    figures are on the card.
+
+    Args:
+        name: name of the model.
+        test: logs with lights and boxes.
+        routes: what is driven.
+        work: folder of drives and caches, where an interrupted call goes on.
+        data: the training and test data, in one sentence.
+        limits: what the driver cannot do, in a sentence or two.
+        models: folder of all models.
+
+    Raises:
+        InputError: the weights are too large, or a drive failed.
+    """
+    small = dataclasses.replace(run, folder=work / name, logs=(), start=None)
+    _save(load_driver(run), work / name / run.weights.relative_to(run.folder))
+    shutil.copyfile(run.folder / RIGS, small.folder / RIGS)
+    save_recipe(run.recipe, small.folder / CONFIG)
+    (small.folder / LOGS).write_text(json.dumps({"logs": [], "start": None}))
+    clips = PackedClips(open_clips(test, run.recipe.clips, work / "cache"), work / "cache" / "packed")
+    clips.pack()
+    both = []
+    for one, folder in ((run, work / "drives"), (small, work / "drives_in_8_bits")):
+        driven = drive_suite(DriveSuite(str(one.folder.absolute()), routes, sensors=False), folder)
+        if driven.broken:
+            raise InputError(f"{folder}: {len(driven.broken)} drives failed")
+        values = [values_of(drive) for drive in driven.drives.values()]
+        seen = judge_sight(load_driver(one), clips)
+        both.append(
+            {title: seen[key] for title, key in SIGHT_FIGURES.items()}
+            | {
+                title: count * sum(value[key] for value in values) / len(values)
+                for title, (key, count) in DRIVE_FIGURES.items()
+            }
+        )
+    figures = {title: (both[0][title], both[1][title]) for title in both[0]}
+    commit = str(collect_provenance()["commit"])
+    card = ModelCard(name, run.recipe.name, commit, data, len(clips), 0, figures, limits)
+    (small.folder / CARD).write_text(card.markdown())
+    with atomic_path(models / name) as temporary:
+        shutil.copytree(small.folder, temporary)
+    return models / name
+
+
+def _save(model: nn.Module, weights: Path) -> None:
+    """Write weights in 8 bits.
+
+    Raises:
+        InputError: they are too large for the package.
+    """
+    weights.parent.mkdir(parents=True, exist_ok=True)
+    save_small(model, weights)
+    if weights.stat().st_size > MAX_BYTES:
+        raise InputError(f"{weights}: {weights.stat().st_size} bytes of weights; {MAX_BYTES} at most")
 
 
 def _card(
