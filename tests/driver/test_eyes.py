@@ -9,12 +9,14 @@ from path_truth import SPEC, sight_of, truth
 
 from foredrive.driver.eyes import CameraEyes, CameraEyesConfig
 from foredrive.driver.losses import SightWeights, lamp_places, sight_losses
-from foredrive.driver.sight import line_m, scaled_line
+from foredrive.driver.route_cells import BESIDE_M
+from foredrive.driver.sight import VELOCITY_SCALE_MPS, line_m, occupied_at_constant_velocity, scaled_line
 from foredrive.driver.volume_eyes import VolumeEyes, VolumeEyesConfig
 from foredrive.errors import InputError
 from foredrive.geometry.se3 import inverse_se3, transform_points
 from foredrive.recipes.nemo import nemo_town
 from foredrive.scene import Example, VoxelSpec
+from foredrive.scene.affordances import CELLS, TIMES
 from foredrive.scene.traffic_light import LightState
 
 
@@ -28,19 +30,19 @@ def test_past_frames_are_read_where_the_cells_were_then(make_example: Callable[.
     """Features of a past frame do not depend on where the vehicle has gone since, in the world's places."""
     clip = make_example(spec=SPEC, batch=2, past=1, future=0, cameras=2).clip
     network = eyes()
-    fine, coarse = network._features(clip)
+    features = network._features(clip)
     cells = torch.tensor([[[[5.0, 0.5], [8.0, -1.0]], [[7.0, 1.0], [12.0, 2.0]]]]).expand(2, -1, -1, -1)
-    read = network._read(clip, cells, fine, coarse)
-    of_frame = read.shape[1] // 2
+    read = network._read(clip, cells, features)
+    of_frame = read.shape[1] // 3  # one camera then, two at now
     # The same places, in the frame before, read as if that were now.
     T = inverse_se3(clip.T_world_ego[:, 0]) @ clip.T_world_ego[:, 1]
     before = clip.frames([0])
     for row, height in enumerate((0.4, 1.3)):
         z = torch.full((2, 4, 1), height)
         moved = transform_points(T.float(), torch.cat([cells.flatten(1, 2), z], dim=-1))[..., :2]
-        again = network._read(before, moved.view(2, 2, 2, 2), fine[:, :1], coarse[:, :1])
-        by_height = read[:, :of_frame].view(2, 2, 2, -1, 2, 2)[:, :, row]
-        expected = again.view(2, 2, 2, -1, 2, 2)[:, :, row]
+        again = network._read(before, moved.view(2, 2, 2, 2), features[:1])
+        by_height = read[:, :of_frame].view(2, 2, -1, 2, 2)[:, row]
+        expected = again.view(2, 2, -1, 2, 2)[:, row]
         torch.testing.assert_close(by_height, expected, atol=1e-4, rtol=1e-4)
         assert by_height.abs().amax() > 0.1
 
@@ -148,3 +150,26 @@ def test_a_light_that_no_image_shows_is_not_learned(make_example: Callable[..., 
     sight_losses(sight_of(2, logits), known, clip, SightWeights())["light"].backward()
     assert not logits.grad[0].any()
     assert logits.grad[1, LightState.RED] < 0
+
+
+def test_road_users_that_go_on_as_they_move_come_into_the_way() -> None:
+    """A cyclist 8.5 m to the left of cell 3 rides to the right at 4 m/s and forward at 1 m/s; one stands."""
+    users = torch.full((2, 4, CELLS, len(BESIDE_M)), -20.0)
+    users[:, 2:] = 0.0
+    rides = users[1, :, 3, BESIDE_M.index(8.5)]
+    rides[1], rides[2], rides[3] = 3.0, 1.0 / VELOCITY_SCALE_MPS, -4.0 / VELOCITY_SCALE_MPS
+    users[1, 0, 10, BESIDE_M.index(0.8)] = 2.0
+    occupied = occupied_at_constant_velocity(users.requires_grad_())
+    p = torch.tensor([3.0, 2.0]).sigmoid()
+    assert float(occupied[0].detach().max()) < 1e-6
+    # 8.5, 6.5, 4.5, 2.5, 0.5, -1.5, -3.5 m beside: a share of 0.13, all, and 0.8 from 1.5 s to 2.5 s.
+    shares = {3: (1 - 1.3 / 1.5, 4), 4: (1.0, 4), 5: (1 - 0.3 / 1.5, 4)}
+    for step in range(TIMES):
+        wanted = torch.zeros(CELLS)
+        wanted[10] = p[1]
+        if step in shares:
+            share, cell = shares[step]
+            wanted[cell] = share * p[0]
+        torch.testing.assert_close(occupied[1, step].detach(), wanted, atol=1e-5, rtol=0)
+    occupied[1, 4, 4].backward()
+    assert users.grad[1, 1, 3, BESIDE_M.index(8.5)] > 0

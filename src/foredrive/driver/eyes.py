@@ -2,11 +2,11 @@
 
 import dataclasses
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 from torch import Tensor, nn
 
 from foredrive.driver.route_cells import HEIGHTS_M, route_cells, sample_cameras
@@ -30,6 +30,15 @@ class CameraEyesConfig:
     blind: bool = False
     """Images are black: what the route alone tells."""
     kind: Literal["cameras"] = "cameras"
+
+
+class FrameFeatures(NamedTuple):
+    """Features of the images of one key frame."""
+
+    fine: Float[Tensor, "b C F h w"]
+    """At stride 4."""
+    coarse: Float[Tensor, "b C K y x"]
+    """At stride 8."""
 
 
 class Trunk(nn.Module):
@@ -75,8 +84,9 @@ def seen_frames(clip: Clip, frames: int, cameras: int) -> Clip:
 class CameraEyes(nn.Module):
     """A convolutional trunk for each camera, features sampled along the route in each key frame, two heads.
 
-    Cells of the route are fixed in the world: in the frames before now they are read where the cameras were
-    then, so that what moves differs between frames and what stands does not.
+    Of the frames before now the first camera alone is looked at. Cells of the route are fixed in the world:
+    there they are read where the camera was then, so that what moves differs between frames and what stands
+    does not.
 
     Args:
         config: sizes.
@@ -87,8 +97,9 @@ class CameraEyes(nn.Module):
         self.config = config
         self.trunks = nn.ModuleList([Trunk() for _ in range(config.cameras)])
         self.narrow = nn.ModuleList([nn.Conv2d(FINE, FINE_READ, 1) for _ in range(config.cameras)])
-        of_frame = config.cameras * len(HEIGHTS_M) * (COARSE + FINE_READ + 1)
-        self.reader = RouteReader(config.frames * of_frame, FINE + COARSE, COARSE, config.cameras)
+        views = config.cameras + config.frames - 1
+        of_view = len(HEIGHTS_M) * (COARSE + FINE_READ + 1)
+        self.reader = RouteReader(views * of_view, FINE + COARSE, COARSE, config.cameras)
 
     def forward(self, clip: Clip) -> Sight:
         """Return what is seen of the route at now.
@@ -98,35 +109,36 @@ class CameraEyes(nn.Module):
         """
         clip = blacked(clip) if self.config.blind else clip
         frames = seen_frames(clip, self.config.frames, self.config.cameras)
-        fine, coarse = self._features(frames)
-        wide = F.interpolate(coarse[:, -1].flatten(0, 1), size=fine.shape[-2:], mode="nearest")
-        wide = wide.unflatten(0, coarse.shape[:1] + coarse.shape[2:3])
-        cells = self._read(frames, route_cells(clip.route_xy, clip.route_valid), fine, coarse)
-        sight: Sight = self.reader(
-            clip, cells, torch.cat([fine[:, -1], wide], dim=2), coarse[:, -1].mean((-2, -1))
-        )
+        features = self._features(frames)
+        fine, coarse = features[-1]
+        wide = F.interpolate(coarse.flatten(0, 1), size=fine.shape[-2:], mode="nearest")
+        wide = wide.unflatten(0, coarse.shape[:2])
+        cells = self._read(frames, route_cells(clip.route_xy, clip.route_valid), features)
+        sight: Sight = self.reader(clip, cells, torch.cat([fine, wide], dim=2), coarse.mean((-2, -1)))
         return sight
 
-    def _features(
-        self, frames: Clip
-    ) -> tuple[Float[Tensor, "b T C _F _h _w"], Float[Tensor, "b T C _K _y _x"]]:
-        """Return the features of all images at strides 4 and 8."""
-        b, t = frames.images.shape[:2]
-        images = (frames.images.float() / 255 - MEAN_GREY) / SPREAD_GREY
-        fine, coarse = [], []
-        for c, trunk in enumerate(self.trunks):
-            one = images[:, :, c].flatten(0, 1).contiguous(memory_format=torch.channels_last)
-            at_4, at_8 = trunk(one)
-            fine.append(at_4.unflatten(0, (b, t)))
-            coarse.append(at_8.unflatten(0, (b, t)))
-        return torch.stack(fine, dim=2), torch.stack(coarse, dim=2)
+    def _features(self, frames: Clip) -> list[FrameFeatures]:
+        """Return the features of each frame: of all cameras at now, of the first one before."""
+        images = frames.images
+        b, t = images.shape[:2]
+        of_first = [map_.unflatten(0, (b, t)) for map_ in self._seen(0, images[:, :, 0].flatten(0, 1))]
+        others = [self._seen(c, images[:, -1, c]) for c in range(1, len(self.trunks))]
+        past = [FrameFeatures(*(map_[:, k, None] for map_ in of_first)) for k in range(t - 1)]
+        now = [
+            torch.stack([map_[:, -1], *rest], dim=1) for map_, *rest in zip(of_first, *others, strict=True)
+        ]
+        return [*past, FrameFeatures(*now)]
+
+    def _seen(
+        self, camera: int, images: UInt8[Tensor, "n 3 H W"]
+    ) -> tuple[Float[Tensor, "n _F _h _w"], Float[Tensor, "n _K _y _x"]]:
+        """Return the features of images of a camera at strides 4 and 8."""
+        scaled = images.float().mul_(1 / (255 * SPREAD_GREY)).sub_(MEAN_GREY / SPREAD_GREY)
+        fine, coarse = self.trunks[camera](scaled.contiguous(memory_format=torch.channels_last))
+        return fine, coarse
 
     def _read(
-        self,
-        frames: Clip,
-        cells: Float[Tensor, "b G L 2"],
-        fine: Float[Tensor, "b T C _F _h _w"],
-        coarse: Float[Tensor, "b T C _K _y _x"],
+        self, frames: Clip, cells: Float[Tensor, "b G L 2"], features: list[FrameFeatures]
     ) -> Float[Tensor, "b _N G L"]:
         """Return the features of all frames and cameras in the cells."""
         b, count = cells.shape[0], len(HEIGHTS_M)
@@ -136,11 +148,12 @@ class CameraEyes(nn.Module):
         # Places of now in the ego frame of each key frame: features are read where the cameras were then.
         T_frame_now = compose_se3(inverse_se3(frames.T_world_ego), frames.T_world_ego[:, -1:]).float()
         read = []
-        for t in range(frames.images.shape[1]):
+        for t, (fine, coarse) in enumerate(features):
             moved = transform_points(T_frame_now[:, t], points)
-            rig, valid = frames.rig[:, t], frames.image_valid[:, t]
-            narrow = torch.stack([layer(fine[:, t, c]) for c, layer in enumerate(self.narrow)], dim=1)
-            at_8 = sample_cameras(coarse[:, t], valid, rig, moved)[:, :, :-1]
+            cameras = slice(fine.shape[1])
+            rig, valid = frames.rig[:, t, cameras], frames.image_valid[:, t, cameras]
+            narrow = torch.stack([self.narrow[c](fine[:, c]) for c in range(fine.shape[1])], dim=1)
+            at_8 = sample_cameras(coarse, valid, rig, moved)[:, :, :-1]
             at_4 = sample_cameras(narrow, valid, rig, moved)
             both = torch.cat([at_8, at_4], dim=2)  # [b C F N]
             both = both.unflatten(-1, (count, *cells.shape[1:3])).permute(0, 1, 3, 2, 4, 5)

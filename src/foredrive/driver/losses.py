@@ -32,6 +32,8 @@ class SightWeights:
     user_pixels: float = 4.0
     user_cells: float = 4.0
     user_velocity: float = 1.0
+    vulnerable: float = 4.0
+    """Factor for the velocity of people and those on two wheels."""
 
 
 def sight_losses(
@@ -124,7 +126,10 @@ def _user_losses(sight: Sight, clip: Clip, weights: SightWeights) -> dict[str, F
     logits, velocity = sight.user_cells.split([len(USERS), 2], dim=1)
     is_cell = F.binary_cross_entropy_with_logits(logits, cells.present.float(), reduction="none")
     is_cell = torch.where(cells.present, weights.occupied_cells, 1.0) * is_cell
+    # Most vehicles stand or drive along: people and those on two wheels count more.
+    vulnerable = torch.where(cells.present[:, 1], weights.vulnerable, 1.0)
     error = F.smooth_l1_loss(velocity, cells.velocity / VELOCITY_SCALE_MPS, reduction="none", beta=0.2).sum(1)
+    error = vulnerable * error
     return {
         "user_pixels": weights.user_pixels
         * masked_mean(is_pixel, pixels_known & annotated[:, None, None, None, None]),

@@ -13,6 +13,8 @@ from foredrive.driver.volume_eyes import VolumeEyes
 
 BRIGHTNESS, CONTRAST, COLOUR = 0.06, 0.2, 0.03
 """Standard deviations of the changes of an image in training, as shares of its range."""
+GREY = 110
+"""The value that keeps its brightness when contrast changes."""
 
 
 class SightObjective(nn.Module):
@@ -38,14 +40,14 @@ class SightObjective(nn.Module):
 
 def _recoloured(example: RouteExample, generator: torch.Generator) -> RouteExample:
     """Return the examples with other contrast, brightness and colours; the same for all images of a clip."""
-    images = example.clip.images.float()
+    images = example.clip.images
     b, device = len(images), images.device
 
     def normal(*shape: int) -> Tensor:
         return torch.randn(b, *shape, generator=generator, device=generator.device).to(device)
 
     contrast = (1 + CONTRAST * normal(1, 1, 1, 1, 1)).clamp(0.5, 1.6)
-    changed = (images - 110) * contrast + 110
-    changed = changed + 255 * BRIGHTNESS * normal(1, 1, 1, 1, 1) + 255 * COLOUR * normal(1, 1, 3, 1, 1)
-    clip = dataclasses.replace(example.clip, images=changed.clamp(0, 255).to(torch.uint8))
+    shift = 255 * BRIGHTNESS * normal(1, 1, 1, 1, 1) + 255 * COLOUR * normal(1, 1, 3, 1, 1)
+    changed = images.float().mul_(contrast).add_(GREY * (1 - contrast) + shift).clamp_(0, 255)
+    clip = dataclasses.replace(example.clip, images=changed.to(torch.uint8))
     return dataclasses.replace(example, clip=clip)

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from foredrive.driver.road_user_targets import USERS
 from foredrive.driver.route_cells import BESIDE_M, route_cells
 from foredrive.scene import Clip
-from foredrive.scene.affordances import CELLS, TIMES, PathEstimate
+from foredrive.scene.affordances import CELL_M, CELLS, HALF_WIDTH_M, LATER_DT_S, TIMES, PathEstimate
 from foredrive.scene.clip import ROUTE_M
 from foredrive.scene.record import Record
 from foredrive.scene.traffic_light import LightState
@@ -17,6 +17,8 @@ from foredrive.scene.traffic_light import LightState
 COLOURS = (LightState.RED, LightState.YELLOW, LightState.GREEN)
 CONTEXT = 64
 ROUTE_SCALE_M, VELOCITY_SCALE_MPS = 20.0, 5.0
+FADES_M = 1.5
+"""Distance beyond half the width of the path over which a road user beside it counts less, m."""
 RARE_LOGIT, NONE_LOGIT = -4.0, -2.0
 LIGHT_SCALE_M, LINE_BEFORE_LAMP_M = 20.0, 4.0
 """The distance of a stop line is read at the lamp, as a logarithm from some metres before the line."""
@@ -129,9 +131,9 @@ class LampHead(nn.Module):
         hidden: width.
     """
 
-    def __init__(self, channels: int, wide: int, context: int, cameras: int, hidden: int = 64) -> None:
+    def __init__(self, channels: int, wide: int, context: int, cameras: int, hidden: int = 48) -> None:
         super().__init__()
-        self.read = nn.ModuleList([nn.Conv2d(channels + 2, hidden, 3, padding=1) for _ in range(cameras)])
+        self.read = nn.ModuleList([nn.Conv2d(channels + 2, hidden, 1) for _ in range(cameras)])
         self.scale = nn.ModuleList([nn.Linear(context, hidden) for _ in range(cameras)])
         self.shift = nn.ModuleList([nn.Linear(context, hidden) for _ in range(cameras)])
         self.lamps = nn.ModuleList([_lamp_layers(hidden) for _ in range(cameras)])
@@ -160,16 +162,18 @@ class LampHead(nn.Module):
 
 
 def _lamp_layers(hidden: int) -> nn.Sequential:
-    last = nn.Conv2d(48, len(COLOURS) + 1, 1)
+    last = nn.Conv2d(32, len(COLOURS) + 1, 1)
     assert last.bias is not None
     nn.init.constant_(last.bias[: len(COLOURS)], RARE_LOGIT - 1)
-    return nn.Sequential(nn.Conv2d(hidden, 48, 3, padding=1), nn.ReLU(), last)
+    return nn.Sequential(nn.Conv2d(hidden, 32, 3, padding=1), nn.ReLU(), last)
 
 
 class OccupancyHead(nn.Module):
     """Reads who is on the route, and will be, from features in the cells along and beside it.
 
-    Convolutions in the plane of the cells, then along the route alone.
+    Convolutions in the plane of the cells find road users and their velocities (`Sight.user_cells`).
+    Convolutions along the route alone then read the plane, and where these road users would be on the route
+    if they went on at constant velocity.
 
     Args:
         channels: channels of each cell.
@@ -187,7 +191,7 @@ class OccupancyHead(nn.Module):
         assert last.bias is not None
         nn.init.constant_(last.bias, RARE_LOGIT + 1.5)
         self.route = nn.Sequential(
-            nn.Conv1d(width * len(BESIDE_M), 96, 1),
+            nn.Conv1d(width * len(BESIDE_M) + TIMES, 96, 1),
             nn.ReLU(),
             nn.Dropout(0.1),
             nn.Conv1d(96, width, 3, padding=1),
@@ -200,8 +204,31 @@ class OccupancyHead(nn.Module):
     ) -> tuple[Float[Tensor, f"b {TIMES} {CELLS}"], Float[Tensor, "b U G L"]]:
         """Return the logits of occupancy, and `Sight.user_cells`."""
         plane = self.plane(self.cells(cells))  # [b F G L]
-        logits: Tensor = self.route(plane.permute(0, 1, 3, 2).flatten(1, 2))
-        return logits.float(), self.users(plane).float()
+        users = self.users(plane).float()
+        ahead = occupied_at_constant_velocity(users).to(plane)
+        logits: Tensor = self.route(torch.cat([plane.permute(0, 1, 3, 2).flatten(1, 2), ahead], dim=1))
+        return logits.float(), users
+
+
+def occupied_at_constant_velocity(users: Float[Tensor, "b U G L"]) -> Float[Tensor, f"b {TIMES} G"]:
+    """Return how probably road users would be on the route at each time if they went on as they move.
+
+    Args:
+        users: as `Sight.user_cells`.
+    """
+    b, _, along, _ = users.shape
+    kinds = len(USERS)
+    probability = users[:, :kinds].sigmoid().amax(1)
+    # Positions along the route, in cells, and beside it, in metres, of what each cell holds.
+    velocity = VELOCITY_SCALE_MPS * users[:, kinds:]
+    t_s = LATER_DT_S * torch.arange(TIMES, device=users.device)[:, None, None]
+    first = torch.arange(along, device=users.device)[:, None]
+    at = (first + velocity[:, None, 0] * t_s / CELL_M).round().long()
+    beside_m = users.new_tensor(BESIDE_M) + velocity[:, None, 1] * t_s
+    in_way = (1 - (beside_m.abs() - HALF_WIDTH_M) / FADES_M).clamp(0, 1)
+    weight = probability[:, None] * in_way * ((at >= 0) & (at < along))
+    occupied = users.new_zeros(b, TIMES, along)
+    return occupied.scatter_reduce(2, at.clamp(0, along - 1).flatten(2), weight.flatten(2), "amax")
 
 
 def conv_block(inputs: int, outputs: int, size: int = 3, stride: int = 2) -> nn.Sequential:
