@@ -9,7 +9,7 @@ import dataclasses
 import json
 import math
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
@@ -61,7 +61,7 @@ def made_up(recipe: Recipe) -> Example:
         ego_speed_valid=yes,
         command=torch.full((1,), 2),
         command_valid=yes[:, 0],
-        route_xy=torch.zeros(batch, 7, 2),
+        route_xy=torch.zeros(1, 7, 2),
         route_valid=yes[:, :1].expand(-1, 7),
         future=Trajectory(
             xy=torch.stack([torch.arange(1, steps + 1) * 2.0, torch.zeros(steps)], -1)[None, None],
@@ -122,10 +122,8 @@ def recipe_at(voxel_m: float) -> Recipe:
     """Return nemo_base with voxels of this size and without the perceptual loss."""
     recipe = find_recipe("nemo_base")
     spec = recipe.clips.voxels
-    shape_zyx = tuple(round(n * spec.voxel_m / voxel_m) for n in spec.shape_zyx)
-    clips = dataclasses.replace(
-        recipe.clips, voxels=VoxelSpec(lower_m=spec.lower_m, voxel_m=voxel_m, shape_zyx=shape_zyx)
-    )
+    z, y, x = (round(n * spec.voxel_m / voxel_m) for n in spec.shape_zyx)
+    clips = dataclasses.replace(recipe.clips, voxels=VoxelSpec(spec.lower_m, voxel_m, (z, y, x)))
     finetune = dataclasses.replace(recipe.finetune, perceptual=None)
     return dataclasses.replace(recipe, clips=clips, finetune=finetune)
 
@@ -145,7 +143,7 @@ def kernels_as(change: Callable[[str, Callable[..., Tensor]], Callable[..., Tens
             setattr(module, name, op)
 
 
-REFERENCES = {
+REFERENCES: Mapping[str, Callable[..., Tensor]] = {
     "lift": lift_reference,
     "attend_volume": attend_volume_reference,
     "sample_volume": sample_volume_reference,
