@@ -8,21 +8,28 @@ import tempfile
 import threading
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from statistics import median
-from types import FrameType
+from types import CodeType, FrameType, ModuleType
+from typing import Any, TypeVar
 
 import torch
+from py123d.common.io.camera import jpeg_camera_io
 
+from foredrive.data.log_writer import LogWriter
 from foredrive.evaluation.bench import Benchmark
 from foredrive.scene.conditions import BackgroundTraffic
 from foredrive.sensors.rigs import camera_rig
 from foredrive.sensors.vehicle import roof_lidar
+from foredrive.towns import recorder
+from foredrive.towns.labels import captions, frame_facts, occupancy, semantics, visibility
 from foredrive.towns.map.town_map import load_town_map
 from foredrive.towns.recorder import record
+from foredrive.towns.sensing import capture, raycast
 from foredrive.towns.sensing.capture import SensorSuite
+from foredrive.towns.traffic import expert
 from foredrive.towns.traffic.expert import ExpertDrive
 from foredrive.towns.traffic.traffic import Traffic
 from foredrive.towns.world import World
@@ -35,19 +42,22 @@ SETTLED_FROM, ENDS_FROM = 0.1, 0.9
 """Shares of a run between which memory is compared; before the first, caches fill."""
 SAMPLE_S = 0.005
 
-PARTS = (
-    ("traffic", "expert.py", None),
-    ("jpeg", "jpeg", None),
-    ("arrow", "log_writer.py", "write"),
-    ("labels", "occupancy.py", None),
-    ("labels", "visibility.py", None),
-    ("labels", "semantics.py", None),
-    ("labels", "captions.py", None),
-    ("lidar", "capture.py", "sweep"),
-    ("casting", "raycast.py", None),
-    ("shading", "capture.py", None),
+FRAMES_ARE_MADE = (recorder._sense, recorder._frame, LogWriter.write)
+"""A sample without one of these functions in its stack is of the start of a recording."""
+PARTS: tuple[tuple[str, Any], ...] = (
+    ("traffic", expert),
+    ("jpeg", jpeg_camera_io),
+    ("arrow", LogWriter.write),
+    ("labels", frame_facts),
+    ("labels", occupancy),
+    ("labels", visibility),
+    ("labels", semantics),
+    ("labels", captions),
+    ("lidar", capture.simulate_sweep),
+    ("casting", raycast),
+    ("shading", capture),
 )
-"""Name of a part, with its file and function. A sample counts for the first entry that its stack contains."""
+"""Names of parts, each with a module or function. A sample counts for the first that its stack contains."""
 
 
 def sensors(seed: int) -> dict[str, float]:
@@ -91,7 +101,7 @@ def memory(seed: int) -> dict[str, float]:
 def profile(seed: int) -> dict[str, float]:
     """Return the share of recording time of each part, on one thread."""
     _record(seed, 1)  # compiles
-    threads, main = torch.get_num_threads(), threading.main_thread().ident
+    threads, main = torch.get_num_threads(), threading.get_ident()
     torch.set_num_threads(1)
     try:
         with _sampled(SAMPLE_S, lambda: _part(sys._current_frames()[main])) as samples:
@@ -101,7 +111,7 @@ def profile(seed: int) -> dict[str, float]:
     while samples and samples[0] == "start":
         samples.pop(0)
     found = Counter(part for part in samples if part != "start")
-    names = dict.fromkeys([name for name, _, _ in PARTS] + ["rest"])
+    names = dict.fromkeys([name for name, _ in PARTS] + ["rest"])
     return {f"{name}_share": found[name] / found.total() for name in names}
 
 
@@ -119,10 +129,13 @@ def _suite() -> SensorSuite:
     return SensorSuite(camera_rig((144, 256)), roof_lidar())
 
 
+T = TypeVar("T")
+
+
 @contextmanager
-def _sampled(every_s, take) -> Iterator[list]:
+def _sampled(every_s: float, take: Callable[[], T]) -> Iterator[list[T]]:
     """Collect the results of `take` every `every_s` while the block runs."""
-    samples, over = [], threading.Event()
+    samples, over = list[T](), threading.Event()
 
     def watch() -> None:
         while not over.wait(every_s):
@@ -139,16 +152,14 @@ def _sampled(every_s, take) -> Iterator[list]:
 
 def _part(frame: FrameType | None) -> str:
     """Return the part that a stack works on."""
-    stack = []
+    stack = set[CodeType | str]()
     while frame is not None:
-        stack.append((Path(frame.f_code.co_filename).name, frame.f_code.co_name))
+        stack |= {frame.f_code, frame.f_code.co_filename}
         frame = frame.f_back
-    if not any(file == "recorder.py" and called in ("_sensed", "_frame") for file, called in stack) and (
-        ("log_writer.py", "write") not in stack
-    ):
+    if stack.isdisjoint(function.__code__ for function in FRAMES_ARE_MADE):
         return "start"
-    for part, file, function in PARTS:
-        if any(file in name and function in (None, called) for name, called in stack):
+    for part, place in PARTS:
+        if (place.__file__ if isinstance(place, ModuleType) else place.__code__) in stack:
             return part
     return "rest"
 
