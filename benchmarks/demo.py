@@ -13,7 +13,7 @@ from pathlib import Path
 
 from benchmarks.common.study import PLANNERS, work_folder
 from foredrive.evaluation.bench import Benchmark
-from foredrive.evaluation.summary import read_summary
+from foredrive.evaluation.summary import numbers, read_summary
 from foredrive.metrics.protocols import PROTOCOLS
 from foredrive.training import read_metrics
 
@@ -38,25 +38,25 @@ def demo(seed: int, *options: str) -> Mapping[str, float]:
     return figures | results(out)
 
 
-def results(out: Path) -> Mapping[str, float]:
+def results(out: Path) -> dict[str, float]:
     """Return the figures of a finished demo."""
     figures: dict[str, float] = {}
     for part in ("seen", "learned"):
-        summary = read_summary(out / part / "summary.json")
+        summary = numbers(read_summary(out / part / "summary.json"))
         keys = ["items", "failed", *(key for key in summary if key.startswith("vehicles.car_recall_20m"))]
         keys += [key for key in summary if "iou_" in key and "threshold" not in key]
         for planner in ("", *(f"{name}." for name in PLANNERS)):
             for protocol in PROTOCOLS:
                 keys += [f"planning.{planner}{protocol}.{end}" for end in ("l2_avg_m", "collision_avg_pct")]
-        figures |= {f"{part}.{key}": summary[key] for key in keys if summary[key] is not None}
+        figures |= {f"{part}.{key}": summary[key] for key in keys if key in summary}
     for stage in STAGES:
         steps = read_metrics(out / "learned" / stage / "metrics.jsonl")
         figures[f"learned.{stage}.steps"] = len(steps)
         figures[f"learned.{stage}.min"] = sum(float(step["step_s"]) for step in steps) / 60
     for part in ("driven", "driven_expert"):
-        summary = read_summary(out / part / "summary.json")
+        summary = numbers(read_summary(out / part / "summary.json"))
         figures |= {f"{part}.{key}": summary[key] for key in ("driving_score_1_0", "completion")}
-    rebuilt = read_summary(out / "rebuilt" / "summary.json")
+    rebuilt = numbers(read_summary(out / "rebuilt" / "summary.json"))
     figures |= {f"rebuilt.{key}": rebuilt[key] for key in ("psnr_db", "nearest.psnr_db", "minutes")}
     return figures
 

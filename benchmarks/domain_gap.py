@@ -74,6 +74,7 @@ def town(name: str, conditions: str, seed: int) -> Iterator[Sensed]:
     drive = ExpertDrive(Traffic(town_map, seed, VEHICLES + 1, PEOPLE), FRAMES * SPACING_S)
     for index, m in enumerate(drive.snapshots(FRAMES, SPACING_S)):
         seen = world.render(m.actors, sensors, m.T_world_ego, m.twist_ego, index, m.lights)
+        assert seen.sweep is not None
         yield Sensed(seen.sweep, np.stack(list(seen.images.values())))
 
 

@@ -11,6 +11,7 @@ from pathlib import Path
 from benchmarks.common.study import work_folder
 from foredrive.errors import InputError
 from foredrive.evaluation.bench import Benchmark
+from foredrive.evaluation.summary import numbers
 from foredrive.runs.drive.in_towns import TownRoutes
 from foredrive.runs.drive.records import summarise
 from foredrive.runs.drive.suite import DriveSuite, drive_suite
@@ -33,10 +34,10 @@ def scores(seed: int, name: str) -> Mapping[str, float]:
     if driven.broken:
         job, why = next(iter(driven.broken.items()))
         raise InputError(f"{len(driven.broken)} drives failed, {job.name}: {why}")
-    summary = summarise(list(driven.drives.values()))
+    summary = numbers(summarise(list(driven.drives.values())))
     kept = [key for key in summary if key in FIGURES or key.startswith(("infractions.", "endings."))]
     short = {"driving_score_1_0": "ds", "driving_score_2_1": "ds_2_1", "completion": "rc"}
-    return {f"{short.get(key, key)}_{name}": float(summary[key] or 0.0) for key in kept}  # type: ignore[arg-type]
+    return {f"{short.get(key, key)}_{name}": summary[key] for key in kept}
 
 
 BENCHMARK = Benchmark(

@@ -12,6 +12,7 @@ import dataclasses
 import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 from benchmarks.common.driver_study import (
     EGOS,
@@ -73,14 +74,14 @@ def with_frames(frames: int) -> Change:
     )
 
 
-def with_eyes(**changes: object) -> Change:
+def with_eyes(**changes: Any) -> Change:
     """Return the change of entries of a recipe's eyes."""
-    return lambda recipe: dataclasses.replace(recipe, eyes=dataclasses.replace(recipe.eyes, **changes))  # type: ignore[arg-type]
+    return lambda recipe: dataclasses.replace(recipe, eyes=dataclasses.replace(recipe.eyes, **changes))
 
 
-def arm(name: str, **choices: object) -> Callable[[int], Mapping[str, float]]:
+def arm(name: str, **choices: Any) -> Callable[[int], Mapping[str, float]]:
     """Return an arm; the choices are those of `sees`."""
-    return lambda seed: sees(name, seed, **choices)  # type: ignore[arg-type]
+    return lambda seed: sees(name, seed, **choices)
 
 
 BENCHMARK = Benchmark(

@@ -9,6 +9,7 @@ import dataclasses
 import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 from benchmarks.common.study import work_folder
 from foredrive.errors import InputError
@@ -29,21 +30,21 @@ FROM_S = 3.0
 RAISED_M = 0.5
 
 
-def scores(seed: int, name: str, **changes: object) -> Mapping[str, float]:
+def scores(seed: int, name: str, raised_m: float = 0.0, **changes: Any) -> Mapping[str, float]:
     """Return the figures of one repetition with a fault.
 
     Args:
         seed: seed of the traffic.
         name: name of the arm.
-        changes: fields of the suite, and `raised_m`.
+        raised_m: the cameras are mounted higher by this.
+        changes: fields of the suite.
     """
-    raised_m = float(str(changes.pop("raised_m", 0.0)))
     agent = str(Path(AGENT).absolute()) if Path(AGENT).is_dir() else AGENT
     rig = rig_of(agent)
     source = TownRoutes(
         ROUTES, seed=seed, rig=rig.raised(raised_m) if raised_m else rig, other_rig=raised_m != 0
     )
-    suite = dataclasses.replace(DriveSuite(agent, source, sensors=False), **changes)  # type: ignore[arg-type]
+    suite = dataclasses.replace(DriveSuite(agent, source, sensors=False), **changes)
     for fault in suite.faults.cameras:
         if fault.camera not in rig.cameras:
             raise InputError(f"{name}: {AGENT} has no camera {fault.camera}; leave out this arm")
@@ -64,12 +65,12 @@ def scores(seed: int, name: str, **changes: object) -> Mapping[str, float]:
     }
 
 
-def arm(name: str, **changes: object) -> Callable[[int], Mapping[str, float]]:
+def arm(name: str, **changes: Any) -> Callable[[int], Mapping[str, float]]:
     """Return an arm with a fault; its arguments are those of `scores`."""
     return lambda seed: scores(seed, name, **changes)
 
 
-CHANGES: Mapping[str, Mapping[str, object]] = {
+CHANGES: Mapping[str, Mapping[str, Any]] = {
     "untouched": {},
     **{
         f"{kind}_{place}": {"faults": Faults(cameras=(CameraFault(kind, camera, FROM_S),))}

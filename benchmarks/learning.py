@@ -27,6 +27,7 @@ from foredrive.evaluation.bench import Benchmark, study_identity
 from foredrive.evaluation.metrics.occupancy import CONTINUED, EGO_COMPENSATED, OccupancyMetric
 from foredrive.evaluation.metrics.vehicles import VehicleMetric
 from foredrive.evaluation.run import evaluate
+from foredrive.evaluation.summary import numbers
 from foredrive.recipes import find_recipe
 from foredrive.recipes.config import Recipe, load_recipe, rescheduled
 from foredrive.runs.drive.recording import log_of
@@ -117,6 +118,7 @@ def learned(name: str, budget_name: str) -> Callable[[int], dict[str, float]]:
         run = train_run(recipe, train_logs, folder, ROOT / "cache")
         lines = read_metrics(folder / "pretrain" / "metrics.jsonl")
         cpu_s = sum(float(line["cpu_s"]) for line in lines)
+        assert recipe.pretrain is not None
         samples = len(lines) * recipe.pretrain.schedule.batch_size
         return judge(run, test_logs, budget_name) | {
             f"cpu_s_{budget_name}": cpu_s,
@@ -137,7 +139,7 @@ def judge(run: Run, logs: Sequence[LogPath], budget_name: str) -> dict[str, floa
         frame_dt_s=clips.frame_dt_s,
         metrics=(OccupancyMetric, VehicleMetric),
     )
-    found = result.summary
+    summary = numbers(result.summary)
     above = "occupancy.above_ground.iou"
     figures = {"iou": f"{above}_now"} | {
         name: f"vehicles.{name}" for name in ("car_recall_20m", "column_precision_20m")
@@ -148,11 +150,8 @@ def judge(run: Run, logs: Sequence[LogPath], budget_name: str) -> dict[str, floa
             f"iou_{when}_persistence": f"{above}_{when}{EGO_COMPENSATED}",
             f"iou_{when}_continued": f"{above}_{when}{CONTINUED}",
         }
-    named = {f"{key}_{budget_name}": float(found[name]) for key, name in figures.items()}
-    return named | {
-        f"clips_{budget_name}": float(found["items"]),
-        f"failed_{budget_name}": float(found["failed"]),
-    }
+    figures |= {"clips": "items", "failed": "failed"}
+    return {f"{key}_{budget_name}": summary[name] for key, name in figures.items() if name in summary}
 
 
 def speed(seed: int) -> dict[str, float]:
@@ -166,6 +165,7 @@ def speed(seed: int) -> dict[str, float]:
             train_run(recipe, train_logs, Path(folder), ROOT / "cache")
             lines = read_metrics(Path(folder) / "pretrain" / "metrics.jsonl")
         took_s = statistics.mean(float(line["cpu_s"]) for line in lines[PROBE_STEPS // 4 :])
+        assert recipe.pretrain is not None
         rate[name] = recipe.pretrain.schedule.batch_size / took_s
     today, before = rate.values()
     return {

@@ -44,6 +44,7 @@ def image_recipe(*, future: float, perceptual: str | None) -> NemoRecipe:
         perceptual: network of the perceptual loss.
     """
     recipe = find_recipe("nemo_town")
+    assert recipe.pretrain is not None
     stage = dataclasses.replace(
         rescheduled(recipe.pretrain, steps=STEPS, warmup_steps=20),
         weights=dataclasses.replace(recipe.pretrain.weights, future=future),

@@ -8,6 +8,7 @@ two cores, and 16 times as many. No encoder can bring a gain that the planner do
 import dataclasses
 import functools
 from collections.abc import Callable
+from operator import itemgetter
 from pathlib import Path
 from typing import NamedTuple
 
@@ -64,7 +65,7 @@ def draw(clip: Clip, spec: VoxelSpec) -> Float[Tensor, "K Y X"]:
     image = torch.zeros(CHANNELS, *spec.shape_zyx[1:])
     for channel, kind in enumerate(KINDS):
         _draw_lines(image[channel], clip.map, kind, spec)
-    now, before = (clip.boxes.map_tensors(lambda t, k=k: t[k]) for k in (clip.now, clip.now - 1))
+    now, before = (clip.boxes.map_tensors(itemgetter(k)) for k in (clip.now, clip.now - 1))
     walks = now.category == int(Category.PEDESTRIAN)
     T_ego_world = torch.linalg.inv(clip.T_world_ego[clip.now])
     T_now_before = (T_ego_world @ clip.T_world_ego[clip.now - 1]).float()

@@ -14,6 +14,7 @@ from benchmarks.common.rebuilt_towns import TownDrive
 from benchmarks.common.study import pandaset_log, work_folder
 from foredrive.data import LogPath
 from foredrive.evaluation.bench import Benchmark
+from foredrive.evaluation.summary import numbers
 from foredrive.recipes.rebuilding import gaussians_tiny, rescheduled_recipe
 from foredrive.runs.evaluate.real_to_sim_gap import measure_gap
 from foredrive.runs.rebuild.reconstruct import reconstruct
@@ -52,7 +53,7 @@ def gap(name: str, seed: int) -> dict[str, float]:
     figures = measure_gap(open_run(run_folder(Path(MODEL), WORK)), folder, folder)
     took = {key: summary[key] for key in ("minutes", "computing_minutes", "gaussians", "peak_memory_gib")}
     kept = {**figures, **{f"rebuilt.{key}": value for key, value in took.items()}}
-    return {key: float(value) for key, value in kept.items() if isinstance(value, float | int)}
+    return numbers(kept)
 
 
 BENCHMARK = Benchmark(

@@ -20,6 +20,7 @@ from benchmarks.common.rebuilt_towns import TownDrive, TownTruth, TrueViews
 from benchmarks.common.study import work_folder
 from foredrive.evaluation.bench import Benchmark
 from foredrive.evaluation.rendering import evaluate_cameras, evaluate_sweeps
+from foredrive.evaluation.summary import numbers
 from foredrive.recipes.rebuilding import RebuildRecipe, gaussians_tiny, rescheduled_recipe
 from foredrive.rendering.edits import Edit, Move, Remove, ShiftEgo, apply_edits
 from foredrive.rendering.scene_graph import SceneGraph
@@ -102,8 +103,8 @@ def rebuilt(arm: str, seed: int) -> dict[str, float]:
     """Return the metrics of one run, see `judged_town`, and its minutes."""
     recipe = rescheduled_recipe(ARMS[arm], seed=seed)
     run = reconstruct(recipe, DRIVE.recorded(WORK / "town"), WORK / f"{arm}_seed{seed}", WORK / "cache")
-    figures = {name: float(run.summary[name] or 0.0) for name in ("minutes", "gaussians")}
-    return figures | judged_town(run)
+    summary = numbers(run.summary)
+    return {name: summary[name] for name in ("minutes", "gaussians")} | judged_town(run)
 
 
 def judged_town(run: Reconstruction) -> dict[str, float]:
@@ -137,19 +138,18 @@ def judge(run: Reconstruction, views: Sequence[TrueViews], graph: SceneGraph) ->
 
 def judge_changed(run: Reconstruction, name: str, graph: SceneGraph) -> dict[str, float]:
     """Return the same metrics over changed pixels and beams only, for the scene with and without the edit."""
-    pixels, beams = [], []
+    pixels, beams = list[tuple[CameraView, Tensor]](), list[tuple[SweepView, Tensor]]()
     for before, after in zip(true_views("held_out"), true_views(name), strict=True):
-        pixels += list(zip(after.cameras, map(changed_pixels, before.cameras, after.cameras), strict=True))
+        pixels += zip(after.cameras, map(changed_pixels, before.cameras, after.cameras), strict=True)
         beams.append((after.sweep, changed_beams(before.sweep, after.sweep)))
-    pixels, beams = ([seen for seen in some if int(seen[1].sum()) >= FEWEST] for some in (pixels, beams))
-    found = {}
+    cameras, where = zip(*(view for view in pixels if int(view[1].sum()) >= FEWEST), strict=True)
+    sweeps, which = zip(*(view for view in beams if int(view[1].sum()) >= FEWEST), strict=True)
+    changed: dict[str, float] = {}
     for prefix, shown in (("changed.", graph), ("unedited.changed.", run.scene.graph)):
-        cameras, where = zip(*pixels, strict=True)
         figures = evaluate_cameras(run.scene, cameras, run.train.cameras, shown, where)
-        sweeps, which = zip(*beams, strict=True)
         figures |= evaluate_sweeps(run.scene, sweeps, graph=shown, where=which)
-        found |= named(f"{name}.{prefix}", {key: figures[key] for key in OF_IMAGES + OF_SWEEPS})
-    return found
+        changed |= named(f"{name}.{prefix}", {key: figures[key] for key in OF_IMAGES + OF_SWEEPS})
+    return changed
 
 
 def changed_pixels(before: CameraView, after: CameraView) -> Bool[Tensor, "H W"]:

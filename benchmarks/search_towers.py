@@ -23,8 +23,9 @@ from foredrive.data.logs import Log
 from foredrive.evaluation.bench import Benchmark
 from foredrive.models.lidar_clip import LidarEncoder, LidarEncoderConfig, PointCloud
 from foredrive.runs.drive.recording import record_plan
+from foredrive.scene import LidarSweep
 from foredrive.search.crops import Crop
-from foredrive.search.embedding import read_views
+from foredrive.search.embedding import View, read_views
 from foredrive.sensors.rigs import SURROUND
 from foredrive.towns.campaign import DrivePlan
 
@@ -44,7 +45,7 @@ def embed_speed(folder: Path, size: str) -> dict[str, float]:
     log = Log(find_logs(folder)[0])
     read = [read_views(log, frame, SIDE_PX, Crop.WHOLE, with_lidar=True) for frame in range(len(log.t_us))]
     clouds = [
-        PointCloud.from_sweeps(stack_records([views[name].sweep for views in read])) for name in read[0]
+        PointCloud.from_sweeps(stack_records([_sweep(views[name]) for views in read])) for name in read[0]
     ]
     torch.manual_seed(0)
     tower = LidarEncoder(LidarEncoderConfig(block_layers=BLOCK_LAYERS[size]), dim=DIM).eval()
@@ -72,6 +73,11 @@ def embed_speed(folder: Path, size: str) -> dict[str, float]:
         "sectors": float(len(clouds)),
         "points_per_sector": sum(len(cloud.points) for cloud in clouds) / len(clouds) / len(read),
     }
+
+
+def _sweep(view: View) -> LidarSweep:
+    assert view.sweep is not None
+    return view.sweep
 
 
 def _in_parallel(work: Callable[[int], None], threads: int) -> Took:

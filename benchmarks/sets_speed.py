@@ -64,8 +64,10 @@ def scene(m: int, n: int, side_m: float, rng: np.random.Generator) -> tuple[Mult
     logits = np.full((m, CLASSES), -3.0)
     logits[np.arange(m), np.concatenate([label[source], rng.integers(0, CLASSES, clutter)])] = 2.0
     twice = max(len(source) - len(seen), 0)
-    r = np.concatenate([rng.beta(5, 2, len(source) - twice), rng.beta(1, 3, twice), rng.beta(1, 15, clutter)])
-    r = torch.as_tensor(np.clip(r, 1e-4, 1 - 1e-4))
+    chance = np.concatenate(
+        [rng.beta(5, 2, len(source) - twice), rng.beta(1, 3, twice), rng.beta(1, 15, clutter)]
+    )
+    r = torch.as_tensor(np.clip(chance, 1e-4, 1 - 1e-4))
     boxes = BoxDensity(
         torch.as_tensor(mean),
         torch.diag_embed(torch.as_tensor(STD).expand(m, 6)).contiguous(),
@@ -122,7 +124,7 @@ def likelihood(seed: int, *, background: bool = True) -> dict[str, float]:
         pmb, objects = predicted(size, seed)
         if not background:
             pmb = PoissonMultiBernoulli(pmb.detected)
-        figures[f"ms_{size}_k{K}"] = least_ms(lambda pmb=pmb, objects=objects: set_nll(pmb, objects, k=K))
+        figures[f"ms_{size}_k{K}"] = least_ms(functools.partial(set_nll, pmb, objects, k=K))
         result = set_nll(pmb, objects, k=K)
         figures[f"gap_nats_{size}"] = float(result.nll) - result.lower
     return figures
@@ -133,7 +135,7 @@ def k_best(seed: int) -> dict[str, float]:
     figures = {}
     for size in ("100x50", "900x200"):
         cost, free = costs(size, seed)
-        figures[f"ms_{size}_k{K}"] = least_ms(lambda c=cost, f=free: k_best_assignments(c, f, K), 5)
+        figures[f"ms_{size}_k{K}"] = least_ms(functools.partial(k_best_assignments, cost, free, K), 5)
         started = time.process_time()
         expected = murty_on_scipy(cost, free, K)
         scipy_ms = 1e3 * (time.process_time() - started)
@@ -148,7 +150,7 @@ def best_only(seed: int) -> dict[str, float]:
     figures = {}
     for size in SIZES:
         padded = with_background(*costs(size, seed))
-        figures[f"ms_{size}_k1"] = least_ms(lambda padded=padded: linear_sum_assignment(padded))
+        figures[f"ms_{size}_k1"] = least_ms(functools.partial(linear_sum_assignment, padded))
     return figures
 
 

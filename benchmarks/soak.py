@@ -52,9 +52,9 @@ class Look(NamedTuple):
 def driving(seed: int) -> dict[str, float]:
     """Drive the ten short routes in Town05 again and again, with new traffic."""
     out = _new_folder("driving")
-    arguments = ("drive", "--agent", "expert", "--routes", "town05-short-10", "--repetitions", "1000")
-    arguments = (*arguments, "--image-size", "36", "64", "--seed", str(seed), "--workers", "1")
-    arguments = (*arguments, "--out", str(out / "suite"))
+    suite = ("--agent", "expert", "--routes", "town05-short-10", "--repetitions", "1000", "--seed", str(seed))
+    sensors = ("--image-size", "36", "64")
+    arguments = ("drive", *suite, *sensors, "--workers", "1", "--out", str(out / "suite"))
     return _soak(out, arguments, done=lambda: {"drives": _count(out / "suite/drives", "*.json")})
 
 
@@ -62,8 +62,8 @@ def training(seed: int) -> dict[str, float]:
     """Load and train on small batches; a checkpoint every 200 steps."""
     out, logs = _new_folder("training"), _recorded()
     long = ("schedule.steps=1000000", "schedule.batch_size=2", "schedule.workers=1", f"schedule.seed={seed}")
-    arguments = ("train", "nemo_tiny", "--logs", str(logs), "--out", str(out / "run"))
-    arguments = (*arguments, "--set", *(f"pretrain.{entry}" for entry in long))
+    recipe = ("nemo_tiny", "--set", *(f"pretrain.{entry}" for entry in long))
+    arguments = ("train", *recipe, "--logs", str(logs), "--out", str(out / "run"))
     metrics = out / "run/pretrain/metrics.jsonl"
     return _soak(out, arguments, done=lambda: {"steps": float(len(read_metrics(metrics)))})
 
@@ -138,7 +138,7 @@ def _watch(program: "subprocess.Popen[bytes]", said: Path) -> list[Look]:
     began_s, looks = time.monotonic(), list[Look]()
     while (t_min := (time.monotonic() - began_s) / 60) < MINUTES:
         if program.poll() is not None:
-            raise RuntimeError(f"{' '.join(map(str, program.args))} ended: {said.read_text()[-2000:]}")
+            raise RuntimeError(f"{said.parent.name}: the program has ended: {said.read_text()[-2000:]}")
         looks.append(Look(t_min, tree_use(program.pid)))
         time.sleep(LOOK_S)
     return looks

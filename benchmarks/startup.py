@@ -7,6 +7,7 @@ A verb's own work begins when its modules are imported; the arms called "begin" 
 torch" is the lower bound for most verbs.
 """
 
+import functools
 import resource
 import subprocess
 import sys
@@ -50,11 +51,11 @@ def _cpu_s(command: list[str]) -> dict[str, float]:
     return {"cpu_s": min(taken[1:]), "most_cpu_s": max(taken[1:])}
 
 
-def _line(line: str) -> dict[str, float]:
+def _line(line: str, _: int) -> dict[str, float]:
     return _cpu_s([sys.executable, "-m", "foredrive", *line.split()])
 
 
-def _import(modules: str) -> dict[str, float]:
+def _import(modules: str, _: int) -> dict[str, float]:
     code = f"from foredrive.lazy import importing\nwith importing():\n    import {modules}"  # as the verbs do
     return _cpu_s([sys.executable, "-c", code])
 
@@ -62,8 +63,8 @@ def _import(modules: str) -> dict[str, float]:
 BENCHMARK = Benchmark(
     question="How much CPU passes until the program helps, refuses a wrong argument, begins a verb's work?",
     arms={
-        **{name: lambda seed, line=line: _line(line) for name, line in LINES.items()},
-        **{name: lambda seed, modules=modules: _import(modules) for name, modules in IMPORTS.items()},
+        **{name: functools.partial(_line, line) for name, line in LINES.items()},
+        **{name: functools.partial(_import, modules) for name, modules in IMPORTS.items()},
     },
     seeds=(0,),
     config={"repetitions": REPETITIONS, "lines": LINES, "imports": IMPORTS},

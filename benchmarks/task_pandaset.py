@@ -20,6 +20,7 @@ from foredrive.evaluation.metrics.detection import DetectionMetric
 from foredrive.evaluation.metrics.motion import MotionMetric
 from foredrive.evaluation.metrics.tracking import TrackingMetric
 from foredrive.evaluation.run import evaluate
+from foredrive.evaluation.summary import numbers
 from foredrive.recipes.task_heads import town_heads
 from foredrive.runs.evaluate.predict import AgentPredictor
 from foredrive.runs.shipped import run_folder
@@ -50,8 +51,8 @@ def nemo_town(seed: int) -> Mapping[str, float]:
         frame_dt_s=clips.frame_dt_s,
         metrics=[DetectionMetric, TrackingMetric, MotionMetric],
     )
-    counted = {key: float(result.summary[key]) for key in ("items", "failed")}
-    return kept_figures(result.summary) | counted
+    summary = numbers(result.summary)
+    return kept_figures(summary) | {key: summary[key] for key in ("items", "failed")}
 
 
 ARMS: Mapping[str, Callable[[int], Mapping[str, float]]] = {"nemo_town": nemo_town}

@@ -11,7 +11,6 @@ study continues.
 """
 
 import dataclasses
-import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -25,7 +24,8 @@ from benchmarks.learning_towns import learning_digest
 from foredrive.data import ClipDataset, collate
 from foredrive.evaluation.bench import Benchmark, study_identity
 from foredrive.evaluation.metrics import METRICS
-from foredrive.evaluation.run import evaluate
+from foredrive.evaluation.run import evaluate, parts_needed
+from foredrive.evaluation.summary import Summary, numbers
 from foredrive.recipes import Recipe, find_recipe
 from foredrive.recipes.config import rescheduled
 from foredrive.recipes.task_heads import HEADED, INSTANCES, TaskHeadsRecipe, town_heads
@@ -137,21 +137,18 @@ def probed(name: str, world_of: Callable[[int], Run]) -> Callable[[int], dict[st
             AgentPredictor(load_agent(run), clips.future_frames, ray_stride=0, heads=found.heads),
             DataLoader(ClipDataset(test_logs, read, run.cache_dir), batch_size=4, collate_fn=collate),
             frame_dt_s=clips.frame_dt_s,
-            metrics=[metric for metric in METRICS if metric.needs & JUDGED_PARTS],
+            metrics=[metric for metric in METRICS if parts_needed([metric]) & JUDGED_PARTS],
             task_priors=found.priors,
         )
-        return kept_figures(result.summary) | {
-            "clips": float(result.summary["items"]),
-            "failed": float(result.summary["failed"]),
-        }
+        summary = numbers(result.summary)
+        return kept_figures(summary) | {"clips": summary["items"], "failed": summary["failed"]}
 
     return measure
 
 
-def kept_figures(summary: Mapping[str, Any]) -> dict[str, float]:
+def kept_figures(summary: Summary) -> dict[str, float]:
     """Return the figures of the tasks, and the baselines' beside them; those that are known."""
-    chosen = {key: value for key, value in summary.items() if key.startswith(KEPT) and value is not None}
-    return {key: float(value) for key, value in chosen.items() if math.isfinite(value)}
+    return {key: value for key, value in numbers(summary).items() if key.startswith(KEPT)}
 
 
 WORLDS: Mapping[str, Callable[[int], Run]] = {

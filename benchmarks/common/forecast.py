@@ -7,6 +7,7 @@ from torch.utils.data import DataLoader
 
 from foredrive.data import LogPath, collate
 from foredrive.evaluation.run import evaluate
+from foredrive.evaluation.summary import numbers
 from foredrive.recipes.config import Recipe
 from foredrive.runs.evaluate.inputs import FUTURES
 from foredrive.runs.evaluate.predict import AgentPredictor
@@ -48,12 +49,13 @@ def judge_forecast(run: Run, logs: Sequence[LogPath], part_s: tuple[float, float
     clips = run.recipe.clips
     dataset = open_clips(logs, replace(clips, part_s=part_s, future_images=False), run.cache_dir)
     prior, _ = fit_baselines(run.logs, run.recipe, run.cache_dir, clips.past_frames)
-    summary = evaluate(
+    result = evaluate(
         AgentPredictor(load_agent(run), clips.future_frames, 0, FUTURES),
         DataLoader(dataset, batch_size=BATCH, collate_fn=collate),
         frame_dt_s=clips.frame_dt_s,
         prior=prior,
-    ).summary
+    )
+    summary = numbers(result.summary)
     kept = ("occupancy.iou_", "occupancy.above_ground.iou_", "occupancy.above_ground.spread_", "flow.")
-    figures = {key: float(value) for key, value in summary.items() if key.startswith(kept)}
-    return figures | {"items": float(summary["items"]), "failed": float(summary["failed"])}
+    figures = {key: value for key, value in summary.items() if key.startswith(kept)}
+    return figures | {key: summary[key] for key in ("items", "failed")}

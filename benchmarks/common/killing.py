@@ -166,7 +166,7 @@ def _grows(file: Path, say: Callable[[str], None]) -> bool:
             for line in file.read_text().splitlines()[:-1]:
                 json.loads(line)
         elif file.suffix == ".safetensors":
-            with safetensors.safe_open(file, "pt") as opened:  # type: ignore[no-untyped-call]
+            with safetensors.safe_open(file, "pt") as opened:
                 opened.keys()
         elif file.name == "progress.json":
             json.loads(file.read_text())

@@ -84,7 +84,7 @@ def _add_scene(drives: Drives, scene: int, size: Size, rng: np.random.Generator)
         there = place + np.c_[speed * 0.5 * f, np.zeros(n)]
         true = drives.truth[token] = []
         found = drives.detections[token] = []
-        for k in np.flatnonzero((birth <= f) & (f < death)):
+        for k in np.flatnonzero((birth <= f) & (f < death)).tolist():
             box = _box(token, there[k], ego, lwh[k], yaw[k], speed[k], names[k])
             more = {"num_pts": int(rng.integers(0, 6)), "attribute_name": _attribute(rng, names[k], 0.1)}
             true.append({**box, **more, "tracking_id": f"true{scene}_{k}"})

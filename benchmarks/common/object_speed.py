@@ -165,7 +165,7 @@ def _validation_rows(
     false_label = rng.integers(0, len(classes), (parts, false))[part]
     false_score = rng.beta(1, 3, (parts, false))[part]
     false_track = TRUE + (step // 4)[:, None] * false + np.arange(false)
-    columns = [
+    xy, label, score, track = (
         np.concatenate([a, b], axis=1)
         for a, b in (
             (true_xy + rng.normal(0, 0.5, true_xy.shape), false_xy),
@@ -173,9 +173,9 @@ def _validation_rows(
             (true_score, false_score),
             (true_track, false_track),
         )
-    ]
+    )
     seen = np.concatenate([rng.random((FRAMES, TRUE)) < 0.85, np.ones((FRAMES, false), bool)], axis=1)
-    found = _as_rows(*columns[:2], columns[3], seen, columns[2])
+    found = _as_rows(xy, label, track, seen, score)
     true = _as_rows(true_xy, true_label, true_track, np.ones((FRAMES, TRUE), bool))
     return found, true, Frames(scene, 500_000 * frame)
 
@@ -209,8 +209,8 @@ def protocols_compared(seed: int) -> dict[str, float]:
         for key, value in {"map": scored.mean_ap, "nds": scored.nds, **scored.errors}.items():
             figures[f"detection.{name}.{key}"] = value
     found, truth = _read(drives, "tracking")
-    for name, protocol in TRACKING_PROTOCOLS.items():
-        scored = evaluate_tracking(found, truth.boxes, truth.racks, truth.frames, protocol).all_classes
+    for name, rules in TRACKING_PROTOCOLS.items():
+        averages = evaluate_tracking(found, truth.boxes, truth.racks, truth.frames, rules).all_classes
         for key in ("amota", "amotp", "recall", "mota", "motp", "ids", "frag"):
-            figures[f"tracking.{name}.{key}"] = scored[key]
+            figures[f"tracking.{name}.{key}"] = averages[key]
     return figures

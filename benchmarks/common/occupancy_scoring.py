@@ -64,11 +64,11 @@ def street(rng: np.random.Generator, classes: tuple[str, ...]) -> list[Thing]:
         "bicycle": ((5, 2, 4), 3),
         "barrier": ((2, 6, 3), 3),
     }
-    for name, (size, number) in kinds.items():
+    for name, (extent, number) in kinds.items():
         for _ in range(number):
             low = np.array([*rng.integers([0, 20], [185, 170]), 2])
             speed = 0.0 if name == "barrier" else float(rng.choice([0.0, 6.0]))
-            things.append(Thing(low, np.array(size), index[name], (speed, 0.0)))
+            things.append(Thing(low, np.array(extent), index[name], (speed, 0.0)))
     return things
 
 
@@ -207,19 +207,20 @@ def _voxels_compared(
     figures: dict[str, float] = {}
     origins = [places(rng) for _ in drawn]
     for name in ("predicted", "thick"):
-        voxels = sum(
+        counts = [
             count_voxels(getattr(frame, name), frame.true, frame.camera, frame.lidar, len(classes))
             for frame in drawn
-        )
+        ]
+        voxels = np.sum(counts, axis=0)
         for key, protocol in VOXEL_PROTOCOLS.items():
             if protocol.classes == classes:
                 figures[f"{name}.{key}.miou_pct"] = 100 * mean_iou(voxel_ious(voxels, protocol))
         ends = [
             _seen_by_both(frame, name, o, len(classes) - 1) for frame, o in zip(drawn, origins, strict=True)
         ]
-        for key, protocol in RAY_PROTOCOLS.items():
-            if protocol.classes == classes:
-                figures |= {f"{name}.{key}.{k}": v for k, v in _ray_figures(ends, protocol).items()}
+        for key, rays in RAY_PROTOCOLS.items():
+            if rays.classes == classes:
+                figures |= {f"{name}.{key}.{k}": v for k, v in _ray_figures(ends, rays).items()}
     return figures
 
 

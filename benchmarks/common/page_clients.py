@@ -9,14 +9,15 @@ import urllib.error
 import urllib.parse
 import urllib.request
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import msgspec
 import viser
 import zstandard
 from websockets.exceptions import WebSocketException
-from websockets.sync.client import ClientConnection, connect
+from websockets.sync.client import connect
+from websockets.sync.connection import Connection
 
 TEXTS = ("car", "pedestrian crossing", "a van ahead", "empty street", "traffic light", "parked vehicles")
 ANSWER_S, START_S = 60.0, 300.0
@@ -100,19 +101,21 @@ class SearchClients(Clients):
         view = draw.choice(("all", "sectors"))
         hits = self._find(text=draw.choice(TEXTS), top=draw.randint(3, 24), gap_s=0, view=view)
         for hit in draw.sample(hits, min(3, len(hits))):
-            self._get("/picture", key=hit["key"])
+            self._get("/picture", {"key": hit["key"]})
 
     def _find(self, **asked: object) -> list[dict[str, Any]]:
-        found: list[dict[str, Any]] = json.loads(self._get("/find", **asked))["hits"]
+        found: list[dict[str, Any]] = json.loads(self._get("/find", asked))["hits"]
         return found
 
     def _tag(self, draw: random.Random) -> None:
         keys = [hit["key"] for hit in self._find(text=draw.choice(TEXTS), top=2)]
         body = json.dumps({"tag": draw.choice(("seen", "later")), "keys": keys}).encode()
-        self._get("/tag", body)
+        self._get("/tag", body=body)
 
-    def _get(self, path: str, body: bytes | None = None, **asked: object) -> bytes:
-        url = f"http://127.0.0.1:{self.port}{path}?{urllib.parse.urlencode(asked)}"
+    def _get(
+        self, path: str, query: Mapping[str, object] | None = None, *, body: bytes | None = None
+    ) -> bytes:
+        url = f"http://127.0.0.1:{self.port}{path}?{urllib.parse.urlencode(query or {})}"
         headers = {"Content-Type": "application/json"}
         with urllib.request.urlopen(urllib.request.Request(url, body, headers), timeout=ANSWER_S) as answer:
             read: bytes = answer.read()
@@ -144,7 +147,7 @@ class ViewerClients(Clients):
                     self.count("requests")
 
     def _follow(
-        self, connection: ClientConnection, sliders: dict[str, tuple[str, int]], draw: random.Random
+        self, connection: Connection, sliders: dict[str, tuple[str, int]], draw: random.Random
     ) -> None:
         """Receive messages for some seconds; note the sliders."""
         until_s = time.monotonic() + draw.uniform(0.5, 1.5) * THINKS_S
@@ -161,5 +164,5 @@ class ViewerClients(Clients):
                             sliders[props["label"]] = (message["uuid"], int(props["max"]))
 
 
-def _send(connection: ClientConnection, kind: str, **fields: object) -> None:
+def _send(connection: Connection, kind: str, **fields: object) -> None:
     connection.send(msgspec.msgpack.encode({"type": kind, **fields}))

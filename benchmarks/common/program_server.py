@@ -58,7 +58,7 @@ class ProgramServer:
         path = os.pathsep.join([*map(str, paths), os.environ.get("PYTHONPATH", "")])
         self._err, self._start_s = scratch / "stderr", start_s
         self._group: int | None = None
-        self._process = subprocess.Popen(
+        process = subprocess.Popen(
             [sys.executable, "-W", "error", "-c", SERVER.format(prelude=prelude)],
             bufsize=0,  # so that `select` sees every line that is not read yet
             stdin=subprocess.PIPE,
@@ -66,20 +66,22 @@ class ProgramServer:
             env=os.environ | {"PYTHONPATH": path} | ({"TMPDIR": str(temporary)} if temporary else {}),
             start_new_session=True,
         )
+        assert process.stdin is not None
+        assert process.stdout is not None
+        self._process, self._stdin, self._stdout = process, process.stdin, process.stdout
 
     def start(self, *args: str | Path) -> int:
         """Start the program, and return its process, which is also its group and its session."""
         self._end_the_last()
         files = [os.devnull, os.devnull, str(self._err)]
         asked = json.dumps({"args": [str(arg) for arg in args], "files": files})
-        assert self._process.stdin is not None
-        self._process.stdin.write(asked.encode() + b"\n")
+        self._stdin.write(asked.encode() + b"\n")
         self._group = self._read(self._start_s)
         return self._group
 
     def is_running(self) -> bool:
         """Return whether the program that was started last has not ended yet."""
-        return not select.select([self._process.stdout], [], [], 0)[0]
+        return not select.select([self._stdout], [], [], 0)[0]
 
     def finish(self, patience_s: float) -> tuple[int, str]:
         """Wait for the program to end; return its exit code and what it printed on stderr."""
@@ -98,6 +100,5 @@ class ProgramServer:
             self.finish(self._start_s)
 
     def _read(self, patience_s: float) -> int:
-        assert self._process.stdout is not None
-        assert select.select([self._process.stdout], [], [], patience_s)[0], "nothing was heard of it"
-        return int(self._process.stdout.readline())
+        assert select.select([self._stdout], [], [], patience_s)[0], "nothing was heard of it"
+        return int(self._stdout.readline())

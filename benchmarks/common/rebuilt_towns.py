@@ -127,6 +127,7 @@ class TownTruth:
             )
             for number, image in enumerate(picture.images.values())
         ]
+        assert picture.sweep is not None
         sweep = SweepView(picture.sweep, True, T_scene_ego, seen_from.twist_ego, moment.t_s)
         return TrueViews(cameras, sweep)
 

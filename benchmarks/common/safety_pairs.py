@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import shapely
@@ -132,10 +133,10 @@ def outline(
     return shapely.Polygon(corners @ np.array([[cos, sin], [-sin, cos]]) + centre)
 
 
-def read_pair(written: Mapping[str, object]) -> Pair:
+def read_pair(written: Mapping[str, Any]) -> Pair:
     """Return a pair as `PairedTests.pair` wrote it."""
-    town, rebuilt = (Driven(**written[name]) for name in ("town", "rebuilt"))  # type: ignore[arg-type]
-    return Pair(str(written["kind"]), town, rebuilt)
+    town, rebuilt = (Driven(**written[name]) for name in ("town", "rebuilt"))
+    return Pair(written["kind"], town, rebuilt)
 
 
 def agreement(pairs: Sequence[Pair]) -> dict[str, float]:

@@ -13,7 +13,7 @@ import pytest
 
 from foredrive.errors import InputError
 from foredrive.evaluation.provenance import collect_provenance, command_line, git_commit, peak_rss_gib
-from foredrive.evaluation.summary import read_summary, write_summary
+from foredrive.evaluation.summary import numbers, read_summary, write_summary
 
 
 def test_numbers_that_json_lacks_become_null(tmp_path: Path) -> None:
@@ -29,6 +29,11 @@ def test_numbers_that_json_lacks_become_null(tmp_path: Path) -> None:
     }
     assert list(read_summary(path)) == ["b.x", "a", "n", "s", "f", "none"]
     assert list(path.parent.iterdir()) == [path]
+
+
+def test_words_and_what_could_not_be_counted_are_no_numbers() -> None:
+    summary = {"a": 0.5, "n": 3, "zero": 0, "nan": math.nan, "inf": math.inf, "word": "1.0", "none": None}
+    assert numbers(summary) == {"a": 0.5, "n": 3.0, "zero": 0.0}
 
 
 def test_what_is_not_a_summary_is_named(tmp_path: Path) -> None:

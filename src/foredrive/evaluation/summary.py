@@ -37,6 +37,15 @@ def read_summary(path: Path) -> Figures:
     return summary
 
 
+def numbers(summary: Summary) -> dict[str, float]:
+    """Return the figures that are finite numbers; words, and what could not be counted, are left out."""
+    return {
+        key: float(value)
+        for key, value in summary.items()
+        if isinstance(value, float | int) and math.isfinite(value)
+    }
+
+
 def _finite(value: object) -> object:
     if isinstance(value, Mapping):
         return {key: _finite(entry) for key, entry in value.items()}
