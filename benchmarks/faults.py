@@ -29,9 +29,11 @@ from PIL import Image
 
 from benchmarks.common.killing import Command, kill_and_compare
 from benchmarks.common.program_server import ProgramServer
+from foredrive.data.commands import route_at
 from foredrive.data.log_paths import LogPath, find_logs
 from foredrive.data.logs import Log
 from foredrive.evaluation.bench import Benchmark
+from foredrive.geometry.polylines import points_at
 from foredrive.recipes import find_recipe
 from foredrive.recipes.config import save_recipe
 from foredrive.scene import VoxelSpec
@@ -53,6 +55,7 @@ KILLS = {
 KILLS_A_RUN = 3
 TOWN, IMAGE_HW = "Town02", (36, 64)
 TRAIN_STEPS, REBUILD_STEPS, BATCH_SIZE = 4, 6, 2
+ROUTE_M = 20.0
 START_S = 1200.0
 BAD_INPUTS = (
     "tests/data/test_bad_files.py",
@@ -131,10 +134,13 @@ def search_index() -> Command:
 
 
 def drive() -> Command:
-    """Drive a short route twice, in two worker processes."""
+    """Drive the beginning of the recording's route twice, in two worker processes."""
     out, file = ROOT / "drive", ROOT / "routes.xml"
-    xyz = Log(_town()).T_world_ego[[0, -1], :3, 3]
-    points = "".join(f'<waypoint x="{x:.2f}" y="{-y:.2f}" z="{z:.2f}"/>' for x, y, z in xyz.tolist())
+    route = route_at(Log(_town()), 0)  # not the driven path, which a red light may cut short
+    assert route is not None
+    arc_m, xyz, start_m = route
+    ends = points_at(xyz, arc_m, start_m + np.array([0.0, ROUTE_M]))
+    points = "".join(f'<waypoint x="{x:.2f}" y="{-y:.2f}" z="{z:.2f}"/>' for x, y, z in ends.tolist())
     file.write_text(f'<routes><route id="short" town="{TOWN}">{points}</route></routes>\n')
     traffic = ("--vehicles", "3", "--people", "2", "--no-scenarios", "--no-sensors")
     arguments = ("drive", "--agent", "constant-velocity", "--routes", str(file), *traffic)
@@ -264,6 +270,7 @@ BENCHMARK = Benchmark(
         "image_hw": IMAGE_HW,
         "train_steps": TRAIN_STEPS,
         "rebuild_steps": REBUILD_STEPS,
+        "route_m": ROUTE_M,
         "bad_inputs": BAD_INPUTS,
     },
     decided_by=("benchmarks.faults", "benchmarks.common.killing", "foredrive.files", "foredrive.runs"),
