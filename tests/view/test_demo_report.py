@@ -1,5 +1,6 @@
 """The report of the demo: the loop is its table of contents, and a failed step does not stop the others."""
 
+import dataclasses
 import re
 from pathlib import Path
 
@@ -45,6 +46,13 @@ def test_a_step_that_fails_says_so_and_the_others_go_on(tmp_path: Path) -> None:
     assert (first.failure, last.failure) == ("", "")
     assert failed.section is None
     assert failed.failure == f"{tmp_path}: holds {EVIL}"
+
+
+def test_a_long_step_says_how_long_it_takes(tmp_path: Path) -> None:
+    size, lines = dataclasses.replace(quick_demo(), minutes={"Step1": 3}), list[str]()
+    do_steps(steps(section, section), Demo(size, tmp_path), lines.append)
+    assert lines == ["1/2 doing", "2/2 doing (about 3 min on two cores)"]
+    assert set(full_demo().minutes) == {step.title for step in STEPS}
 
 
 def test_an_error_of_the_program_is_told_in_one_line(tmp_path: Path) -> None:

@@ -4,7 +4,7 @@ import time
 from pathlib import Path
 
 from foredrive.cli.arguments import OptionalPath, check_out_folder
-from foredrive.cli.progress import progress_lines
+from foredrive.cli.progress import duration, progress_lines
 from foredrive.errors import InputError
 from foredrive.lazy import importing
 
@@ -26,17 +26,20 @@ def demo(out: OptionalPath = None, quick: bool = False) -> None:
         from foredrive.view.demo_steps import STEPS
         from foredrive.view.html import Provenance
 
-    started = time.perf_counter()
+    started = began = time.perf_counter()
+    size = quick_demo() if quick else full_demo()
     folder = out or Path("runs", "demo-quick" if quick else "demo")
     step = "demo"
 
     def tell(text: str) -> None:
-        nonlocal step
-        step = text
+        nonlocal step, began
+        step, began = text, time.perf_counter()
         print(text, flush=True)
 
-    with progress_lines(lambda: f"still {step}"):
-        outcomes = do_steps(STEPS, Demo(quick_demo() if quick else full_demo(), folder), tell)
+    total = f"{sum(size.minutes.values())} minutes" if size.minutes else "a minute"
+    print(f"{len(STEPS)} steps, about {total} on two cores", flush=True)
+    with progress_lines(lambda: f"still {step}: {duration(time.perf_counter() - began)}; in all"):
+        outcomes = do_steps(STEPS, Demo(size, folder), tell)
     report = folder / "report.html"
     write_demo_report(report, outcomes, Provenance.of(collect_provenance()))
     print(f"done in {time.perf_counter() - started:.0f} s: the report is {report}")

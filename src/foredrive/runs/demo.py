@@ -5,8 +5,8 @@ The folder is a 123D data root. What an earlier call has finished is not done ag
 
 import dataclasses
 import os
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from foredrive.data import LogPath
@@ -68,6 +68,8 @@ class DemoSize:
     """Id of the route of `ROUTES` that is driven."""
     examples: int
     """Number of moments that models are asked about for the pictures."""
+    minutes: Mapping[str, int] = field(default_factory=dict)
+    """Expected time of each step on two cores, min, by its title; without those that take seconds."""
 
 
 @dataclass(frozen=True)
@@ -133,6 +135,8 @@ def full_demo() -> DemoSize:
         ),
         route="28",
         examples=4,
+        # estimates: speeds of the parts in benchmarks/results (towns, real-to-sim), training time in README
+        minutes={"Record": 2, "See": 1, "Learn": 10, "Drive": 2, "Rebuild": 3, "Search": 1},
     )
 
 

@@ -73,7 +73,9 @@ def do_steps(steps: Sequence[Step], demo: Demo, say: Callable[[str], None]) -> l
     """
     outcomes = []
     for number, step in enumerate(steps, 1):
-        say(f"{number}/{len(steps)} {step.doing}")
+        minutes = demo.size.minutes.get(step.title)
+        expected = f" (about {minutes} min on two cores)" if minutes else ""
+        say(f"{number}/{len(steps)} {step.doing}{expected}")
         began, section, failure = time.perf_counter(), None, ""
         try:
             section = step.work(demo)
