@@ -18,6 +18,8 @@ from foredrive.scene import Clip
 FINE, COARSE, FINE_READ = 32, 48, 16
 """Channels of the features at strides 4 and 8, and how many of the former the cells read."""
 MEAN_GREY, SPREAD_GREY = 0.45, 0.25
+ACROSS_MPS = (-5.0, -2.5, 0.0, 2.5, 5.0)
+"""Speeds across the route, positive to the left, at which the frames before are compared with now."""
 
 
 @dataclass(frozen=True)
@@ -99,7 +101,8 @@ class CameraEyes(nn.Module):
         self.narrow = nn.ModuleList([nn.Conv2d(FINE, FINE_READ, 1) for _ in range(config.cameras)])
         views = config.cameras + config.frames - 1
         of_view = len(HEIGHTS_M) * (COARSE + FINE_READ + 1)
-        self.reader = RouteReader(views * of_view, FINE + COARSE, COARSE, config.cameras)
+        of_motion = (config.frames - 1) * len(HEIGHTS_M) * len(ACROSS_MPS)
+        self.reader = RouteReader(views * of_view + of_motion, FINE + COARSE, COARSE, config.cameras)
 
     def forward(self, clip: Clip) -> Sight:
         """Return what is seen of the route at now.
@@ -113,7 +116,10 @@ class CameraEyes(nn.Module):
         fine, coarse = features[-1]
         wide = F.interpolate(coarse.flatten(0, 1), size=fine.shape[-2:], mode="nearest")
         wide = wide.unflatten(0, coarse.shape[:2])
-        cells = self._read(frames, route_cells(clip.route_xy, clip.route_valid), features)
+        places = route_cells(clip.route_xy, clip.route_valid)
+        cells = torch.cat(
+            [self._read(frames, places, features), self._motion(frames, places, features)], dim=1
+        )
         sight: Sight = self.reader(clip, cells, torch.cat([fine, wide], dim=2), coarse.mean((-2, -1)))
         return sight
 
@@ -141,12 +147,9 @@ class CameraEyes(nn.Module):
         self, frames: Clip, cells: Float[Tensor, "b G L 2"], features: list[FrameFeatures]
     ) -> Float[Tensor, "b _N G L"]:
         """Return the features of all frames and cameras in the cells."""
-        b, count = cells.shape[0], len(HEIGHTS_M)
-        z = cells.new_tensor(HEIGHTS_M)[:, None, None, None].expand(count, *cells.shape[1:3], 1)
-        points = torch.cat([cells[:, None].expand(-1, count, -1, -1, -1), z.expand(b, *z.shape)], dim=-1)
-        points = points.flatten(1, 3)
+        count, points = len(HEIGHTS_M), _at_heights(cells)
         # Places of now in the ego frame of each key frame: features are read where the cameras were then.
-        T_frame_now = compose_se3(inverse_se3(frames.T_world_ego), frames.T_world_ego[:, -1:]).float()
+        T_frame_now = _from_now(frames)
         read = []
         for t, (fine, coarse) in enumerate(features):
             moved = transform_points(T_frame_now[:, t], points)
@@ -159,3 +162,45 @@ class CameraEyes(nn.Module):
             both = both.unflatten(-1, (count, *cells.shape[1:3])).permute(0, 1, 3, 2, 4, 5)
             read.append(both.flatten(1, 3))
         return torch.cat(read, dim=1)
+
+    def _motion(
+        self, frames: Clip, cells: Float[Tensor, "b G L 2"], features: list[FrameFeatures]
+    ) -> Float[Tensor, "b _N G L"]:
+        """Return how much each cell looks now as the places looked from which it would have been entered.
+
+        For each frame before, height and speed across the route of `ACROSS_MPS`: the cosine between the
+        features of the first camera in the cell now, and then in the place that moves into it at this speed.
+        """
+        count, shape = len(HEIGHTS_M), cells.shape[1:3]
+        points = _at_heights(cells)
+        T_frame_now = _from_now(frames)
+        left = (cells[:, :, -1:] - cells[:, :, :1]).expand(-1, -1, shape[1], -1)
+        left = F.normalize(left, dim=-1).flatten(1, 2).repeat(1, count, 1)
+        left = torch.cat([left, torch.zeros_like(left[..., :1])], dim=-1)
+
+        def looks(t: int, places: Float[Tensor, "b M 3"]) -> Float[Tensor, "b F M"]:
+            narrow = self.narrow[0](features[t].fine[:, 0])[:, None]
+            at = transform_points(T_frame_now[:, t], places)
+            seen = sample_cameras(narrow, frames.image_valid[:, t, :1], frames.rig[:, t, :1], at)
+            return F.normalize(seen[:, 0, :-1], dim=1)
+
+        now, cosines = looks(len(features) - 1, points), []
+        speeds = points.new_tensor(ACROSS_MPS)
+        for t in range(len(features) - 1):
+            gone_m = (frames.t_s[:, -1] - frames.t_s[:, t])[:, None] * speeds
+            before = points[:, None] - gone_m[..., None, None] * left[:, None]
+            then = looks(t, before.flatten(1, 2)).unflatten(-1, before.shape[1:3])
+            cosines.append((then * now[:, :, None]).sum(1).unflatten(-1, (count, *shape)).flatten(1, 2))
+        return torch.cat(cosines, dim=1) if cosines else points.new_zeros(len(points), 0, *shape)
+
+
+def _at_heights(cells: Float[Tensor, "b G L 2"]) -> Float[Tensor, "b N 3"]:
+    """Return the cells at each of `HEIGHTS_M` above the road, one height after the other."""
+    z = cells.new_tensor(HEIGHTS_M)[:, None, None, None].expand(-1, *cells.shape[1:3], 1)
+    xy = cells[:, None].expand(-1, len(HEIGHTS_M), -1, -1, -1)
+    return torch.cat([xy, z.expand(len(cells), -1, -1, -1, -1)], dim=-1).flatten(1, 3)
+
+
+def _from_now(frames: Clip) -> Float[Tensor, "b T 4 4"]:
+    """Return the transform from the ego frame at the last key frame to that of each."""
+    return compose_se3(inverse_se3(frames.T_world_ego), frames.T_world_ego[:, -1:]).float()

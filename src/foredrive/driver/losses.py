@@ -31,7 +31,7 @@ class SightWeights:
     """Factor for cells that are free now and occupied later: who crosses or cuts in."""
     user_pixels: float = 4.0
     user_cells: float = 4.0
-    user_velocity: float = 1.0
+    user_velocity: float = 2.0
     vulnerable: float = 4.0
     """Factor for the velocity of people and those on two wheels."""
 
@@ -128,7 +128,7 @@ def _user_losses(sight: Sight, clip: Clip, weights: SightWeights) -> dict[str, F
     is_cell = torch.where(cells.present, weights.occupied_cells, 1.0) * is_cell
     # Most vehicles stand or drive along: people and those on two wheels count more.
     vulnerable = torch.where(cells.present[:, 1], weights.vulnerable, 1.0)
-    error = F.smooth_l1_loss(velocity, cells.velocity / VELOCITY_SCALE_MPS, reduction="none", beta=0.2).sum(1)
+    error = F.mse_loss(velocity, cells.velocity / VELOCITY_SCALE_MPS, reduction="none").sum(1)
     error = vulnerable * error
     return {
         "user_pixels": weights.user_pixels
