@@ -7,12 +7,13 @@ import pytest
 import torch
 from path_truth import SPEC, sight_of, truth
 
-from foredrive.driver.eyes import CameraEyes, CameraEyesConfig
+from foredrive.driver.eyes import ACROSS_MPS, CameraEyes, CameraEyesConfig, FrameFeatures
 from foredrive.driver.losses import SightWeights, lamp_places, sight_losses
-from foredrive.driver.route_cells import BESIDE_M
+from foredrive.driver.route_cells import BESIDE_M, HEIGHTS_M
 from foredrive.driver.sight import VELOCITY_SCALE_MPS, line_m, occupied_at_constant_velocity, scaled_line
 from foredrive.driver.volume_eyes import VolumeEyes, VolumeEyesConfig
 from foredrive.errors import InputError
+from foredrive.geometry.projection import project
 from foredrive.geometry.se3 import inverse_se3, transform_points
 from foredrive.recipes.nemo import nemo_town
 from foredrive.scene import Example, VoxelSpec
@@ -173,3 +174,36 @@ def test_road_users_that_go_on_as_they_move_come_into_the_way() -> None:
         torch.testing.assert_close(occupied[1, step].detach(), wanted, atol=1e-5, rtol=0)
     occupied[1, 4, 4].backward()
     assert users.grad[1, 1, 3, BESIDE_M.index(8.5)] > 0
+
+
+@torch.no_grad()
+def test_what_moves_across_looks_as_it_did_where_it_was(make_example: Callable[..., Example]) -> None:
+    """A patch moves to the right at 2.5 m/s, seen from a vehicle that drives and turns; all else is plain."""
+    clip = make_example(spec=SPEC, batch=2, past=1, future=0, cameras=2).clip
+    network = eyes()
+    network.narrow[0].weight.copy_(torch.eye(16, 32)[..., None, None])
+    network.narrow[0].bias.zero_()
+    cells = torch.tensor([[[12.0, -4.0], [12.0, 0.0], [12.0, 4.0]]]).expand(2, 1, -1, -1)
+    left = torch.tensor([0.0, 1.0, 0.0])
+    dt_s = float(clip.t_s[0, 1] - clip.t_s[0, 0])
+    features = []
+    for t in (0, 1):
+        place = torch.tensor([12.0, 0.0, HEIGHTS_M[1]]) + (1 - t) * dt_s * 2.5 * left
+        T_frame_now = (inverse_se3(clip.T_world_ego[:, t]) @ clip.T_world_ego[:, 1]).float()
+        at = transform_points(T_frame_now, place.expand(2, 1, 3))
+        rig = clip.rig[:, t]
+        in_camera = transform_points(inverse_se3(rig.T_ego_cam[:, 0]), at)
+        uv, _, inside = project(in_camera, rig.K[:, 0], rig.dist[:, 0], rig.size_hw)
+        assert inside.all()
+        fine = torch.zeros(2, 2, 32, 64, 96)
+        fine[:, :, 0] = 1.0  # what all else looks like
+        for item in (0, 1):
+            scale = torch.tensor([96.0, 64.0]) / torch.tensor(rig.size_hw[::-1])
+            column, row = (uv[item, 0] * scale).long().tolist()
+            patch = torch.tensor([0.0, 1.0])[:, None, None]
+            fine[item, 0, :2, row - 1 : row + 2, column - 1 : column + 2] = patch
+        features.append(FrameFeatures(fine[:, : 1 + t], torch.zeros(2, 1 + t, 48, 4, 6)))
+    cosines = network._motion(clip, cells, features).view(2, 2, len(ACROSS_MPS), 3)[:, 1, :, 1]
+    assert cosines.argmax(-1).tolist() == [ACROSS_MPS.index(-2.5)] * 2
+    assert (cosines.amax(-1) > 0.8).all()
+    assert (cosines[:, ACROSS_MPS.index(0.0)] < 0.3).all()

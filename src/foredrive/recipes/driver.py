@@ -43,7 +43,7 @@ NO_VOXELS = VoxelSpec(lower_m=(-4.0, -4.0, -1.0), voxel_m=4.0, shape_zyx=(1, 2, 
 
 
 def driver_small() -> DriverRecipe:
-    """Return a driver of 0.9 M weights that sees two cameras and two key frames."""
+    """Return a driver of 0.7 M weights that sees two cameras and two key frames."""
     eyes = CameraEyesConfig()
     return DriverRecipe(
         name="driver_small",
