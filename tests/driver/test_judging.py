@@ -1,11 +1,14 @@
 """Figures of what a driver sees, counted by hand."""
 
+import dataclasses
 import math
 
 import numpy as np
 import pytest
+import torch
+from path_truth import sight_of, truth
 
-from foredrive.driver.judging import THRESHOLDS, Moment, _figures
+from foredrive.driver.judging import THRESHOLDS, Moment, _figures, _moment
 from foredrive.scene.traffic_light import LightState
 
 PLAIN = Moment(
@@ -87,3 +90,20 @@ def test_a_clip_is_missed_if_the_driver_would_act_wrongly() -> None:
     assert conflict(0.45, true=True).missed
     assert not conflict(0.55, true=True).missed
     assert not conflict(0.9, true=False).missed
+
+
+@pytest.mark.parametrize(("light", "met"), [(LightState.RED, False), (LightState.GREEN, True)])
+def test_who_is_met_beyond_a_red_light_is_no_conflict(light: LightState, met: bool) -> None:
+    """The line is 5 m ahead; somebody is 8 to 10 m ahead from one second on. The vehicle has 6 m/s."""
+    seen = truth(1)[0]
+    path = torch.stack([torch.arange(72.0), torch.zeros(72)], dim=-1)
+    seen = dataclasses.replace(
+        seen,
+        path_xy=path,
+        path_valid=torch.ones(72, dtype=torch.bool),
+        light=torch.tensor(int(light)),
+        lead_known=torch.tensor(False),
+    )
+    nothing = sight_of(1).estimate()[0]
+    moment = _moment(seen, nothing, 6.0, visible=True)
+    assert (moment.conflict, moment.crossing) == (met, met)
