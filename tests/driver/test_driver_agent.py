@@ -9,6 +9,7 @@ import torch
 from path_truth import SPEC, sight_of
 
 from foredrive.driver.agent import (
+    BEFORE_LINE_M,
     CREEPS,
     IMPATIENT,
     WAITS,
@@ -42,12 +43,20 @@ def test_a_red_light_is_remembered_at_its_line_and_forgotten_beyond_it() -> None
     assert state(memory.update(estimate(LightState.RED, 9.0), 0.0)) is LightState.RED
     view = memory.update(estimate(LightState.NONE), 4.0)  # at 5 m the lamps are out of the image
     assert state(view) is LightState.RED
-    assert float(view.light_m) == pytest.approx(5.0)
-    for _ in range(20):  # it waits
+    assert float(view.light_m) == pytest.approx(5.0 - BEFORE_LINE_M)
+    for _ in range(60):  # it waits for half a minute
         view = memory.update(estimate(LightState.NONE), 0.0)
     assert state(view) is LightState.RED
     assert state(memory.update(estimate(LightState.GREEN, 5.0), 0.0)) is LightState.GREEN
     assert state(memory.update(estimate(LightState.NONE), 12.0)) is LightState.NONE  # beyond the line
+
+
+def test_a_line_that_looks_farther_moves_less_than_one_that_looks_nearer() -> None:
+    for read_m, line_m in ((15.0, 9.9), (5.0, 7.0)):
+        memory = LightMemory()
+        memory.update(estimate(LightState.RED, 10.0), 0.0)
+        view = memory.update(estimate(LightState.RED, read_m), 1.0)
+        assert float(view.light_m) == pytest.approx(line_m - BEFORE_LINE_M)
 
 
 def test_a_light_that_was_seen_far_away_and_vanishes_fades() -> None:

@@ -30,8 +30,12 @@ FADES, LONGEST = 0.5, 5.0
 NEAR_M, OTHER_M = 7.0, 12.0
 """A light that is not seen is remembered within the first distance before its line. A distance that differs
 by more than the second is that of another light."""
-FORGETS = 30
-"""Plans without a lamp after which a light is forgotten."""
+NEARER, FARTHER, BEFORE_LINE_M = 0.5, 0.15, 0.7
+"""Shares by which a line that is seen nearer or farther than remembered moves it, and how far before it the
+vehicle stops."""
+FORGETS, STILL_M = 30, 0.02
+"""Plans without a lamp after which a light is forgotten; those over which the vehicle has moved less do not
+count."""
 STANDS_MPS = 0.2
 WAITS, CREEPS, IMPATIENT = 10, 8, 70
 """Plans that the vehicle stands without a red light before it creeps, for which it creeps, and after which it
@@ -86,9 +90,11 @@ class LightMemory:
             if self._line_m is None or abs(line_m - self._line_m) > OTHER_M:
                 self._line_m = line_m
             else:
-                self._line_m = 0.6 * self._line_m + 0.4 * line_m
+                # Lamps are read too far away more often than too near, and to stop too early costs less.
+                share = NEARER if line_m < self._line_m else FARTHER
+                self._line_m += share * (line_m - self._line_m)
         else:
-            self._unseen += 1
+            self._unseen += moved_m > STILL_M  # who stands before a light waits for it
             near = self._line_m is not None and -PASSED_M < self._line_m < NEAR_M
             self._evidence *= 1.0 if near else FADES
         if self._unseen > FORGETS or (self._line_m is not None and self._line_m < -PASSED_M):
@@ -100,9 +106,8 @@ class LightMemory:
         light = torch.zeros(4)
         light[LightState.YELLOW if self._yellow else LightState.RED] = stop
         light[LightState.GREEN] = 1 - stop
-        return PathEstimate(
-            light[None].to(view.light), torch.full_like(view.light_m, self._line_m), view.occupied
-        )
+        line_m = torch.full_like(view.light_m, self._line_m - BEFORE_LINE_M)
+        return PathEstimate(light[None].to(view.light), line_m, view.occupied)
 
     def forget(self) -> None:
         """Forget the light."""
