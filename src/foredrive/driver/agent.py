@@ -30,9 +30,9 @@ FADES, LONGEST = 0.5, 5.0
 NEAR_M, OTHER_M = 7.0, 12.0
 """A light that is not seen is remembered within the first distance before its line. A distance that differs
 by more than the second is that of another light."""
-NEARER, FARTHER, BEFORE_LINE_M = 0.5, 0.15, 0.7
+NEARER, FARTHER, BEFORE_LINE_M = 0.5, 0.15, 2.5
 """Shares by which a line that is seen nearer or farther than remembered moves it, and how far before it the
-vehicle stops."""
+vehicle stops: at the line itself half of the lamps are out of view."""
 FORGETS, STILL_M = 30, 0.02
 """Plans without a lamp after which a light is forgotten; those over which the vehicle has moved less do not
 count."""
