@@ -59,6 +59,14 @@ def test_a_line_that_looks_farther_moves_less_than_one_that_looks_nearer() -> No
         assert float(view.light_m) == pytest.approx(line_m - BEFORE_LINE_M)
 
 
+@pytest.mark.parametrize(("line_m", "stop_m"), [(8.0, 8.0 - BEFORE_LINE_M), (1.0, 0.0), (-2.0, -2.0)])
+def test_a_vehicle_stops_before_the_line_but_is_told_truly_how_far_beyond_it_is(
+    line_m: float, stop_m: float
+) -> None:
+    view = LightMemory().update(estimate(LightState.RED, line_m), 0.0)
+    assert float(view.light_m) == pytest.approx(stop_m)
+
+
 def test_a_light_that_was_seen_far_away_and_vanishes_fades() -> None:
     memory = LightMemory()
     memory.update(estimate(LightState.RED, 30.0, p=0.7), 0.0)

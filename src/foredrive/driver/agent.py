@@ -106,8 +106,9 @@ class LightMemory:
         light = torch.zeros(4)
         light[LightState.YELLOW if self._yellow else LightState.RED] = stop
         light[LightState.GREEN] = 1 - stop
-        line_m = torch.full_like(view.light_m, self._line_m - BEFORE_LINE_M)
-        return PathEstimate(light[None].to(view.light), line_m, view.occupied)
+        # Beyond the line the true distance counts: a red light holds until the judged point has crossed.
+        stop_m = max(self._line_m - BEFORE_LINE_M, min(self._line_m, 0.0))
+        return PathEstimate(light[None].to(view.light), torch.full_like(view.light_m, stop_m), view.occupied)
 
     def forget(self) -> None:
         """Forget the light."""

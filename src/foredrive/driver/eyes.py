@@ -180,11 +180,12 @@ class CameraEyes(nn.Module):
 
         def looks(t: int, places: Float[Tensor, "b M 3"]) -> Float[Tensor, "b F M"]:
             narrow = self.narrow[0](features[t].fine[:, 0])[:, None]
-            at = transform_points(T_frame_now[:, t], places)
-            seen = sample_cameras(narrow, frames.image_valid[:, t, :1], frames.rig[:, t, :1], at)
+            moved = transform_points(T_frame_now[:, t], places)
+            seen = sample_cameras(narrow, frames.image_valid[:, t, :1], frames.rig[:, t, :1], moved)
             return F.normalize(seen[:, 0, :-1], dim=1)
 
         now, cosines = looks(len(features) - 1, points), []
+        # What moves into a cell at a speed across the route was that far to the other side then.
         speeds = points.new_tensor(ACROSS_MPS)
         for t in range(len(features) - 1):
             gone_m = (frames.t_s[:, -1] - frames.t_s[:, t])[:, None] * speeds

@@ -103,8 +103,8 @@ def road_user_cells(clip: Clip) -> RoadUserCells:
     across = (across / across.norm(dim=-1, keepdim=True))[:, :, None]
     forward = velocity[..., 0] * across[..., 1] - velocity[..., 1] * across[..., 0]
     moved = torch.stack([forward, (velocity * across).sum(-1)], dim=1)
-    known = mine.any(-1).unflatten(1, shape) & velocity.isfinite().all(-1)
-    return RoadUserCells(present, present | ~filled(hidden), moved.nan_to_num(), known)
+    measured = mine.any(-1).unflatten(1, shape) & velocity.isfinite().all(-1)
+    return RoadUserCells(present, present | ~filled(hidden), moved.nan_to_num(), measured)
 
 
 def _kinds(boxes: Boxes) -> tuple[Bool[Tensor, "b K M"], Bool[Tensor, "b K M"]]:

@@ -36,8 +36,8 @@ class Sight(Record):
     """The distance of the stop line as it is read at each place: log((m + 4) / 20)."""
     occupied_logits: Float[Tensor, "b T G"]
     user_pixels: Float[Tensor, "b C K h w"]
-    """Whether a road user of each kind is at a place of an image. Training alone reads this and `user_cells`:
-    they teach the features where road users are and how they move."""
+    """Tells whether a road user of each kind is at a place of an image. Training alone reads it: it teaches
+    the features where road users are."""
     user_cells: Float[Tensor, "b U G L"]
     """The same for the cells along and beside the route; then the velocity along the route and to its left,
     in `VELOCITY_SCALE_MPS`."""
@@ -223,12 +223,12 @@ def occupied_at_constant_velocity(users: Float[Tensor, "b U G L"]) -> Float[Tens
     velocity = VELOCITY_SCALE_MPS * users[:, kinds:]
     t_s = LATER_DT_S * torch.arange(TIMES, device=users.device)[:, None, None]
     first = torch.arange(along, device=users.device)[:, None]
-    at = (first + velocity[:, None, 0] * t_s / CELL_M).round().long()
+    cell = (first + velocity[:, None, 0] * t_s / CELL_M).round().long()
     beside_m = users.new_tensor(BESIDE_M) + velocity[:, None, 1] * t_s
     in_way = (1 - (beside_m.abs() - HALF_WIDTH_M) / FADES_M).clamp(0, 1)
-    weight = probability[:, None] * in_way * ((at >= 0) & (at < along))
+    weight = probability[:, None] * in_way * ((cell >= 0) & (cell < along))
     occupied = users.new_zeros(b, TIMES, along)
-    return occupied.scatter_reduce(2, at.clamp(0, along - 1).flatten(2), weight.flatten(2), "amax")
+    return occupied.scatter_reduce(2, cell.clamp(0, along - 1).flatten(2), weight.flatten(2), "amax")
 
 
 def conv_block(inputs: int, outputs: int, size: int = 3, stride: int = 2) -> nn.Sequential:

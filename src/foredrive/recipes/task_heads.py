@@ -137,8 +137,8 @@ def _heads_of(tasks: Sequence[str], sizes: TaskHeadsConfig, schedule: Schedule) 
     for task in tasks:
         if task not in (*HEADED, INSTANCES):
             known = "has no head" if task in get_args(Task) else "is unknown"
-            there = ", ".join((*HEADED, INSTANCES))
-            raise InputError(f"the task {task!r} {known}; heads can be trained for {there}")
+            headed = ", ".join((*HEADED, INSTANCES))
+            raise InputError(f"the task {task!r} {known}; heads can be trained for {headed}")
     agents = sizes.agents if {"detection", "motion", "tracking", INSTANCES} & set(tasks) else None
     if agents is not None and "motion" not in tasks:
         agents = replace(agents, motion=None)

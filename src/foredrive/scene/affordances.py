@@ -1,4 +1,4 @@
-"""What a driver must see of its path: the next traffic light, and who is in the path, now and later."""
+"""Holds what a driver must see of its path: the next traffic light, and who is in the path, now and later."""
 
 from dataclasses import dataclass
 

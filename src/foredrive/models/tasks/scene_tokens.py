@@ -46,10 +46,10 @@ class SceneTokens(nn.Module):
         self, attends: tuple[Attended, ...], heads: TaskHeadsConfig | None, spec: VoxelSpec, width: int
     ) -> None:
         super().__init__()
-        there = {"agents": heads and heads.agents, "map": heads and heads.elements}
+        heads_of = {"agents": heads and heads.agents, "map": heads and heads.elements}
         tasks = {"agents": "detection", "map": "map"}
         for name in attends:
-            if heads is None or there[name] is None:
+            if heads is None or heads_of[name] is None:
                 raise InputError(
                     f"planner.attends names {name}, but no head finds them: train with {tasks[name]}"
                 )
