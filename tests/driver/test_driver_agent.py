@@ -76,6 +76,16 @@ def test_a_light_that_was_seen_far_away_and_vanishes_fades() -> None:
     assert stops[-1] == pytest.approx(0.5, abs=0.02)
 
 
+def test_doubt_that_there_is_a_light_does_not_turn_it_green() -> None:
+    memory = LightMemory()
+    unsure = PathEstimate(
+        torch.tensor([[0.35, 0.26, 0.15, 0.24]]), torch.tensor([8.0]), torch.zeros(1, TIMES, CELLS)
+    )
+    for _ in range(20):
+        view = memory.update(unsure, 0.0)
+    assert state(view) is LightState.RED  # .41 to .24
+
+
 def test_one_wrong_frame_does_not_turn_a_light() -> None:
     memory = LightMemory()
     for _ in range(4):

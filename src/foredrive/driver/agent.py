@@ -84,7 +84,8 @@ class LightMemory:
             self._line_m -= moved_m
         stops = p[LightState.RED] + p[LightState.YELLOW]
         if 1 - p[LightState.NONE] > SEEN:
-            odds = float(np.log((stops + 0.02) / (1.02 - stops)))
+            # Given that there is a light: what says that there is none does not say green.
+            odds = float(np.log((stops + 0.02) / (p[LightState.GREEN] + 0.02)))
             self._evidence = float(np.clip(FADES * self._evidence + odds, -LONGEST, LONGEST))
             self._unseen, self._yellow = 0, p[LightState.YELLOW] > p[LightState.RED]
             if self._line_m is None or abs(line_m - self._line_m) > OTHER_M:
