@@ -59,6 +59,18 @@ def test_a_line_that_looks_farther_moves_less_than_one_that_looks_nearer() -> No
         assert float(view.light_m) == pytest.approx(line_m - BEFORE_LINE_M)
 
 
+def test_a_line_jumps_nearer_at_once_and_farther_after_three_readings() -> None:
+    memory = LightMemory()
+    memory.update(estimate(LightState.RED, 8.0), 0.0)
+    for _ in range(2):
+        view = memory.update(estimate(LightState.RED, 25.0), 0.0)
+        assert float(view.light_m) == pytest.approx(8.0 - BEFORE_LINE_M)
+    view = memory.update(estimate(LightState.RED, 25.0), 0.0)
+    assert float(view.light_m) == pytest.approx(25.0 - BEFORE_LINE_M)
+    view = memory.update(estimate(LightState.RED, 8.0), 0.0)
+    assert float(view.light_m) == pytest.approx(8.0 - BEFORE_LINE_M)
+
+
 @pytest.mark.parametrize(("line_m", "stop_m"), [(8.0, 8.0 - BEFORE_LINE_M), (1.0, 0.0), (-2.0, -2.0)])
 def test_a_vehicle_stops_before_the_line_but_is_told_truly_how_far_beyond_it_is(
     line_m: float, stop_m: float

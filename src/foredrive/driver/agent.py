@@ -29,7 +29,9 @@ FADES, LONGEST = 0.5, 5.0
 """Share of the evidence for a stop that is kept from plan to plan, and its bound (logit)."""
 NEAR_M, OTHER_M = 7.0, 12.0
 """A light that is not seen is remembered within the first distance before its line. A distance that differs
-by more than the second is that of another light."""
+by more than the second is that of another light: at once if it is nearer, else when it is read again."""
+CONFIRMED = 3
+"""Readings in a row that make a farther light the next one."""
 NEARER, FARTHER, BEFORE_LINE_M = 0.5, 0.15, 2.5
 """Shares by which a line that is seen nearer or farther than remembered moves it, and how far before it the
 vehicle stops: at the line itself half of the lamps are out of view."""
@@ -70,7 +72,7 @@ class LightMemory:
         self._evidence = 0.0
         """Logarithm of the odds that the light stops the vehicle."""
         self._line_m: float | None = None
-        self._unseen, self._yellow = 0, False
+        self._unseen, self._farther, self._yellow = 0, 0, False
 
     def update(self, view: PathEstimate, moved_m: float) -> PathEstimate:
         """Return the view with the light that is seen or remembered.
@@ -88,12 +90,7 @@ class LightMemory:
             odds = float(np.log((stops + 0.02) / (p[LightState.GREEN] + 0.02)))
             self._evidence = float(np.clip(FADES * self._evidence + odds, -LONGEST, LONGEST))
             self._unseen, self._yellow = 0, p[LightState.YELLOW] > p[LightState.RED]
-            if self._line_m is None or abs(line_m - self._line_m) > OTHER_M:
-                self._line_m = line_m
-            else:
-                # Lamps are read too far away more often than too near, and to stop too early costs less.
-                share = NEARER if line_m < self._line_m else FARTHER
-                self._line_m += share * (line_m - self._line_m)
+            self._move_line(line_m)
         else:
             self._unseen += moved_m > STILL_M  # who stands before a light waits for it
             near = self._line_m is not None and -PASSED_M < self._line_m < NEAR_M
@@ -111,9 +108,19 @@ class LightMemory:
         stop_m = max(self._line_m - BEFORE_LINE_M, min(self._line_m, 0.0))
         return PathEstimate(light[None].to(view.light), torch.full_like(view.light_m, stop_m), view.occupied)
 
+    def _move_line(self, line_m: float) -> None:
+        """Take in a reading of the distance of the line."""
+        beyond_m = 0.0 if self._line_m is None else line_m - self._line_m
+        self._farther = self._farther + 1 if beyond_m > OTHER_M else 0
+        if self._line_m is None or beyond_m < -OTHER_M or self._farther >= CONFIRMED:
+            self._line_m, self._farther = line_m, 0
+        elif self._farther == 0:
+            # Lamps are read too far away more often than too near, and to stop too early costs less.
+            self._line_m += (NEARER if beyond_m < 0 else FARTHER) * beyond_m
+
     def forget(self) -> None:
         """Forget the light."""
-        self._evidence, self._line_m, self._unseen = 0.0, None, 0
+        self._evidence, self._line_m, self._unseen, self._farther = 0.0, None, 0, 0
 
 
 class Perception:
