@@ -94,8 +94,9 @@ FRONT_TELE = RigPlan(
     (96, 256),
     {"PCAM_F0": Mount((1.70, 0.00, 1.60), 0.0, 100.0, 2.0), TELE: Mount((1.70, 0.00, 1.65), 0.0, 45.0, 4.0)},
 )
-"""A wide and a narrow front camera: what a small driver sees. From a stop line, the lamps beyond a junction are
-up to 20° aside, where the wide camera shows them in less than a pixel. The narrow one has 2 px at 40 m."""
+"""A wide and a narrow front camera: what a small driver sees. From a stop line, the lamps beyond a junction
+are up to 20° aside, where the wide camera shows them in less than a pixel. The narrow one has 2 px at 40 m.
+"""
 RIGS: Mapping[str, RigPlan] = {"surround": SURROUND, "driving": DRIVING, "front_tele": FRONT_TELE}
 
 
