@@ -12,10 +12,10 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from benchmarks.common.study import PLANNERS, work_folder
-from foredrive.evaluation.bench import Benchmark
-from foredrive.evaluation.summary import numbers, read_summary
-from foredrive.metrics.protocols import PROTOCOLS
-from foredrive.training import read_metrics
+from foredrive.engine.bench import Benchmark
+from foredrive.engine.metrics_log import read_metrics
+from foredrive.engine.summary import numbers, read_summary
+from foredrive.tasks.planning.protocols import PROTOCOLS
 
 WORK = work_folder(Path("runs/demo_benchmark"))
 STAGES = ("pretrain", "finetune")

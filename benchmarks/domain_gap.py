@@ -16,9 +16,9 @@ import torch
 from jaxtyping import Float, UInt8
 
 from foredrive.data import ClipConfig, ClipDataset
-from foredrive.data.convert import convert
+from foredrive.data.formats.convert import convert
+from foredrive.engine.bench import Benchmark
 from foredrive.errors import InputError
-from foredrive.evaluation.bench import Benchmark
 from foredrive.scene import LidarSweep, VoxelSpec
 from foredrive.scene.conditions import CONDITIONS
 from foredrive.sensors.rigs import camera_rig

@@ -9,9 +9,9 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from benchmarks.common.study import work_folder
+from foredrive.engine.bench import Benchmark
+from foredrive.engine.summary import numbers
 from foredrive.errors import InputError
-from foredrive.evaluation.bench import Benchmark
-from foredrive.evaluation.summary import numbers
 from foredrive.runs.drive.in_towns import TownRoutes
 from foredrive.runs.drive.records import summarise
 from foredrive.runs.drive.suite import DriveSuite, drive_suite

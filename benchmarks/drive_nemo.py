@@ -33,21 +33,21 @@ from benchmarks.common.driver_study import (
 )
 from benchmarks.common.study import seeded
 from foredrive.data import LogPath, find_all_logs
+from foredrive.driver.recipes import DRIVER_RECIPES, DriverRecipe
+from foredrive.driving.drive_record import DriveRecord
+from foredrive.engine.bench import Benchmark, study_identity
 from foredrive.errors import InputError
-from foredrive.evaluation.bench import Benchmark, study_identity
-from foredrive.metrics.bootstrap import bootstrap_mean
-from foredrive.recipes import find_recipe
-from foredrive.recipes.config import rescheduled
-from foredrive.recipes.driver import DRIVER_RECIPES, DriverRecipe
+from foredrive.methods.recipe import rescheduled
 from foredrive.runs.drive.agents import CONSTANT_VELOCITY, EXPERT, IDM, STOP, rig_of
 from foredrive.runs.drive.compare import values_of
 from foredrive.runs.drive.in_towns import TownRoutes
 from foredrive.runs.drive.suite import DriveSuite, SuiteResult, drive_suite
+from foredrive.runs.recipes.known import find_recipe
 from foredrive.runs.shipped import run_folder
 from foredrive.runs.train.driver import DriverRun
 from foredrive.runs.train.run import train_run
 from foredrive.sensors.rigs import FRONT_TELE, SURROUND
-from foredrive.simulation.drive_record import DriveRecord
+from foredrive.tasks.bootstrap import bootstrap_mean
 
 EGO_SEEDS, NEMO_EGO_SEEDS = 10, 3
 """Seeds of the towns from which the small driver learns, and from which those with NeMo's volume do."""
@@ -71,12 +71,11 @@ CONFIG = {
     "repetitions": REPETITIONS,
 }
 DECIDED_BY = (
-    "foredrive.simulation",
+    "foredrive.driving",
     "foredrive.towns",
-    "foredrive.driver",
-    "foredrive.models",
-    "foredrive.losses",
-    "foredrive.training",
+    "foredrive.methods",
+    "foredrive.tasks",
+    "foredrive.engine",
     "foredrive.data",
 )
 WORK = Path("runs/drive_nemo") / study_identity(CONFIG, DECIDED_BY)

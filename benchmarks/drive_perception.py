@@ -24,8 +24,8 @@ from benchmarks.common.driver_study import (
     test_egos,
     trained,
 )
-from foredrive.evaluation.bench import Benchmark, study_identity
-from foredrive.recipes.driver import DRIVER_RECIPES, DriverRecipe
+from foredrive.driver.recipes import DRIVER_RECIPES, DriverRecipe
+from foredrive.engine.bench import Benchmark, study_identity
 from foredrive.runs.shipped import run_folder
 from foredrive.sensors.rigs import FRONT_TELE
 
@@ -34,7 +34,12 @@ CURVE = (1, 2, 5, 10, 19)
 SEEDS_OF_ARMS = 5
 """Seeds of the towns that the other arms learn from."""
 CORES = len(os.sched_getaffinity(0))
-DECIDED_BY = ("foredrive.driver", "foredrive.data.affordances", "foredrive.geometry", "foredrive.towns")
+DECIDED_BY = (
+    "foredrive.driver",
+    "foredrive.data.truth.affordances",
+    "foredrive.geometry",
+    "foredrive.towns",
+)
 CONFIG = {
     "recipes": {name: dataclasses.asdict(recipe) for name, recipe in DRIVER_RECIPES.items()},
     "egos": [EGOS, TEST_EGOS],

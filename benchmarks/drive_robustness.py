@@ -12,14 +12,14 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.common.study import work_folder
+from foredrive.driving.faults import CameraFault, Faults
+from foredrive.engine.bench import Benchmark
 from foredrive.errors import InputError
-from foredrive.evaluation.bench import Benchmark
 from foredrive.runs.drive.agents import rig_of
 from foredrive.runs.drive.compare import values_of
 from foredrive.runs.drive.in_towns import TownRoutes
 from foredrive.runs.drive.suite import DriveSuite, drive_suite
 from foredrive.sensors.rigs import TELE
-from foredrive.simulation.faults import CameraFault, Faults
 
 WORK = work_folder(Path("runs/drive_robustness"))
 AGENT = os.environ.get("FOREDRIVE_AGENT", "embedded")
@@ -88,5 +88,5 @@ BENCHMARK = Benchmark(
     question="How much of its score does a driver lose when an input fails?",
     arms={name: arm(name, **changes) for name, changes in CHANGES.items()},
     config={"agent": AGENT, "routes": ROUTES, "from_s": FROM_S, "raised_m": RAISED_M},
-    decided_by=("foredrive.simulation", "foredrive.towns", "foredrive.models"),
+    decided_by=("foredrive.driving", "foredrive.towns", "foredrive.methods"),
 )

@@ -19,23 +19,23 @@ import torch
 from benchmarks.common.measuring import held_mib
 from foredrive.data.batches import stack_records
 from foredrive.data.resizing import shrink_images
-from foredrive.evaluation.bench import Benchmark
-from foredrive.recipes import find_recipe
+from foredrive.driving.controller import ControllerState, follow
+from foredrive.driving.dynamics import STEP_S
+from foredrive.driving.observation import FRAME_DT_S
+from foredrive.driving.plans import fixed_in_world
+from foredrive.driving.route_sets import load_route_set
+from foredrive.engine.bench import Benchmark
 from foredrive.runs.build import build_agent
 from foredrive.runs.drive.in_towns import TownRoutes
 from foredrive.runs.drive.suite import DriveSuite, drive_one
+from foredrive.runs.recipes.known import find_recipe
 from foredrive.scene import Clip
 from foredrive.scene.conditions import BackgroundTraffic
 from foredrive.sensors.rigs import DRIVING, TELE, RigPlan, camera_rig
 from foredrive.sensors.vehicle import roof_lidar
-from foredrive.simulation.controller import ControllerState, follow
-from foredrive.simulation.dynamics import STEP_S
-from foredrive.simulation.observation import FRAME_DT_S
-from foredrive.simulation.plans import fixed_in_world
-from foredrive.simulation.route_sets import load_route_set
-from foredrive.simulation.routes import snap_route
-from foredrive.simulation.town import TownScenario, TownSimulator
-from foredrive.simulation.town_expert import TownExpert
+from foredrive.towns.driving.routes import snap_route
+from foredrive.towns.driving.town import TownScenario, TownSimulator
+from foredrive.towns.driving.town_expert import TownExpert
 from foredrive.towns.sensing.capture import SensorSuite
 
 TRAFFIC = BackgroundTraffic(vehicles=40, pedestrians=20)

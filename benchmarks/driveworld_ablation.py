@@ -20,9 +20,9 @@ from benchmarks.common.study import (
     shortened,
     work_folder,
 )
-from foredrive.evaluation.bench import Benchmark
-from foredrive.recipes import RECIPES, Recipe
-from foredrive.recipes.config import rescheduled
+from foredrive.engine.bench import Benchmark
+from foredrive.methods.recipe import Recipe, rescheduled
+from foredrive.runs.recipes.known import RECIPES
 
 WORK = work_folder(Path("runs/nemo_study"))
 TOWNS = StudyTowns()

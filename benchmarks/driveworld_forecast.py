@@ -18,8 +18,8 @@ from benchmarks.common.study import (
     shortened,
     work_folder,
 )
-from foredrive.evaluation.bench import Benchmark
-from foredrive.recipes import RECIPES
+from foredrive.engine.bench import Benchmark
+from foredrive.runs.recipes.known import RECIPES
 from foredrive.runs.train.run import train_run
 
 WORK = work_folder(Path("runs/nemo_study"))

@@ -10,9 +10,9 @@ from pathlib import Path
 
 from benchmarks.common.forecast import forecasting, judge_forecast
 from benchmarks.common.study import StudyTowns, record_study, seeded, shortened, work_folder
-from foredrive.evaluation.bench import Benchmark
-from foredrive.recipes import RECIPES
-from foredrive.recipes.config import Recipe
+from foredrive.engine.bench import Benchmark
+from foredrive.methods.recipe import Recipe
+from foredrive.runs.recipes.known import RECIPES
 from foredrive.runs.train.run import train_run
 
 WORK = work_folder(Path("runs/nemo_study"))

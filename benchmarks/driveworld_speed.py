@@ -14,14 +14,15 @@ import torch
 
 from benchmarks.common.measuring import Took, forget_peak, measure, peak_mib
 from foredrive.data import collate
-from foredrive.evaluation.bench import Benchmark
-from foredrive.recipes import RECIPES, Recipe
+from foredrive.engine.bench import Benchmark
+from foredrive.engine.fabric import make_fabric
+from foredrive.methods.recipe import Recipe
 from foredrive.runs.build import build_agent, build_objective
 from foredrive.runs.drive.recording import record_drives
 from foredrive.runs.open_clips import open_clips
+from foredrive.runs.recipes.known import RECIPES
 from foredrive.sensors.rigs import SURROUND
 from foredrive.towns.campaign import Campaign, plan_drives
-from foredrive.training import make_fabric
 
 DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
 PLANS = plan_drives(Campaign(("Town01",), (1,), seconds=20.0, rate_hz=2.0))

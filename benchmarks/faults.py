@@ -32,10 +32,10 @@ from benchmarks.common.program_server import ProgramServer
 from foredrive.data.commands import route_at
 from foredrive.data.log_paths import LogPath, find_logs
 from foredrive.data.logs import Log
-from foredrive.evaluation.bench import Benchmark
+from foredrive.engine.bench import Benchmark
+from foredrive.engine.config import save_recipe
 from foredrive.geometry.polylines import points_at
-from foredrive.recipes import find_recipe
-from foredrive.recipes.config import save_recipe
+from foredrive.runs.recipes.known import find_recipe
 from foredrive.scene import VoxelSpec
 
 ROOT = Path("runs/faults").absolute()
@@ -61,12 +61,12 @@ BAD_INPUTS = (
     "tests/data/test_bad_files.py",
     "tests/data/test_damaged_clips.py",
     "tests/data/test_safe_pickle.py",
-    "tests/integration/test_bad_input.py",
+    "tests/end_to_end/test_bad_input.py",
 )
 PRELUDE = """
 import foredrive.runs.drive.recording, foredrive.runs.drive.suite, foredrive.runs.drive.in_towns
 import foredrive.runs.convert, foredrive.runs.train.run, foredrive.runs.rebuild.reconstruct
-import foredrive.runs.search.indexing, foredrive.runs.score.run, foredrive.training.fabric
+import foredrive.runs.search.indexing, foredrive.runs.score.run, foredrive.engine.fabric
 import foredrive.runs.evaluate.run, foredrive.view.run_report
 import foredrive.view.score_report, foredrive.view.drive_report, foredrive.view.rebuilt_sheet
 import lancedb

@@ -19,17 +19,17 @@ import torch
 from torch import Tensor
 
 from benchmarks.common.measuring import in_a_process, measure
-from foredrive.cli.memory import keep_freed_memory
-from foredrive.evaluation.bench import Benchmark
+from foredrive.cli.main import keep_freed_memory
+from foredrive.engine.bench import Benchmark
 from foredrive.geometry.se3 import exp_se3
+from foredrive.methods.neurad.recipes import tiny_field
+from foredrive.methods.neurad.scene import FieldScene
+from foredrive.methods.rebuilding.tracks import ActorTracks
+from foredrive.methods.rebuilding.training import SensorViews, make_optimizer
+from foredrive.methods.rebuilding.views import CameraView, SweepView
 from foredrive.ops.hash_grid import Level, grid_levels, read_hash_grid, read_hash_grid_reference
-from foredrive.recipes.field import tiny_field
-from foredrive.rendering.field.scene import FieldScene
-from foredrive.rendering.tracks import ActorTracks
-from foredrive.rendering.views import CameraView, SweepView
 from foredrive.scene import LidarSweep
 from foredrive.sensors import pandar64
-from foredrive.training.rebuilding import SensorViews, make_optimizer
 
 RUNS, POINTS, REFERENCE_POINTS = 7, 2**20, 2**16
 CAM_AHEAD = torch.tensor([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])

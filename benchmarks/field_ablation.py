@@ -13,9 +13,9 @@ from typing import Any
 
 from benchmarks.common.study import pandaset_log
 from benchmarks.rebuild_pandaset import FIGURES
-from foredrive.evaluation.bench import Benchmark, study_identity
-from foredrive.recipes.rebuilding import RebuildRecipe, field_tiny, rescheduled_recipe
+from foredrive.engine.bench import Benchmark, study_identity
 from foredrive.runs.rebuild.reconstruct import reconstruct
+from foredrive.runs.recipes.rebuilding import RebuildRecipe, field_tiny, rescheduled_recipe
 
 ROOT = Path("runs/field_ablation")
 STEPS = 1500
@@ -47,15 +47,13 @@ ARMS: dict[str, RebuildRecipe[Any]] = {
     "static_only": dataclasses.replace(SHORT, actors=False),
 }
 DECIDED_BY = (
-    "foredrive.evaluation.rendering",
-    "foredrive.losses.field",
-    "foredrive.losses.rendering",
+    "foredrive.methods.neurad.losses",
+    "foredrive.methods.splatad.losses",
     "foredrive.ops.hash_grid",
     "foredrive.ops.ray_boxes",
-    "foredrive.recipes.field",
-    "foredrive.rendering",
-    "foredrive.training.field_training",
-    "foredrive.training.rebuilding",
+    "foredrive.methods.neurad.recipes",
+    "foredrive.methods.rebuilding",
+    "foredrive.methods.neurad.training",
 )
 CONFIG = {"arms": {arm: dataclasses.asdict(recipe) for arm, recipe in ARMS.items()}}
 WORK = ROOT / study_identity(CONFIG, DECIDED_BY)

@@ -23,17 +23,18 @@ from torch.utils.data import DataLoader
 from benchmarks.common.study import seeded
 from benchmarks.learning_towns import TEST_TOWNS, learning_digest, plan_learning, record_missing
 from foredrive.data import ClipDataset, LogPath, collate
-from foredrive.evaluation.bench import Benchmark, study_identity
-from foredrive.evaluation.metrics.occupancy import CONTINUED, EGO_COMPENSATED, OccupancyMetric
-from foredrive.evaluation.metrics.vehicles import VehicleMetric
-from foredrive.evaluation.run import evaluate
-from foredrive.evaluation.summary import numbers
-from foredrive.recipes import find_recipe
-from foredrive.recipes.config import Recipe, load_recipe, rescheduled
+from foredrive.engine.bench import Benchmark, study_identity
+from foredrive.engine.metrics_log import read_metrics
+from foredrive.engine.summary import numbers
+from foredrive.methods.recipe import Recipe, rescheduled
 from foredrive.runs.drive.recording import log_of
 from foredrive.runs.evaluate.predict import AgentPredictor
+from foredrive.runs.recipes.known import find_recipe
+from foredrive.runs.recipes.world_models import load_recipe
 from foredrive.runs.train.run import Run, load_agent, train_run
-from foredrive.training import read_metrics
+from foredrive.tasks.evaluation.run import evaluate
+from foredrive.tasks.occupancy.occupancy_metric import CONTINUED, EGO_COMPENSATED, OccupancyMetric
+from foredrive.tasks.occupancy.vehicles_metric import VehicleMetric
 
 ROOT = Path("runs/learning")
 DRIVES = ROOT / "drives"
@@ -44,23 +45,20 @@ RECIPES: Mapping[str, Recipe[Any, Any]] = {
 JUDGED_EVERY_S = 1.0
 PROBE_STEPS, PROBE_DRIVES = 40, 2
 DECIDED_BY = (
-    "foredrive.data.accumulated_labels",
+    "foredrive.data.label_store",
     "foredrive.data.clips",
     "foredrive.data.labels",
     "foredrive.geometry",
-    "foredrive.losses",
-    "foredrive.metrics.occupancy",
-    "foredrive.metrics.vehicles",
-    "foredrive.models.averaging",
-    "foredrive.models.backbone",
-    "foredrive.models.lifting",
-    "foredrive.models.nemo",
-    "foredrive.models.plane_context",
-    "foredrive.training.augmentation",
-    "foredrive.training.loop",
-    "foredrive.training.objective",
-    "foredrive.training.parameter_groups",
-    "foredrive.training.rays",
+    "foredrive.tasks",
+    "foredrive.methods.blocks.averaging",
+    "foredrive.methods.blocks.backbone",
+    "foredrive.methods.blocks.lifting",
+    "foredrive.methods.nemo",
+    "foredrive.methods.blocks.plane_context",
+    "foredrive.data.augmentation",
+    "foredrive.engine.loop",
+    "foredrive.engine.parameter_groups",
+    "foredrive.methods.blocks.training_rays",
 )
 
 

@@ -17,11 +17,11 @@ from torch.utils.data import DataLoader
 
 from benchmarks.common.process_tree import tree_use
 from foredrive.data import ClipDataset, collate, find_logs
-from foredrive.evaluation.bench import Benchmark
-from foredrive.recipes import find_recipe
+from foredrive.engine.bench import Benchmark
+from foredrive.engine.interrupts import start_fork_server
+from foredrive.runs.recipes.known import find_recipe
 from foredrive.scene import Example
 from foredrive.towns.recorder import record
-from foredrive.training.interrupts import start_fork_server
 
 TOWN, SECONDS = "Town02", 30.0
 WORKERS, BATCH_SIZE, CLIPS, LOGS = 2, 4, 5000, 40

@@ -17,11 +17,11 @@ from pathlib import Path
 
 from benchmarks.common.safety_suites import DRIVES, REBUILDING, SuiteSize, driven_suite, rebuilt_town
 from benchmarks.common.study import pandaset_log
+from foredrive.engine.bench import Benchmark, study_identity
 from foredrive.errors import InputError
-from foredrive.evaluation.bench import Benchmark, study_identity
-from foredrive.recipes.rebuilding import gaussians_tiny
 from foredrive.runs.drive.in_ncap import propose_scenarios
 from foredrive.runs.rebuild.reconstruct import reconstruct
+from foredrive.runs.recipes.rebuilding import gaussians_tiny
 
 SIZE = SuiteSize()
 WORKERS = len(os.sched_getaffinity(0))
@@ -48,14 +48,13 @@ CONFIG = {
 }
 DECIDED_BY = (
     "benchmarks.common.safety_suites",
-    "foredrive.rendering",
-    "foredrive.simulation.collisions",
-    "foredrive.simulation.controller",
-    "foredrive.simulation.dynamics",
-    "foredrive.simulation.ncap",
-    "foredrive.simulation.rebuilt",
-    "foredrive.training.gaussian_training",
-    "foredrive.training.rebuilding",
+    "foredrive.methods.rebuilding",
+    "foredrive.driving.collisions",
+    "foredrive.driving.controller",
+    "foredrive.driving.dynamics",
+    "foredrive.driving.ncap",
+    "foredrive.driving.replay.rebuilt",
+    "foredrive.methods.splatad.training",
 )
 WORK = Path("runs/ncap") / study_identity(CONFIG, DECIDED_BY)
 

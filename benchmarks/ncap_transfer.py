@@ -22,9 +22,9 @@ from benchmarks.common.safety_suites import (
     chosen_scenarios,
     rebuilt_town,
 )
-from foredrive.evaluation.bench import Benchmark, study_identity
-from foredrive.simulation.ncap.scenario_file import load_scenarios
-from foredrive.simulation.threats import Threat
+from foredrive.driving.ncap.scenario_file import load_scenarios
+from foredrive.driving.replay.threats import Threat
+from foredrive.engine.bench import Benchmark, study_identity
 
 SIZE = SuiteSize(runs=3)
 """3 towns x 3 kinds x 4 starts x 3 runs: 108 pairs of each agent, if all kinds are feasible four times."""
@@ -37,15 +37,14 @@ CONFIG = {
 DECIDED_BY = (
     "benchmarks.common.safety_pairs",
     "benchmarks.common.safety_suites",
-    "foredrive.rendering",
-    "foredrive.simulation.collisions",
-    "foredrive.simulation.controller",
-    "foredrive.simulation.dynamics",
-    "foredrive.simulation.ncap",
-    "foredrive.simulation.rebuilt",
-    "foredrive.simulation.town_replay",
-    "foredrive.training.gaussian_training",
-    "foredrive.training.rebuilding",
+    "foredrive.methods.rebuilding",
+    "foredrive.driving.collisions",
+    "foredrive.driving.controller",
+    "foredrive.driving.dynamics",
+    "foredrive.driving.ncap",
+    "foredrive.driving.replay.rebuilt",
+    "foredrive.towns.driving.town_replay",
+    "foredrive.methods.splatad.training",
 )
 WORK = Path("runs/ncap_transfer") / study_identity(CONFIG, DECIDED_BY)
 

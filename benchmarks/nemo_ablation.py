@@ -7,8 +7,8 @@ Rows with the same pre-training share it (common/fine_tuning.py). The rows of Ta
 import functools
 
 from benchmarks.common.fine_tuning import CONFIG, DECIDED_BY, fine_tuned
-from foredrive.evaluation.bench import Benchmark
-from foredrive.recipes import RECIPES
+from foredrive.engine.bench import Benchmark
+from foredrive.runs.recipes.known import RECIPES
 
 TABLE_1 = ("nemo_town", "nemo_town_scratch", "nemo_town_base", "nemo_town_attention")
 TABLE_3 = tuple(name for name in RECIPES if name.startswith("nemo_town") and name not in TABLE_1)

@@ -18,19 +18,20 @@ from torch import Tensor
 from torch.utils.flop_counter import FlopCounterMode, sdpa_flop_count
 
 from benchmarks.common.measuring import forget_peak, in_a_process, measure, peak_mib
-from foredrive.evaluation.bench import Benchmark
+from foredrive.engine.bench import Benchmark
+from foredrive.engine.fabric import make_fabric
 from foredrive.geometry.se3 import matrix_from_yaw
-from foredrive.models import lifting
-from foredrive.models.nemo import rendering
+from foredrive.methods.blocks import lifting
+from foredrive.methods.nemo import rendering
+from foredrive.methods.recipe import Recipe
 from foredrive.ops import volume
 from foredrive.ops.attention3d import attend_volume_reference
 from foredrive.ops.lifting import lift_reference
 from foredrive.ops.volume import sample_volume_reference
-from foredrive.recipes import Recipe, find_recipe
 from foredrive.runs.build import build_agent, build_objective
+from foredrive.runs.recipes.known import find_recipe
 from foredrive.scene import Boxes, CameraRig, Clip, Example, LidarSweep, Trajectory, VoxelGrid, VoxelSpec
 from foredrive.scene.boxes import unlabelled
-from foredrive.training import make_fabric
 
 DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
 STEPS = 5 if DEVICE == "cuda" else 1

@@ -17,17 +17,17 @@ from torch import Tensor
 
 from benchmarks.common.study import StudyTowns, record_study, seeded, work_folder
 from foredrive.data import ClipDataset, collate
-from foredrive.evaluation.bench import Benchmark
-from foredrive.metrics.images import psnr_db
-from foredrive.metrics.occupancy import OccupancyCounts, above_ground, count_occupancy
-from foredrive.models.agent import PlanningAgent
-from foredrive.models.nemo import Nemo
-from foredrive.recipes import find_recipe
-from foredrive.recipes.config import rescheduled
-from foredrive.recipes.nemo import NemoRecipe
+from foredrive.engine.bench import Benchmark
+from foredrive.methods.blocks.training_rays import thinned_rays
+from foredrive.methods.nemo import Nemo
+from foredrive.methods.nemo.recipes import NemoRecipe
+from foredrive.methods.planner.agent import PlanningAgent
+from foredrive.methods.recipe import rescheduled
+from foredrive.runs.recipes.known import find_recipe
 from foredrive.runs.train.run import load_agent, train_run
 from foredrive.scene import Example, VoxelGrid
-from foredrive.training.rays import thinned_rays
+from foredrive.tasks.occupancy.scores import OccupancyCounts, above_ground, count_occupancy
+from foredrive.tasks.rendering.image_scores import psnr_db
 
 WORK = work_folder(Path("runs/nemo_images"))
 TOWNS = StudyTowns(train=("Town01", "Town03", "Town10HD"), train_seeds=(1, 2), test_seeds=(1, 2))

@@ -9,7 +9,7 @@ from pathlib import Path
 from benchmarks.common.study import record_study, work_folder
 from benchmarks.nemo_images import TOWNS, judge
 from foredrive.data import ClipDataset
-from foredrive.evaluation.bench import Benchmark
+from foredrive.engine.bench import Benchmark
 from foredrive.runs.shipped import run_folder
 from foredrive.runs.train.run import load_agent, open_run
 

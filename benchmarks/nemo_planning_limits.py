@@ -20,15 +20,15 @@ from torch import Tensor, nn
 from benchmarks.common.study import StudyTowns, record_study, work_folder
 from foredrive.data import ClipDataset, LogPath
 from foredrive.data.batches import stack_records
-from foredrive.evaluation.bench import Benchmark
+from foredrive.engine.bench import Benchmark
 from foredrive.geometry.boxes import points_in_boxes
-from foredrive.losses import waypoint_loss
-from foredrive.models.ego_mlp import EgoMLP, EgoMLPConfig, ego_motion
-from foredrive.models.path_correction import PathCorrectionConfig
-from foredrive.models.planner import VolumePlanner
-from foredrive.recipes import find_recipe
+from foredrive.methods.planner.ego_mlp import EgoMLP, EgoMLPConfig, ego_motion
+from foredrive.methods.planner.ego_mlp_fit import EgoMLPFit, fit_ego_mlp, read_status
+from foredrive.methods.planner.path_correction import PathCorrectionConfig
+from foredrive.methods.planner.planner import VolumePlanner
+from foredrive.runs.recipes.known import find_recipe
 from foredrive.scene import Boxes, Category, Clip, MapKind, MapPatch, Trajectory, VoxelSpec
-from foredrive.training import EgoMLPFit, fit_ego_mlp, read_status
+from foredrive.tasks.planning.losses import waypoint_loss
 
 WORK = work_folder(Path("runs/nemo_study"))
 TOWNS = StudyTowns()

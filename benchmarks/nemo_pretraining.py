@@ -7,7 +7,7 @@ of the paper has no such pair: its scratch lacks auxiliary losses and temporal a
 import functools
 
 from benchmarks.common.fine_tuning import CONFIG, DECIDED_BY, PRETRAINED, fine_tuned
-from foredrive.evaluation.bench import Benchmark
+from foredrive.engine.bench import Benchmark
 
 SHARES = (1.0, 0.3, 0.1)
 

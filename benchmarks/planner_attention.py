@@ -13,11 +13,11 @@ from typing import Any
 from benchmarks import learning, task_probes
 from benchmarks.common.fine_tuning import PATH_STRIDE_S, STEPS, WARMUP_STEPS
 from benchmarks.common.study import StudyLogs, run_arm
-from foredrive.evaluation.bench import Benchmark, study_identity
-from foredrive.models.tasks.scene_tokens import Attended
-from foredrive.recipes import Recipe, find_recipe
-from foredrive.recipes.config import rescheduled
-from foredrive.training import PathFit
+from foredrive.engine.bench import Benchmark, study_identity
+from foredrive.methods.planner.path_fit import PathFit
+from foredrive.methods.recipe import Recipe, rescheduled
+from foredrive.runs.recipes.known import find_recipe
+from foredrive.tasks.heads.scene_tokens import Attended
 
 ATTENDED: dict[str, tuple[Attended, ...]] = {
     "volume": (),
@@ -34,13 +34,12 @@ CONFIG = {
     "path_stride_s": PATH_STRIDE_S,
 }
 DECIDED_BY = (
-    *task_probes.DECIDED_BY,
-    "foredrive.metrics.planning",
-    "foredrive.metrics.protocols",
-    "foredrive.models.planner",
+    "foredrive.tasks.planning.scores",
+    "foredrive.tasks.planning.protocols",
+    "foredrive.methods.planner.planner",
     "foredrive.runs.train.kept_parts",
-    "foredrive.training.path_fit",
-    "foredrive.training.planner_objective",
+    "foredrive.methods.planner.path_fit",
+    "foredrive.methods.planner.objective",
 )
 WORK = Path("runs/planner_attention") / study_identity(CONFIG, DECIDED_BY)
 

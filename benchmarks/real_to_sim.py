@@ -13,11 +13,11 @@ from pathlib import Path
 from benchmarks.common.rebuilt_towns import TownDrive
 from benchmarks.common.study import pandaset_log, work_folder
 from foredrive.data import LogPath
-from foredrive.evaluation.bench import Benchmark
-from foredrive.evaluation.summary import numbers
-from foredrive.recipes.rebuilding import gaussians_tiny, rescheduled_recipe
+from foredrive.engine.bench import Benchmark
+from foredrive.engine.summary import numbers
 from foredrive.runs.evaluate.real_to_sim_gap import measure_gap
 from foredrive.runs.rebuild.reconstruct import reconstruct
+from foredrive.runs.recipes.rebuilding import gaussians_tiny, rescheduled_recipe
 from foredrive.runs.shipped import run_folder
 from foredrive.runs.train.run import open_run
 from foredrive.sensors.rigs import SURROUND

@@ -20,9 +20,9 @@ from benchmarks.common.study import kitti_drive, pandaset_log
 from benchmarks.rebuild_pandaset import FIGURES
 from benchmarks.rebuild_town import DRIVE, judged_town
 from foredrive.data import LogPath
-from foredrive.evaluation.bench import Benchmark, study_identity
-from foredrive.recipes.rebuilding import RebuildRecipe, field_tiny, gaussians_tiny, rescheduled_recipe
+from foredrive.engine.bench import Benchmark, study_identity
 from foredrive.runs.rebuild.reconstruct import reconstruct
+from foredrive.runs.recipes.rebuilding import RebuildRecipe, field_tiny, gaussians_tiny, rescheduled_recipe
 
 ROOT = Path("runs/rebuild_compare")
 RECIPES: dict[str, RebuildRecipe[Any]] = {"gaussians": gaussians_tiny(), "field": field_tiny()}
@@ -36,12 +36,9 @@ RENAMED = {"moving.psnr_db": "psnr_driving_db", "moving.nearest.psnr_db": "neare
 DECIDED_BY = (
     "benchmarks.rebuild_town",
     "benchmarks.common.rebuilt_towns",
-    "foredrive.evaluation.rendering",
     "foredrive.geometry",
-    "foredrive.losses.field",
-    "foredrive.losses.rendering",
-    "foredrive.metrics.images",
-    "foredrive.metrics.lidar_rendering",
+    "foredrive.methods.neurad.losses",
+    "foredrive.methods.splatad.losses",
     "foredrive.ops.hash_grid",
     "foredrive.ops.hash_grid_kernels",
     "foredrive.ops.ray_box_kernels",
@@ -49,13 +46,12 @@ DECIDED_BY = (
     "foredrive.ops.splatting",
     "foredrive.ops.splatting_back_kernels",
     "foredrive.ops.splatting_kernels",
-    "foredrive.recipes.field",
-    "foredrive.recipes.gaussians",
-    "foredrive.rendering",
-    "foredrive.training.field_training",
-    "foredrive.training.gaussian_steps",
-    "foredrive.training.gaussian_training",
-    "foredrive.training.rebuilding",
+    "foredrive.methods.neurad.recipes",
+    "foredrive.methods.splatad.recipes",
+    "foredrive.methods.rebuilding",
+    "foredrive.methods.neurad.training",
+    "foredrive.methods.splatad.training",
+    "foredrive.methods.splatad.training",
 )
 CONFIG = {
     "recipes": {arm: dataclasses.asdict(recipe) for arm, recipe in RECIPES.items()},

@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.common.study import pandaset_log, work_folder
-from foredrive.evaluation.bench import Benchmark
-from foredrive.recipes.rebuilding import RebuildRecipe, gaussians_tiny, rescheduled_recipe
+from foredrive.engine.bench import Benchmark
 from foredrive.runs.rebuild.reconstruct import reconstruct
+from foredrive.runs.recipes.rebuilding import RebuildRecipe, gaussians_tiny, rescheduled_recipe
 
 WORK = work_folder(Path("runs/rebuild"))
 RECIPE = dataclasses.replace(gaussians_tiny(), cameras=("pcam_f0",))

@@ -18,14 +18,14 @@ from torch import Tensor
 
 from benchmarks.common.rebuilt_towns import TownDrive, TownTruth, TrueViews
 from benchmarks.common.study import work_folder
-from foredrive.evaluation.bench import Benchmark
-from foredrive.evaluation.rendering import evaluate_cameras, evaluate_sweeps
-from foredrive.evaluation.summary import numbers
-from foredrive.recipes.rebuilding import RebuildRecipe, gaussians_tiny, rescheduled_recipe
-from foredrive.rendering.edits import Edit, Move, Remove, ShiftEgo, apply_edits
-from foredrive.rendering.scene_graph import SceneGraph
-from foredrive.rendering.views import CameraView, SweepView
+from foredrive.engine.bench import Benchmark
+from foredrive.engine.summary import numbers
+from foredrive.methods.rebuilding.edits import Edit, Move, Remove, ShiftEgo, apply_edits
+from foredrive.methods.rebuilding.evaluation import evaluate_cameras, evaluate_sweeps
+from foredrive.methods.rebuilding.scene_graph import SceneGraph
+from foredrive.methods.rebuilding.views import CameraView, SweepView
 from foredrive.runs.rebuild.reconstruct import Reconstruction, reconstruct
+from foredrive.runs.recipes.rebuilding import RebuildRecipe, gaussians_tiny, rescheduled_recipe
 from foredrive.scene import Category
 from foredrive.view.rebuilt_sheet import write_rebuilt_sheet
 

@@ -20,9 +20,9 @@ import torch
 
 from benchmarks.loading import BATCH_SIZE, CLIPS, WORKERS, load_clips
 from foredrive.data import ClipDataset, LogPath, find_logs
-from foredrive.evaluation.bench import Benchmark
-from foredrive.recipes import find_recipe
+from foredrive.engine.bench import Benchmark
 from foredrive.runs.evaluate.run import evaluate_run
+from foredrive.runs.recipes.known import find_recipe
 from foredrive.runs.search.indexing import index_logs
 from foredrive.runs.train.run import train_run
 from foredrive.towns.recorder import record

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from benchmarks.common.retrieval_quality import GAP_S, MODALITIES, Judged, judge_naming, judge_retrieval
 from foredrive.data import LogPath
-from foredrive.evaluation.bench import Benchmark
+from foredrive.engine.bench import Benchmark
 from foredrive.runs.drive.recording import record_drives
 from foredrive.runs.search.sector_views import gather_views
 from foredrive.runs.search.towers import EMBEDDED, find_towers

@@ -22,8 +22,8 @@ import numpy as np
 import pyarrow as pa
 
 from benchmarks.common.measuring import held_mib
-from foredrive.evaluation.bench import Benchmark
-from foredrive.evaluation.provenance import peak_rss_gib
+from foredrive.engine.bench import Benchmark
+from foredrive.engine.provenance import peak_rss_gib
 from foredrive.runs.search.indexing import IndexWriter
 from foredrive.search.find import find
 from foredrive.search.index import PARTITION_ROWS, PROBES, REFINEMENT, FrameIndex, IndexSettings, Part

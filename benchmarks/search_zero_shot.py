@@ -8,7 +8,7 @@ default they are the embedded ones.
 import os
 
 from benchmarks.search_retrieval import CROWD, RATE_HZ, SECONDS, SEEDS, TOWN, WEATHERS, WORK, drives
-from foredrive.evaluation.bench import Benchmark
+from foredrive.engine.bench import Benchmark
 from foredrive.runs.search.evaluating import evaluate_index
 from foredrive.runs.search.indexing import index_logs
 from foredrive.runs.search.towers import EMBEDDED, find_towers

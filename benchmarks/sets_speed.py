@@ -16,11 +16,8 @@ import numpy as np
 import torch
 from scipy.optimize import linear_sum_assignment
 
-from foredrive.evaluation.bench import Benchmark
-from foredrive.evaluation.detections.files import read_detections
-from foredrive.evaluation.detections.score import ScoreConfig, score_frames
-from foredrive.evaluation.detections.summary import summarise_scores
-from foredrive.evaluation.provenance import peak_rss_gib
+from foredrive.engine.bench import Benchmark
+from foredrive.engine.provenance import peak_rss_gib
 from foredrive.sets import (
     BoxDensity,
     LabelledBoxes,
@@ -30,6 +27,9 @@ from foredrive.sets import (
     set_nll,
 )
 from foredrive.sets.assignment import k_best_assignments
+from foredrive.tasks.detection.files import read_detections
+from foredrive.tasks.detection.score import ScoreConfig, score_frames
+from foredrive.tasks.detection.summary import summarise_scores
 
 SIZES = {
     "100x50": (100, 50, 100.0),

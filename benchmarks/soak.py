@@ -27,8 +27,8 @@ from typing import NamedTuple
 from benchmarks.common.killing import left_temporary
 from benchmarks.common.page_clients import SearchClients, ViewerClients
 from benchmarks.common.process_tree import TreeUse, in_session, tree_use
-from foredrive.evaluation.bench import Benchmark
-from foredrive.training.metrics_log import read_metrics
+from foredrive.engine.bench import Benchmark
+from foredrive.engine.metrics_log import read_metrics
 from foredrive.view.page import free_port
 
 ROOT = Path("runs/soak")

@@ -28,8 +28,9 @@ from torch import Tensor
 
 from benchmarks.common.measuring import in_a_process
 from benchmarks.common.measuring import measure as time_of
-from foredrive.evaluation.bench import Benchmark
+from foredrive.engine.bench import Benchmark
 from foredrive.geometry.se3 import exp_se3, inverse_se3, sensor_twist
+from foredrive.methods.splatad import Gaussians, project_camera, project_lidar, scan_times, tiled_lidar_beams
 from foredrive.ops.splat_points import TiledPoints, pixel_points
 from foredrive.ops.splatting import (
     Composited,
@@ -37,13 +38,6 @@ from foredrive.ops.splatting import (
     composite_splats,
     composite_splats_reference,
     list_splats,
-)
-from foredrive.rendering.gaussians import (
-    Gaussians,
-    project_camera,
-    project_lidar,
-    scan_times,
-    tiled_lidar_beams,
 )
 from foredrive.sensors import pandar64
 

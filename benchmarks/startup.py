@@ -12,7 +12,7 @@ import resource
 import subprocess
 import sys
 
-from foredrive.evaluation.bench import Benchmark
+from foredrive.engine.bench import Benchmark
 
 REPETITIONS = 3
 NOWHERE = "/nonexistent"
@@ -31,9 +31,9 @@ LINES = {
 IMPORTS = {
     "import torch": "torch",
     "begin: view": "foredrive.view.log_frames",
-    "begin: convert": "foredrive.data.convert",
+    "begin: convert": "foredrive.data.formats.convert",
     "begin: record": "foredrive.runs.drive.recording, foredrive.towns.campaign",
-    "begin: train": "foredrive.recipes, foredrive.runs.train.run",
+    "begin: train": "foredrive.runs.recipes.known, foredrive.runs.train.run",
     "begin: evaluate": "foredrive.runs.evaluate.run",
     "begin: reconstruct": "foredrive.runs.rebuild.reconstruct",
     "begin: drive": "foredrive.runs.drive.suite",

@@ -15,17 +15,17 @@ from torch.utils.data import DataLoader
 from benchmarks.common.study import pandaset_log
 from benchmarks.task_probes import kept_figures
 from foredrive.data import ClipDataset, collate
-from foredrive.evaluation.bench import Benchmark
-from foredrive.evaluation.metrics.detection import DetectionMetric
-from foredrive.evaluation.metrics.motion import MotionMetric
-from foredrive.evaluation.metrics.tracking import TrackingMetric
-from foredrive.evaluation.run import evaluate
-from foredrive.evaluation.summary import numbers
-from foredrive.recipes.task_heads import town_heads
+from foredrive.engine.bench import Benchmark
+from foredrive.engine.summary import numbers
 from foredrive.runs.evaluate.predict import AgentPredictor
+from foredrive.runs.recipes.task_heads import town_heads
 from foredrive.runs.shipped import run_folder
 from foredrive.runs.train.run import load_agent, open_run
 from foredrive.runs.train.tasks import probe_run, train_heads
+from foredrive.tasks.detection.metric import DetectionMetric
+from foredrive.tasks.evaluation.run import evaluate
+from foredrive.tasks.motion.metric import MotionMetric
+from foredrive.tasks.tracking.metric import TrackingMetric
 
 ROOT = Path("runs/task_pandaset")
 TRAIN_S, JUDGE_S = (0.0, 4.0), (4.0, 6.0)
@@ -61,5 +61,5 @@ BENCHMARK = Benchmark(
     arms=ARMS,
     seeds=(0,),
     config={"train_s": TRAIN_S, "judge_s": JUDGE_S, "stride_s": STRIDE_S, "steps": STEPS},
-    decided_by=("foredrive.models", "foredrive.training", "foredrive.metrics", "foredrive.data"),
+    decided_by=("foredrive.methods", "foredrive.engine", "foredrive.tasks", "foredrive.data"),
 )

@@ -22,17 +22,17 @@ from benchmarks.common.study import seeded
 from benchmarks.learning import logs_of
 from benchmarks.learning_towns import learning_digest
 from foredrive.data import ClipDataset, collate
-from foredrive.evaluation.bench import Benchmark, study_identity
-from foredrive.evaluation.metrics import METRICS
-from foredrive.evaluation.run import evaluate, parts_needed
-from foredrive.evaluation.summary import Summary, numbers
-from foredrive.recipes import Recipe, find_recipe
-from foredrive.recipes.config import rescheduled
-from foredrive.recipes.task_heads import HEADED, INSTANCES, TaskHeadsRecipe, town_heads
+from foredrive.engine.bench import Benchmark, study_identity
+from foredrive.engine.summary import Summary, numbers
+from foredrive.methods.recipe import Recipe, rescheduled
 from foredrive.runs.evaluate.predict import AgentPredictor
+from foredrive.runs.recipes.known import find_recipe
+from foredrive.runs.recipes.task_heads import HEADED, INSTANCES, TaskHeadsRecipe, town_heads
 from foredrive.runs.shipped import run_folder
 from foredrive.runs.train.run import Run, load_agent, open_run, train_run
 from foredrive.runs.train.tasks import TrainedHeads, probe_run, train_heads
+from foredrive.tasks.evaluation.metrics import METRICS
+from foredrive.tasks.evaluation.run import evaluate, parts_needed
 
 ROOT = Path("runs/task_probes")
 DRIVES = 14
@@ -52,24 +52,15 @@ KEPT = (
 )  # fmt: skip
 """Beginnings of the keys of a summary that are kept."""
 DECIDED_BY = (
-    "foredrive.data.accumulated_labels",
-    "foredrive.data.agent_futures",
+    "foredrive.data.label_store",
     "foredrive.data.clips",
-    "foredrive.data.map_elements",
-    "foredrive.data.semantic_labels",
     "foredrive.geometry",
-    "foredrive.losses",
-    "foredrive.metrics",
-    "foredrive.models.backbone",
-    "foredrive.models.driveworld",
-    "foredrive.models.lifting",
-    "foredrive.models.nemo",
-    "foredrive.models.tasks",
-    "foredrive.training.agent_losses",
-    "foredrive.training.loop",
-    "foredrive.training.task_losses",
-    "foredrive.training.task_probe",
-    "foredrive.training.task_targets",
+    "foredrive.tasks",
+    "foredrive.methods.blocks.backbone",
+    "foredrive.methods.driveworld",
+    "foredrive.methods.blocks.lifting",
+    "foredrive.methods.nemo",
+    "foredrive.engine.loop",
 )
 
 

@@ -19,7 +19,7 @@ import torch
 from py123d.common.io.camera import jpeg_camera_io
 
 from foredrive.data.log_writer import LogWriter
-from foredrive.evaluation.bench import Benchmark
+from foredrive.engine.bench import Benchmark
 from foredrive.scene.conditions import BackgroundTraffic
 from foredrive.sensors.rigs import camera_rig
 from foredrive.sensors.vehicle import roof_lidar

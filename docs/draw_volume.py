@@ -15,7 +15,7 @@ from foredrive.runs.shipped import run_folder
 from foredrive.view.example_panel import front_camera
 from foredrive.view.image_drawing import Camera, resize
 from foredrive.view.log_frames import LogFrames
-from foredrive.view.volume_nodes import shown_voxels
+from foredrive.view.model_panel import shown_voxels
 from foredrive.view.voxel_drawing import draw_volume_pca, draw_voxels
 
 HERE = Path(__file__).parent

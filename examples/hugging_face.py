@@ -10,10 +10,10 @@ from pathlib import Path
 
 from huggingface_hub import snapshot_download
 
+from foredrive.engine.folder import CONFIG, LOGS
 from foredrive.files import atomic_path
-from foredrive.models.agent import PlanningAgent
+from foredrive.methods.planner.agent import PlanningAgent
 from foredrive.runs import Run, load_agent, open_run
-from foredrive.runs.folder import CONFIG, LOGS
 from foredrive.runs.shipped import run_folder
 
 FILES = (CONFIG, "rigs.yaml", "*/model.safetensors", "baselines*.safetensors", "tasks/*.safetensors")

@@ -15,13 +15,13 @@ from nuplan.planning.simulation.trajectory.trajectory_sampling import Trajectory
 
 from foredrive.data.batches import stack_records
 from foredrive.data.resizing import shrink_images
+from foredrive.driving.observation import FRAME_DT_S, KeyFrame, make_clip
 from foredrive.geometry.se3 import matrix_from_yaw
 from foredrive.runs import load_agent, open_run
 from foredrive.runs.shipped import run_folder
 from foredrive.scene import CameraRig, Clip, Command
 from foredrive.scene import Trajectory as Plan
 from foredrive.scene.actors import boxes_in_ego_frame
-from foredrive.simulation.observation import FRAME_DT_S, KeyFrame, make_clip
 
 CAMERAS = ("cam_f0", "cam_l0", "cam_r0", "cam_l1", "cam_r1", "cam_b0")
 """The six of NAVSIM's eight cameras that look as those of the rig `surround` do."""

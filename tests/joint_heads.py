@@ -5,18 +5,18 @@ from collections.abc import Sequence
 
 import torch
 
-from foredrive.data.task_truth import TaskTruthConfig
-from foredrive.models.tasks.agents import AgentHeadConfig, CarriedConfig
-from foredrive.models.tasks.decoder import DecoderConfig
-from foredrive.models.tasks.maps import MapHeadConfig
-from foredrive.models.tasks.motion import MotionConfig
-from foredrive.recipes import Recipe
-from foredrive.recipes.task_heads import TaskHeadsRecipe, town_heads, with_joint_heads
+from foredrive.data.truth.store import TaskTruthConfig
+from foredrive.methods.recipe import Recipe
+from foredrive.runs.recipes.task_heads import TaskHeadsRecipe, town_heads, with_joint_heads
 from foredrive.scene import Example
 from foredrive.scene.agent_futures import AgentFutures
 from foredrive.scene.map_elements import MapElements, MapRaster, RasterLayer
 from foredrive.scene.semantics import SemanticVoxels
 from foredrive.scene.task_truth import TaskTruth
+from foredrive.tasks.detection.agents_head import AgentHeadConfig, CarriedConfig
+from foredrive.tasks.heads.decoder import DecoderConfig
+from foredrive.tasks.maps.head import MapHeadConfig
+from foredrive.tasks.motion.head import MotionConfig
 
 ALL = ("detection", "motion", "map", "occupancy")
 

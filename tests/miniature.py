@@ -10,26 +10,28 @@ from flat_street import street
 from foredrive.data import ClipConfig, LogPath, find_logs
 from foredrive.data.logs import Log
 from foredrive.data.maps import write_map
-from foredrive.models.backbone import BackboneConfig
-from foredrive.models.bev import BevConfig
-from foredrive.models.driveworld import DriveWorldConfig
-from foredrive.models.driveworld.planes import (
+from foredrive.engine.loop import Schedule
+from foredrive.methods.blocks.backbone import BackboneConfig
+from foredrive.methods.blocks.bev import BevConfig
+from foredrive.methods.blocks.lift_splat import LiftSplatConfig
+from foredrive.methods.blocks.lifting import LiftingConfig
+from foredrive.methods.blocks.pooled_lifting import PooledLiftingConfig
+from foredrive.methods.driveworld import DriveWorldConfig
+from foredrive.methods.driveworld.objective import DriveWorldStage, DriveWorldWeights
+from foredrive.methods.driveworld.planes import (
     PlanesToVolumeConfig,
     PlaneToVectorConfig,
     StaticSceneConfig,
     VectorToPlaneConfig,
 )
-from foredrive.models.driveworld.state_space import StateSpaceConfig
-from foredrive.models.lift_splat import LiftSplatConfig
-from foredrive.models.lifting import LiftingConfig
-from foredrive.models.nemo import MotionConfig, NemoConfig, RendererConfig
-from foredrive.models.planner import PlannerConfig
-from foredrive.models.pooled_lifting import PooledLiftingConfig
-from foredrive.recipes import Recipe
-from foredrive.recipes.driveworld import DriveWorldRecipe
-from foredrive.recipes.nemo import NemoRecipe
+from foredrive.methods.driveworld.recipes import DriveWorldRecipe
+from foredrive.methods.driveworld.state_space import StateSpaceConfig
+from foredrive.methods.nemo import MotionConfig, NemoConfig, RendererConfig
+from foredrive.methods.nemo.objective import NemoStage, NemoWeights
+from foredrive.methods.nemo.recipes import NemoRecipe
+from foredrive.methods.planner.planner import PlannerConfig
+from foredrive.methods.recipe import Recipe
 from foredrive.scene import VoxelSpec
-from foredrive.training import DriveWorldStage, DriveWorldWeights, NemoStage, NemoWeights, Schedule
 
 STEPS = 3
 """Of either stage."""

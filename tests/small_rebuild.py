@@ -1,11 +1,11 @@
 """A log rebuilt in seconds: hardly any Gaussians, hardly trained. What stands is an actor too."""
 
-from foredrive.recipes.gaussians import GaussianRecipe
-from foredrive.recipes.rebuilding import RebuildRecipe
-from foredrive.rendering.decoders import CameraDecoderConfig
-from foredrive.rendering.gaussians.initial import InitialGaussians
-from foredrive.rendering.gaussians.scene_config import GaussianSceneConfig
-from foredrive.training.gaussian_training import GaussianSchedule
+from foredrive.methods.rebuilding.decoders import CameraDecoderConfig
+from foredrive.methods.splatad.initial import InitialGaussians
+from foredrive.methods.splatad.recipes import GaussianRecipe
+from foredrive.methods.splatad.scene_config import GaussianSceneConfig
+from foredrive.methods.splatad.training import GaussianSchedule
+from foredrive.runs.recipes.rebuilding import RebuildRecipe
 
 SMALLEST = RebuildRecipe(
     name="smallest",

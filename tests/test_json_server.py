@@ -13,8 +13,8 @@ import pytest
 
 from foredrive import bounded_server, json_server
 from foredrive.errors import InputError
+from foredrive.integrations.remote.json_http import ask
 from foredrive.json_server import Address, JsonServer, Raw
-from foredrive.simulation.remote.json_http import ask
 
 BAD_CLIENTS = 200
 POST = b"POST /twice HTTP/1.1\r\nContent-Type: application/json\r\n"

@@ -12,7 +12,7 @@ import pytest
 from foredrive.lazy import importing
 
 
-@pytest.mark.parametrize("package", ["data", "scene", "training", "recipes", "runs"])
+@pytest.mark.parametrize("package", ["data", "scene", "runs"])
 def test_what_a_package_offers_is_there(package: str) -> None:
     module = importlib.import_module(f"foredrive.{package}")
     assert all(getattr(module, name) is not None for name in module.__all__)

@@ -1,6 +1,7 @@
 """The detection task: samples from any log, metrics of a head on them, and a comparison of losses.
 
-`training.detection.fit_head` trains a head (`models.detection`) on samples; docs/sets.md shows how.
+`tasks.detection.training.fit_head` trains a head (`tasks.detection.network`) on samples; docs/sets.md shows
+how.
 """
 
 import copy
@@ -15,15 +16,15 @@ from jaxtyping import Float
 from torch import Tensor
 
 from foredrive.data import ClipConfig, ClipDataset, LogPath
-from foredrive.evaluation.detections.frames import DetectionFrame, DetectionSet
-from foredrive.evaluation.detections.score import score_frames
-from foredrive.evaluation.detections.summary import summarise_scores
 from foredrive.geometry.boxes import points_in_boxes
-from foredrive.models.detection import DetectionHead
 from foredrive.scene import Category, Clip, LidarSweep, VoxelSpec, WorldModel
 from foredrive.sets import Family, LabelledBoxes, MultiBernoulli, UniformPoisson, fit_set_calibration
-from foredrive.training.detection import Sample, fit_head, predict_sets
-from foredrive.training.detection_losses import Loss, MatchingLossConfig, matching_loss, set_loss
+from foredrive.tasks.detection.frames import DetectionFrame, DetectionSet
+from foredrive.tasks.detection.losses import Loss, MatchingLossConfig, matching_loss, set_loss
+from foredrive.tasks.detection.network import DetectionHead
+from foredrive.tasks.detection.score import score_frames
+from foredrive.tasks.detection.summary import summarise_scores
+from foredrive.tasks.detection.training import Sample, fit_head, predict_sets
 
 CLASSES = ("vehicle", "cycle", "pedestrian")
 _CLASS_OF = {

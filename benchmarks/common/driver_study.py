@@ -8,13 +8,13 @@ from pathlib import Path
 from foredrive.data import LogPath, find_all_logs
 from foredrive.driver.judging import judge_sight, judge_sight_by
 from foredrive.driver.packed import PackedClips
+from foredrive.driver.recipes import DRIVER_RECIPES, DriverRecipe
+from foredrive.driving.drive_record import DriveRecord
 from foredrive.errors import InputError
-from foredrive.recipes.driver import DRIVER_RECIPES, DriverRecipe
 from foredrive.runs.drive.recording import EgosPlan, record_egos
 from foredrive.runs.open_clips import open_clips
 from foredrive.runs.train.driver import DriverRun, load_driver, train_driver
 from foredrive.sensors.rigs import FRONT_TELE
-from foredrive.simulation.drive_record import DriveRecord
 from foredrive.towns.map.names import TEST_TOWNS, TOWNS
 
 TRAINING_TOWNS = tuple(town for town in TOWNS if town not in TEST_TOWNS)

@@ -12,12 +12,12 @@ from typing import Any
 from benchmarks import learning
 from benchmarks.common.study import StudyLogs, run_arm, seeded, share_of
 from benchmarks.learning_towns import learning_digest
-from foredrive.evaluation.bench import study_identity
-from foredrive.recipes import RECIPES, find_recipe
-from foredrive.recipes.config import Recipe, rescheduled
-from foredrive.runs.folder import WEIGHTS
+from foredrive.engine.bench import study_identity
+from foredrive.engine.folder import WEIGHTS
+from foredrive.methods.planner.path_fit import PathFit
+from foredrive.methods.recipe import Recipe, rescheduled
+from foredrive.runs.recipes.known import RECIPES, find_recipe
 from foredrive.runs.train.run import train_run
-from foredrive.training import PathFit
 
 ROOT = Path("runs/nemo_fine_tuning")
 BUDGET = "30min"
@@ -35,12 +35,11 @@ CONFIG = {
     "drives": learning_digest(),
 }
 DECIDED_BY = (
-    *learning.DECIDED_BY,
-    "foredrive.metrics.planning",
-    "foredrive.metrics.protocols",
-    "foredrive.models.planner",
+    "foredrive.tasks.planning.scores",
+    "foredrive.tasks.planning.protocols",
+    "foredrive.methods.planner.planner",
     "foredrive.runs.train.path_features",
-    "foredrive.training.path_fit",
+    "foredrive.methods.planner.path_fit",
 )
 IDENTITY = study_identity(CONFIG, DECIDED_BY)
 

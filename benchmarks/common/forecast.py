@@ -6,14 +6,14 @@ from dataclasses import replace
 from torch.utils.data import DataLoader
 
 from foredrive.data import LogPath, collate
-from foredrive.evaluation.run import evaluate
-from foredrive.evaluation.summary import numbers
-from foredrive.recipes.config import Recipe
+from foredrive.engine.summary import numbers
+from foredrive.methods.recipe import Recipe
 from foredrive.runs.evaluate.inputs import FUTURES
 from foredrive.runs.evaluate.predict import AgentPredictor
 from foredrive.runs.open_clips import open_clips
 from foredrive.runs.train.baselines import fit_baselines
 from foredrive.runs.train.run import Run, load_agent
+from foredrive.tasks.evaluation.run import evaluate
 
 BATCH = 4
 

@@ -8,11 +8,11 @@ import time
 
 import numpy as np
 
-from foredrive.metrics.motion.agents import PredictedAgents, TrueAgents
-from foredrive.metrics.motion.moving import score_moving
-from foredrive.metrics.motion.protocols import PROTOCOLS
-from foredrive.metrics.motion.scores import score_motion
 from foredrive.scene import Category
+from foredrive.tasks.motion.agents import PredictedAgents, TrueAgents
+from foredrive.tasks.motion.moving import score_moving
+from foredrive.tasks.motion.protocols import PROTOCOLS
+from foredrive.tasks.motion.scores import score_motion
 
 FRAMES, BOXES, AGENTS, FUTURES, STEPS = 6019, 300, 75, 6, 12
 

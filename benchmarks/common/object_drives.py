@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from foredrive.metrics.detection_protocols import CLASSES
 from foredrive.scene.boxes import Attribute
+from foredrive.tasks.detection.protocols import CLASSES
 
 Box = dict[str, Any]
 SHARES = np.array([493, 88, 16, 25, 15, 220, 13, 12, 98, 152]) / 1132

@@ -24,14 +24,14 @@ from benchmarks.common.object_drives import (
     tracking_boxes,
     truth_file,
 )
-from foredrive.evaluation.objects.nuscenes_json import ObjectTask
-from foredrive.evaluation.objects.score import read_objects
-from foredrive.evaluation.objects.truth import ObjectTruth
-from foredrive.metrics.detection_protocols import CLASSES, DETECTION_PROTOCOLS, evaluate_detections
-from foredrive.metrics.motion.protocols import PROTOCOLS as MOTION_PROTOCOLS
-from foredrive.metrics.motion.scores import score_motion
-from foredrive.metrics.object_rows import Frames, ObjectRows, make_rows
-from foredrive.metrics.tracking.protocols import TRACKING_PROTOCOLS, evaluate_tracking
+from foredrive.tasks.detection.protocols import CLASSES, DETECTION_PROTOCOLS, evaluate_detections
+from foredrive.tasks.motion.protocols import PROTOCOLS as MOTION_PROTOCOLS
+from foredrive.tasks.motion.scores import score_motion
+from foredrive.tasks.tracking.nuscenes_json import ObjectTask
+from foredrive.tasks.tracking.object_rows import Frames, ObjectRows, make_rows
+from foredrive.tasks.tracking.protocols import TRACKING_PROTOCOLS, evaluate_tracking
+from foredrive.tasks.tracking.score import read_objects
+from foredrive.tasks.tracking.truth import ObjectTruth
 
 FIFTEEN_SCENES = Size(scenes=15, frames=40, objects=60, false=420, false_frames=3, reach_m=45.0, shares=True)
 """600 frames of some 250 detections."""

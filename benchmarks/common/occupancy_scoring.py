@@ -16,8 +16,9 @@ import torch
 from scipy.ndimage import distance_transform_edt
 
 from foredrive.data.beam_casting import FREE, cast_beams
-from foredrive.metrics.voxels.instances import InstanceCounts, count_instances
-from foredrive.metrics.voxels.protocols import (
+from foredrive.ops import voxel_rays
+from foredrive.tasks.occupancy.instances_metric import InstanceCounts, count_instances
+from foredrive.tasks.occupancy.protocols import (
     GRID,
     OCC3D_CLASSES,
     OPENOCC_CLASSES,
@@ -26,9 +27,8 @@ from foredrive.metrics.voxels.protocols import (
     VOXEL_PROTOCOLS,
     RayProtocol,
 )
-from foredrive.metrics.voxels.rays import RayCounts, Seen, cast_rays, count_rays, lidar_rays, score_rays
-from foredrive.metrics.voxels.semantic import count_voxels, mean_iou, voxel_ious
-from foredrive.ops import voxel_rays
+from foredrive.tasks.occupancy.score import RayCounts, Seen, cast_rays, count_rays, lidar_rays, score_rays
+from foredrive.tasks.occupancy.semantic_scores import count_voxels, mean_iou, voxel_ious
 
 FRAMES, PLAIN_FRAMES, TABLE_FRAMES, SAMPLES = 100, 1, 12, 40
 OBJECTS = 45

@@ -11,11 +11,11 @@ from benchmarks.common.tower_quality import MOST_SHARE, QUERIES, embed_all
 from foredrive.data.log_paths import LogPath
 from foredrive.data.logs import Log
 from foredrive.data.setting import Place
-from foredrive.metrics.retrieval import draw_sequences, mean_and_interval
 from foredrive.runs.search.sector_views import LogViews, ViewRow
 from foredrive.search.facts import MANY, NOUNS
 from foredrive.search.find import collapse
 from foredrive.search.phrases import SETTINGS
+from foredrive.search.retrieval import draw_sequences, mean_and_interval
 from foredrive.search.towers import Towers, embed_prompt
 from foredrive.search.zero_shot import class_vectors, classify
 

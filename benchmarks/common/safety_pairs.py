@@ -14,23 +14,23 @@ from jaxtyping import Float64
 from scipy import stats
 
 from benchmarks.common.rebuilt_towns import TownDrive, TownTruth
-from foredrive.evaluation.summary import write_json
-from foredrive.rendering.scene_graph import SceneGraph
-from foredrive.rendering.tracks import ActorTracks
+from foredrive.driving.drive import Drive, drive_route
+from foredrive.driving.dynamics import EGO, STEP_S
+from foredrive.driving.ncap.drawing import DrawnRun, draw_run
+from foredrive.driving.ncap.outcome import judge
+from foredrive.driving.ncap.rules import OURS
+from foredrive.driving.ncap.running import Place, set_up_run
+from foredrive.driving.ncap.scenario import SafetyScenario
+from foredrive.driving.ncap.self_test import run_reference
+from foredrive.driving.replay.replayed import users_at
+from foredrive.engine.summary import write_json
+from foredrive.methods.rebuilding.scene_graph import SceneGraph
+from foredrive.methods.rebuilding.tracks import ActorTracks
 from foredrive.runs.drive.agents import inputs_of
 from foredrive.runs.drive.in_ncap import place_in
 from foredrive.runs.drive.in_rebuilt import agent_in
 from foredrive.scene import Renderer
-from foredrive.simulation.drive import Drive, drive_route
-from foredrive.simulation.dynamics import EGO, STEP_S
-from foredrive.simulation.ncap.drawing import DrawnRun, draw_run
-from foredrive.simulation.ncap.outcome import judge
-from foredrive.simulation.ncap.rules import OURS
-from foredrive.simulation.ncap.running import Place, set_up_run
-from foredrive.simulation.ncap.scenario import SafetyScenario
-from foredrive.simulation.ncap.self_test import run_reference
-from foredrive.simulation.replayed import users_at
-from foredrive.simulation.town_replay import TownReplayRenderer
+from foredrive.towns.driving.town_replay import TownReplayRenderer
 
 
 @dataclass(frozen=True)

@@ -8,20 +8,20 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.common.rebuilt_towns import TownDrive
+from foredrive.driving.drive_record import DriveRecord
+from foredrive.driving.ncap.aggregation import SafetyFigures, aggregate
+from foredrive.driving.ncap.scenario import SafetyScenario
+from foredrive.driving.ncap.scenario_file import load_scenarios, save_scenarios
+from foredrive.driving.replay.threats import Threat
+from foredrive.engine.bench import study_identity
+from foredrive.engine.folder import SUMMARY
 from foredrive.errors import InputError
-from foredrive.evaluation.bench import study_identity
-from foredrive.recipes.rebuilding import gaussians_tiny
 from foredrive.runs.drive.in_ncap import SafetyTests, propose_scenarios
 from foredrive.runs.drive.records import tested_runs
 from foredrive.runs.drive.suite import DriveSuite, drive_suite
-from foredrive.runs.folder import SUMMARY
 from foredrive.runs.rebuild.reconstruct import reconstruct
+from foredrive.runs.recipes.rebuilding import gaussians_tiny
 from foredrive.scene.conditions import BackgroundTraffic
-from foredrive.simulation.drive_record import DriveRecord
-from foredrive.simulation.ncap.aggregation import SafetyFigures, aggregate
-from foredrive.simulation.ncap.scenario import SafetyScenario
-from foredrive.simulation.ncap.scenario_file import load_scenarios, save_scenarios
-from foredrive.simulation.threats import Threat
 
 CAMERAS = ("PCAM_F0", "PCAM_L0", "PCAM_R0", "PCAM_L1", "PCAM_R1", "PCAM_B0")
 
@@ -52,7 +52,11 @@ REBUILDING = {
 }
 WORK = Path("runs/safety_rebuilds") / study_identity(
     REBUILDING,
-    ("foredrive.rendering", "foredrive.training.gaussian_training", "foredrive.training.rebuilding"),
+    (
+        "foredrive.methods.rebuilding",
+        "foredrive.methods.splatad.training",
+        "foredrive.methods.rebuilding.training",
+    ),
 )
 
 

@@ -8,19 +8,20 @@ from pathlib import Path
 from typing import Any
 
 from foredrive.data import LogPath, find_logs
-from foredrive.data.convert import convert
+from foredrive.data.formats.convert import convert
+from foredrive.engine.metrics_log import read_metrics
+from foredrive.engine.provenance import collect_provenance
+from foredrive.engine.summary import read_summary
 from foredrive.errors import InputError
-from foredrive.evaluation.provenance import collect_provenance
-from foredrive.evaluation.summary import read_summary
 from foredrive.files import atomic_path
-from foredrive.metrics.protocols import PROTOCOLS
-from foredrive.recipes.config import Recipe, rescheduled
+from foredrive.methods.planner.path_fit import PathFit
+from foredrive.methods.recipe import Recipe, rescheduled
 from foredrive.runs.drive.recording import record_drives
 from foredrive.runs.evaluate.run import SUMMARY, evaluate_run
 from foredrive.runs.train.run import train_run
 from foredrive.sensors.rigs import SURROUND
+from foredrive.tasks.planning.protocols import PROTOCOLS
 from foredrive.towns.campaign import Campaign, plan_drives
-from foredrive.training import PathFit, read_metrics
 
 HEADLINE = "uniad"
 """The protocol of NeMo's own tables."""

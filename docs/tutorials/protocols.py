@@ -30,7 +30,7 @@ plan.xy[0, 0].round(decimals=2)
 # Each protocol is a record of its choices.
 
 # %%
-from foredrive.metrics.protocols import PROTOCOLS
+from foredrive.tasks.planning.protocols import PROTOCOLS
 
 for name, protocol in PROTOCOLS.items():
     cells = f"cells of {protocol.grid.cell_m} m" if protocol.grid else "exact polygons"
@@ -43,9 +43,9 @@ for name, protocol in PROTOCOLS.items():
 # the way of counting differs.
 
 # %%
-from foredrive.metrics.obstacles import future_obstacles
-from foredrive.metrics.planning import score_plan
-from foredrive.metrics.protocols import STEP_S, STEPS
+from foredrive.tasks.planning.obstacles import future_obstacles
+from foredrive.tasks.planning.protocols import STEP_S, STEPS
+from foredrive.tasks.planning.scores import score_plan
 
 driven, obstacles = example.clip.future, future_obstacles(example.clip, STEPS, STEP_S)
 for protocol in PROTOCOLS.values():

@@ -20,8 +20,8 @@
 # %%
 from pathlib import Path
 
-from foredrive.recipes import find_recipe
-from foredrive.recipes.config import save_recipe
+from foredrive.engine.config import save_recipe
+from foredrive.runs.recipes.known import find_recipe
 
 few = ["pretrain.schedule.steps=150", "pretrain.schedule.warmup_steps=15", "finetune.schedule.steps=30"]
 save_recipe(find_recipe("nemo_tiny", few), Path("few_steps.yaml"))
@@ -36,7 +36,7 @@ save_recipe(find_recipe("nemo_tiny", few), Path("few_steps.yaml"))
 import matplotlib.pyplot as plt
 import numpy as np
 
-from foredrive.training import read_metrics
+from foredrive.engine.metrics_log import read_metrics
 
 lines = read_metrics(Path("runs/tiny/pretrain/metrics.jsonl"))
 for name in ("occ", "l1"):  # of occupancy, and of rendered images

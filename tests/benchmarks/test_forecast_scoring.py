@@ -3,8 +3,8 @@
 import numpy as np
 
 from benchmarks.common.forecast_scoring import AGENTS, BOXES, scene
-from foredrive.metrics.motion.protocols import PROTOCOLS
-from foredrive.metrics.motion.scores import score_motion
+from foredrive.tasks.motion.protocols import PROTOCOLS
+from foredrive.tasks.motion.scores import score_motion
 
 
 def test_scenes_have_their_boxes_and_are_partly_found() -> None:

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from benchmarks.common.occupancy_scoring import Frame, frames
-from foredrive.metrics.voxels.protocols import OCC3D_CLASSES, VOXEL_PROTOCOLS
-from foredrive.metrics.voxels.semantic import count_voxels, mean_iou, voxel_ious
+from foredrive.tasks.occupancy.protocols import OCC3D_CLASSES, VOXEL_PROTOCOLS
+from foredrive.tasks.occupancy.semantic_scores import count_voxels, mean_iou, voxel_ious
 
 FREE = len(OCC3D_CLASSES) - 1
 

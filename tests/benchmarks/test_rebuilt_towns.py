@@ -11,10 +11,10 @@ from scipy.spatial import cKDTree
 from benchmarks.common.rebuilt_towns import TownDrive, TownTruth, TrueViews
 from foredrive.errors import InputError
 from foredrive.geometry.se3 import exp_se3, inverse_se3, transform_points
-from foredrive.rendering.calibration import with_images_from
-from foredrive.rendering.edits import Duplicate, Move, Remove, ShiftEgo
-from foredrive.rendering.tracks import ActorTracks
-from foredrive.rendering.views import CameraView, SweepView
+from foredrive.methods.rebuilding.calibration import with_images_from
+from foredrive.methods.rebuilding.edits import Duplicate, Move, Remove, ShiftEgo
+from foredrive.methods.rebuilding.tracks import ActorTracks
+from foredrive.methods.rebuilding.views import CameraView, SweepView
 from foredrive.runs.rebuild.calibration_check import calibration_findings
 from foredrive.scene import Category
 from foredrive.scene.actors import ActorState

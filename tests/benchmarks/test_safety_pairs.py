@@ -11,11 +11,11 @@ import torch
 from benchmarks.common.rebuilt_towns import TownDrive, TownTruth
 from benchmarks.common.safety_pairs import Driven, Pair, agreement, outline, read_pair
 from benchmarks.common.safety_suites import spread
+from foredrive.driving.ncap.scenario import Polyline, SafetyScenario, ScenarioActor
+from foredrive.driving.replay.threats import Threat
 from foredrive.errors import InputError
-from foredrive.rendering.tracks import ActorTracks
-from foredrive.simulation.ncap.scenario import Polyline, SafetyScenario, ScenarioActor
-from foredrive.simulation.threats import Threat
-from foredrive.simulation.town_replay import TownReplayRenderer
+from foredrive.methods.rebuilding.tracks import ActorTracks
+from foredrive.towns.driving.town_replay import TownReplayRenderer
 
 
 def driven(outcome: str, score: float | None, near_m: float = 0.0) -> Driven:

@@ -8,9 +8,9 @@ from miniature import miniature
 
 from benchmarks.common.study import StudyLogs, pandaset_log, run_arm, seeded, share_of
 from foredrive.data import LogPath
+from foredrive.engine.metrics_log import read_metrics
 from foredrive.errors import InputError
 from foredrive.runs import Run
-from foredrive.training import read_metrics
 
 LOGS = tuple(LogPath(Path(f"log{i}"), Path("maps")) for i in range(7))
 

@@ -9,8 +9,8 @@ from miniature import miniature
 
 import benchmarks.task_probes as study
 from foredrive.data import LogPath
-from foredrive.recipes import RECIPES
 from foredrive.runs import Run, open_run, train_run
+from foredrive.runs.recipes.known import RECIPES
 
 
 def test_rows_pretrain_their_own_world_model_and_nothing_else() -> None:

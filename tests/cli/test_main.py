@@ -347,11 +347,11 @@ def test_help_waits_for_nothing_heavy() -> None:
 
 def test_verbs_wait_for_nothing_they_do_not_use() -> None:
     bench, convert, record, view, recipes, evaluate = heavy_after(
-        "import foredrive.evaluation.bench",
-        "import foredrive.data.convert",
+        "import foredrive.engine.bench",
+        "import foredrive.data.formats.convert",
         "import foredrive.runs.drive.recording",
         "import foredrive.data, foredrive.view.log_sheet, foredrive.view.log_frames",
-        "import foredrive.recipes.known",
+        "import foredrive.runs.recipes.known",
         "import foredrive.runs.evaluate.run, foredrive.view.run_report",
     )
     assert bench == {"torch"}

@@ -9,7 +9,7 @@ import ctypes
 import resource
 ctypes.CDLL(None).prctl(41, 1, 0, 0, 0)  # PR_SET_THP_DISABLE: the kernel's huge pages hide most of the faults
 import torch
-from foredrive.cli.memory import keep_freed_memory
+from foredrive.cli.main import keep_freed_memory
 if {kept}:
     keep_freed_memory()
 for _ in range(3):

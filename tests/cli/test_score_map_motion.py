@@ -4,10 +4,10 @@ import json
 from pathlib import Path
 
 import pytest
-from evaluation.test_av2_forecast_files import bus, submission, write_scenario, write_sensor_log
-from evaluation.test_map_files import FOUND, TRUE, maptr, streammapnet, write
-from evaluation.test_motion_files import FOUND as AGENTS
-from evaluation.test_motion_files import TRUE as TRUE_AGENTS
+from tasks.maps.test_map_files import FOUND, TRUE, maptr, streammapnet, write
+from tasks.motion.test_av2_forecast_files import bus, submission, write_scenario, write_sensor_log
+from tasks.motion.test_motion_files import FOUND as AGENTS
+from tasks.motion.test_motion_files import TRUE as TRUE_AGENTS
 
 from foredrive.cli.main import main
 

@@ -6,7 +6,7 @@ from typing import get_args
 
 import numpy as np
 import pytest
-from evaluation.voxels.folders_of_voxels import (
+from tasks.folders_of_voxels import (
     OCC3D_FREE,
     XYZ,
     street,

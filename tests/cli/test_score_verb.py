@@ -6,8 +6,8 @@ import re
 from pathlib import Path
 
 import pytest
-from evaluation.detections.files_of_detections import box, write_nuscenes
 from html_pages import EVIL, assert_harmless
+from tasks.files_of_detections import box, write_nuscenes
 
 from foredrive.cli.main import main
 from foredrive.search.rows import SCORES

@@ -7,8 +7,7 @@ import pytest
 import synthetic_log as world
 import torch
 
-from foredrive.data.accumulated_labels import accumulated_labels
-from foredrive.data.label_store import LabelStore
+from foredrive.data.label_store import LabelStore, accumulated_labels
 from foredrive.data.labels import VoxelLabels, make_labels
 from foredrive.data.log_paths import find_logs
 from foredrive.data.logs import Log

@@ -11,10 +11,10 @@ import synthetic_log as world
 import torch
 
 from foredrive.data import find_logs
-from foredrive.data.agent_futures import read_futures, read_instances
 from foredrive.data.boxes import read_boxes
 from foredrive.data.log_writer import LogWriter
 from foredrive.data.logs import Log
+from foredrive.data.truth.agent_futures import read_futures, read_instances
 from foredrive.geometry.se3 import inverse_se3, matrix_from_yaw
 from foredrive.scene import Category
 from foredrive.scene.boxes import unlabelled

@@ -9,12 +9,12 @@ import torch
 from small_drives import drives, one_example
 from torch import Tensor
 
+from foredrive.data.augmentation import AugmentConfig, augmented, mirrored
 from foredrive.data.labels import voxel_labels
 from foredrive.errors import InputError
 from foredrive.geometry.projection import project
 from foredrive.geometry.se3 import exp_se3, inverse_se3, transform_points
 from foredrive.scene import Example, LidarSweep, VoxelSpec
-from foredrive.training.augmentation import AugmentConfig, augmented, mirrored
 
 ACROSS = torch.tensor([1.0, -1.0, 1.0])
 BOTH = torch.tensor([True, True])

@@ -11,8 +11,8 @@ from xml.sax.saxutils import escape
 import pytest
 
 from foredrive.cli.main import main
-from foredrive.data.raw import s3_files
-from foredrive.data.raw.av2_fetch import ROOT, fetch_log, find_log, log_ids
+from foredrive.data.formats import s3_files
+from foredrive.data.formats.av2_fetch import ROOT, fetch_log, find_log, log_ids
 from foredrive.errors import InputError
 
 LOG, OTHER = "00a6ffc1-6ce9-3bc3-a060-6006e9893a1a", "11a6ffc1-6ce9-3bc3-a060-6006e9893a1a"

@@ -31,24 +31,25 @@ from PIL import Image
 from foredrive.data.boxes import read_tracks
 from foredrive.data.cameras import pinhole_cameras, read_camera
 from foredrive.data.clip_list import ListedClip, clip_list, read_clip_list, write_clip_list
-from foredrive.data.convert import convert
+from foredrive.data.formats.bag_topics import propose_topics, topics_file
+from foredrive.data.formats.convert import convert
 from foredrive.data.lidar import read_sweep
 from foredrive.data.log_paths import LogPath
 from foredrive.data.logs import Log
 from foredrive.data.notices import read_notices
-from foredrive.data.raw.bag_topics import propose_topics, topics_file
+from foredrive.driving.ncap.scenario_file import load_scenarios
+from foredrive.driving.route_sets import read_carla_routes
+from foredrive.engine.config import save_recipe
 from foredrive.errors import InputError
-from foredrive.evaluation.objects.nuscenes_tables import _table
-from foredrive.evaluation.voxels.poses import read_poses
-from foredrive.recipes.config import load_recipe, save_recipe
-from foredrive.rendering.edits import Remove, load_edits, save_edits
+from foredrive.methods.rebuilding.edits import Remove, load_edits, save_edits
 from foredrive.runs.drive.records import read_suite
+from foredrive.runs.recipes.world_models import load_recipe
 from foredrive.runs.train.run import open_run
 from foredrive.search.rows import SCORES
 from foredrive.search.scores import read_scores
 from foredrive.sensors.rigs import SURROUND, find_rig
-from foredrive.simulation.ncap.scenario_file import load_scenarios
-from foredrive.simulation.route_sets import read_carla_routes
+from foredrive.tasks.occupancy.files import read_poses
+from foredrive.tasks.tracking.nuscenes_tables import _table
 
 TOO_LONG_S = 20
 

@@ -11,11 +11,7 @@ from rosbags.rosbag2 import StoragePlugin
 
 from foredrive.cli.main import main
 from foredrive.data.cameras import pinhole_cameras, read_camera
-from foredrive.data.convert import convert
-from foredrive.data.lidar import read_sweep
-from foredrive.data.logs import Log
-from foredrive.data.notices import read_notices
-from foredrive.data.raw.bag_messages import (
+from foredrive.data.formats.bag_messages import (
     Placed,
     read_calibration,
     read_cloud,
@@ -23,8 +19,12 @@ from foredrive.data.raw.bag_messages import (
     seconds_since_stamp,
     time_unit,
 )
-from foredrive.data.raw.bag_topics import propose_topics, read_topics, topics_file
-from foredrive.data.raw.frame_tree import FrameTree
+from foredrive.data.formats.bag_topics import propose_topics, read_topics, topics_file
+from foredrive.data.formats.convert import convert
+from foredrive.data.formats.frame_tree import FrameTree
+from foredrive.data.lidar import read_sweep
+from foredrive.data.logs import Log
+from foredrive.data.notices import read_notices
 from foredrive.errors import InputError
 
 

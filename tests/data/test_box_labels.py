@@ -15,7 +15,7 @@ from arrow_surgery import rewrite_column
 
 from foredrive.data import ClipConfig, ClipDataset, LogPath, collate, find_logs
 from foredrive.data.boxes import read_boxes, with_counted_points
-from foredrive.data.convert import convert
+from foredrive.data.formats.convert import convert
 from foredrive.data.log_writer import LogWriter
 from foredrive.data.logs import Log
 from foredrive.errors import InputError

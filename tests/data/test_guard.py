@@ -15,10 +15,10 @@ from made_bags import Messages
 from PIL import Image
 from py123d.parser.base_dataset_parser import ParsedLidar
 
+from foredrive.data.formats.datasets import DATASETS
+from foredrive.data.formats.guard import PartReader, SensorFiles
+from foredrive.data.images import read_rgb
 from foredrive.data.notices import collecting
-from foredrive.data.raw.datasets import DATASETS
-from foredrive.data.raw.guard import PartReader, SensorFiles
-from foredrive.data.raw.images import read_rgb
 from foredrive.data.safe_pickle import load_table
 from foredrive.errors import InputError
 

@@ -10,7 +10,7 @@ from PIL import Image
 
 from foredrive.data.boxes import read_boxes
 from foredrive.data.cameras import pinhole_cameras, read_camera
-from foredrive.data.convert import convert
+from foredrive.data.formats.convert import convert
 from foredrive.data.lidar import read_sweep
 from foredrive.data.logs import Log
 from foredrive.data.notices import read_notices

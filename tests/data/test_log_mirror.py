@@ -21,8 +21,8 @@ from test_clips import config
 from foredrive.cli.main import main
 from foredrive.data import ClipDataset, find_logs
 from foredrive.data.logs import Log
+from foredrive.engine.interrupts import start_fork_server
 from foredrive.errors import InputError
-from foredrive.training.interrupts import start_fork_server
 
 pytest.importorskip("moto")
 FRAMES, NAMES = 21, ("one", "three", "two")

@@ -108,11 +108,7 @@ def test_a_provided_route_is_kept_and_none_is_made_up(tmp_path: Path) -> None:
     assert ArrowSceneAPI(world.write(tmp_path, frames=3, name="without")).get_route() is None
 
 
-@pytest.mark.parametrize("name", ["expert_plan", "taught_plan"])
-def test_the_experts_plan_comes_back_from_logs_of_this_and_earlier_versions(
-    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("foredrive.data.log_writer.EXPERT_PLAN", name)
+def test_the_experts_plan_comes_back(tmp_path: Path) -> None:
     xy = torch.tensor([[[1.0, 0.25], [2.5, 0.5]]])
     plan = Trajectory(
         xy, torch.tensor([[0.25, 0.5]]), torch.ones(1, 2, dtype=torch.bool), torch.zeros(1), 0.5

@@ -6,13 +6,13 @@ from collections.abc import Callable
 import pytest
 import torch
 
+from foredrive.data.augmentation import mirrored
 from foredrive.errors import InputError
 from foredrive.scene import Example, VoxelSpec
 from foredrive.scene.agent_futures import AgentFutures
 from foredrive.scene.map_elements import InstanceRaster, MapElements, MapRaster, PlaneSpec
 from foredrive.scene.semantics import SemanticVoxels
 from foredrive.scene.task_truth import TaskTruth
-from foredrive.training.augmentation import mirrored
 
 PLANE = PlaneSpec((-2.0, -1.0), 0.5, (4, 8))
 VOXELS = VoxelSpec((-2.0, -1.0, 0.0), 0.5, (2, 4, 8))

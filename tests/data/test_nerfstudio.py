@@ -9,7 +9,7 @@ import torch
 from PIL import Image
 
 from foredrive.data.cameras import pinhole_cameras, read_camera
-from foredrive.data.convert import convert
+from foredrive.data.formats.convert import convert
 from foredrive.data.logs import Log
 from foredrive.data.notices import read_notices
 from foredrive.errors import InputError

@@ -23,12 +23,12 @@ from test_raw_pandaset import Intruder
 
 from foredrive.data.boxes import read_boxes
 from foredrive.data.cameras import pinhole_cameras, read_camera
-from foredrive.data.convert import convert
+from foredrive.data.formats.convert import convert
+from foredrive.data.formats.datasets import DATASETS
 from foredrive.data.lidar import read_sweep
 from foredrive.data.logs import Log
 from foredrive.data.maps import read_map_patch
 from foredrive.data.notices import read_notices
-from foredrive.data.raw.datasets import DATASETS
 from foredrive.data.safe_pickle import PlainPickle
 from foredrive.errors import InputError
 from foredrive.scene import Attribute, Category, Visibility

@@ -10,7 +10,7 @@ from pyarrow import feather
 
 from foredrive.data.boxes import frames_with_boxes, read_boxes
 from foredrive.data.cameras import pinhole_cameras, read_camera
-from foredrive.data.convert import convert
+from foredrive.data.formats.convert import convert
 from foredrive.data.lidar import frames_with_lidar
 from foredrive.data.logs import Log
 from foredrive.data.notices import read_notices

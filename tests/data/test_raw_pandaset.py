@@ -9,7 +9,7 @@ import raw_pandaset
 
 from foredrive.data.boxes import read_boxes
 from foredrive.data.cameras import pinhole_cameras
-from foredrive.data.convert import convert
+from foredrive.data.formats.convert import convert
 from foredrive.data.lidar import read_sweep
 from foredrive.data.log_check import check_log
 from foredrive.data.logs import Log

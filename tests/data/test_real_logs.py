@@ -9,8 +9,8 @@ import torch
 from foredrive.data import ClipConfig, ClipDataset, LogPath
 from foredrive.data.boxes import read_boxes
 from foredrive.data.cameras import find_camera, pinhole_cameras, read_camera
-from foredrive.data.convert import convert
 from foredrive.data.drives import read_drive
+from foredrive.data.formats.convert import convert
 from foredrive.data.labels import make_labels
 from foredrive.data.lidar import read_sweep
 from foredrive.data.logs import Log

@@ -14,7 +14,7 @@ from foredrive.data.labels import make_labels
 from foredrive.data.log_writer import LogWriter
 from foredrive.data.logs import Log
 from foredrive.data.modalities import FullOccupancy
-from foredrive.data.semantic_labels import NEVER_IN_TOWNS, STATIC_CLASSES, read_semantics
+from foredrive.data.truth.semantic_labels import NEVER_IN_TOWNS, STATIC_CLASSES, read_semantics
 from foredrive.scene import Category, VoxelSpec
 from foredrive.scene.semantics import VOXEL_CLASSES, SemanticVoxels, Taxonomy
 from foredrive.towns.place.materials import Surface

@@ -11,24 +11,24 @@ from foredrive.data.log_paths import LogPath
 from foredrive.driver.agent import SightDriver
 from foredrive.driver.judging import judge_sight
 from foredrive.driver.packed import PackedClips, join
+from foredrive.driver.recipes import DriverRecipe, driver_nemo, driver_small
+from foredrive.engine.metrics_log import read_metrics
 from foredrive.errors import InputError
-from foredrive.recipes.driver import DriverRecipe, driver_nemo, driver_small
-from foredrive.recipes.known import find_driver_recipe, find_recipe
 from foredrive.runs import model_card, shipped
 from foredrive.runs.drive.agents import inputs_of, make_agent, rig_of
 from foredrive.runs.drive.in_towns import TownRoutes
 from foredrive.runs.model_card import find_card, read_card, shipped_weights
+from foredrive.runs.recipes.known import find_driver_recipe, find_recipe
 from foredrive.runs.ship import ship_driver
 from foredrive.runs.shipped import DRIVER, run_folder
 from foredrive.runs.train.driver import load_driver, open_driver, train_driver
 from foredrive.runs.train.run import load_agent, open_run
 from foredrive.sensors.rigs import FRONT_TELE, camera_rig, same_rig
-from foredrive.simulation.demonstrations import AlternatingStudent
-from foredrive.simulation.town import TownSimulator
 from foredrive.towns import virtual_egos
+from foredrive.towns.driving.demonstrations import AlternatingStudent
+from foredrive.towns.driving.town import TownSimulator
 from foredrive.towns.sensing.capture import SensorSuite
 from foredrive.towns.world import World
-from foredrive.training.metrics_log import read_metrics
 
 
 @pytest.fixture(scope="module")
@@ -179,7 +179,7 @@ def test_eyes_that_read_a_volume_start_from_a_pretrained_run(logs: list[LogPath]
 
 
 def test_recipes_of_drivers_are_found_by_name_and_file(tmp_path: Path) -> None:
-    from foredrive.recipes.config import save_recipe
+    from foredrive.engine.config import save_recipe
 
     assert find_driver_recipe("nemo_tiny") is None
     changed = find_driver_recipe("driver_small", ["see.epochs=1"])

@@ -15,7 +15,7 @@ from foredrive.driver.volume_eyes import VolumeEyes, VolumeEyesConfig
 from foredrive.errors import InputError
 from foredrive.geometry.projection import project
 from foredrive.geometry.se3 import inverse_se3, transform_points
-from foredrive.recipes.nemo import nemo_town
+from foredrive.methods.nemo.recipes import nemo_town
 from foredrive.scene import Example, VoxelSpec
 from foredrive.scene.affordances import CELLS, TIMES
 from foredrive.scene.traffic_light import LightState

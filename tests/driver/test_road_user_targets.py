@@ -9,11 +9,11 @@ from path_truth import SPEC
 
 from foredrive.driver.road_user_targets import road_user_cells, road_user_pixels
 from foredrive.driver.route_cells import BESIDE_M
+from foredrive.driving.speed_rule import FRONT_M
 from foredrive.geometry.se3 import inverse_se3, transform_points
 from foredrive.scene import Boxes, Clip, Example
 from foredrive.scene.boxes import UNKNOWN, Category, Visibility
 from foredrive.scene.clip import ROUTE_M
-from foredrive.simulation.speed_rule import FRONT_M
 
 CYCLIST_M = FRONT_M + 9.0
 """Distance of the cyclist along the route: the middle of the cell of index 4."""

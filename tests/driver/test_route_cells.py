@@ -7,12 +7,12 @@ import torch
 from path_truth import SPEC
 
 from foredrive.driver.route_cells import BESIDE_M, route_cells, sample_cameras
+from foredrive.driving.speed_rule import FRONT_M
 from foredrive.geometry.projection import project
 from foredrive.geometry.se3 import inverse_se3, transform_points
 from foredrive.scene import Example
 from foredrive.scene.affordances import CELL_M, CELLS
 from foredrive.scene.clip import ROUTE_M
-from foredrive.simulation.speed_rule import FRONT_M
 
 
 def straight(heading_rad: float) -> torch.Tensor:

@@ -17,10 +17,10 @@ from foredrive.driver.speed_planner import (
     profile_numbers,
     profile_progress,
 )
+from foredrive.driving.observation import HORIZON_STEPS
+from foredrive.engine.in_memory_fit import FitSchedule, fit_in_memory
 from foredrive.scene.affordances import CELLS, TIMES, Affordances, PathEstimate
 from foredrive.scene.traffic_light import LightState
-from foredrive.simulation.observation import HORIZON_STEPS
-from foredrive.training.in_memory_fit import FitSchedule, fit_in_memory
 
 
 def test_profiles_are_kinematics_within_the_limit() -> None:

@@ -7,11 +7,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from foredrive.driving.comfort import comfort_of
+from foredrive.driving.dynamics import EGO, STEP_S
+from foredrive.driving.time_to_collision import MovingBoxes, time_to_collision_s
 from foredrive.errors import InputError
 from foredrive.scene import BicycleState
-from foredrive.simulation.comfort import comfort_of
-from foredrive.simulation.dynamics import EGO, STEP_S
-from foredrive.simulation.time_to_collision import MovingBoxes, time_to_collision_s
 
 
 def driven(speed: np.ndarray, curvature: np.ndarray | float = 0.0) -> list[BicycleState]:

@@ -6,12 +6,11 @@ import numpy as np
 import pytest
 import torch
 
+from foredrive.driving.controller import ControllerState, follow
+from foredrive.driving.dynamics import EGO, STEP_S, step
+from foredrive.driving.plans import fit_path, fixed_in_world
 from foredrive.errors import InputError
 from foredrive.scene import BicycleState, Trajectory
-from foredrive.simulation.controller import ControllerState, follow
-from foredrive.simulation.dynamics import EGO, STEP_S, step
-from foredrive.simulation.plans import fixed_in_world
-from foredrive.simulation.smooth_path import fit_path
 
 DT_S = 0.5
 

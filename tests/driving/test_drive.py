@@ -7,15 +7,15 @@ import numpy as np
 import pytest
 import torch
 
+from foredrive.driving.drive import Drive, PlanningTiming, drive_route
+from foredrive.driving.dynamics import STEP_S
+from foredrive.driving.scores import Ending
+from foredrive.driving.simple_agents import StraightAgent
 from foredrive.errors import InputError
 from foredrive.scene import Clip, Trajectory
 from foredrive.scene.conditions import BackgroundTraffic
-from foredrive.simulation.drive import Drive, PlanningTiming, drive_route
-from foredrive.simulation.dynamics import STEP_S
-from foredrive.simulation.scores import Ending
-from foredrive.simulation.simple_agents import StraightAgent
-from foredrive.simulation.town import TownScenario, TownSimulator
-from foredrive.simulation.town_expert import TownExpert
+from foredrive.towns.driving.town import TownScenario, TownSimulator
+from foredrive.towns.driving.town_expert import TownExpert
 from foredrive.towns.map.town_map import load_town_map
 from foredrive.towns.traffic.traffic import Traffic
 

@@ -8,9 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from foredrive.data.log_writer import EGO_VEHICLE
+from foredrive.driving.dynamics import EGO, STEP_S, Vehicle, step, yaw_rate_radps
 from foredrive.errors import InputError
 from foredrive.scene import BicycleState, Control
-from foredrive.simulation.dynamics import EGO, STEP_S, Vehicle, step, yaw_rate_radps
 
 AT_ONCE = dataclasses.replace(EGO, max_steering_radps=1e9, max_jerk_mps3=1e9)
 

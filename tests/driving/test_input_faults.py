@@ -6,10 +6,10 @@ import pytest
 import torch
 from small_drives import one_example
 
+from foredrive.driving.faults import CameraFault, Faults, read_camera_fault
+from foredrive.driving.faulty_agent import FaultyAgent
 from foredrive.errors import InputError
 from foredrive.scene import Clip, Trajectory
-from foredrive.simulation.faults import CameraFault, Faults, read_camera_fault
-from foredrive.simulation.faulty_agent import FaultyAgent
 
 
 class Keeper:

@@ -6,14 +6,14 @@ import math
 import numpy as np
 import pytest
 
+from foredrive.driving.drive import Drive
+from foredrive.driving.drive_record import DriveRecord, record_of
+from foredrive.driving.ncap.outcome import Outcome, judge, threat_score
+from foredrive.driving.replay.threats import Threat
+from foredrive.driving.scores import Ending, RouteScore, infraction_of
 from foredrive.errors import InputError
 from foredrive.runs.drive.records import summarise
 from foredrive.scene import BicycleState, Event
-from foredrive.simulation.drive import Drive
-from foredrive.simulation.drive_record import DriveRecord, record_of
-from foredrive.simulation.ncap.outcome import Outcome, judge, threat_score
-from foredrive.simulation.scores import Ending, RouteScore, infraction_of
-from foredrive.simulation.threats import Threat
 from foredrive.view.drive_report import threat_text
 
 HIT = Event("collision_vehicle", 3.2, (20.0, 0.0), "car 8 at 2.5 m/s", "car", 2.5)

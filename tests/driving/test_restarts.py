@@ -7,11 +7,11 @@ import pytest
 import torch
 
 from foredrive.data.batches import stack_records
+from foredrive.driving.observation import KeyFrame, make_clip, no_images
+from foredrive.driving.restarts import RestartingAgent, is_free_ahead
+from foredrive.driving.simple_agents import StraightAgent
 from foredrive.scene import Clip, Command, VoxelSpec
 from foredrive.scene.actors import boxes_in_ego_frame
-from foredrive.simulation.observation import KeyFrame, make_clip, no_images
-from foredrive.simulation.restarts import RestartingAgent, is_free_ahead
-from foredrive.simulation.simple_agents import StraightAgent
 
 SPEC = VoxelSpec(lower_m=(-8.0, -8.0, -1.5), voxel_m=1.0, shape_zyx=(6, 16, 28))
 

@@ -6,13 +6,14 @@ import itertools
 import numpy as np
 import pytest
 
+from foredrive.driving.collisions import Box, RoadUsers, touched
+from foredrive.driving.dynamics import EGO
+from foredrive.driving.lane_rules import RuleState
+from foredrive.driving.route_progress import RouteLine, RouteProgress
 from foredrive.scene import BicycleState, Command, Event
 from foredrive.scene.traffic_light import LightState
-from foredrive.simulation.dynamics import EGO
-from foredrive.simulation.lane_rules import RuleState
-from foredrive.simulation.road_users import Box, RoadUsers, road_users, touched
-from foredrive.simulation.route_progress import RouteLine, RouteProgress
-from foredrive.simulation.town_lanes import TownLaneRules, stop_lines
+from foredrive.towns.driving.road_users import road_users
+from foredrive.towns.driving.town_lanes import TownLaneRules, stop_lines
 from foredrive.towns.map.town_map import TownMap, load_town_map
 from foredrive.towns.traffic.traffic import Traffic
 

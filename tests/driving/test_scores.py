@@ -5,9 +5,7 @@ import math
 
 import pytest
 
-from foredrive.errors import InputError
-from foredrive.scene import Event
-from foredrive.simulation.scores import (
+from foredrive.driving.scores import (
     FACTOR_1_0,
     Ending,
     Infraction,
@@ -17,6 +15,8 @@ from foredrive.simulation.scores import (
     score_suite,
     timeout_s,
 )
+from foredrive.errors import InputError
+from foredrive.scene import Event
 
 K = InfractionKind
 FLAWLESS = RouteScore("0", 0, 1.0, 0.0, Ending.COMPLETED, (), 500.0, 60.0)

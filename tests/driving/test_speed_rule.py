@@ -3,11 +3,8 @@
 import numpy as np
 import pytest
 
-from foredrive.data.affordances import PathAhead, path_ahead
-from foredrive.geometry.polylines import arc_lengths
-from foredrive.scene.affordances import CELLS, TIMES
-from foredrive.scene.traffic_light import LightState
-from foredrive.simulation.speed_rule import (
+from foredrive.data.truth.affordances import PathAhead, path_ahead
+from foredrive.driving.speed_rule import (
     DESIRED_MPS,
     MARGIN_M,
     STANDSTILL_M,
@@ -20,6 +17,9 @@ from foredrive.simulation.speed_rule import (
     rule_progress,
     slowed_m,
 )
+from foredrive.geometry.polylines import arc_lengths
+from foredrive.scene.affordances import CELLS, TIMES
+from foredrive.scene.traffic_light import LightState
 
 FRONT_M = 4.1
 

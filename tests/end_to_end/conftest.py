@@ -7,7 +7,7 @@ import pytest
 from miniature import miniature
 
 from foredrive.cli.main import main
-from foredrive.recipes import RECIPES
+from foredrive.runs.recipes.known import RECIPES
 
 
 @pytest.fixture

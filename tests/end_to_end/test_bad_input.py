@@ -10,7 +10,7 @@ import synthetic_log
 from arrow_surgery import rewrite_column
 
 from foredrive.data import LogPath
-from foredrive.evaluation.summary import read_summary
+from foredrive.engine.summary import read_summary
 from foredrive.runs import Run
 
 EGO, CAMERA = "ego_state_se3", "camera.pcam_f0"

@@ -10,10 +10,10 @@ from pathlib import Path
 import pytest
 
 from foredrive.data import LogPath
+from foredrive.engine.folder import held, held_for_results
+from foredrive.engine.metrics_log import read_metrics
 from foredrive.files import atomic_path
 from foredrive.runs import Run
-from foredrive.runs.folder import held, held_for_results
-from foredrive.training import read_metrics
 
 Program = Callable[..., tuple[int, str]]
 RECORD = ("record", "--town", "Town02", "--seconds", "1", "--rate", "2", "--image-size", "36", "64")

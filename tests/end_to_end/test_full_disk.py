@@ -14,9 +14,9 @@ from torch._utils import ExceptionWrapper
 
 from foredrive.cli import main as program
 from foredrive.data import LogPath, find_logs
+from foredrive.engine.metrics_log import read_metrics
 from foredrive.files import atomic_path
 from foredrive.runs import Run
-from foredrive.training import read_metrics
 
 Program = Callable[..., tuple[int, str]]
 RECORD = ("record", "--town", "Town02", "--seconds", "1", "--rate", "2", "--image-size", "36", "64")

@@ -16,9 +16,9 @@ from miniature import miniature
 
 from benchmarks.common.program_server import ProgramServer
 from foredrive.data import LogPath
-from foredrive.evaluation.summary import read_summary
+from foredrive.engine.metrics_log import read_metrics
+from foredrive.engine.summary import read_summary
 from foredrive.runs import Run, train_run
-from foredrive.training import read_metrics
 
 TESTS = Path(__file__).parents[1]
 PATIENCE_S = 300.0
@@ -26,7 +26,7 @@ PRELUDE = """
 import foredrive.runs.drive.recording, foredrive.runs.evaluate.run, foredrive.runs.train.run
 import foredrive.view.overview, foredrive.view.run_report, foredrive.view.summary_tables
 from miniature import miniature
-from foredrive.recipes import RECIPES
+from foredrive.runs.recipes.known import RECIPES
 RECIPES["miniature"] = miniature()
 """
 Sign = Callable[[], bool]

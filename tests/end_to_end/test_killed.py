@@ -25,9 +25,9 @@ from foredrive.runs import Run
 
 TESTS = Path(__file__).parents[1]
 PRELUDE = """
-import foredrive.runs.convert, foredrive.runs.train.run, foredrive.training.fabric
+import foredrive.runs.convert, foredrive.runs.train.run, foredrive.engine.fabric
 from miniature import miniature
-from foredrive.recipes import RECIPES
+from foredrive.runs.recipes.known import RECIPES
 RECIPES["miniature"] = miniature()
 """
 FANNED_OUT = """
@@ -35,7 +35,7 @@ import contextlib, os, sys, time
 from pathlib import Path
 from foredrive.cli import main as program
 from foredrive.files import atomic_path
-from foredrive.runs.fan_out import fan_out
+from foredrive.engine.fan_out import fan_out
 def work(seconds):
     with atomic_path(Path("out", str(seconds))) as temporary:
         temporary.write_text("half")

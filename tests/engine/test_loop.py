@@ -11,12 +11,12 @@ from lightning_fabric import Fabric
 from torch import nn
 from torch.utils.data import Dataset
 
+from foredrive.engine.checkpoints import latest_checkpoint
+from foredrive.engine.fabric import make_fabric
+from foredrive.engine.loop import Schedule, batch_order, train
+from foredrive.engine.metrics_log import read_metrics
 from foredrive.errors import InputError
 from foredrive.scene import Example, VoxelSpec
-from foredrive.training.checkpoints import latest_checkpoint
-from foredrive.training.fabric import make_fabric
-from foredrive.training.loop import Schedule, batch_order, train
-from foredrive.training.metrics_log import read_metrics
 
 SPEC = VoxelSpec(lower_m=(-2.0, -2.0, -1.0), voxel_m=1.0, shape_zyx=(2, 4, 4))
 

@@ -9,9 +9,10 @@ from torch import Tensor, nn
 from torch.optim.lr_scheduler import OneCycleLR
 from torch.utils.data import Dataset
 
+from foredrive.engine.fabric import make_fabric
+from foredrive.engine.loop import Schedule, train
+from foredrive.engine.one_cycle import OneCycle
 from foredrive.scene.record import Record
-from foredrive.training import Schedule, make_fabric, train
-from foredrive.training.one_cycle import OneCycle
 
 SCHEDULE = Schedule(batch_size=1, lr=1e-2, steps=12, weight_decay=0.0, one_cycle=OneCycle())
 

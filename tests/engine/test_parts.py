@@ -10,10 +10,10 @@ from lightning_fabric import Fabric
 from torch import nn
 from torch.utils.data import Dataset
 
+from foredrive.engine.loop import Schedule, train
+from foredrive.engine.metrics_log import read_metrics
+from foredrive.engine.parts import StepBuffers, mean_losses, parts_of_step
 from foredrive.errors import InputError
-from foredrive.training.loop import Schedule, train
-from foredrive.training.metrics_log import read_metrics
-from foredrive.training.parts import StepBuffers, mean_losses, parts_of_step
 
 
 @given(st.lists(st.integers(), min_size=1, max_size=12), st.integers(1, 8))

@@ -14,10 +14,10 @@ from miniature import miniature
 from safetensors.torch import load_file
 
 from foredrive.data import LogPath
-from foredrive.recipes import Recipe
-from foredrive.recipes.config import save_recipe
+from foredrive.engine.config import save_recipe
+from foredrive.engine.metrics_log import read_metrics
+from foredrive.methods.recipe import Recipe
 from foredrive.runs import Run, open_run, train_run
-from foredrive.training import read_metrics
 
 TESTS = Path(__file__).parents[1]
 STEPS = 3
@@ -38,7 +38,7 @@ if second:
     sys.addaudithook(note)
 
 from foredrive.cli.main import main
-from foredrive.training import NemoObjective
+from foredrive.methods.nemo.objective import NemoObjective
 
 def train(name, *more):
     return main(["train", recipe, "--logs", log, "--out", f"{out}/{name}", "--cache", cache, *more])

@@ -6,14 +6,15 @@ from typing import Any
 
 import pytest
 
+from foredrive.engine.learning_rates import Rate
+from foredrive.engine.loop import Schedule
+from foredrive.engine.one_cycle import OneCycle
 from foredrive.errors import InputError
-from foredrive.recipes.field import tiny_field
-from foredrive.recipes.gaussians import tiny_gaussians
-from foredrive.recipes.rebuilding import find_rebuild_recipe
-from foredrive.training import EgoMLPFit, PathFit
-from foredrive.training.learning_rates import Rate
-from foredrive.training.loop import Schedule
-from foredrive.training.one_cycle import OneCycle
+from foredrive.methods.neurad.recipes import tiny_field
+from foredrive.methods.planner.ego_mlp_fit import EgoMLPFit
+from foredrive.methods.planner.path_fit import PathFit
+from foredrive.methods.splatad.recipes import tiny_gaussians
+from foredrive.runs.recipes.rebuilding import find_rebuild_recipe
 
 SCHEDULES = {
     "training": Schedule(batch_size=2, lr=1e-3, steps=5),

@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from foredrive.engine.provenance import collect_provenance, command_line, git_commit, peak_rss_gib
+from foredrive.engine.summary import numbers, read_summary, write_summary
 from foredrive.errors import InputError
-from foredrive.evaluation.provenance import collect_provenance, command_line, git_commit, peak_rss_gib
-from foredrive.evaluation.summary import numbers, read_summary, write_summary
 
 
 def test_numbers_that_json_lacks_become_null(tmp_path: Path) -> None:

@@ -10,12 +10,12 @@ from joint_heads import ALL, with_small_heads, with_truth
 from miniature import shrunk
 from torch import nn
 
+from foredrive.engine.checkpoints import load_checkpoint, save_checkpoint
+from foredrive.engine.parameter_groups import parameter_groups
 from foredrive.errors import InputError
-from foredrive.recipes import RECIPES
 from foredrive.runs.build import build_agent, build_objective
+from foredrive.runs.recipes.known import RECIPES
 from foredrive.scene import Example
-from foredrive.training.checkpoints import load_checkpoint, save_checkpoint
-from foredrive.training.parameter_groups import parameter_groups
 
 STAGES = [
     (name, stage)

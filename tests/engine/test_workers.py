@@ -15,8 +15,8 @@ from pathlib import Path
 
 from torch.utils.data import Dataset
 
-from foredrive.training.loop import _loader
-from foredrive.training.parts import Part
+from foredrive.engine.loop import _loader
+from foredrive.engine.parts import Part
 
 
 class Workers(Dataset):
@@ -39,7 +39,7 @@ def test_a_collection_in_a_worker_leaves_the_modules_it_was_born_with_alone() ->
     """Else the first full collection in each worker would copy the memory that all of them share."""
     code = (
         "import gc, multiprocessing\n"
-        "from foredrive.training.interrupts import start_fork_server\n"
+        "from foredrive.engine.interrupts import start_fork_server\n"
         "start_fork_server(preload='decimal')\n"
         "with multiprocessing.get_context('forkserver').Pool(1) as pool:\n"
         "    print(pool.apply(gc.get_freeze_count))"

@@ -18,16 +18,16 @@ from foredrive.data import CameraSpec, LogPath, Points
 from foredrive.data import write_log as write_own_log
 from foredrive.data.boxes import read_boxes
 from foredrive.data.cameras import encoded_image, pinhole_cameras, read_camera
-from foredrive.data.convert import convert
+from foredrive.data.formats.convert import convert
+from foredrive.data.formats.nuscenes_names import NAME_OF_CATEGORY
 from foredrive.data.lidar import read_sweep
 from foredrive.data.log_writer import LogWriter
 from foredrive.data.logs import Log
 from foredrive.data.maps import write_map
-from foredrive.data.nuscenes_names import NAME_OF_CATEGORY
-from foredrive.evaluation.objects.nuscenes_tables import read_tables_truth
-from foredrive.export.nuscenes.streams import lidar_axes
-from foredrive.metrics.detection_protocols import CLASSES
+from foredrive.integrations.nuscenes.streams import lidar_axes
 from foredrive.scene import Attribute, Category
+from foredrive.tasks.detection.protocols import CLASSES
+from foredrive.tasks.tracking.nuscenes_tables import read_tables_truth
 
 FRAMES = 21
 """Two seconds at 10 Hz: five samples."""

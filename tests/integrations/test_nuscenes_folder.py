@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import synthetic_log
-from integration.test_full_disk import FULL, all_files, files_up_to
+from end_to_end.test_full_disk import FULL, all_files, files_up_to
 from miniature import write_log
 from nuscenes_files import Tables
 
@@ -15,8 +15,8 @@ from foredrive.cli.main import main
 from foredrive.data import CameraSpec, LogPath
 from foredrive.data import write_log as write_own_log
 from foredrive.data.clip_list import ListedClip, clip_list, write_clip_list
-from foredrive.export.nuscenes.dataset import NuScenesFolder, export_log
-from foredrive.export.nuscenes.scene import SceneOptions
+from foredrive.integrations.nuscenes.dataset import NuScenesFolder, export_log
+from foredrive.integrations.nuscenes.scene import SceneOptions
 from foredrive.runs.nuscenes import export_nuscenes
 
 Export = Callable[..., tuple[int, str, str]]

@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from foredrive.metrics.motion.agents import PredictedAgents, TrueAgents
-from foredrive.metrics.motion.argoverse import forecast_errors, forecast_precision
+from foredrive.tasks.motion.agents import PredictedAgents, TrueAgents
+from foredrive.tasks.motion.argoverse import forecast_errors, forecast_precision
 
 GOLDEN = Path(__file__).with_suffix(".json")
 CLASSES = ["REGULAR_VEHICLE", "PEDESTRIAN", "BICYCLIST", "BUS"]

@@ -10,14 +10,14 @@ import pytest
 from oracles.track_sequences import LEAST_SIMILARITY, Sequence, as_rows
 
 from benchmarks.common.object_drives import Drives, detection_boxes, tracking_boxes, truth_file
-from foredrive.evaluation.detections.files import read_detections
-from foredrive.evaluation.detections.score import score_frames
-from foredrive.evaluation.detections.summary import summarise_scores
-from foredrive.evaluation.objects.nuscenes_json import read_json_truth, read_results
-from foredrive.metrics.detection_protocols import DETECTION_PROTOCOLS, evaluate_detections
-from foredrive.metrics.tracking.clear import Candidates, clear_mot
-from foredrive.metrics.tracking.hota import hota
-from foredrive.metrics.tracking.protocols import TRACKING_PROTOCOLS, evaluate_tracking
+from foredrive.tasks.detection.files import read_detections
+from foredrive.tasks.detection.protocols import DETECTION_PROTOCOLS, evaluate_detections
+from foredrive.tasks.detection.score import score_frames
+from foredrive.tasks.detection.summary import summarise_scores
+from foredrive.tasks.tracking.clear import Candidates, clear_mot
+from foredrive.tasks.tracking.hota import hota
+from foredrive.tasks.tracking.nuscenes_json import read_json_truth, read_results
+from foredrive.tasks.tracking.protocols import TRACKING_PROTOCOLS, evaluate_tracking
 
 ERRORS = {
     "trans_err": "ate_m",

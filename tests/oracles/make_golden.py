@@ -9,7 +9,7 @@ from oracles.track_sequences import clear_by_motmetrics, hota_by_trackeval, make
 
 from benchmarks.common import nuscenes_devkit as devkit
 from benchmarks.common.object_drives import make_drives
-from foredrive.metrics.tracking.protocols import TRACKING_PROTOCOLS
+from foredrive.tasks.tracking.protocols import TRACKING_PROTOCOLS
 
 GOLDEN = Path(__file__).with_name("golden.json")
 SEEDS = (0, 1)

@@ -42,9 +42,9 @@ from oracles.reference_scenes import (
     ray_scene,
 )
 
-from foredrive.metrics.motion.protocols import PROTOCOLS as MOTION
-from foredrive.metrics.voxels.protocols import OCC3D_CLASSES
 from foredrive.scene import Category
+from foredrive.tasks.motion.protocols import PROTOCOLS as MOTION
+from foredrive.tasks.occupancy.protocols import OCC3D_CLASSES
 
 FOLDER = Path(__file__).with_name("reference")
 COMMITS = {

@@ -3,12 +3,12 @@
 from collections.abc import Mapping
 
 import numpy as np
-from metrics.map_scenes import random_maps
-from metrics.motion_scenes import random_predictions, random_truth
+from tasks.map_scenes import random_maps
+from tasks.motion_scenes import random_predictions, random_truth
 
 from benchmarks.common.occupancy_scoring import frames, places
-from foredrive.metrics.maps.lines import LineSet
-from foredrive.metrics.voxels.protocols import OCC3D_CLASSES
+from foredrive.tasks.maps.lines import LineSet
+from foredrive.tasks.occupancy.protocols import OCC3D_CLASSES
 
 Arrays = dict[str, np.ndarray]
 AGENT_FRAMES, MAP_FRAMES = 5, 8

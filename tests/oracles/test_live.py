@@ -12,8 +12,8 @@ from oracles.make_golden import REGIONS
 from oracles.track_sequences import clear_by_motmetrics, hota_by_trackeval, make_sequence
 
 from benchmarks.common.object_drives import Size, make_drives
-from foredrive.evaluation.objects.kitti_tracks import score_kitti_tracks
-from foredrive.metrics.tracking.protocols import TRACKING_PROTOCOLS
+from foredrive.tasks.tracking.kitti_tracks import score_kitti_tracks
+from foredrive.tasks.tracking.protocols import TRACKING_PROTOCOLS
 
 pytestmark = [pytest.mark.oracle, pytest.mark.filterwarnings("ignore")]
 DENSE = Size(scenes=2, frames=10, objects=60, false=30, reach_m=25.0)

@@ -11,7 +11,7 @@ from miniature import write_log
 
 from foredrive.cli.main import main
 from foredrive.data.logs import Log
-from foredrive.metrics.detection_protocols import CLASSES
+from foredrive.tasks.detection.protocols import CLASSES
 
 pytestmark = [pytest.mark.oracle, pytest.mark.filterwarnings("ignore")]
 

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from foredrive.metrics.detection import overlaps
-from foredrive.metrics.tracking.clear import Candidates, ClearCounts, TrackRows, clear_mot
+from foredrive.tasks.detection.matching import overlaps
+from foredrive.tasks.tracking.clear import Candidates, ClearCounts, TrackRows, clear_mot
 
 pytestmark = pytest.mark.oracle
 MIN_OVERLAP = 0.5

@@ -9,16 +9,16 @@ import pytest
 from oracles.reference_code import FOLDER, METRICS
 from oracles.reference_scenes import line_set
 
-from foredrive.metrics.maps.precision import mean_precision, score_maps
-from foredrive.metrics.maps.protocols import PROTOCOLS as MAPS
-from foredrive.metrics.maps.raster import count_raster, raster_figures
-from foredrive.metrics.motion.agents import PredictedAgents, TrueAgents
-from foredrive.metrics.motion.protocols import PROTOCOLS as MOTION
-from foredrive.metrics.motion.scores import score_motion
-from foredrive.metrics.voxels.instances import count_instances
-from foredrive.metrics.voxels.protocols import OCC3D_CLASSES, RAY_PROTOCOLS, UNIAD_INSTANCES
-from foredrive.metrics.voxels.rays import cast_rays, count_rays, score_rays
-from foredrive.metrics.voxels.semantic import mean_iou
+from foredrive.tasks.maps.metric import count_raster, raster_figures
+from foredrive.tasks.maps.precision import mean_precision, score_maps
+from foredrive.tasks.maps.protocols import PROTOCOLS as MAPS
+from foredrive.tasks.motion.agents import PredictedAgents, TrueAgents
+from foredrive.tasks.motion.protocols import PROTOCOLS as MOTION
+from foredrive.tasks.motion.scores import score_motion
+from foredrive.tasks.occupancy.instances_metric import count_instances
+from foredrive.tasks.occupancy.protocols import OCC3D_CLASSES, RAY_PROTOCOLS, UNIAD_INSTANCES
+from foredrive.tasks.occupancy.score import cast_rays, count_rays, score_rays
+from foredrive.tasks.occupancy.semantic_scores import mean_iou
 
 Arrays = Mapping[str, np.ndarray]
 

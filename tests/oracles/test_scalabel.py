@@ -16,8 +16,8 @@ import numpy as np
 import pytest
 from oracles.test_published import MIN_OVERLAP, counts_by_overlap
 
-from foredrive.metrics.detection import overlaps
 from foredrive.sets.assignment import best_assignment
+from foredrive.tasks.detection.matching import overlaps
 
 pytestmark = pytest.mark.oracle
 

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from foredrive.metrics.tracking.clear import Candidates, TrackRows
+from foredrive.tasks.tracking.clear import Candidates, TrackRows
 
 LEAST_SIMILARITY = 0.3
 

@@ -23,10 +23,10 @@ def rebuilt(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def scenarios(rebuilt: Path) -> Path:
     """A car stands on the logged path 5 s on, and in a second scenario far beside it."""
+    from foredrive.driving.ncap.scenario import Jitter, Polyline, SafetyScenario, ScenarioActor
+    from foredrive.driving.ncap.scenario_file import save_scenarios
+    from foredrive.driving.replay.threats import Threat
     from foredrive.runs.drive.in_rebuilt import opened_rebuilt
-    from foredrive.simulation.ncap.scenario import Jitter, Polyline, SafetyScenario, ScenarioActor
-    from foredrive.simulation.ncap.scenario_file import save_scenarios
-    from foredrive.simulation.threats import Threat
 
     vehicle = opened_rebuilt(str(rebuilt)).vehicle
     spot = vehicle.T_world_scene @ vehicle.at(5.0).T_scene_ego.double()

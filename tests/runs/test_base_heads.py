@@ -6,16 +6,16 @@ import pytest
 import torch
 from joint_heads import ALL
 
-from foredrive.models.tasks.heads import TaskHeads, TaskVolume
-from foredrive.recipes import RECIPES
-from foredrive.recipes.task_heads import heads_for
+from foredrive.engine.parameter_groups import parameter_groups
+from foredrive.runs.recipes.known import RECIPES
+from foredrive.runs.recipes.task_heads import heads_for
 from foredrive.scene import Boxes
 from foredrive.scene.boxes import unlabelled
 from foredrive.scene.map_elements import MapElements, MapRaster, RasterLayer
 from foredrive.scene.semantics import SemanticVoxels
 from foredrive.scene.task_truth import TaskTruth
-from foredrive.training.parameter_groups import parameter_groups
-from foredrive.training.task_losses import task_losses
+from foredrive.tasks.heads.heads import TaskHeads, TaskVolume
+from foredrive.tasks.heads.losses import task_losses
 
 FRAMES = 2
 

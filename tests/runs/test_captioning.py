@@ -9,12 +9,12 @@ from small_towers import save_clip
 
 from foredrive.cli.main import main
 from foredrive.data import LogPath
+from foredrive.engine.loop import Schedule
 from foredrive.errors import InputError
-from foredrive.models.lidar_clip import LidarEncoder, LidarEncoderConfig
+from foredrive.methods.lidarclip import LidarEncoder, LidarEncoderConfig
 from foredrive.runs.search.captioning import CAPTIONS, load_captions, train_captions
 from foredrive.runs.search.towers import find_towers
 from foredrive.search.embedded import TowerCard, save_towers
-from foredrive.training import Schedule
 
 
 @pytest.fixture(scope="module")

@@ -7,8 +7,8 @@ import pytest
 from html_pages import EVIL, assert_harmless
 
 from foredrive.cli.main import main
+from foredrive.engine.summary import read_summary
 from foredrive.errors import InputError
-from foredrive.evaluation.summary import read_summary
 from foredrive.runs.drive.compare import compare, figures_of, read_agent
 from foredrive.view.compare_report import means_table, routes_table
 

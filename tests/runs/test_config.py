@@ -8,10 +8,12 @@ from typing import Any
 import pytest
 import yaml
 
+from foredrive.engine.config import save_recipe
 from foredrive.errors import InputError
-from foredrive.recipes import RECIPES, find_recipe, with_occupancy_source
-from foredrive.recipes.config import load_recipe, save_recipe
-from foredrive.recipes.rebuilding import find_rebuild_recipe, load_rebuild_recipe
+from foredrive.methods.recipe import with_occupancy_source
+from foredrive.runs.recipes.known import RECIPES, find_recipe
+from foredrive.runs.recipes.rebuilding import find_rebuild_recipe
+from foredrive.runs.recipes.world_models import load_recipe
 
 
 @pytest.mark.parametrize("name", RECIPES)
@@ -30,11 +32,6 @@ def test_a_recipe_may_take_its_labels_from_recordings(tmp_path: Path) -> None:
     assert recorded.name == "nemo_tiny (recorded occupancy)"
     save_recipe(recorded, tmp_path / "config.yaml")
     assert load_recipe(tmp_path / "config.yaml") == recorded
-    entries = yaml.safe_load((tmp_path / "config.yaml").read_text())
-    del entries["clips"]["occupancy_source"]  # of a run from before there was a choice
-    entries["name"] = plain.name
-    (tmp_path / "config.yaml").write_text(yaml.safe_dump(entries))
-    assert load_recipe(tmp_path / "config.yaml") == plain
 
 
 def without_model(entries: dict[str, Any]) -> None:
@@ -91,46 +88,6 @@ def test_a_folder_without_a_config_is_no_run(tmp_path: Path) -> None:
 def test_an_unknown_name_is_told_the_known_ones() -> None:
     with pytest.raises(InputError, match="no recipe 'nemo_huge'; near: nemo_base"):
         find_recipe("nemo_huge")
-
-
-WRITTEN_BEFORE = Path(__file__).parent / "written_before"
-FLAT, NESTED = WRITTEN_BEFORE.glob("*.yaml"), (WRITTEN_BEFORE / "nested").glob("*.yaml")
-
-
-@pytest.mark.parametrize("file", sorted([*FLAT, *NESTED]), ids=lambda file: f"{file.parent.name}-{file.stem}")
-def test_a_recipe_in_an_earlier_format_opens_as_the_same_recipe(file: Path) -> None:
-    since_changed = WRITTEN_BEFORE / "as_opened" / file.name
-    recipe = load_recipe(since_changed) if since_changed.is_file() else as_it_was(find_recipe(file.stem))
-    assert load_recipe(file) == recipe
-
-
-def as_it_was(recipe: Any) -> Any:
-    """The recipe without the changes since those files were written: their runs go on as they began."""
-    stages = {}
-    for name in ("pretrain", "finetune"):
-        stage = getattr(recipe, name)
-        weights = dataclasses.replace(stage.weights, over_frames="mean")
-        if stage.kind == "driveworld":
-            weights = dataclasses.replace(weights, scal=1.0, bce=10.0, occupied=3.0)
-        stages[name] = dataclasses.replace(stage, weights=weights)
-        if stage.kind == "nemo":
-            stages[name] = dataclasses.replace(stages[name], pixels="thinned")
-    planner = dataclasses.replace(recipe.planner, final_norm=False)
-    model, whole = recipe.of_pretraining.model, "world_model"
-    if model.kind == "driveworld" and model.prompt is not None:
-        prompts = ("occupancy", "forecast", "planning")
-        model = dataclasses.replace(model, prompt=dataclasses.replace(model.prompt, prompts=prompts))
-    return dataclasses.replace(
-        recipe, **stages, planner=planner, model=model, pretrained_model=None, transfer=whole
-    )
-
-
-def test_a_reconstruction_in_an_earlier_format_opens_as_the_same_recipe() -> None:
-    files = sorted((WRITTEN_BEFORE / "reconstructions").glob("*.yaml"))
-    assert len(files) == 2
-    for file in files:
-        recipe = find_rebuild_recipe(load_rebuild_recipe(file).name)  # written when all tracks were actors
-        assert load_rebuild_recipe(file) == dataclasses.replace(recipe, moves_m=0.0, nonrigid=True)
 
 
 def test_a_recipe_may_be_a_file_and_entries_may_be_set(tmp_path: Path) -> None:

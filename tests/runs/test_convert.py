@@ -10,8 +10,8 @@ import raw_pandaset
 from py123d.datatypes import LogMetadata
 
 from foredrive.cli.main import main
-from foredrive.data.convert import convert, log_path
-from foredrive.data.raw.guard import check_names
+from foredrive.data.formats.convert import convert, log_path
+from foredrive.data.formats.guard import check_names
 from foredrive.errors import InputError
 from foredrive.files import sole_writer
 from foredrive.runs.convert import convert_all

@@ -13,25 +13,28 @@ from transformers import BertConfig, BertModel, BertTokenizerFast
 
 from benchmarks.common.forecast import forecasting, judge_forecast
 from foredrive.data import ClipDataset, LogPath, collate
+from foredrive.engine.checkpoints import load_weights, save_weights
+from foredrive.engine.config import save_recipe
+from foredrive.engine.metrics_log import read_metrics
+from foredrive.engine.summary import read_summary
 from foredrive.errors import InputError
-from foredrive.evaluation.summary import read_summary
-from foredrive.models.driveworld import DriveWorld
-from foredrive.models.driveworld.planes import VectorToPlaneConfig
-from foredrive.models.driveworld.task_prompt import PROMPTS, PromptConfig
-from foredrive.models.lifting import LiftingConfig
-from foredrive.models.pooled_lifting import PooledLiftingConfig
-from foredrive.recipes import Recipe
-from foredrive.recipes.config import load_recipe, save_recipe
-from foredrive.recipes.driveworld_ablations import driveworld_ablations
+from foredrive.methods.blocks.lifting import LiftingConfig
+from foredrive.methods.blocks.pooled_lifting import PooledLiftingConfig
+from foredrive.methods.driveworld import DriveWorld
+from foredrive.methods.driveworld.ablations import driveworld_ablations
+from foredrive.methods.driveworld.objective import DriveWorldObjective
+from foredrive.methods.driveworld.planes import VectorToPlaneConfig
+from foredrive.methods.driveworld.task_prompt import PROMPTS, PromptConfig
+from foredrive.methods.recipe import Recipe
 from foredrive.runs import Run, evaluate_run, open_run, predict_examples, train_run
 from foredrive.runs.build import build_agent
 from foredrive.runs.drive.agents import AgentInputs, inputs_of
 from foredrive.runs.evaluate.display import DisplayPredictor
 from foredrive.runs.evaluate.imagination import imagine_run
 from foredrive.runs.export import export_run
+from foredrive.runs.recipes.world_models import load_recipe
 from foredrive.runs.train.run import load_agent
 from foredrive.scene import Example
-from foredrive.training import DriveWorldObjective, load_weights, read_metrics, save_weights
 from foredrive.view.imagination_video import write_imagination_video
 from foredrive.view.run_report import report_on_run, write_run_report
 

@@ -18,23 +18,23 @@ from foredrive.data.clips import ClipConfig, ClipDataset
 from foredrive.data.lidar import read_sweep
 from foredrive.data.log_paths import LogPath, find_logs
 from foredrive.data.logs import Log
+from foredrive.driving.route_sets import RouteWaypoints
+from foredrive.driving.scores import Ending, RouteScore
+from foredrive.engine.summary import read_summary
 from foredrive.errors import InputError
-from foredrive.evaluation.summary import read_summary
 from foredrive.files import atomic_path
-from foredrive.runs.drive.agents import _run_folder, inputs_of
+from foredrive.runs.drive.agents import inputs_of
 from foredrive.runs.drive.in_towns import TownRoutes
-from foredrive.runs.drive.records import read_drive, suite_title, summarise
+from foredrive.runs.drive.records import read_drive, summarise
 from foredrive.runs.drive.route_source import job_of
 from foredrive.runs.drive.suite import DriveJob, DriveSuite, SuiteResult, drive_one, drive_suite, folder_of
 from foredrive.scene import VoxelSpec
 from foredrive.scene.conditions import CONDITIONS
 from foredrive.sensors.rigs import SURROUND
-from foredrive.simulation.route_sets import RouteWaypoints
-from foredrive.simulation.routes import snap_route
-from foredrive.simulation.scenarios.places import scenarios_on
-from foredrive.simulation.scores import Ending, RouteScore
-from foredrive.simulation.town import grow
+from foredrive.towns.driving.routes import snap_route
+from foredrive.towns.driving.town import grow
 from foredrive.towns.map.town_map import load_town_map
+from foredrive.towns.scenarios.places import scenarios_on
 from foredrive.towns.traffic.lane_graph import build_lane_graph
 from foredrive.view.drive_report import write_drive_report
 
@@ -255,18 +255,6 @@ def test_a_carla_server_is_reached_by_the_verb(
         assert "a CARLA server is named HOST:PORT" in capsys.readouterr().err
 
 
-def test_a_suite_of_an_earlier_version_goes_on(driven: SuiteResult, suite: DriveSuite, out: Path) -> None:
-    """It calls the agent "driver"."""
-    title, file = suite_title(out), out / "suite.json"
-    noted = json.loads(file.read_text())
-    file.write_text(json.dumps({"driver" if key == "agent" else key: value for key, value in noted.items()}))
-    assert suite_title(out) == title == "constant-velocity on two"
-    with pytest.raises(InputError, match="another suite"):
-        drive_suite(dataclasses.replace(suite, agent="stop"), out, workers=1)
-    assert drive_suite(suite, out, workers=1).skipped == len(driven.drives)
-    assert json.loads(file.read_text()) == noted
-
-
 def test_a_folder_holds_one_suite(driven: SuiteResult, suite: DriveSuite, out: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="another suite"):
         drive_suite(changed(suite, seed=1), out, workers=1)
@@ -327,7 +315,3 @@ def test_the_report_has_a_film_of_every_drive(suite: DriveSuite, tmp_path: Path)
     (tmp_path / "drives" / f"{HOSTILE}.json").write_text(json.dumps(drive))
     shutil.copy(tmp_path / "videos" / "routea_rep0.webp", tmp_path / "videos" / f"{HOSTILE}.webp")
     assert "<svg onload" not in write_drive_report(tmp_path).read_text()
-
-
-def test_the_agent_of_demonstrations_has_two_spellings(tmp_path: Path) -> None:
-    assert _run_folder(f"student:{tmp_path}") == _run_folder(f"pupil:{tmp_path}") == tmp_path

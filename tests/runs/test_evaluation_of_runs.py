@@ -8,12 +8,12 @@ import torch
 from miniature import write_log
 
 from foredrive.data import LogPath
+from foredrive.engine.folder import WEIGHTS
+from foredrive.engine.summary import read_summary
 from foredrive.errors import InputError
-from foredrive.evaluation.run import EvaluationResult
-from foredrive.evaluation.summary import read_summary
-from foredrive.metrics.protocols import PROTOCOLS
 from foredrive.runs import ExamplePrediction, Run, evaluate_run, predict_examples
-from foredrive.runs.folder import WEIGHTS
+from foredrive.tasks.evaluation.run import EvaluationResult
+from foredrive.tasks.planning.protocols import PROTOCOLS
 from foredrive.view.run_report import report_on_run, write_run_report
 
 CLIPS = 4

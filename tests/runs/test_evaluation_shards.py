@@ -12,7 +12,7 @@ from small_drives import one_example
 from foredrive.data import ClipDataset, LogPath
 from foredrive.errors import InputError
 from foredrive.runs.evaluate.inputs import Batches, plan_batches
-from foredrive.runs.evaluate.shards import SHARD_BATCHES, plan_shards
+from foredrive.runs.evaluate.run import SHARD_BATCHES, plan_shards
 
 
 class Clips(ClipDataset):

@@ -11,13 +11,13 @@ from torch import nn
 from foredrive.cli.main import main
 from foredrive.data import ClipDataset, LogPath, collate
 from foredrive.errors import InputError
-from foredrive.export.graph import GraphInputs
+from foredrive.integrations.graph import GraphInputs
 from foredrive.runs import Run, export
 from foredrive.runs.train.run import load_agent
 from foredrive.scene import Command
 
 onnxruntime = pytest.importorskip("onnxruntime", reason="the extra `export` is not installed")
-from foredrive.export.onnx import write_onnx  # noqa: E402
+from foredrive.integrations.onnx import write_onnx  # noqa: E402
 
 
 @pytest.fixture(scope="module")

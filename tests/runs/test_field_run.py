@@ -13,24 +13,24 @@ from torch import Tensor
 
 from foredrive.cli.main import main
 from foredrive.data import LogPath, find_logs
+from foredrive.engine import loop
+from foredrive.engine.learning_rates import Rate
 from foredrive.errors import InputError
-from foredrive.recipes.field import FieldRecipe, padded_scale_m, tiny_field
-from foredrive.recipes.rebuilding import RebuildRecipe, field_base, field_tiny, rescheduled_recipe
-from foredrive.rendering.edits import Duplicate, Insert, Move, Remove, apply_edits
-from foredrive.rendering.field.config import FieldConfig, GridConfig, GridsConfig
-from foredrive.rendering.field.content import field_of
-from foredrive.rendering.field.decoders import PatchDecoderConfig
-from foredrive.rendering.field.rays import FieldRays
-from foredrive.rendering.field.scene import FieldScene, FieldSceneConfig
-from foredrive.rendering.gaussians.content import GaussianContent
-from foredrive.rendering.gaussians.initial import AHEAD_LEFT_UP
-from foredrive.rendering.scene_graph import STATIC, SceneGraph
+from foredrive.methods.neurad.config import FieldConfig, GridConfig, GridsConfig
+from foredrive.methods.neurad.content import field_of
+from foredrive.methods.neurad.decoders import PatchDecoderConfig
+from foredrive.methods.neurad.rays import FieldRays
+from foredrive.methods.neurad.recipes import FieldRecipe, padded_scale_m, tiny_field
+from foredrive.methods.neurad.scene import FieldScene, FieldSceneConfig
+from foredrive.methods.neurad.training import FieldTraining
+from foredrive.methods.rebuilding.edits import Duplicate, Insert, Move, Remove, apply_edits
+from foredrive.methods.rebuilding.scene_graph import STATIC, SceneGraph
+from foredrive.methods.rebuilding.training import SensorViews, make_optimizer
+from foredrive.methods.splatad.content import GaussianContent
+from foredrive.methods.splatad.initial import AHEAD_LEFT_UP
 from foredrive.runs.rebuild.rebuilt_run import open_rebuilt
 from foredrive.runs.rebuild.reconstruct import Reconstruction, reconstruct
-from foredrive.training import loop
-from foredrive.training.field_training import FieldTraining
-from foredrive.training.learning_rates import Rate
-from foredrive.training.rebuilding import SensorViews, make_optimizer
+from foredrive.runs.recipes.rebuilding import RebuildRecipe, field_base, field_tiny, rescheduled_recipe
 from foredrive.view.rebuilt_viewer import RebuiltViewer
 
 STEPS = 6

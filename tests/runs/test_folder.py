@@ -10,18 +10,19 @@ import pytest
 from miniature import miniature
 
 from foredrive.data import LogPath
+from foredrive.engine import folder
+from foredrive.engine.folder import RunFolder, held
 from foredrive.errors import InputError
-from foredrive.runs import folder, train_run
+from foredrive.runs import train_run
 from foredrive.runs.drive.in_towns import TownRoutes
 from foredrive.runs.drive.suite import DriveSuite, drive_suite
-from foredrive.runs.folder import RunFolder, held
 from foredrive.runs.search.indexing import index_logs
 from foredrive.runs.search.tower_training import tower_recipe, train_towers
 
 HOLDER = """
 import sys, time
 from pathlib import Path
-from foredrive.runs.folder import RunFolder, held
+from foredrive.engine.folder import RunFolder, held
 with held(Path(sys.argv[1])):
     print("holds", flush=True)
     time.sleep(600)

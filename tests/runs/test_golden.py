@@ -22,8 +22,9 @@ from lightning_fabric import Fabric
 from miniature import miniature, with_steps
 
 from foredrive.data import ClipDataset, LogPath, collate
+from foredrive.engine.loop import train
+from foredrive.engine.metrics_log import read_metrics
 from foredrive.runs.build import build_agent, build_objective
-from foredrive.training import read_metrics, train
 
 GOLDEN = Path(__file__).with_name("golden.json")
 RTOL = 3e-4

@@ -20,18 +20,18 @@ import torch
 from torch.nn.functional import adaptive_avg_pool1d, adaptive_avg_pool2d
 
 from foredrive.data import LogPath, find_logs
-from foredrive.recipes.gaussians import GaussianRecipe, published_gaussians
-from foredrive.recipes.rebuilding import RebuildRecipe
-from foredrive.rendering.decoders import CameraDecoderConfig
-from foredrive.rendering.edits import DriveStraight, Duplicate, Edit, Move, Remove
-from foredrive.rendering.gaussians.initial import InitialGaussians
-from foredrive.rendering.gaussians.scene_config import GaussianSceneConfig
+from foredrive.engine.learning_rates import Rate
+from foredrive.engine.metrics_log import read_metrics
+from foredrive.methods.rebuilding.decoders import CameraDecoderConfig
+from foredrive.methods.rebuilding.edits import DriveStraight, Duplicate, Edit, Move, Remove
+from foredrive.methods.splatad.initial import InitialGaussians
+from foredrive.methods.splatad.rates import LearningRates
+from foredrive.methods.splatad.recipes import GaussianRecipe, published_gaussians
+from foredrive.methods.splatad.scene_config import GaussianSceneConfig
+from foredrive.methods.splatad.training import GaussianSchedule
 from foredrive.runs.rebuild.rebuilt_run import edited_scene, open_rebuilt
 from foredrive.runs.rebuild.reconstruct import reconstruct
-from foredrive.training.gaussian_rates import LearningRates
-from foredrive.training.gaussian_training import GaussianSchedule
-from foredrive.training.learning_rates import Rate
-from foredrive.training.metrics_log import read_metrics
+from foredrive.runs.recipes.rebuilding import RebuildRecipe
 
 GOLDEN = Path(__file__).with_name("golden_rebuild.json")
 RTOL, ATOL = 2e-3, 2e-4

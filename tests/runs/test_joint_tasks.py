@@ -11,18 +11,18 @@ from miniature import STEPS, miniature, miniature_driveworld, with_map, with_ste
 from safetensors.torch import load_file
 
 from foredrive.data import LogPath, collate
+from foredrive.engine.metrics_log import read_metrics
 from foredrive.errors import InputError
-from foredrive.export.graph import AgentGraph, GraphInputs
-from foredrive.recipes import Recipe
-from foredrive.recipes.config import load_recipe
-from foredrive.recipes.task_heads import base_heads, heads_for, with_joint_heads
+from foredrive.integrations.graph import AgentGraph, GraphInputs
+from foredrive.methods.recipe import Recipe
 from foredrive.runs import Run, evaluate_run, load_agent, open_run, train_run
 from foredrive.runs.build import build_agent
-from foredrive.runs.drive.seeing_agents import SeeingAgent, following
+from foredrive.runs.drive.agents import SeeingAgent, following
 from foredrive.runs.export import export_run
 from foredrive.runs.open_clips import open_clips
+from foredrive.runs.recipes.task_heads import base_heads, heads_for, with_joint_heads
+from foredrive.runs.recipes.world_models import load_recipe
 from foredrive.runs.train.tasks import load_heads, probe_run, train_heads
-from foredrive.training import read_metrics
 
 WITHOUT_MAP = ("detection", "motion", "occupancy")
 """Tasks that the log has truth of."""

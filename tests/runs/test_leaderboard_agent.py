@@ -12,11 +12,11 @@ import pytest
 from miniature import miniature
 
 import foredrive.runs.drive.leaderboard_agent as agent_file
+from foredrive.engine.checkpoints import save_weights
+from foredrive.engine.config import save_recipe
 from foredrive.errors import InputError
-from foredrive.recipes.config import save_recipe
 from foredrive.runs.build import build_agent
 from foredrive.runs.drive.leaderboard_agent import agent_of
-from foredrive.training import save_weights
 
 
 class AutonomousAgent:

@@ -12,15 +12,15 @@ from jaxtyping import Float64
 
 from foredrive.data import find_logs
 from foredrive.data.logs import Log
+from foredrive.driving.dynamics import STEP_S, step
+from foredrive.driving.observation import FRAME_STEPS, KeyFrame, no_images
+from foredrive.driving.route_progress import RouteLine, RouteProgress
 from foredrive.errors import InputError
 from foredrive.runs.drive.agents import inputs_of, make_agent
 from foredrive.runs.drive.suite import DriveJob, DriveSetup, DriveSource, DriveSuite, drive_suite
 from foredrive.scene import BicycleState, Clip, Control, DriveProgress, Simulator, Step
 from foredrive.scene.actors import boxes_in_ego_frame
-from foredrive.simulation.drive_log import drive_log, log_frame
-from foredrive.simulation.dynamics import STEP_S, step
-from foredrive.simulation.observation import FRAME_STEPS, KeyFrame, no_images
-from foredrive.simulation.route_progress import RouteLine, RouteProgress
+from foredrive.towns.driving.drive_log import drive_log, log_frame
 from foredrive.view.drive_report import write_drive_report
 
 LIMIT_S = 12.0

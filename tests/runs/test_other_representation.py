@@ -17,26 +17,26 @@ from torch.optim import Optimizer
 
 from foredrive.cli.main import main
 from foredrive.data import LogPath, find_logs
+from foredrive.engine.learning_rates import Rate
 from foredrive.errors import InputError
 from foredrive.geometry.projection import pixel_centres, pixels_to_rays
 from foredrive.geometry.se3 import inverse_se3, rotate_vectors, transform_points
-from foredrive.losses.rendering import intensity_loss
-from foredrive.recipes import rebuilding
-from foredrive.recipes.rebuilding import RebuildRecipe
-from foredrive.rendering.edits import DriveStraight, Duplicate, Insert, Remove, apply_edits
-from foredrive.rendering.gaussians.content import GaussianContent
-from foredrive.rendering.gaussians.gaussians import Gaussians
-from foredrive.rendering.novel_views import novel_camera_view
-from foredrive.rendering.rebuilt import RebuiltScene, saved_tracks
-from foredrive.rendering.rendered import RenderedImage, RenderedSweep
-from foredrive.rendering.scene_graph import STATIC, Content, SceneGraph
-from foredrive.rendering.tracks import ActorTracks, states_at
-from foredrive.rendering.views import CameraView, SweepView
+from foredrive.methods.rebuilding.edits import DriveStraight, Duplicate, Insert, Remove, apply_edits
+from foredrive.methods.rebuilding.gaussians import Gaussians
+from foredrive.methods.rebuilding.novel_views import novel_camera_view
+from foredrive.methods.rebuilding.rebuilt import RebuiltScene, saved_tracks
+from foredrive.methods.rebuilding.rendered import RenderedImage, RenderedSweep
+from foredrive.methods.rebuilding.scene_graph import STATIC, Content, SceneGraph
+from foredrive.methods.rebuilding.tracks import ActorTracks, states_at
+from foredrive.methods.rebuilding.training import ParameterGroup, SensorViews, StepLosses, ViewOrder
+from foredrive.methods.rebuilding.views import CameraView, SweepView
+from foredrive.methods.splatad.content import GaussianContent
+from foredrive.methods.splatad.losses import intensity_loss
 from foredrive.runs.rebuild.rebuilt_run import edited_scene, open_rebuilt
 from foredrive.runs.rebuild.reconstruct import Reconstruction, reconstruct
+from foredrive.runs.recipes import rebuilding
+from foredrive.runs.recipes.rebuilding import RebuildRecipe
 from foredrive.scene.record import Record
-from foredrive.training.learning_rates import Rate
-from foredrive.training.rebuilding import ParameterGroup, SensorViews, StepLosses, ViewOrder
 
 
 @dataclass(frozen=True)

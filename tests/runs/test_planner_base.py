@@ -10,15 +10,15 @@ from safetensors.torch import load_file
 
 from benchmarks.common.study import seeded
 from foredrive.data import LogPath, collate
-from foredrive.models.ego_mlp import EgoMLPConfig
-from foredrive.models.path_correction import PathCorrectionConfig
-from foredrive.recipes import Recipe
+from foredrive.methods.planner.ego_mlp import EgoMLPConfig
+from foredrive.methods.planner.path_correction import PathCorrectionConfig
+from foredrive.methods.planner.path_fit import PathFit
+from foredrive.methods.recipe import Recipe
 from foredrive.runs import Run, evaluate_run, train_run
 from foredrive.runs.export import export_run
 from foredrive.runs.open_clips import open_clips
 from foredrive.runs.train.path_features import sample_paths
 from foredrive.runs.train.run import load_agent
-from foredrive.training import PathFit
 
 
 def recipe(lr: float, path: PathFit | None = None) -> Recipe:

@@ -9,14 +9,14 @@ from small_rebuild import SMALLEST
 
 from foredrive.cli.main import main
 from foredrive.data import ClipDataset, LogPath
+from foredrive.engine.summary import read_summary
 from foredrive.errors import InputError
-from foredrive.evaluation.predictor import Prediction
-from foredrive.evaluation.summary import read_summary
 from foredrive.runs import Run
 from foredrive.runs.evaluate.real_to_sim_gap import RealToSimComparison, measure_gap, rendered_images
 from foredrive.runs.rebuild.rebuilt_run import camera_indices, open_rebuilt
 from foredrive.runs.rebuild.reconstruct import read_reconstruction_data, reconstruct
 from foredrive.scene import Clip, Trajectory
+from foredrive.tasks.evaluation.predictor import Prediction
 
 RECIPE = dataclasses.replace(SMALLEST, hold_out_every=4)
 

@@ -11,16 +11,16 @@ from small_rebuild import SMALLEST
 from foredrive.cli.main import main
 from foredrive.data import ClipConfig, ClipDataset, LogPath, find_logs
 from foredrive.data.drives import read_drive as read_log
+from foredrive.driving.replay.threats import Threat
+from foredrive.engine.summary import read_summary
 from foredrive.errors import InputError
-from foredrive.evaluation.summary import read_summary
-from foredrive.rendering.renderer import RebuiltRenderer
+from foredrive.methods.rebuilding.renderer import RebuiltRenderer
 from foredrive.runs import Run, evaluate_run
 from foredrive.runs.drive.in_rebuilt import REPLAY, RebuiltRoutes
 from foredrive.runs.drive.suite import DriveSuite, drive_suite
 from foredrive.runs.rebuild.rebuilt_run import open_rebuilt
 from foredrive.runs.rebuild.reconstruct import reconstruct
 from foredrive.scene import Renderer, VoxelSpec
-from foredrive.simulation.threats import Threat
 from foredrive.view.drive_report import write_drive_report
 
 VOXELS = VoxelSpec(lower_m=(-8.0, -8.0, -1.0), voxel_m=2.0, shape_zyx=(2, 8, 8))

@@ -12,9 +12,9 @@ from small_rebuild import SMALLEST
 from foredrive.data import find_logs
 from foredrive.errors import InputError
 from foredrive.geometry.se3 import matrix_from_yaw
-from foredrive.rendering.edits import Insert, Remove, apply_edits
-from foredrive.rendering.novel_views import novel_camera_view, novel_sweep_view, rendered_sweep
-from foredrive.rendering.scene_graph import STATIC
+from foredrive.methods.rebuilding.edits import Insert, Remove, apply_edits
+from foredrive.methods.rebuilding.novel_views import novel_camera_view, novel_sweep_view, rendered_sweep
+from foredrive.methods.rebuilding.scene_graph import STATIC
 from foredrive.runs.rebuild.rebuilt_run import edited_scene, open_rebuilt
 from foredrive.runs.rebuild.reconstruct import Reconstruction, reconstruct
 from foredrive.runs.rebuild.render import plan_frames, render_frame

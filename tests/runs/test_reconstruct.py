@@ -16,13 +16,26 @@ from safetensors.torch import load_file, save_file
 
 from foredrive.cli.main import main
 from foredrive.data import LogPath, find_logs
+from foredrive.engine import loop
+from foredrive.engine.config import save_recipe
+from foredrive.engine.learning_rates import Rate
 from foredrive.errors import InputError
-from foredrive.evaluation.perceptual import PerceptualMetrics, PerceptualWeights
-from foredrive.evaluation.rendering import evaluate_cameras, evaluate_sweeps
-from foredrive.models.inception import InceptionFeatures
-from foredrive.recipes.config import save_recipe
-from foredrive.recipes.gaussians import GaussianRecipe
-from foredrive.recipes.rebuilding import (
+from foredrive.methods.blocks.inception import InceptionFeatures
+from foredrive.methods.rebuilding.evaluation import evaluate_cameras, evaluate_sweeps
+from foredrive.methods.rebuilding.perceptual import PerceptualMetrics, PerceptualWeights
+from foredrive.methods.rebuilding.scene_graph import STATIC
+from foredrive.methods.splatad.initial import InitialGaussians
+from foredrive.methods.splatad.rates import LearningRates
+from foredrive.methods.splatad.recipes import GaussianRecipe
+from foredrive.methods.splatad.training import GaussianSchedule
+from foredrive.runs.rebuild.rebuilt_run import open_rebuilt
+from foredrive.runs.rebuild.reconstruct import (
+    initial_model,
+    memory_needed_gib,
+    read_reconstruction_data,
+    reconstruct,
+)
+from foredrive.runs.recipes.rebuilding import (
     RebuildRecipe,
     find_rebuild_recipe,
     gaussians_base,
@@ -31,19 +44,6 @@ from foredrive.recipes.rebuilding import (
     load_rebuild_recipe,
     rescheduled_recipe,
 )
-from foredrive.rendering.gaussians.initial import InitialGaussians
-from foredrive.rendering.scene_graph import STATIC
-from foredrive.runs.rebuild.rebuilt_run import open_rebuilt
-from foredrive.runs.rebuild.reconstruct import (
-    initial_model,
-    memory_needed_gib,
-    read_reconstruction_data,
-    reconstruct,
-)
-from foredrive.training import loop
-from foredrive.training.gaussian_rates import LearningRates
-from foredrive.training.gaussian_training import GaussianSchedule
-from foredrive.training.learning_rates import Rate
 
 STEPS = 40
 

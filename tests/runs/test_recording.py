@@ -11,9 +11,9 @@ from file_digests import digests
 from foredrive.cli.arguments import chosen_rig
 from foredrive.data.cameras import rig_of_log
 from foredrive.data.logs import Log
+from foredrive.engine.fan_out import fan_out
 from foredrive.errors import InputError
 from foredrive.runs.drive.recording import RecordingResult, is_recorded, record_drives, record_plan
-from foredrive.runs.fan_out import fan_out
 from foredrive.sensors.rigs import DRIVING, SURROUND, TELE, Mount, RigPlan, same_rig, told_rig
 from foredrive.towns.campaign import DrivePlan
 

@@ -15,11 +15,13 @@ from safetensors.torch import load_file
 from torch.utils.data import Dataset
 
 from foredrive.data import ClipDataset, LogPath, collate
+from foredrive.engine.loop import Schedule, train
+from foredrive.engine.metrics_log import read_metrics
 from foredrive.errors import InputError
+from foredrive.methods.nemo.objective import NemoObjective
 from foredrive.runs import Run, open_run, train_run
 from foredrive.runs.build import build_agent, build_objective
 from foredrive.scene import Example
-from foredrive.training import NemoObjective, Schedule, read_metrics, train
 
 STAGES = ("pretrain", "finetune")
 

@@ -9,19 +9,19 @@ import pytest
 from PIL import Image
 
 from foredrive.cli.main import main
+from foredrive.driving.faults import CameraFault, Faults
+from foredrive.driving.ncap.outcome import Outcome
+from foredrive.driving.ncap.rules import RULES
+from foredrive.driving.ncap.running import set_up_run
+from foredrive.driving.ncap.scenario import Polyline, Rectilinear
+from foredrive.driving.ncap.scenario_file import load_scenarios
+from foredrive.engine.summary import read_summary
 from foredrive.errors import InputError
-from foredrive.evaluation.summary import read_summary
 from foredrive.runs.drive.in_ncap import SafetyTests, _folders, place_in, propose_scenarios
 from foredrive.runs.drive.in_rebuilt import RebuiltRoutes
 from foredrive.runs.drive.pseudo import pseudo_simulate
 from foredrive.runs.drive.suite import DriveSuite, drive_suite
 from foredrive.runs.rebuild.rebuilt_run import open_run_log
-from foredrive.simulation.faults import CameraFault, Faults
-from foredrive.simulation.ncap.outcome import Outcome
-from foredrive.simulation.ncap.rules import RULES
-from foredrive.simulation.ncap.running import set_up_run
-from foredrive.simulation.ncap.scenario import Polyline, Rectilinear
-from foredrive.simulation.ncap.scenario_file import load_scenarios
 from foredrive.view.ncap_pictures import write_scenario_picture
 
 

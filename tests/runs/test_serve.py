@@ -17,15 +17,15 @@ import torch
 from PIL import Image
 
 from foredrive.cli.main import main
+from foredrive.driving.ncap.outcome import Outcome
+from foredrive.engine.summary import read_summary
 from foredrive.errors import InputError
-from foredrive.evaluation.summary import read_summary
+from foredrive.integrations.remote.json_http import ask
 from foredrive.json_server import Address, JsonServer
 from foredrive.runs.drive.in_ncap import SafetyTests
 from foredrive.runs.drive.in_rebuilt import opened_rebuilt
 from foredrive.runs.drive.suite import DriveSuite, drive_suite
 from foredrive.runs.serve import alpasim_server_of, planner_of, renderer_of
-from foredrive.simulation.ncap.outcome import Outcome
-from foredrive.simulation.remote.json_http import ask
 
 
 def suite(agent: str, rebuilt: Path, scenarios: Path, runs: int = 1) -> DriveSuite:
@@ -83,7 +83,7 @@ def test_who_is_not_there_is_told_before_driving(
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("foredrive.simulation.remote.planner_client.check_planner.__defaults__", (0.1,))
+    monkeypatch.setattr("foredrive.integrations.remote.planner_client.check_planner.__defaults__", (0.1,))
     server = JsonServer({})
     server.close()
     command = [
@@ -184,8 +184,8 @@ def _shift(x_m: float, y_m: float) -> np.ndarray:
 
 
 def _view(opened: Any, t_s: float) -> Any:
-    from foredrive.rendering.novel_views import novel_camera_view
-    from foredrive.rendering.vehicle import EgoState
+    from foredrive.methods.rebuilding.novel_views import novel_camera_view
+    from foredrive.methods.rebuilding.vehicle import EgoState
 
     ego = opened.vehicle.at(t_s)
     return novel_camera_view(opened.vehicle.rig, 0, EgoState(ego.T_scene_ego, torch.zeros(6), t_s))

@@ -11,8 +11,8 @@ import torch
 
 from foredrive.cli.main import main
 from foredrive.data import LogPath
+from foredrive.engine.summary import read_summary
 from foredrive.errors import InputError
-from foredrive.evaluation.summary import read_summary
 from foredrive.runs import Run, evaluate_run, load_agent, open_run, shipped
 from foredrive.runs.drive.agents import inputs_of, rig_of
 from foredrive.runs.model_card import find_card, read_card, shipped_weights

@@ -14,28 +14,30 @@ from miniature import miniature, miniature_driveworld, with_map
 from safetensors.torch import load_file
 
 from foredrive.data import LogPath
+from foredrive.engine.checkpoints import save_weights
+from foredrive.engine.config import save_recipe
+from foredrive.engine.folder import WEIGHTS
+from foredrive.engine.metrics_log import read_metrics
 from foredrive.errors import InputError
-from foredrive.models.agent import PlanningAgent
-from foredrive.models.driveworld.planes import VectorToPlaneConfig
-from foredrive.models.driveworld.task_prompt import PROMPTS, PromptConfig
-from foredrive.models.tasks.agents import CarriedConfig
-from foredrive.recipes import Recipe
-from foredrive.recipes.config import load_recipe, save_recipe
-from foredrive.recipes.task_heads import (
+from foredrive.methods.driveworld.planes import VectorToPlaneConfig
+from foredrive.methods.driveworld.task_prompt import PROMPTS, PromptConfig
+from foredrive.methods.planner.agent import PlanningAgent
+from foredrive.methods.recipe import Recipe
+from foredrive.runs import Run, evaluate_run
+from foredrive.runs.build import build_agent
+from foredrive.runs.recipes.task_heads import (
     base_heads,
     load_task_heads,
     town_heads,
     with_joint_heads,
     with_settings,
 )
-from foredrive.runs import Run, evaluate_run
-from foredrive.runs.build import build_agent
-from foredrive.runs.folder import WEIGHTS
+from foredrive.runs.recipes.world_models import load_recipe
 from foredrive.runs.train.run import begin_run
 from foredrive.runs.train.tasks import TASKS, load_heads, probe_run, train_heads
 from foredrive.scene import Example
-from foredrive.training import read_metrics, save_weights
-from foredrive.training.task_probe import task_volumes
+from foredrive.tasks.detection.agents_head import CarriedConfig
+from foredrive.tasks.heads.probe import task_volumes
 
 
 def test_heads_of_a_run_are_trained_continued_and_evaluated(

@@ -13,12 +13,10 @@ from miniature import miniature
 from torch import Tensor, nn
 
 from foredrive.data import ClipConfig, LogPath
+from foredrive.engine.loop import Schedule
 from foredrive.errors import InputError
-from foredrive.losses import waypoint_loss
-from foredrive.models.agent import PlanningAgent
-from foredrive.recipes import Recipe
-from foredrive.recipes.config import load_recipe
-from foredrive.recipes.world_models import WORLD_MODELS, WorldModelEntry
+from foredrive.methods.planner.agent import PlanningAgent
+from foredrive.methods.recipe import Recipe
 from foredrive.runs import Run, evaluate_run, open_run, predict_examples, train_run
 from foredrive.runs.drive.agents import rig_of
 from foredrive.runs.drive.in_towns import TownRoutes
@@ -26,12 +24,13 @@ from foredrive.runs.drive.route_source import job_of
 from foredrive.runs.drive.suite import DriveSuite, drive_one
 from foredrive.runs.evaluate.imagination import imagine_run
 from foredrive.runs.export import export_run
+from foredrive.runs.recipes.world_models import WORLD_MODELS, WorldModelEntry, load_recipe
 from foredrive.scene import Belief, Clip, Decoded, Example, Frames, Task, VoxelSpec, WorldModel, last_frames
 from foredrive.sensors.rigs import SURROUND
+from foredrive.tasks.heads.joint import TaskTerms
+from foredrive.tasks.planning.losses import waypoint_loss
 from foredrive.towns.map.town_map import load_town_map
 from foredrive.towns.traffic.lane_graph import build_lane_graph
-from foredrive.training import Schedule
-from foredrive.training.joint_tasks import TaskTerms
 from foredrive.view.log_frames import LogFrames
 from foredrive.view.viewer import Viewer
 

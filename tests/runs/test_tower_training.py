@@ -12,11 +12,13 @@ from small_towers import SMALL, WORDS, save_clip, save_tokenizer
 from transformers import BertConfig, BertModel
 
 from foredrive.data import LogPath
+from foredrive.engine.loop import Schedule
+from foredrive.engine.metrics_log import read_metrics
 from foredrive.errors import InputError
-from foredrive.losses.contrastive import is_true
-from foredrive.models.image_tower import ImageTowerConfig
-from foredrive.models.lidar_clip import LidarEncoderConfig
-from foredrive.models.text_encoder import TextEncoder
+from foredrive.methods.blocks.text_encoder import TextEncoder
+from foredrive.methods.lidarclip import LidarEncoderConfig
+from foredrive.methods.lidarclip.alignment import is_true
+from foredrive.methods.lidarclip.image_tower import ImageTowerConfig
 from foredrive.runs.search.sector_views import gather_views
 from foredrive.runs.search.tower_data import (
     CaptionedViews,
@@ -30,7 +32,6 @@ from foredrive.runs.search.tower_training import TowerRecipe, tower_recipe, trai
 from foredrive.runs.search.towers import SHIPPED, find_towers
 from foredrive.search.crops import Crop
 from foredrive.search.embedded import CARD, LidarTowers, SentenceTowers, load_towers
-from foredrive.training import Schedule, read_metrics
 
 
 @pytest.fixture(scope="module")

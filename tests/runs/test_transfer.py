@@ -10,9 +10,9 @@ from safetensors.torch import load_file
 
 from foredrive.data import LogPath
 from foredrive.errors import InputError
-from foredrive.recipes import RECIPES
-from foredrive.recipes.driveworld_ablations import driveworld_ablations
+from foredrive.methods.driveworld.ablations import driveworld_ablations
 from foredrive.runs import train_run
+from foredrive.runs.recipes.known import RECIPES
 from foredrive.runs.train.run import fresh_agent
 
 ROWS = driveworld_ablations(with_steps(miniature_driveworld(), pretrain=2, finetune=0))

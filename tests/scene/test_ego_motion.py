@@ -9,8 +9,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from foredrive.geometry.se3 import exp_se3, inverse_se3
-from foredrive.models.nemo.ego_motion import continued_motion
 from foredrive.scene import CameraRig, Frames
+from foredrive.scene.ego_motion import continued_motion
 
 DT_S = 0.5
 

@@ -5,7 +5,7 @@ import itertools
 import numpy as np
 import pytest
 
-from foredrive.search.diversity import facility_location, k_centre
+from foredrive.search.find import facility_location, k_centre
 
 
 def on_circle(*degrees: float) -> np.ndarray:

@@ -13,8 +13,8 @@ from foredrive.data import LogPath
 from foredrive.data.batches import stack_records
 from foredrive.data.logs import Log
 from foredrive.errors import InputError
-from foredrive.models.image_tower import ImageTower, ImageTowerConfig
-from foredrive.models.lidar_clip import LidarEncoder, LidarEncoderConfig
+from foredrive.methods.lidarclip import LidarEncoder, LidarEncoderConfig
+from foredrive.methods.lidarclip.image_tower import ImageTower, ImageTowerConfig
 from foredrive.runs.search.towers import find_towers
 from foredrive.search.embedded import (
     CARD,

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from foredrive.metrics.retrieval import draw_sequences, match_rank, mean_and_interval, mean_of_groups
+from foredrive.search.retrieval import draw_sequences, match_rank, mean_and_interval, mean_of_groups
 
 
 def test_draws_begin_with_all_sequences_and_bounds_hold_what_varies() -> None:

@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 
 from foredrive.errors import InputError
-from foredrive.sets.associations import sum_associations
+from foredrive.sets.associations import bound_component, sum_associations
 from foredrive.sets.component import scale
 from foredrive.sets.frontier import sum_assignments
 from foredrive.sets.gating import bound_left_out
-from foredrive.sets.interval import bound_component
 
 
 def enumerate_associations(

@@ -7,8 +7,6 @@ import pytest
 import torch
 from scipy import stats
 
-from foredrive.metrics.proper_scores import brier
-from foredrive.metrics.reliability import reliability
 from foredrive.sets import BoxDensity, LabelledBoxes, MultiBernoulli, UniformPoisson
 from foredrive.sets.calibration import (
     conformal_factor,
@@ -17,6 +15,8 @@ from foredrive.sets.calibration import (
     fit_scale,
     fit_set_calibration,
 )
+from foredrive.tasks.detection.proper_scores import brier
+from foredrive.tasks.detection.reliability import reliability
 
 
 def drawn_pairs(

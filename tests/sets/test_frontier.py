@@ -6,10 +6,9 @@ import math
 import numpy as np
 import pytest
 
-from foredrive.sets.associations import sum_associations
+from foredrive.sets.associations import bound_component, sum_associations
 from foredrive.sets.component import scale
 from foredrive.sets.frontier import plan_sweep, sum_assignments
-from foredrive.sets.interval import bound_component
 
 ANY = 1 << 40
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from foredrive.metrics.voxels.protocols import OCC3D_CLASSES, OPENOCC_CLASSES
+from foredrive.tasks.occupancy.protocols import OCC3D_CLASSES, OPENOCC_CLASSES
 
 XYZ = (200, 200, 16)
 LIDAR_M = [0.943713, 0.0, 1.84023]

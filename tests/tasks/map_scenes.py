@@ -4,8 +4,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from foredrive.metrics.maps.lines import LineSet
 from foredrive.scene.map_elements import ElementKind
+from foredrive.tasks.maps.lines import LineSet
 
 
 def elements(

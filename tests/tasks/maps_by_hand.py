@@ -7,7 +7,7 @@ import numpy as np
 from scipy.spatial.distance import cdist
 from shapely import LineString
 
-from foredrive.metrics.maps.lines import LineSet
+from foredrive.tasks.maps.lines import LineSet
 
 
 def points_of(line: np.ndarray, count: int) -> np.ndarray:

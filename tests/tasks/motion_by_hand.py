@@ -9,8 +9,8 @@ from collections import defaultdict
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from foredrive.metrics.motion.agents import PredictedAgents, TrueAgents
 from foredrive.scene import Category
+from foredrive.tasks.motion.agents import PredictedAgents, TrueAgents
 
 CAR_OF_UNIAD = {
     Category.CAR,

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from foredrive.metrics.motion.agents import PredictedAgents, TrueAgents
 from foredrive.scene import Category
+from foredrive.tasks.motion.agents import PredictedAgents, TrueAgents
 
 STEPS, FUTURES = 12, 6
 

@@ -1,6 +1,6 @@
 """Tables of docs/tasks.md: what the same synthetic predictions score under each protocol.
 
-    PYTHONPATH=src:tests python tests/metrics/protocol_tables.py
+    PYTHONPATH=src:tests python tests/tasks/protocol_tables.py
 
 prints them. A test compares them with the page.
 """
@@ -8,14 +8,14 @@ prints them. A test compares them with the page.
 import dataclasses
 
 import numpy as np
-from metrics.map_scenes import random_maps
-from metrics.motion_scenes import random_predictions, random_truth
+from tasks.map_scenes import random_maps
+from tasks.motion_scenes import random_predictions, random_truth
 
-from foredrive.metrics.maps.precision import mean_precision, score_maps
-from foredrive.metrics.maps.protocols import PROTOCOLS as MAP_PROTOCOLS
-from foredrive.metrics.motion.moving import MovingScores, score_moving
-from foredrive.metrics.motion.protocols import PROTOCOLS as MOTION_PROTOCOLS
-from foredrive.metrics.motion.scores import MotionScores, score_motion
+from foredrive.tasks.maps.precision import mean_precision, score_maps
+from foredrive.tasks.maps.protocols import PROTOCOLS as MAP_PROTOCOLS
+from foredrive.tasks.motion.moving import MovingScores, score_moving
+from foredrive.tasks.motion.protocols import PROTOCOLS as MOTION_PROTOCOLS
+from foredrive.tasks.motion.scores import MotionScores, score_motion
 
 FRAMES, FRAMES_OF_DRIVE = 60, 10
 

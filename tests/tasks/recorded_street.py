@@ -16,12 +16,12 @@ from foredrive.data import ClipConfig, ClipDataset, collate, find_logs
 from foredrive.data.log_writer import LogWriter
 from foredrive.data.maps import write_map
 from foredrive.data.modalities import FullOccupancy
-from foredrive.data.task_truth import TaskTruthConfig
-from foredrive.evaluation.predictor import Prediction
-from foredrive.models.tasks.agents import AGENT_CLASSES
+from foredrive.data.truth.store import TaskTruthConfig
 from foredrive.scene import Attribute, Boxes, Category, Example, VoxelSpec
 from foredrive.scene.agents import Agents, MapLines
 from foredrive.scene.map_elements import ElementKind
+from foredrive.tasks.detection.agents_head import AGENT_CLASSES
+from foredrive.tasks.evaluation.predictor import Prediction
 
 STEP_S, SECONDS = 0.25, 9.0
 GRID = VoxelSpec((-8.0, -8.0, -1.0), 0.5, (6, 32, 32))

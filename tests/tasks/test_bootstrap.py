@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from foredrive.errors import InputError
-from foredrive.metrics.bootstrap import bootstrap_mean
+from foredrive.tasks.bootstrap import bootstrap_mean
 
 
 def test_bootstrap_draws_whole_sequences() -> None:

@@ -9,8 +9,8 @@ from foredrive.data.boxes import read_boxes
 from foredrive.data.logs import Log
 from foredrive.data.recorded import read_visibility
 from foredrive.data.recorded_labels import recorded_labels
-from foredrive.data.task_truth import TaskTruthConfig
-from foredrive.data.tasks import tasks_of
+from foredrive.data.truth.store import TaskTruthConfig
+from foredrive.data.truth.tasks import tasks_of
 from foredrive.scene import Attribute, Category, Example
 from foredrive.scene.conditions import BackgroundTraffic
 from foredrive.scene.map_elements import ElementKind, RasterLayer

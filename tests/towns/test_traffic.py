@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 import shapely
 
+from foredrive.driving.car_following import MAX_BRAKING_MPS2
 from foredrive.scene import Category
 from foredrive.scene.traffic_light import LightState
 from foredrive.towns.map.town_map import TownMap
-from foredrive.towns.traffic.car_following import MAX_BRAKING_MPS2
 from foredrive.towns.traffic.lane_graph import LaneControl
 from foredrive.towns.traffic.lights import GREEN_S, PHASE_S, YELLOW_S, plan_signals
 from foredrive.towns.traffic.traffic import Traffic, TrafficState

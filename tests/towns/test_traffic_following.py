@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from foredrive.towns.traffic.car_following import follow_acceleration, free_acceleration
+from foredrive.driving.car_following import follow_acceleration, free_acceleration
 
 
 def follow(

@@ -9,12 +9,12 @@ import torch
 from file_digests import digests
 
 from foredrive.data import ClipConfig, ClipDataset
-from foredrive.data.affordances import read_affordances
 from foredrive.data.boxes import read_boxes
 from foredrive.data.cameras import pinhole_cameras, read_camera
 from foredrive.data.commands import route_at
 from foredrive.data.log_paths import LogPath
 from foredrive.data.logs import Log
+from foredrive.data.truth.affordances import read_affordances
 from foredrive.scene import Category, VoxelSpec
 from foredrive.sensors.rigs import camera_rig
 from foredrive.towns import virtual_egos

@@ -14,15 +14,17 @@ from foredrive.sensors.vehicle import roof_lidar
 from foredrive.towns.map.town_map import TownMap
 from foredrive.towns.place.materials import Material, MaterialArrays, MaterialTable, Surface, Texture
 from foredrive.towns.sensing import lens
-from foredrive.towns.sensing.air import BACKSCATTER_RATIO, make_air, rain_extinction_per_m
 from foredrive.towns.sensing.beams import MAX_LATERAL_M, add_beams, phase
 from foredrive.towns.sensing.capture import NOT_KNOWN, SensorSuite
 from foredrive.towns.sensing.lamps import UNIT_LUX, gather_lamps, lamp_light
 from foredrive.towns.sensing.lidar_returns import air_returns, lidar_returns
 from foredrive.towns.sensing.light import (
+    BACKSCATTER_RATIO,
     daylight_lux,
     headlights_on,
+    make_air,
     make_light,
+    rain_extinction_per_m,
     street_lamps_on,
     sun_direction,
 )

@@ -9,9 +9,9 @@ import pytest
 from html_pages import EVIL, Page, assert_harmless
 from PIL import Image
 
+from foredrive.driving.route_sets import load_route_set
 from foredrive.errors import InputError
 from foredrive.runs.demo import Demo, full_demo, quick_demo
-from foredrive.simulation.route_sets import load_route_set
 from foredrive.view.demo_report import Block, Outcome, Section, Step, do_steps, write_demo_report
 from foredrive.view.demo_steps import STEPS
 from foredrive.view.html import MetricTile, Provenance, picture, stored_film

@@ -6,7 +6,7 @@ from urllib.parse import quote
 
 from html_pages import EVIL, Page, assert_harmless
 
-from foredrive.evaluation.summary import write_summary
+from foredrive.engine.summary import write_summary
 from foredrive.runs.drive.records import read_drive, summarise
 from foredrive.view.drive_report import score_table, write_drive_report
 

@@ -14,11 +14,11 @@ from miniature import write_log
 from foredrive.cli.main import main
 from foredrive.data.boxes import read_boxes
 from foredrive.data.cameras import encoded_image, pinhole_cameras, read_camera
-from foredrive.data.convert import convert
+from foredrive.data.formats.bag_topics import propose_topics, topics_file
+from foredrive.data.formats.convert import convert
 from foredrive.data.lidar import read_sweep
 from foredrive.data.logs import Log
 from foredrive.data.maps import read_map_patch
-from foredrive.data.raw.bag_topics import propose_topics, topics_file
 from foredrive.errors import InputError
 from foredrive.scene import Category
 from foredrive.view.log_frames import LogFrames

@@ -9,10 +9,10 @@ import synthetic_log as world
 from PIL import Image
 
 from foredrive.cli.main import main
-from foredrive.recipes import rebuilding
-from foredrive.recipes.gaussians import GaussianRecipe
-from foredrive.rendering.gaussians.initial import InitialGaussians
-from foredrive.training.gaussian_training import GaussianSchedule
+from foredrive.methods.splatad.initial import InitialGaussians
+from foredrive.methods.splatad.recipes import GaussianRecipe
+from foredrive.methods.splatad.training import GaussianSchedule
+from foredrive.runs.recipes import rebuilding
 
 
 def test_the_verb_writes_a_picture_and_says_how_good_it_is(

@@ -12,7 +12,15 @@ from small_rebuild import SMALLEST
 
 from foredrive.cli.main import main
 from foredrive.data import find_logs
-from foredrive.rendering.edits import Insert, Move, Remove, ShiftEgo, apply_edits, load_edits, save_edits
+from foredrive.methods.rebuilding.edits import (
+    Insert,
+    Move,
+    Remove,
+    ShiftEgo,
+    apply_edits,
+    load_edits,
+    save_edits,
+)
 from foredrive.runs.rebuild import render as rebuilt_render
 from foredrive.runs.rebuild.rebuilt_run import edited_scene, open_rebuilt
 from foredrive.runs.rebuild.reconstruct import Reconstruction, reconstruct

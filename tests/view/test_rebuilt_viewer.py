@@ -14,14 +14,14 @@ from small_rebuild import SMALLEST
 from foredrive.cli.main import main
 from foredrive.data import find_logs
 from foredrive.errors import InputError
-from foredrive.rendering.edits import Move, Remove, ShiftEgo, load_edits, move_between
-from foredrive.rendering.gaussians import Gaussians
-from foredrive.rendering.tracks import states_at
+from foredrive.methods.rebuilding.edits import Move, Remove, ShiftEgo, load_edits, move_between
+from foredrive.methods.rebuilding.tracks import states_at
+from foredrive.methods.splatad import Gaussians
 from foredrive.runs.rebuild.rebuilt_run import OpenedReconstruction, open_rebuilt
 from foredrive.runs.rebuild.reconstruct import reconstruct
 from foredrive.view.job_runner import JobRunner
+from foredrive.view.rebuilt_nodes import thin_out
 from foredrive.view.rebuilt_viewer import RebuiltViewer
-from foredrive.view.splat_nodes import thin_out
 
 PARKED, MOVING = 7, 11
 ONE_CAMERA = dataclasses.replace(SMALLEST, cameras=("ahead",))

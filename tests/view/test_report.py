@@ -11,9 +11,9 @@ from html_pages import EVIL, Page, assert_harmless
 from PIL import Image
 
 from foredrive.errors import InputError
-from foredrive.metrics.protocols import PROTOCOLS
 from foredrive.runs import ExamplePrediction
 from foredrive.scene import Example
+from foredrive.tasks.planning.protocols import PROTOCOLS
 from foredrive.view import palette
 from foredrive.view.example_panel import (
     camera_with_paths,

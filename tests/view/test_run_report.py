@@ -5,10 +5,10 @@ import json
 from pathlib import Path
 
 from foredrive.data import LogPath
-from foredrive.evaluation.run import Failure
-from foredrive.recipes import find_recipe
 from foredrive.runs import Run
+from foredrive.runs.recipes.known import find_recipe
 from foredrive.scene import Example
+from foredrive.tasks.evaluation.run import Failure
 from foredrive.view.example_panel import example_title
 from foredrive.view.run_report import report_on_run
 

@@ -23,12 +23,17 @@ from foredrive.runs.evaluate.display import DisplayPrediction
 from foredrive.scene import Trajectory, VoxelSpec
 from foredrive.scene.agents import MapLines
 from foredrive.view.log_frames import LogFrames
-from foredrive.view.model_panel import pinhole
+from foredrive.view.model_panel import (
+    arrows,
+    pinhole,
+    show_agents,
+    show_lines,
+    show_true_classes,
+    shown_voxels,
+)
 from foredrive.view.overview import CAPTION_PX, GAP_PX, VOXELS_WIDTH_PX, Overview, occupancy_with_paths
 from foredrive.view.page import free_port
-from foredrive.view.task_nodes import show_agents, show_lines
 from foredrive.view.viewer import Viewer
-from foredrive.view.volume_nodes import arrows, show_true_classes, shown_voxels
 from foredrive.view.voxel_drawing import pca_colours
 
 SPEC = VoxelSpec((0.0, -1.0, 0.0), 1.0, (1, 2, 3))

@@ -11,7 +11,7 @@ from foredrive.errors import InputError
 from foredrive.lazy import importing
 
 if TYPE_CHECKING:
-    from foredrive.evaluation.bench import Benchmark
+    from foredrive.engine.bench import Benchmark
 
 
 def bench(
@@ -29,7 +29,7 @@ def bench(
             name has _ in place of -.
     """
     with importing():
-        from foredrive.evaluation.bench import run_benchmark
+        from foredrive.engine.bench import run_benchmark
 
     files = {path.stem.replace("_", "-"): path for path in sorted(folder.glob("*.py"))}
     if not files:
@@ -55,7 +55,7 @@ def bench(
 
 def _load(path: Path) -> "Benchmark | None":
     """Load the BENCHMARK of a file; return None if the file defines none."""
-    from foredrive.evaluation.bench import Benchmark
+    from foredrive.engine.bench import Benchmark
 
     module_name = f"benchmarks.{path.stem}"
     spec = importlib.util.spec_from_file_location(module_name, path)

@@ -32,11 +32,11 @@ def compare(
     with importing():
         from rich.console import Console
 
-        from foredrive.evaluation.provenance import collect_provenance
-        from foredrive.evaluation.summary import write_summary
+        from foredrive.engine.folder import SUMMARY, held_for_results
+        from foredrive.engine.provenance import collect_provenance
+        from foredrive.engine.summary import write_summary
         from foredrive.runs.drive.compare import compare as compare_agents
         from foredrive.runs.drive.compare import figures_of, read_agent
-        from foredrive.runs.folder import SUMMARY, held_for_results
         from foredrive.view.compare_report import (
             REPORT,
             means_table,

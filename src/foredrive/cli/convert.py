@@ -81,8 +81,8 @@ def convert(
 
 def _propose(bag: Path, topics: Path | None) -> None:
     with importing():
-        from foredrive.data.raw.bag_topics import propose_topics, topics_file
-        from foredrive.data.raw.guard import reading_raw
+        from foredrive.data.formats.bag_topics import propose_topics, topics_file
+        from foredrive.data.formats.guard import reading_raw
 
     file = topics or topics_file(bag)
     with reading_raw(bag):

@@ -20,7 +20,7 @@ def demo(out: OptionalPath = None, quick: bool = False) -> None:
     check_out_folder(out)
 
     with importing():
-        from foredrive.evaluation.provenance import collect_provenance
+        from foredrive.engine.provenance import collect_provenance
         from foredrive.runs.demo import Demo, full_demo, quick_demo
         from foredrive.view.demo_report import do_steps, write_demo_report
         from foredrive.view.demo_steps import STEPS

@@ -13,8 +13,8 @@ from foredrive.errors import InputError
 from foredrive.lazy import importing
 
 if TYPE_CHECKING:
+    from foredrive.driving.drive_record import DriveRecord
     from foredrive.runs.drive.suite import DriveJob, SuiteResult
-    from foredrive.simulation.drive_record import DriveRecord
 
 
 def drive(

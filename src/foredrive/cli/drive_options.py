@@ -19,10 +19,10 @@ from foredrive.cli.arguments import (
 from foredrive.errors import InputError
 
 if TYPE_CHECKING:
+    from foredrive.driving.faults import Faults
     from foredrive.runs.drive.in_carla import CarlaRoutes
     from foredrive.runs.drive.in_rebuilt import RebuiltRoutes
     from foredrive.runs.drive.in_towns import TownRoutes
-    from foredrive.simulation.faults import Faults
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ class InputFaults:
 
     def check(self) -> None:
         """Raise `InputError` if a fault has another form, or a deviation is impossible."""
-        from foredrive.simulation.faults import read_camera_fault
+        from foredrive.driving.faults import read_camera_fault
 
         for text in self.camera_fault:
             read_camera_fault(text)
@@ -82,7 +82,7 @@ class InputFaults:
         Raises:
             InputError: the vehicle has no such camera.
         """
-        from foredrive.simulation.faults import Faults, read_camera_fault
+        from foredrive.driving.faults import Faults, read_camera_fault
 
         found = tuple(map(read_camera_fault, self.camera_fault))
         faults = Faults(found, self.speed_noise, self.position_noise)
@@ -207,8 +207,8 @@ class InRebuilt:
             if self.start or self.threat or self.edits is not None:
                 raise InputError("--start, --threat and --edits need a reconstructed log (--in RUN)")
             return None
+        from foredrive.driving.replay.threats import Threat
         from foredrive.runs.drive.in_rebuilt import RebuiltRoutes
-        from foredrive.simulation.threats import Threat
 
         return RebuiltRoutes(
             run=str(Path(self.rebuilt).absolute()),

@@ -59,12 +59,12 @@ def evaluate(
     named = find_all_logs(logs)
 
     with importing():
+        from foredrive.engine.folder import held_for_results
         from foredrive.runs import evaluate_run, open_run, predict_examples
-        from foredrive.runs.folder import held_for_results
 
     from rich.console import Console
 
-    from foredrive.evaluation.summary import read_summary
+    from foredrive.engine.summary import read_summary
     from foredrive.view.run_report import report_on_run, write_run_report
     from foredrive.view.summary_tables import print_summary
 
@@ -98,9 +98,9 @@ def _evaluate_gap(run: Path, rebuilt: Path, out: Path) -> None:
         from rich.console import Console
         from rich.progress import Progress
 
+        from foredrive.engine.folder import held_for_results
         from foredrive.runs import open_run
         from foredrive.runs.evaluate.real_to_sim_gap import GAP, measure_gap
-        from foredrive.runs.folder import held_for_results
         from foredrive.view.gap_table import gap_table
         from foredrive.view.table import print_table
 

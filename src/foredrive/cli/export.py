@@ -31,9 +31,9 @@ def export(
     named = find_all_logs(logs)
 
     with importing():
+        from foredrive.engine.folder import held_for_results
         from foredrive.runs import open_run
         from foredrive.runs.export import export_run
-        from foredrive.runs.folder import held_for_results
 
     trained = open_run(run)
     folder = out or run / "export"

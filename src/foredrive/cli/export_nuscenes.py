@@ -50,8 +50,8 @@ def export_nuscenes(
         raise InputError(f"whole logs are exported, not parts of them as of {parts[0]} in a list of clips")
 
     with importing():
-        from foredrive.export.nuscenes.dataset import NuScenesFolder
-        from foredrive.export.nuscenes.scene import SceneOptions
+        from foredrive.integrations.nuscenes.dataset import NuScenesFolder
+        from foredrive.integrations.nuscenes.scene import SceneOptions
         from foredrive.runs.nuscenes import export_nuscenes
 
     folder, failed = NuScenesFolder(out, name, SceneOptions(rate, sweeps)), {}

@@ -42,7 +42,7 @@ def fetch_av2(
     check_number("--at-a-time", at_a_time, low=1, high=32)
     check_out_folder(out)
     with importing():
-        from foredrive.data.raw.av2_fetch import fetch_log, find_log, log_ids
+        from foredrive.data.formats.av2_fetch import fetch_log, find_log, log_ids
 
     bucket = bucket.rstrip("/")
     if not log:

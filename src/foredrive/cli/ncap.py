@@ -69,10 +69,10 @@ def ncap(
     with importing():
         from rich.console import Console
 
+        from foredrive.driving.ncap.rules import RULES
         from foredrive.runs.drive.in_ncap import SafetyTests
         from foredrive.runs.drive.records import tested_runs
         from foredrive.runs.drive.suite import DriveSuite, SuiteResult, drive_suite
-        from foredrive.simulation.ncap.rules import RULES
         from foredrive.view.drive_report import REPORT, write_drive_report
         from foredrive.view.ncap_tables import safety_table
         from foredrive.view.table import Table, print_table

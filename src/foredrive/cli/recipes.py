@@ -16,10 +16,10 @@ def recipes(
         name: Print this recipe; without a name, all recipes are listed.
     """
     with importing():
-        from foredrive.recipes.config import recipe_yaml
-        from foredrive.recipes.driver import DRIVER_RECIPES
-        from foredrive.recipes.known import RECIPES, find_driver_recipe, find_recipe
-        from foredrive.recipes.rebuilding import REBUILD_RECIPES, find_rebuild_recipe
+        from foredrive.driver.recipes import DRIVER_RECIPES
+        from foredrive.engine.config import recipe_yaml
+        from foredrive.runs.recipes.known import RECIPES, find_driver_recipe, find_recipe
+        from foredrive.runs.recipes.rebuilding import REBUILD_RECIPES, find_rebuild_recipe
 
     if name is not None:
         driver = find_driver_recipe(name)

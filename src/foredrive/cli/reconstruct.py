@@ -24,8 +24,8 @@ from foredrive.errors import InputError
 from foredrive.lazy import importing
 
 if TYPE_CHECKING:
-    from foredrive.evaluation.perceptual import PerceptualWeights
-    from foredrive.recipes.rebuilding import RebuildRecipe
+    from foredrive.methods.rebuilding.perceptual import PerceptualWeights
+    from foredrive.runs.recipes.rebuilding import RebuildRecipe
 
 FIGURES = (
     *("minutes", "psnr_db", "nearest.psnr_db", "ssim", "lpips", "fid"),
@@ -80,8 +80,8 @@ def reconstruct(
     found = find_logs(logs)
 
     with importing():
-        from foredrive.evaluation.perceptual import PerceptualWeights
-        from foredrive.recipes.rebuilding import find_rebuild_recipe
+        from foredrive.methods.rebuilding.perceptual import PerceptualWeights
+        from foredrive.runs.recipes.rebuilding import find_rebuild_recipe
 
     chosen = find_rebuild_recipe(recipe or f"{method or 'gaussians'}_tiny", set)
     kind = chosen.representation.kind
@@ -113,7 +113,7 @@ def rebuild_log(
     """Reconstruct one log in a folder, draw its held-out frames, and return its figures as lines."""
     import torch
 
-    from foredrive.evaluation.perceptual import PerceptualMetrics, PerceptualWeights
+    from foredrive.methods.rebuilding.perceptual import PerceptualMetrics, PerceptualWeights
     from foredrive.runs.rebuild.reconstruct import Reconstruction, reconstruct
     from foredrive.view.rebuilt_sheet import write_rebuilt_sheet
 
@@ -147,7 +147,7 @@ def _rebuild_logs(
     """
     import torch
 
-    from foredrive.runs.fan_out import fan_out, reason
+    from foredrive.engine.fan_out import fan_out, reason
 
     jobs = [(log, out / log.name) for log in found]
     work = functools.partial(work, threads=max(1, torch.get_num_threads() // workers))

@@ -59,8 +59,8 @@ def render(
     check_rebuilt(run)
 
     with importing():
-        from foredrive.rendering.edits import load_edits
-        from foredrive.rendering.edits import save_edits as write_edits
+        from foredrive.methods.rebuilding.edits import load_edits
+        from foredrive.methods.rebuilding.edits import save_edits as write_edits
         from foredrive.runs.rebuild.rebuilt_run import open_rebuilt
         from foredrive.runs.rebuild.render import edits_from_arguments, plan_frames
         from foredrive.view.rebuilt_video import write_rebuilt_video

@@ -65,9 +65,9 @@ def score(
 
     from rich.console import Console
 
-    from foredrive.evaluation.detections.score import ScoreConfig
-    from foredrive.runs.folder import held_for_results
+    from foredrive.engine.folder import held_for_results
     from foredrive.runs.score.run import FRAMES, SUMMARY, score_detections
+    from foredrive.tasks.detection.score import ScoreConfig
     from foredrive.view.score_report import REPORT, score_table, write_score_report
     from foredrive.view.table import print_table
 
@@ -84,7 +84,7 @@ def score(
 def _score_task(task: Task, results: Path, truth: Path, out: Path, poses: Path | None) -> None:
     from rich.console import Console
 
-    from foredrive.runs.folder import held_for_results
+    from foredrive.engine.folder import held_for_results
     from foredrive.runs.score.run import SUMMARY
     from foredrive.runs.score.tasks import score_task
     from foredrive.view.score_report import REPORT

@@ -73,8 +73,8 @@ def search_train_captions(
     found = find_all_logs(logs)
 
     with importing():
+        from foredrive.engine.loop import Schedule
         from foredrive.runs.search.captioning import train_captions
-        from foredrive.training import Schedule
 
     schedule = Schedule(batch_size=64, lr=1e-3, epochs=epochs, weight_decay=0.01, warmup_steps=50, seed=seed)
     print(f"wrote {train_captions(found, towers, out, schedule, stride)}")

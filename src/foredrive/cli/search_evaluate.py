@@ -29,7 +29,7 @@ def search_evaluate(
     check_index(index)
 
     with importing():
-        from foredrive.evaluation.summary import write_json
+        from foredrive.engine.summary import write_json
         from foredrive.runs.search.evaluating import evaluate_index
         from foredrive.runs.search.towers import find_towers
         from foredrive.search.index import FrameIndex

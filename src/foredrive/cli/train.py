@@ -62,10 +62,10 @@ def train(
     found = find_all_logs(logs)
 
     with importing():
-        from foredrive.recipes import find_recipe, with_occupancy_source
-        from foredrive.recipes.known import find_driver_recipe
-        from foredrive.recipes.task_heads import heads_for, with_joint_heads, with_settings
+        from foredrive.methods.recipe import with_occupancy_source
         from foredrive.runs import train_run
+        from foredrive.runs.recipes.known import find_driver_recipe, find_recipe
+        from foredrive.runs.recipes.task_heads import heads_for, with_joint_heads, with_settings
         from foredrive.runs.train.driver import train_driver
         from foredrive.runs.train.tasks import TASKS, probe_run, train_heads
 

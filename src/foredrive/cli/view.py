@@ -113,7 +113,7 @@ def _opened(run: Path) -> "Run":
 
 def _serve_rebuilt(folder: Path, edits: Path | None, t_s: float | None, host: str, port: int) -> None:
     with importing():
-        from foredrive.rendering.edits import load_edits
+        from foredrive.methods.rebuilding.edits import load_edits
         from foredrive.runs.rebuild.rebuilt_run import edited_scene, open_rebuilt
         from foredrive.view.rebuilt_viewer import RebuiltViewer
 

@@ -7,9 +7,9 @@ import torch
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
+from foredrive.data.truth.mirrored import mirrored_truth
 from foredrive.errors import InputError
 from foredrive.scene import Boxes, CameraRig, Clip, Command, Example, LidarSweep, VoxelGrid
-from foredrive.training.mirrored_truth import mirrored_truth
 
 
 @dataclass(frozen=True)

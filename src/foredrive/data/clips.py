@@ -25,7 +25,7 @@ from foredrive.data.logs import Log
 from foredrive.data.maps import read_map_patch
 from foredrive.data.recorded import read_expert_plan
 from foredrive.data.recorded_labels import check_recorded_occupancy, recorded_labels
-from foredrive.data.task_truth import TaskTruthConfig, TaskTruthStore
+from foredrive.data.truth.store import TaskTruthConfig, TaskTruthStore
 from foredrive.errors import InputError
 from foredrive.scene import Clip, Example, Trajectory, VoxelGrid, VoxelSpec
 from foredrive.scene.task_truth import TaskTruth

@@ -7,7 +7,7 @@ from py123d.datatypes import Lidar, LidarID, LidarMergedMetadata, LidarMetadata,
 from py123d.datatypes.custom.custom_modality import CustomModality
 from torch import Tensor
 
-import foredrive.data.pandaset  # noqa: F401  (a log may refer to raw sweeps, which are pickles)
+import foredrive.data.formats.pandaset  # noqa: F401  (a log may refer to raw sweeps, which are pickles)
 from foredrive.data.arrow_files import reading
 from foredrive.data.logs import Log
 from foredrive.data.modalities import LIDAR_BEAMS, unpack_beams

@@ -32,8 +32,6 @@ EXPERT_PLAN = "expert_plan"
 """The plan of the expert from the frame on."""
 SIGNAL_LAMPS = "signal_lamps"
 """Middles of the lamps of traffic lights around the vehicle, by the lane that each guards."""
-OLD_NAMES = {EXPERT_PLAN: "taught_plan"}
-"""Names of modalities in logs of earlier versions. They are read where the present name is absent."""
 
 _ORIGIN_STEP_M = 1e-4
 _DIRECTION_STEP = 1 / 32767

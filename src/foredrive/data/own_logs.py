@@ -20,9 +20,9 @@ from py123d.geometry import PoseSE3
 from foredrive.data.camera_streams import CameraSpec
 from foredrive.data.category_names import category_named
 from foredrive.data.ego_path import interpolated_poses
+from foredrive.data.images import read_rgb
 from foredrive.data.log_paths import LogPath
 from foredrive.data.log_writer import Frame, LogWriter
-from foredrive.data.raw.images import read_rgb
 from foredrive.errors import InputError
 from foredrive.scene import Boxes, Category, LidarSweep
 from foredrive.scene.boxes import unlabelled

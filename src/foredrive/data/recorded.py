@@ -17,7 +17,6 @@ from foredrive.data.modalities import (
     CAPTION,
     EXPERT_PLAN,
     FULL_OCCUPANCY,
-    OLD_NAMES,
     SETTING,
     SIGNAL_LAMPS,
     FullOccupancy,
@@ -110,9 +109,6 @@ def read_signal_lamps(log: Log, frame: int) -> dict[int, Float64[np.ndarray, "_ 
 
 def _read(log: Log, frame: int, name: str, unpack: Callable[[CustomModality], T]) -> T | None:
     """Unpack a frame's row of a custom modality. Return None if it was not recorded."""
-    old = OLD_NAMES.get(name)
-    if old is not None and not log.file(f"custom.{name}").exists():
-        name = old
     with reading(log.file(f"custom.{name}"), f"the {name.replace('_', ' ')} at frame {frame}"):
         row = log.scene.get_custom_modality_at_iteration(log.iteration(frame), name)
         return unpack(row) if isinstance(row, CustomModality) else None

@@ -8,20 +8,19 @@ from jaxtyping import Float, Float64
 from scipy.interpolate import PchipInterpolator
 from torch import Tensor, nn
 
-from foredrive.data.affordances import PASSED_M, POINTS, PathAhead
+from foredrive.data.truth.affordances import PASSED_M, POINTS, PathAhead
 from foredrive.driver.eyes import CameraEyes
 from foredrive.driver.sight import Sight
 from foredrive.driver.speed_planner import SpeedPlanner, profile_progress
 from foredrive.driver.volume_eyes import VolumeEyes
-from foredrive.models.ego_mlp import ego_speeds
+from foredrive.driving.observation import HORIZON_STEPS
+from foredrive.driving.simple_agents import plan_of
+from foredrive.driving.speed_rule import FRONT_M, curve_speed, waypoints_along
+from foredrive.methods.planner.ego_mlp import ego_speeds
 from foredrive.scene import Clip, Trajectory
 from foredrive.scene.affordances import PathEstimate
 from foredrive.scene.clip import ROUTE_M
 from foredrive.scene.traffic_light import LightState
-from foredrive.simulation.idm_agent import waypoints_along
-from foredrive.simulation.observation import HORIZON_STEPS
-from foredrive.simulation.simple_agents import plan_of
-from foredrive.simulation.speed_rule import FRONT_M, curve_speed
 
 SEEN = 0.5
 """Probability of a lamp from which the light of a frame counts."""

@@ -8,14 +8,14 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from foredrive.data.affordances import PathAhead
+from foredrive.data.truth.affordances import PathAhead
 from foredrive.driver.agent import Driver
 from foredrive.driver.losses import lamp_places
 from foredrive.driver.packed import BATCH, PackedClips, join
-from foredrive.models.ego_mlp import ego_speeds
+from foredrive.driving.speed_rule import FRONT_M, PathView, meets_somebody, rule_progress
+from foredrive.methods.planner.ego_mlp import ego_speeds
 from foredrive.scene.affordances import CELL_M, LATER_DT_S, TIMES, Affordances, PathEstimate
 from foredrive.scene.traffic_light import LightState
-from foredrive.simulation.speed_rule import FRONT_M, PathView, meets_somebody, rule_progress
 
 LIGHT_M, OBSTACLE_M = 40.0, 30.0
 """Distances up to which lights and the first obstacle are judged."""

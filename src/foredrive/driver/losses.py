@@ -11,7 +11,7 @@ from foredrive.driver.road_user_targets import USERS, road_user_cells, road_user
 from foredrive.driver.sight import VELOCITY_SCALE_MPS, Sight, scaled_line
 from foredrive.geometry.projection import project
 from foredrive.geometry.se3 import inverse_se3, transform_points
-from foredrive.losses.masked import masked_mean
+from foredrive.ops.masked import masked_mean
 from foredrive.scene import CameraRig, Clip
 from foredrive.scene.affordances import Affordances
 from foredrive.scene.traffic_light import LightState

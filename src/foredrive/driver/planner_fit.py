@@ -8,18 +8,18 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from foredrive.data.affordances import PathAhead
 from foredrive.data.batches import stack_records
+from foredrive.data.truth.affordances import PathAhead
 from foredrive.driver.agent import Driver
 from foredrive.driver.packed import BATCH, PackedClips, join
 from foredrive.driver.speed_planner import chosen_labels, profile_numbers, profile_progress
+from foredrive.driving.observation import HORIZON_STEPS
+from foredrive.driving.speed_rule import FRONT_M, Obstacle, PathView, curve_speed, rule_progress
+from foredrive.engine.in_memory_fit import FitSchedule, fit_in_memory
 from foredrive.errors import InputError
-from foredrive.models.ego_mlp import ego_speeds
+from foredrive.methods.planner.ego_mlp import ego_speeds
 from foredrive.scene.affordances import Affordances, PathEstimate
 from foredrive.scene.traffic_light import LightState
-from foredrive.simulation.observation import HORIZON_STEPS
-from foredrive.simulation.speed_rule import FRONT_M, Obstacle, PathView, curve_speed, rule_progress
-from foredrive.training.in_memory_fit import FitSchedule, fit_in_memory
 
 FASTEST_MPS = 9.0
 ROWS = 512

@@ -4,16 +4,16 @@ from dataclasses import dataclass, field, replace
 from typing import Literal
 
 from foredrive.data import ClipConfig
-from foredrive.data.task_truth import TaskTruthConfig
+from foredrive.data.truth.store import TaskTruthConfig
 from foredrive.driver.eyes import CameraEyesConfig
 from foredrive.driver.losses import SightWeights
 from foredrive.driver.planner_fit import PlanFit
 from foredrive.driver.speed_planner import SpeedPlannerConfig
 from foredrive.driver.volume_eyes import VolumeEyesConfig
-from foredrive.recipes.nemo import nemo_town
+from foredrive.engine.loop import Schedule
+from foredrive.methods.nemo.recipes import nemo_town
 from foredrive.scene import VoxelSpec
 from foredrive.sensors.rigs import FRONT_TELE
-from foredrive.training import Schedule
 
 
 @dataclass(frozen=True)

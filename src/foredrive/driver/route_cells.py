@@ -5,12 +5,12 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from foredrive.driving.speed_rule import FRONT_M
 from foredrive.geometry.projection import project
 from foredrive.geometry.se3 import inverse_se3, transform_points
 from foredrive.scene import CameraRig
 from foredrive.scene.affordances import CELL_M, CELLS
 from foredrive.scene.clip import ROUTE_M
-from foredrive.simulation.speed_rule import FRONT_M
 
 BESIDE_M = (-12.0, -8.5, -6.0, -4.0, -2.2, -0.8, 0.8, 2.2, 4.0, 6.0, 8.5, 12.0)
 """Distances of the cells from the route, m, positive to the left: those who cross come from up to 15 m."""

@@ -2,7 +2,7 @@
 
 Each profile is compared with the occupancy of the path over time and with the next light: how probably it
 meets a road user, and when; whether it crosses the line of a light that stops it. A small network turns these
-numbers into a score. It learns from the rule of `simulation.speed_rule` on true perception, without images,
+numbers into a score. It learns from the rule of `driving.speed_rule` on true perception, without images,
 and then from the same rule on what is really seen.
 """
 
@@ -12,10 +12,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from foredrive.driving.dynamics import EGO
+from foredrive.driving.speed_rule import DESIRED_MPS, TAIL_M
 from foredrive.scene.affordances import CELL_M, CELLS, LATER_DT_S, TIMES, PathEstimate
 from foredrive.scene.traffic_light import LightState
-from foredrive.simulation.dynamics import EGO
-from foredrive.simulation.speed_rule import DESIRED_MPS, TAIL_M
 
 PROFILES = (
     (0.0, 8.0), (0.0, 6.0), (0.0, 4.5), (0.0, 3.0), (0.0, 2.0), (0.0, 1.2),

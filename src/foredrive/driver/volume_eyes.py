@@ -12,8 +12,8 @@ from foredrive.driver.eyes import blacked, seen_frames
 from foredrive.driver.route_cells import route_cells
 from foredrive.driver.sight import RouteReader, Sight
 from foredrive.geometry.se3 import compose_se3, inverse_se3, transform_points
-from foredrive.models.lifting import lift_frames
-from foredrive.models.nemo import Nemo, NemoConfig
+from foredrive.methods.blocks.lifting import lift_frames
+from foredrive.methods.nemo import Nemo, NemoConfig
 from foredrive.scene import Clip, VoxelSpec, last_frames
 
 HEIGHTS_M = (0.0, 1.0, 2.0)

@@ -1,27 +1,59 @@
-"""Collisions of the ego vehicle: with road users by their boxes, with static objects by the town's meshes."""
+"""Road users as oriented boxes, and their collisions with the ego vehicle."""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float32, Float64
+from jaxtyping import Bool, Float64, Int
 
+from foredrive.driving.dynamics import EGO, Vehicle
 from foredrive.scene import BicycleState, Category, Event
-from foredrive.simulation.dynamics import EGO, Vehicle
-from foredrive.simulation.road_users import Box, RoadUsers, touched
-from foredrive.towns.place.materials import Surface
-from foredrive.towns.world import World
 
-PASSABLE = (Surface.ROAD, Surface.SIDEWALK, Surface.TERRAIN, Surface.HIDDEN)
-SOLID = np.array([surface not in PASSABLE for surface in Surface])
-RAY_HEIGHTS_M = (0.35, 0.8)
-RAY_SPACING_M = 0.12
-"""Lateral distance between rays, m: posts are not much thinner."""
+LEVEL_M = 2.0
+"""Road users further apart than this in height, m, pass over or under each other."""
 BUMPER_M, FLANK_M = 0.8, 0.3
 """An object inside the first `BUMPER_M` of the front, except in the outer `FLANK_M` on each side, stops
 the vehicle. Contact elsewhere only scrapes."""
 SAME_S, SAME_M = 5.0, 3.0
 """A contact counts as a new collision if the last contact with the same road user is more than `SAME_S`
 ago, or if the last static contact is more than `SAME_M` away (CARLA's CollisionTest)."""
+
+
+class RoadUsers(NamedTuple):
+    """N slots for all road users except the ego vehicle, world frame."""
+
+    track_id: Int[np.ndarray, "N"]
+    """-1 in empty slots."""
+    category: Int[np.ndarray, "N"]
+    foot_m: Float64[np.ndarray, "N 3"]
+    """Middle of the box on the ground, m."""
+    yaw: Float64[np.ndarray, "N"]
+    half_lw: Float64[np.ndarray, "N 2"]
+    velocity_mps: Float64[np.ndarray, "N 2"]
+
+    def towards(self, later: "RoadUsers", part: float) -> "RoadUsers":
+        """Interpolate linearly towards a later time. A user that is absent then stays where it is."""
+        same = self.track_id == later.track_id
+        moved = np.where(same, part, 0.0)
+        turned = (later.yaw - self.yaw + np.pi) % (2 * np.pi) - np.pi
+        return self._replace(
+            foot_m=self.foot_m + moved[:, None] * (later.foot_m - self.foot_m),
+            yaw=self.yaw + moved * turned,
+            velocity_mps=self.velocity_mps + moved[:, None] * (later.velocity_mps - self.velocity_mps),
+        )
+
+    def without(self, track_ids: Int[np.ndarray, "k"]) -> "RoadUsers":
+        """Return the road users with some of them marked as absent."""
+        return self._replace(track_id=np.where(np.isin(self.track_id, track_ids), -1, self.track_id))
+
+
+class Box(NamedTuple):
+    """An upright box on the ground."""
+
+    foot_m: Float64[np.ndarray, "3"]
+    """Middle of the box on the ground, m."""
+    yaw_rad: float
+    half_lw: Float64[np.ndarray, "2"]
 
 
 @dataclass(frozen=True)
@@ -51,61 +83,6 @@ class EgoContact:
             return users
         counts = np.isin(users.category, [int(category) for category in self.categories])
         return users._replace(track_id=np.where(counts, users.track_id, -1))
-
-
-class CollisionSense:
-    """Detects the collisions of the ego vehicle in one world."""
-
-    def __init__(self, world: World) -> None:
-        self._world = world
-        half_width, length = 0.5 * EGO.width_m, EGO.length_m
-        y = np.linspace(-half_width, half_width, int(np.ceil(EGO.width_m / RAY_SPACING_M)) + 1)
-        start = [[EGO.axle_to_centre_m + 0.5 * length, left, up] for up in RAY_HEIGHTS_M for left in y]
-        self._start_ego: Float64[np.ndarray, "R 3"] = np.array(start)
-        self._in_front = np.abs(self._start_ego[:, 1]) < half_width - FLANK_M
-
-    def check(
-        self,
-        T_world_ego: Float64[np.ndarray, "4 4"],
-        ego: BicycleState,
-        users: RoadUsers,
-        contacts: Contacts,
-        t_s: float,
-    ) -> tuple[list[Event], Contacts, bool]:
-        """Return the new collisions, the updated contacts, and whether an obstacle stops the vehicle."""
-        box = ego_box(T_world_ego, ego)
-        events, recent = collide(box, ego, users, contacts.users, t_s)
-        stands_in_front, struck = self._standing(T_world_ego)
-        standing_xy = contacts.standing_xy
-        if struck is not None:
-            xy, surface = struck
-            if standing_xy is None or np.hypot(*np.subtract(xy, standing_xy)) > SAME_M:
-                what = "parked car" if surface is Surface.VEHICLE else surface.name.lower()
-                text = f"{what} at {ego.speed_mps:.1f} m/s"
-                events.append(Event("collision_static", t_s, xy, text, what, ego.speed_mps))
-                standing_xy = xy
-        stopped = stands_in_front or blocked(box, users)
-        return events, Contacts(recent, standing_xy), stopped
-
-    def _standing(
-        self, T_world_ego: Float64[np.ndarray, "4 4"]
-    ) -> tuple[bool, tuple[tuple[float, float], Surface] | None]:
-        """Return whether the bumper meets a static object, and the foremost hit inside the vehicle's outline.
-
-        A hit is its position (m, world frame) and its surface. Rays go from the bumper to the rear.
-        """
-        R, origin = T_world_ego[:3, :3], T_world_ego[:3, 3]
-        start = self._start_ego @ R.T + origin
-        way = np.broadcast_to(-EGO.length_m * R[:, 0], start.shape)
-        rays: list[Float32[np.ndarray, "R 3"]] = [np.ascontiguousarray(x, np.float32) for x in (start, way)]
-        part, surface = self._world.struck(*rays)
-        inside = (part <= 1.0) & SOLID[surface]
-        if not inside.any():
-            return False, None
-        at_front = inside & self._in_front & (part * EGO.length_m < BUMPER_M)
-        first = int(np.argmin(np.where(inside, part, np.inf)))
-        xy = start[first, :2] + part[first] * way[first, :2]
-        return bool(at_front.any()), ((float(xy[0]), float(xy[1])), Surface(int(surface[first])))
 
 
 def collide(
@@ -142,3 +119,28 @@ def ego_box(T_world_ego: Float64[np.ndarray, "4 4"], ego: BicycleState, vehicle:
     """Return the box of the ego vehicle."""
     foot = T_world_ego[:3, 3] + vehicle.axle_to_centre_m * T_world_ego[:3, 0]
     return Box(foot, ego.yaw_rad, 0.5 * np.array([vehicle.length_m, vehicle.width_m]))
+
+
+def touched(box: Box, users: RoadUsers) -> Bool[np.ndarray, "N"]:
+    """Return which road users overlap a box.
+
+    Two boxes overlap if no axis of either separates them (Gottschalk et al. 1996, in the plane).
+    """
+    offset = users.foot_m - box.foot_m
+    near = (users.track_id >= 0) & (np.abs(offset[:, 2]) < LEVEL_M)
+    reach = np.hypot(*box.half_lw) + np.hypot(users.half_lw[:, 0], users.half_lw[:, 1])
+    near &= np.abs(offset[:, :2]).max(axis=1) < reach
+    hit = np.zeros(len(near), dtype=np.bool_)
+    for i in np.flatnonzero(near).tolist():
+        mine, theirs = _axes(box.yaw_rad), _axes(float(users.yaw[i]))
+        between = np.abs(mine @ theirs.T)
+        apart = np.abs(mine @ offset[i, :2]) > box.half_lw + between @ users.half_lw[i]
+        apart |= np.abs(theirs @ offset[i, :2]) > users.half_lw[i] + between.T @ box.half_lw
+        hit[i] = not apart.any()
+    return hit
+
+
+def _axes(yaw_rad: float) -> Float64[np.ndarray, "2 2"]:
+    """Return the forward and the left unit vector, in rows."""
+    cos, sin = np.cos(yaw_rad), np.sin(yaw_rad)
+    return np.array([[cos, sin], [-sin, cos]])

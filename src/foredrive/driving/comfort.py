@@ -7,9 +7,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float64
 
+from foredrive.driving.dynamics import EGO, STEP_S, Vehicle, yaw_rate_radps
 from foredrive.errors import InputError
 from foredrive.scene import BicycleState
-from foredrive.simulation.dynamics import EGO, STEP_S, Vehicle, yaw_rate_radps
 
 ACCELERATION_S, JERK_S = 0.8, 1.5
 """Window lengths, s. Derivatives are those of quadratics fitted over a window (Savitzky & Golay 1964), as

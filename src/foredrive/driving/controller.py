@@ -12,9 +12,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from foredrive.driving.dynamics import EGO, Vehicle
+from foredrive.driving.plans import Plan
 from foredrive.scene import BicycleState, Control
-from foredrive.simulation.dynamics import EGO, Vehicle
-from foredrive.simulation.plans import Plan
 
 RETURN_M, RETURN_S = 2.5, 0.5
 """λ at rest, m, and its increase per m/s of speed, s."""

@@ -12,13 +12,13 @@ import numpy as np
 import torch
 from jaxtyping import Float64
 
+from foredrive.driving.dynamics import EGO
+from foredrive.driving.observation import FRAME_DT_S, HORIZON_STEPS
+from foredrive.driving.replay.logged_drive import LoggedDrive
+from foredrive.driving.simple_agents import plan_of
 from foredrive.errors import InputError
 from foredrive.geometry.polylines import arc_lengths, points_at
 from foredrive.scene import Clip, LidarSweep, Trajectory
-from foredrive.simulation.dynamics import EGO
-from foredrive.simulation.logged_drive import LoggedDrive
-from foredrive.simulation.observation import FRAME_DT_S, HORIZON_STEPS
-from foredrive.simulation.simple_agents import plan_of
 
 CORRIDOR_S = 2.0
 """Length of the corridor in time at the present speed, s."""

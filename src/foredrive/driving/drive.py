@@ -10,15 +10,15 @@ import numpy as np
 from jaxtyping import Float64
 
 from foredrive.data.batches import stack_records
+from foredrive.driving.comfort import JERK_S, Comfort, comfort_of
+from foredrive.driving.controller import ControllerState, follow
+from foredrive.driving.dynamics import EGO, STEP_S
+from foredrive.driving.observation import FRAME_DT_S
+from foredrive.driving.plans import fixed_in_world, waypoints_of
+from foredrive.driving.scores import Ending, RouteScore, infraction_of
+from foredrive.driving.time_to_collision import MovingBoxes, time_to_collision_s
 from foredrive.errors import InputError
 from foredrive.scene import Agent, BicycleState, Clip, Event, Simulator, Step, Trajectory
-from foredrive.simulation.comfort import JERK_S, Comfort, comfort_of
-from foredrive.simulation.controller import ControllerState, follow
-from foredrive.simulation.dynamics import EGO, STEP_S
-from foredrive.simulation.observation import FRAME_DT_S
-from foredrive.simulation.plans import fixed_in_world, waypoints_of
-from foredrive.simulation.scores import Ending, RouteScore, infraction_of
-from foredrive.simulation.time_to_collision import MovingBoxes, time_to_collision_s
 
 
 @dataclass(frozen=True)
@@ -86,7 +86,7 @@ class Pilot(Protocol):
 
 
 class FollowingPilot:
-    """A `Pilot` by `simulation.controller`: it follows smoothed plans once the latency has passed."""
+    """A `Pilot` by `driving.controller`: it follows smoothed plans once the latency has passed."""
 
     def __init__(self, simulator: Simulator, latency_s: float) -> None:
         self._simulator, self._latency_s = simulator, latency_s

@@ -5,12 +5,12 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64
 
+from foredrive.driving.comfort import Comfort
+from foredrive.driving.drive import Drive
+from foredrive.driving.dynamics import STEP_S
+from foredrive.driving.ncap.outcome import SafetyResult
+from foredrive.driving.scores import RouteScore
 from foredrive.scene import Event
-from foredrive.simulation.comfort import Comfort
-from foredrive.simulation.drive import Drive
-from foredrive.simulation.dynamics import STEP_S
-from foredrive.simulation.ncap.outcome import SafetyResult
-from foredrive.simulation.scores import RouteScore
 
 TRACK_EVERY = 5
 """One in this many states of a drive is kept: four per second."""

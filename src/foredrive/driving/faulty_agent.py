@@ -7,8 +7,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from foredrive.driving.faults import CameraFault, Faults
 from foredrive.scene import Agent, Clip, Trajectory
-from foredrive.simulation.faults import CameraFault, Faults
 
 TOLERANCE_S = 1e-6
 

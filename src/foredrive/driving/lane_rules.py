@@ -10,9 +10,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float64, Int
 
+from foredrive.driving.dynamics import EGO
 from foredrive.scene import BicycleState, DriveProgress, Event
 from foredrive.scene.traffic_light import LightState
-from foredrive.simulation.dynamics import EGO
 
 TAIL = 0.8
 """The vehicle runs a red light when a reference point crosses the line. This point lies behind the

@@ -11,8 +11,8 @@ from torch import Tensor
 from foredrive.data.batches import stack_records
 from foredrive.data.commands import RouteAhead, clip_route
 from foredrive.data.lidar import empty_sweep
+from foredrive.driving.dynamics import STEP_S
 from foredrive.scene import Boxes, CameraRig, Clip, Command, LidarSweep, Trajectory
-from foredrive.simulation.dynamics import STEP_S
 
 FRAME_DT_S = 0.5
 FRAME_STEPS = round(FRAME_DT_S / STEP_S)

@@ -12,9 +12,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from foredrive.driving.dynamics import EGO
+from foredrive.driving.observation import FRAME_DT_S, HORIZON_STEPS
 from foredrive.scene import Agent, Clip, Trajectory, VoxelSpec
-from foredrive.simulation.dynamics import EGO
-from foredrive.simulation.observation import FRAME_DT_S, HORIZON_STEPS
 
 STANDS_MPS, STAYS_M = 0.2, 1.0
 """A vehicle stands on purpose if it is slower than `STANDS_MPS` and plans to go no further than `STAYS_M`."""

@@ -8,11 +8,11 @@ import numpy as np
 from jaxtyping import Float64
 
 from foredrive.data.commands import RouteAhead, command_of, route_ahead, route_offset_m
+from foredrive.driving.dynamics import EGO
+from foredrive.driving.observation import KeyFrame, make_clip
 from foredrive.errors import InputError
 from foredrive.geometry.polylines import arc_lengths, points_at
 from foredrive.scene import BicycleState, CameraRig, Clip, Command, Event
-from foredrive.simulation.dynamics import EGO
-from foredrive.simulation.observation import KeyFrame, make_clip
 
 SPACING_M = 1.0
 AHEAD_M, BACK_M = 20.0, 5.0

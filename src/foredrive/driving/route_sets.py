@@ -68,7 +68,7 @@ def load_route_set(name_or_path: str) -> list[RouteWaypoints]:
 
 def shipped_sets() -> dict[str, list[RouteWaypoints]]:
     """Load all sets of the package's data file."""
-    text = resources.files("foredrive.simulation").joinpath(SHIPPED).read_text()
+    text = resources.files("foredrive.driving").joinpath(SHIPPED).read_text()
     return {
         name: [RouteWaypoints(row["id"], row["town"], np.array(row["xyz_m"], dtype=float)) for row in rows]
         for name, rows in json.loads(text).items()

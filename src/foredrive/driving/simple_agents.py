@@ -8,9 +8,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from foredrive.driving.observation import FRAME_DT_S, HORIZON_STEPS
+from foredrive.driving.replay.logged_drive import LoggedDrive
 from foredrive.scene import Clip, Trajectory
-from foredrive.simulation.logged_drive import LoggedDrive
-from foredrive.simulation.observation import FRAME_DT_S, HORIZON_STEPS
 
 
 @dataclass(frozen=True)

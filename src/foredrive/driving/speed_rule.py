@@ -10,13 +10,14 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float64
 
-from foredrive.data.affordances import PathAhead
+from foredrive.data.truth.affordances import PathAhead
+from foredrive.driving.car_following import follow_acceleration, free_acceleration
+from foredrive.driving.dynamics import EGO
+from foredrive.driving.lane_rules import TAIL
+from foredrive.driving.observation import FRAME_DT_S, HORIZON_STEPS
+from foredrive.geometry.polylines import points_at
 from foredrive.scene.affordances import CELL_M, CELLS, LATER_DT_S, TIMES
 from foredrive.scene.traffic_light import LightState
-from foredrive.simulation.dynamics import EGO
-from foredrive.simulation.lane_rules import TAIL
-from foredrive.simulation.observation import FRAME_DT_S, HORIZON_STEPS
-from foredrive.towns.traffic.car_following import follow_acceleration, free_acceleration
 
 DESIRED_MPS, ACCELERATION_MPS2, BRAKING_MPS2 = 8.0, 1.5, 2.5
 STANDSTILL_M, TIME_GAP_S = 2.0, 1.2
@@ -36,6 +37,8 @@ SLOWER = ((6.0, 1.5), (4.0, 2.0), (2.5, 2.5), (0.0, 2.0), (0.0, 3.5), (0.0, 6.0)
 """Speeds, m/s, and the braking down to them, m/s²: profiles for where a road user is in the way."""
 MARGIN_M = 1.5
 """Least distance from the front bumper to a road user who is met, m."""
+REJOINS_M = 8.0
+"""Distance over which a vehicle beside its path comes back to it."""
 STANDS_MPS = 0.2
 """A vehicle that is slower does not drive into anybody."""
 
@@ -169,3 +172,12 @@ def curve_speed(path: PathAhead) -> float:
     heading = np.unwrap(np.arctan2(*(xy[4:] - xy[:-4]).T[::-1]))
     bend = float(np.abs(np.diff(heading)).max()) if len(heading) > 1 else 0.0
     return float(min(DESIRED_MPS, np.sqrt(LATERAL_MPS2 / max(bend, 1e-6))))
+
+
+def waypoints_along(path: PathAhead, along_m: Float64[np.ndarray, "S"]) -> Float64[np.ndarray, "S 2"]:
+    """Return points of the path, which the vehicle rejoins over `REJOINS_M`."""
+    xy = path.xy[path.valid].double().numpy()
+    if len(xy) < 2:
+        return np.zeros((len(along_m), 2))
+    points = points_at(xy, np.arange(len(xy), dtype=np.float64), along_m)
+    return np.asarray(points - np.exp(-along_m / REJOINS_M)[:, None] * xy[0])

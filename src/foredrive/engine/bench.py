@@ -18,9 +18,9 @@ from pathlib import Path
 from statistics import mean, stdev
 from typing import Any
 
+from foredrive.engine.provenance import collect_provenance
+from foredrive.engine.summary import write_json
 from foredrive.errors import InputError
-from foredrive.evaluation.provenance import collect_provenance
-from foredrive.evaluation.summary import write_json
 
 MADE_ON = ("commit", "machine.cpu", "machine.cores")
 """Entries of the provenance that every run keeps for itself."""

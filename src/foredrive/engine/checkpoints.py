@@ -10,10 +10,10 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 from torch.optim import Optimizer
 
+from foredrive.engine.parts import placed_like, whole
+from foredrive.engine.small_weights import full_precision
 from foredrive.errors import InputError
 from foredrive.files import atomic_path
-from foredrive.training.parts import placed_like, whole
-from foredrive.training.small_weights import full_precision
 
 MODEL, OPTIMIZER, PROGRESS = "model.safetensors", "optimizer.safetensors", "progress.json"
 

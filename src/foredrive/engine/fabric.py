@@ -10,9 +10,9 @@ from lightning_fabric.plugins import MixedPrecision
 from lightning_fabric.strategies import DDPStrategy, ModelParallelStrategy
 from torch import nn
 
+from foredrive.engine.processes import processes_of_launcher
 from foredrive.errors import InputError
 from foredrive.ops.precision import computes_bfloat16
-from foredrive.training.processes import processes_of_launcher
 
 if TYPE_CHECKING:
     from torch.distributed.device_mesh import DeviceMesh

@@ -25,9 +25,9 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import rich
 
+from foredrive.engine.interrupts import end_with_parent, hold_interrupts, start_fork_server
 from foredrive.errors import InputError
 from foredrive.interrupts import LastingInterrupt
-from foredrive.training.interrupts import end_with_parent, hold_interrupts, start_fork_server
 
 if TYPE_CHECKING:
     from types import FrameType

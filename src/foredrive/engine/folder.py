@@ -9,8 +9,8 @@ from pathlib import Path
 
 from filelock import FileLock, Timeout
 
+from foredrive.engine.provenance import COMMIT
 from foredrive.errors import InputError
-from foredrive.evaluation.provenance import COMMIT
 from foredrive.files import atomic_path, make_folder, remove_abandoned, together
 
 CONFIG, LOGS, LOG, WEIGHTS, SUMMARY = (

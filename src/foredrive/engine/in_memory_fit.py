@@ -7,8 +7,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from foredrive.training.parameter_groups import parameter_groups
-from foredrive.training.ranges import check_at_least
+from foredrive.engine.parameter_groups import parameter_groups
+from foredrive.engine.ranges import check_at_least
 
 
 @dataclass(frozen=True)

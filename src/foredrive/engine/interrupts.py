@@ -11,9 +11,9 @@ import time
 from collections.abc import Callable, Iterator
 from multiprocessing import forkserver, resource_tracker
 
+from foredrive.engine.frozen import SOCKETS
 from foredrive.files import writes_files
 from foredrive.interrupts import PATIENCE_S, interrupting_signals
-from foredrive.training.frozen import SOCKETS
 
 CLEANUP_S = 10.0
 """Longest time for a worker without a parent to remove its unfinished files. It ends when there are none."""
@@ -58,7 +58,7 @@ def start_fork_server(preload: str) -> None:
     Args:
         preload: module that the workers need. It is imported once, not in each worker, and stays shared.
     """
-    multiprocessing.set_forkserver_preload([preload, "foredrive.training.frozen"])
+    multiprocessing.set_forkserver_preload([preload, "foredrive.engine.frozen"])
     resource_tracker.ensure_running()  # the fork server would start it, which unblocks SIGINT
     os.environ[SOCKETS] = multiprocessing.util.get_temp_dir()
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})

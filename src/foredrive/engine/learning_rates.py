@@ -3,7 +3,7 @@
 import math
 from dataclasses import dataclass
 
-from foredrive.training.ranges import check_at_least
+from foredrive.engine.ranges import check_at_least
 
 
 @dataclass(frozen=True)

@@ -15,16 +15,16 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from torch import Tensor, nn
 from torch.utils.data import DataLoader, Dataset
 
+from foredrive.engine.checkpoints import latest_checkpoint, load_checkpoint, remove_older, save_checkpoint
+from foredrive.engine.interrupts import end_with_parent, hold_interrupts, start_fork_server
+from foredrive.engine.metrics_log import MetricsLog
+from foredrive.engine.one_cycle import OneCycle
+from foredrive.engine.parameter_groups import parameter_groups
+from foredrive.engine.parts import Part, StepBuffers, mean_losses, parts_of_step
+from foredrive.engine.processes import gathered, naming_lost_processes
+from foredrive.engine.ranges import check_at_least
 from foredrive.errors import InputError
 from foredrive.files import atomic_path
-from foredrive.training.checkpoints import latest_checkpoint, load_checkpoint, remove_older, save_checkpoint
-from foredrive.training.interrupts import end_with_parent, hold_interrupts, start_fork_server
-from foredrive.training.metrics_log import MetricsLog
-from foredrive.training.one_cycle import OneCycle
-from foredrive.training.parameter_groups import parameter_groups
-from foredrive.training.parts import Part, StepBuffers, mean_losses, parts_of_step
-from foredrive.training.processes import gathered, naming_lost_processes
-from foredrive.training.ranges import check_at_least
 
 if TYPE_CHECKING:  # slow to import, and not needed to read schedules and metrics
     from lightning_fabric import Fabric

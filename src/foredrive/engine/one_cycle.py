@@ -3,7 +3,7 @@
 import math
 from dataclasses import dataclass
 
-from foredrive.training.ranges import check_at_least, check_shares
+from foredrive.engine.ranges import check_at_least, check_shares
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from pathlib import Path
 import torch
 
 import foredrive
-from foredrive.evaluation.summary import Figures
+from foredrive.engine.summary import Figures
 
 GIB = 1024**3
 CODE = ("--", "src", "pyproject.toml")

@@ -6,8 +6,8 @@ import torch
 from jaxtyping import Bool, Float, Float64, Int, UInt8
 from torch import Tensor, nn
 
-from foredrive.models.agent import AgentOutput, PlanningAgent
-from foredrive.models.ego_mlp import ego_motion, route_target
+from foredrive.methods.planner.agent import AgentOutput, PlanningAgent
+from foredrive.methods.planner.ego_mlp import ego_motion, route_target
 from foredrive.scene import CameraRig, Clip, Frames, last_frames
 
 

@@ -9,13 +9,13 @@ from pathlib import Path
 import torch
 
 from foredrive.data.arrow_files import check_whole
-from foredrive.data.convert import convert_log, find_raw_logs, log_path
+from foredrive.data.formats.convert import convert_log, find_raw_logs, log_path
+from foredrive.data.formats.guard import reading_raw
+from foredrive.data.formats.raw_log import RawLog
 from foredrive.data.log_paths import LogPath
-from foredrive.data.raw.guard import reading_raw
-from foredrive.data.raw.raw_log import RawLog
+from foredrive.engine.fan_out import fan_out, reason
 from foredrive.errors import InputError
 from foredrive.files import remove_abandoned, sole_writer
-from foredrive.runs.fan_out import fan_out, reason
 
 
 @dataclass(frozen=True)

@@ -11,20 +11,22 @@ from pathlib import Path
 
 from foredrive.data import LogPath
 from foredrive.data.clip_list import write_clip_list
+from foredrive.driving.drive_record import DriveRecord
+from foredrive.driving.replay.threats import Threat
+from foredrive.engine.folder import SUMMARY
+from foredrive.engine.summary import Summary, read_summary
 from foredrive.errors import InputError
-from foredrive.evaluation.summary import Summary, read_summary
-from foredrive.recipes.config import Recipe, rescheduled
-from foredrive.recipes.nemo import nemo_tiny
-from foredrive.recipes.rebuilding import RebuildRecipe, gaussians_tiny, rescheduled_recipe
+from foredrive.methods.nemo.recipes import nemo_tiny
+from foredrive.methods.recipe import Recipe, rescheduled
 from foredrive.runs.drive.agents import CORRIDOR, EXPERT, REPLAY
 from foredrive.runs.drive.in_rebuilt import RebuiltRoutes
 from foredrive.runs.drive.in_towns import TownRoutes
 from foredrive.runs.drive.recording import log_of, record_drives
 from foredrive.runs.drive.suite import DriveSuite, drive_suite
 from foredrive.runs.evaluate.run import ExamplePrediction, evaluate_run, predict_examples
-from foredrive.runs.folder import SUMMARY
 from foredrive.runs.rebuild.reconstruct import Reconstruction
 from foredrive.runs.rebuild.reconstruct import reconstruct as rebuild_log
+from foredrive.runs.recipes.rebuilding import RebuildRecipe, gaussians_tiny, rescheduled_recipe
 from foredrive.runs.search.indexing import index_logs
 from foredrive.runs.search.searching import ask, listed_clips
 from foredrive.runs.search.towers import EMBEDDED
@@ -35,8 +37,6 @@ from foredrive.search.find import Hit
 from foredrive.search.index import FrameIndex
 from foredrive.search.query import Query
 from foredrive.sensors.rigs import SURROUND
-from foredrive.simulation.drive_record import DriveRecord
-from foredrive.simulation.threats import Threat
 from foredrive.towns.campaign import DrivePlan
 
 SHIPPED = "embedded:nemo_town"

@@ -15,11 +15,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from foredrive.data import ClipDataset, LogPath, collate
+from foredrive.engine.provenance import collect_provenance
 from foredrive.errors import InputError
-from foredrive.evaluation.provenance import collect_provenance
-from foredrive.export.graph import MEANING, AgentGraph, GraphInputs, GraphOutputs
 from foredrive.files import atomic_path, latest
-from foredrive.models.agent import PlanningAgent
+from foredrive.integrations.graph import MEANING, AgentGraph, GraphInputs, GraphOutputs
+from foredrive.methods.planner.agent import PlanningAgent
 from foredrive.runs.open_clips import open_clips
 from foredrive.runs.train.run import Run, load_agent
 from foredrive.scene import Clip
@@ -60,7 +60,7 @@ def export_run(run: Run, logs: Sequence[LogPath], out: Path, clips: int = 8) -> 
     if clips < 1:
         raise InputError(f"the number of clips to compare must be at least 1, got {clips}")
     _check_packages()
-    from foredrive.export.onnx import OPSET, write_onnx
+    from foredrive.integrations.onnx import OPSET, write_onnx
 
     agent = load_agent(run)
     size = run.recipe.clips

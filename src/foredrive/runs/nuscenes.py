@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import torch
 
 from foredrive.data import LogPath
+from foredrive.engine.fan_out import fan_out, reason
 from foredrive.errors import InputError
-from foredrive.export.nuscenes.dataset import NuScenesFolder, export_log, write_tables
 from foredrive.files import atomic_path
-from foredrive.runs.fan_out import fan_out, reason
+from foredrive.integrations.nuscenes.dataset import NuScenesFolder, export_log, write_tables
 
 
 @dataclass(frozen=True)

@@ -7,13 +7,13 @@ from typing import Any
 
 from foredrive.data.boxes import read_track_ids
 from foredrive.data.logs import Log
+from foredrive.engine.folder import CONFIG, LOG
 from foredrive.errors import InputError
+from foredrive.integrations.remote.planner_server import PlannerNeeds, PlannerService
+from foredrive.integrations.remote.render_server import RenderService
 from foredrive.json_server import Answer
 from foredrive.runs.drive.agents import inputs_of, make_agent, require_alpasim
-from foredrive.runs.folder import CONFIG, LOG
 from foredrive.runs.rebuild.rebuilt_run import open_rebuilt, open_run_log
-from foredrive.simulation.remote.planner_server import PlannerNeeds, PlannerService
-from foredrive.simulation.remote.render_server import RenderService
 
 Answers = Mapping[tuple[str, str], Answer]
 
@@ -57,7 +57,7 @@ def alpasim_server_of(agent: str, host: str, port: int) -> tuple[Any, int]:
         InputError: there is no such agent, the contract is not installed, or the address cannot be served.
     """
     require_alpasim()
-    from foredrive.simulation.remote.alpasim_server import AlpasimDriver, serve_alpasim
+    from foredrive.integrations.remote.alpasim_server import AlpasimDriver, serve_alpasim
 
     make_agent(agent, lambda: 0.0)  # now, not with the first drive
     driver = AlpasimDriver(Path(agent).name, lambda clock: make_agent(agent, clock), _needs_of(agent))

@@ -13,16 +13,17 @@ from torch import nn
 from foredrive.data import LogPath
 from foredrive.driver.judging import judge_sight
 from foredrive.driver.packed import PackedClips
+from foredrive.engine.config import save_recipe
+from foredrive.engine.folder import CONFIG, LOGS, SUMMARY
+from foredrive.engine.provenance import collect_provenance
+from foredrive.engine.small_weights import save_small
+from foredrive.engine.summary import read_summary
 from foredrive.errors import InputError
-from foredrive.evaluation.provenance import collect_provenance
-from foredrive.evaluation.summary import read_summary
 from foredrive.files import atomic_path
-from foredrive.recipes.config import save_recipe
 from foredrive.runs.drive.compare import values_of
 from foredrive.runs.drive.in_towns import TownRoutes
 from foredrive.runs.drive.suite import DriveSuite, drive_suite
 from foredrive.runs.evaluate.run import evaluate_run
-from foredrive.runs.folder import CONFIG, LOGS, SUMMARY
 from foredrive.runs.model_card import ModelCard
 from foredrive.runs.open_clips import open_clips
 from foredrive.runs.shipped import CARD, MODELS
@@ -31,7 +32,6 @@ from foredrive.runs.train.driver import DriverRun, load_driver
 from foredrive.runs.train.rigs import RIGS
 from foredrive.runs.train.run import Run, load_agent
 from foredrive.runs.train.task_priors import PRIORS, TASKS
-from foredrive.training.small_weights import save_small
 
 MAX_BYTES = 6_000_000
 """Maximum size of the weights of one model."""

@@ -12,7 +12,7 @@ EMBEDDED = "embedded:"
 DRIVER = "driver"
 """Name of the model that drives as the agent `embedded`."""
 CONFIG, LOGS, WEIGHTS = "config.yaml", "logs.json", "model.safetensors"
-"""As in `runs.folder`, which is slow to import; arguments are checked before."""
+"""As in `engine.folder`, which is slow to import; arguments are checked before."""
 MODELS = Path(__file__).parent / "models"
 """A folder for each model: config.yaml, logs.json without logs, the baselines, weights of the last stage in
 8 bits (`save_small`), and card.md."""

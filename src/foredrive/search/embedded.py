@@ -15,9 +15,9 @@ from torch import Tensor, nn
 
 from foredrive.errors import InputError
 from foredrive.files import atomic_path
-from foredrive.models.image_tower import ImageTower, ImageTowerConfig
-from foredrive.models.lidar_clip import LidarEncoder, LidarEncoderConfig, PointCloud
-from foredrive.models.text_encoder import TextEncoder
+from foredrive.methods.blocks.text_encoder import TextEncoder
+from foredrive.methods.lidarclip import LidarEncoder, LidarEncoderConfig, PointCloud
+from foredrive.methods.lidarclip.image_tower import ImageTower, ImageTowerConfig
 from foredrive.scene import LidarSweep
 from foredrive.search.crops import Crop
 from foredrive.search.pretrained import PretrainedTowers

@@ -8,8 +8,8 @@ import numpy as np
 from markupsafe import Markup
 from matplotlib.figure import Figure
 
-from foredrive.metrics.bootstrap import BootstrapMean
 from foredrive.runs.drive.compare import METRICS, Comparison
+from foredrive.tasks.bootstrap import BootstrapMean
 from foredrive.view.html import INK_MARK, inline_svg, style_axes, write_page
 from foredrive.view.table import MISSING, Cell, Column, Row, Section, Table, number, simple_table
 

@@ -8,8 +8,8 @@ from typing import Literal
 
 from markupsafe import Markup
 
+from foredrive.engine.fan_out import reason
 from foredrive.runs.demo import Demo
-from foredrive.runs.fan_out import reason
 from foredrive.view.html import MetricTile, Picture, Provenance, write_page
 from foredrive.view.table import Table
 

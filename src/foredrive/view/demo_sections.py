@@ -8,7 +8,7 @@ import torch
 from jaxtyping import UInt8
 from PIL import Image, ImageOps
 
-from foredrive.metrics.images import psnr_db
+from foredrive.engine.metrics_log import read_metrics
 from foredrive.runs.demo import (
     MODEL,
     TEXTS,
@@ -26,7 +26,7 @@ from foredrive.runs.demo import (
 from foredrive.runs.drive.agents import CORRIDOR, EXPERT, REPLAY
 from foredrive.runs.evaluate.run import ExamplePrediction
 from foredrive.runs.train.run import STAGES
-from foredrive.training import read_metrics
+from foredrive.tasks.rendering.image_scores import psnr_db
 from foredrive.view.contact_sheet import write_contact_sheet
 from foredrive.view.demo_report import Block, Section
 from foredrive.view.drive_plots import draw_drive_path, draw_timeline

@@ -11,10 +11,10 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
-from foredrive.simulation.drive_record import DriveRecord
-from foredrive.simulation.observation import FRAME_DT_S
-from foredrive.simulation.scores import InfractionKind
-from foredrive.simulation.time_to_collision import NEAR_COLLISION_S
+from foredrive.driving.drive_record import DriveRecord
+from foredrive.driving.observation import FRAME_DT_S
+from foredrive.driving.scores import InfractionKind
+from foredrive.driving.time_to_collision import NEAR_COLLISION_S
 from foredrive.towns.map.town_map import load_town_map
 from foredrive.view import palette
 from foredrive.view.bev import start_path_map

@@ -8,16 +8,16 @@ from urllib.parse import quote
 from markupsafe import Markup
 
 from foredrive.data.log_paths import LogPath
+from foredrive.driving.drive_record import DriveRecord
+from foredrive.driving.ncap.outcome import Outcome, SafetyResult
+from foredrive.driving.scores import Ending, Infraction, InfractionKind
+from foredrive.driving.time_to_collision import NEAR_COLLISION_S
+from foredrive.engine.folder import DRIVES, SUMMARY
+from foredrive.engine.summary import Summary, read_summary
 from foredrive.errors import InputError
-from foredrive.evaluation.summary import Summary, read_summary
 from foredrive.files import latest
 from foredrive.runs.drive.records import read_drive, suite_title
-from foredrive.runs.folder import DRIVES, SUMMARY
-from foredrive.simulation.drive_record import DriveRecord
-from foredrive.simulation.ncap.outcome import Outcome, SafetyResult
-from foredrive.simulation.scenarios.scenario import ScenarioKind
-from foredrive.simulation.scores import Ending, Infraction, InfractionKind
-from foredrive.simulation.time_to_collision import NEAR_COLLISION_S
+from foredrive.towns.scenarios.scenario import ScenarioKind
 from foredrive.view.drive_plots import LETTERS, draw_drive_path, draw_timeline
 from foredrive.view.drive_video import write_drive_video
 from foredrive.view.html import MetricTile, Provenance, inline_svg, write_page

@@ -11,10 +11,10 @@ from foredrive.data.boxes import read_boxes
 from foredrive.data.cameras import find_camera, pinhole_cameras, read_camera
 from foredrive.data.log_paths import LogPath
 from foredrive.data.logs import Log
+from foredrive.driving.drive_record import DriveRecord
+from foredrive.driving.observation import FRAME_DT_S
 from foredrive.geometry.boxes import box_corners
 from foredrive.scene import Boxes
-from foredrive.simulation.drive_record import DriveRecord
-from foredrive.simulation.observation import FRAME_DT_S
 from foredrive.towns.map.town_map import load_town_map
 from foredrive.view import palette
 from foredrive.view.bev import EGO_OUTLINE_XY

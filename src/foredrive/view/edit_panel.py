@@ -11,7 +11,7 @@ import viser
 from viser.transforms import SO3
 
 from foredrive.errors import InputError
-from foredrive.rendering.edits import (
+from foredrive.methods.rebuilding.edits import (
     Duplicate,
     Edit,
     EditedScene,
@@ -24,8 +24,8 @@ from foredrive.rendering.edits import (
     save_edits,
     unused_id,
 )
-from foredrive.rendering.scene_graph import SceneGraph
-from foredrive.rendering.tracks import states_at
+from foredrive.methods.rebuilding.scene_graph import SceneGraph
+from foredrive.methods.rebuilding.tracks import states_at
 from foredrive.runs.rebuild.rebuilt_run import open_rebuilt
 from foredrive.view.rebuilt_nodes import ROOT, RebuiltNodes
 from foredrive.view.rebuilt_video import describe_edit

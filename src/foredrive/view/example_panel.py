@@ -11,9 +11,9 @@ from jaxtyping import UInt8
 from matplotlib.figure import Figure
 from PIL import Image, ImageDraw
 
-from foredrive.metrics.occupancy import ABOVE_GROUND_M
 from foredrive.runs import ExamplePrediction
 from foredrive.scene import Clip, Command, Example, Trajectory, VoxelSpec
+from foredrive.tasks.occupancy.scores import ABOVE_GROUND_M
 from foredrive.view import palette
 from foredrive.view.bev import EGO_OUTLINE_XY, draw_bev, legend_handles, path_points
 from foredrive.view.html import Picture, picture

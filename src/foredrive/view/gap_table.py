@@ -1,8 +1,8 @@
 """The real-to-sim gap as a table."""
 
-from foredrive.evaluation.summary import Summary
-from foredrive.metrics.occupancy import ABOVE_GROUND_M
+from foredrive.engine.summary import Summary
 from foredrive.runs.evaluate.real_to_sim_gap import AGREEMENT, REAL, RENDERED
+from foredrive.tasks.occupancy.scores import ABOVE_GROUND_M
 from foredrive.view.summary_tables import time_title
 from foredrive.view.table import Column, Table, number, simple_table
 

@@ -17,7 +17,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from PIL import Image
 
-from foredrive.evaluation.summary import Summary
+from foredrive.engine.summary import Summary
 from foredrive.files import atomic_path
 from foredrive.view.table import Cell, Value, number, words
 

@@ -9,8 +9,8 @@ from jaxtyping import UInt8
 from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
-from foredrive.metrics.occupancy import ABOVE_GROUND_M
 from foredrive.runs.evaluate.imagination import ImaginedFutures
+from foredrive.tasks.occupancy.scores import ABOVE_GROUND_M
 from foredrive.view import palette
 from foredrive.view.example_panel import COMPARISON_KEY, with_ego
 from foredrive.view.image_drawing import resize, write_text

@@ -12,7 +12,7 @@ from foredrive.data import ClipConfig, ClipDataset, LogPath, collate
 from foredrive.data.cameras import pinhole_cameras
 from foredrive.data.lidar import frames_with_lidar
 from foredrive.data.logs import Log
-from foredrive.data.semantic_labels import read_semantics
+from foredrive.data.truth.semantic_labels import read_semantics
 from foredrive.errors import InputError
 from foredrive.scene import Clip, VoxelSpec
 from foredrive.scene.semantics import Taxonomy

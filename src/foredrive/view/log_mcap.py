@@ -13,8 +13,8 @@ from foredrive.data.lidar import read_sweep
 from foredrive.data.logs import Log
 from foredrive.data.maps import read_map_patch
 from foredrive.errors import InputError
-from foredrive.export import foxglove
 from foredrive.files import atomic_path
+from foredrive.integrations import foxglove
 from foredrive.runs import Run
 from foredrive.scene import MapKind
 from foredrive.view import palette

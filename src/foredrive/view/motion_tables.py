@@ -1,10 +1,10 @@
 """Tables of motion forecasts under every protocol."""
 
-from foredrive.evaluation.motion.score import LIKELIEST
-from foredrive.evaluation.summary import Summary
-from foredrive.metrics.motion.argoverse import MOTION_NAMES
-from foredrive.metrics.motion.moving import CLASSES as MOVING_CLASSES
-from foredrive.metrics.motion.protocols import PROTOCOLS
+from foredrive.engine.summary import Summary
+from foredrive.tasks.motion.argoverse import MOTION_NAMES
+from foredrive.tasks.motion.moving import CLASSES as MOVING_CLASSES
+from foredrive.tasks.motion.protocols import PROTOCOLS
+from foredrive.tasks.motion.score import LIKELIEST
 from foredrive.view.table import Column, Table, simple_table, words
 
 _FIGURES = {

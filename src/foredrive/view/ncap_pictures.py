@@ -7,17 +7,17 @@ import numpy as np
 import torch
 from jaxtyping import Float64
 
+from foredrive.driving.dynamics import yaw_rate_radps
+from foredrive.driving.ncap.drawing import draw_run
+from foredrive.driving.ncap.placing import place_actors, way_points
+from foredrive.driving.ncap.proposing import IMPACT_S
+from foredrive.driving.ncap.running import Place
+from foredrive.driving.ncap.scenario import SafetyScenario
+from foredrive.driving.observation import FRAME_DT_S
+from foredrive.driving.replay.logged_drive import LoggedDrive
 from foredrive.geometry.se3 import inverse_se3, transform_points
-from foredrive.rendering.tracks import boxes_at
+from foredrive.methods.rebuilding.tracks import boxes_at
 from foredrive.scene import CameraRig
-from foredrive.simulation.dynamics import yaw_rate_radps
-from foredrive.simulation.logged_drive import LoggedDrive
-from foredrive.simulation.ncap.drawing import draw_run
-from foredrive.simulation.ncap.placing import place_actors, way_points
-from foredrive.simulation.ncap.proposing import IMPACT_S
-from foredrive.simulation.ncap.running import Place
-from foredrive.simulation.ncap.scenario import SafetyScenario
-from foredrive.simulation.observation import FRAME_DT_S
 from foredrive.view import palette
 from foredrive.view.bev import draw_boxes, draw_ego, start_bev
 from foredrive.view.image_drawing import Camera, draw_boxes_on_image, resize

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 
-from foredrive.simulation.ncap.aggregation import Interval, SafetyFigures, TestedRun, aggregate
+from foredrive.driving.ncap.aggregation import Interval, SafetyFigures, TestedRun, aggregate
 from foredrive.view.table import Cell, Column, Row, Section, Table, Value, number, words
 
 COLUMNS = (

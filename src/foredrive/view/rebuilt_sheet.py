@@ -8,10 +8,10 @@ import torch
 from matplotlib.figure import Figure
 
 from foredrive.files import atomic_path
-from foredrive.metrics.images import psnr_db
-from foredrive.rendering.rebuilt import RebuiltScene
-from foredrive.rendering.scene_graph import SceneGraph
-from foredrive.rendering.views import CameraView
+from foredrive.methods.rebuilding.rebuilt import RebuiltScene
+from foredrive.methods.rebuilding.scene_graph import SceneGraph
+from foredrive.methods.rebuilding.views import CameraView
+from foredrive.tasks.rendering.image_scores import psnr_db
 from foredrive.view.image_drawing import to_image
 from foredrive.view.palette import MAX_RANGE_M, MIN_RANGE_M, range_colours
 

@@ -12,7 +12,15 @@ from rich.progress import track
 
 from foredrive.files import make_folder
 from foredrive.geometry.boxes import box_corners
-from foredrive.rendering.edits import DriveStraight, Duplicate, Edit, Insert, Move, Remove, apply_edits
+from foredrive.methods.rebuilding.edits import (
+    DriveStraight,
+    Duplicate,
+    Edit,
+    Insert,
+    Move,
+    Remove,
+    apply_edits,
+)
 from foredrive.runs.rebuild.rebuilt_run import OpenedReconstruction, edited_scene
 from foredrive.runs.rebuild.render import RenderedFrame, RenderPlan, render_frame
 from foredrive.scene import Boxes, CameraRig, LidarSweep

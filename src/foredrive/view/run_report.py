@@ -6,11 +6,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from foredrive.data import LogPath
-from foredrive.evaluation.run import Failure
-from foredrive.evaluation.summary import Summary
+from foredrive.engine.metrics_log import read_metrics
+from foredrive.engine.summary import Summary
 from foredrive.runs import ExamplePrediction, Run
 from foredrive.runs.train.run import STAGES
-from foredrive.training import read_metrics
+from foredrive.tasks.evaluation.run import Failure
 from foredrive.view.example_panel import draw_example
 from foredrive.view.html import MetricTile, Provenance, write_page
 from foredrive.view.loss_curves import Losses, draw_loss_curves

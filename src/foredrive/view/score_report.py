@@ -2,14 +2,122 @@
 
 from pathlib import Path
 
-from foredrive.evaluation.detections.score import PARTS, FrameScore
-from foredrive.evaluation.summary import Summary
+import numpy as np
+from jaxtyping import Float
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Ellipse, Polygon
+from numpy import ndarray
+
+from foredrive.engine.summary import Summary
 from foredrive.runs.score.run import ScoredDetections
-from foredrive.view.detection_frame_plot import draw_detection_frame
-from foredrive.view.html import inline_svg, write_page
-from foredrive.view.reliability_diagram import draw_reliability
+from foredrive.tasks.detection.frames import DetectionFrame
+from foredrive.tasks.detection.reliability import Reliability
+from foredrive.tasks.detection.score import PARTS, FrameScore
+from foredrive.view.html import INK_MARK, inline_svg, style_axes, write_page
 from foredrive.view.summary_tables import full_table
 from foredrive.view.table import Column, Table, number, simple_table, words
+
+OBJECT, MISSED, DETECTION = "#2eb67d", "#e5484d", "#3f8efc"
+MIN_EXISTENCE = 0.02
+"""Minimum probability of existence of a drawn detection."""
+MAX_DRAWN = 1000
+"""Maximum number of drawn detections; those most likely to exist are drawn."""
+SIGMAS = 2.0
+
+
+def draw_detection_frame(frame: DetectionFrame, score: FrameScore, is_3d: bool) -> Figure:
+    """Draw objects, detections with ellipses of two σ of their centres, and the likeliest pairs.
+
+    The opacity of a detection is its probability of existence.
+    """
+    figure = Figure(figsize=(5.4, 5.0), layout="constrained")
+    axes = figure.subplots()
+    boxes = frame.detected.boxes
+    existence = frame.detected.log_existence.exp().numpy()
+    mean, state = boxes.mean.numpy(), frame.objects.state.numpy()
+    yaw = boxes.yaw.numpy() if boxes.yaw is not None else np.zeros(len(mean))
+    true_yaw = frame.objects.yaw.numpy() if frame.objects.yaw is not None else np.zeros(len(state))
+    covariance = (boxes.chol @ boxes.chol.mT).numpy()
+    seen, title = np.flatnonzero(existence >= MIN_EXISTENCE), ""
+    if len(seen) > MAX_DRAWN:
+        title = f"the {MAX_DRAWN:,} likeliest of {len(seen):,} detections"
+        seen = seen[np.argsort(-existence[seen], kind="stable")[:MAX_DRAWN]]
+    for i in seen:
+        corners = _corners(mean[i], float(yaw[i]), is_3d)
+        alpha = float(np.sqrt(existence[i]))
+        axes.add_patch(Polygon(corners, fill=False, edgecolor=DETECTION, alpha=alpha, linewidth=1.2))
+        _draw_ellipse(axes, corners.mean(0), _centre_covariance(covariance[i], is_3d), alpha)
+    for j, i in enumerate(score.objects.best):
+        corners = _corners(state[j], float(true_yaw[j]), is_3d)
+        axes.add_patch(Polygon(corners, fill=False, edgecolor=OBJECT if i >= 0 else MISSED, linewidth=1.4))
+        if i >= 0:
+            pair = np.stack([corners.mean(0), _corners(mean[i], float(yaw[i]), is_3d).mean(0)])
+            axes.plot(*pair.T, color=OBJECT, linewidth=1.0)
+    axes.autoscale_view()
+    axes.set_aspect("equal", adjustable="datalim")
+    if not is_3d:
+        axes.invert_yaxis()
+    unit = "m" if is_3d else "px"
+    style_axes(axes, title, f"x, {unit}", f"y, {unit}")
+    return figure
+
+
+def _corners(state: Float[ndarray, "D"], yaw: float, is_3d: bool) -> Float[ndarray, "4 2"]:
+    signs = np.array([[1, 1], [1, -1], [-1, -1], [-1, 1]])
+    if not is_3d:
+        return 0.5 * (state[:2] + state[2:] + signs * (state[2:] - state[:2]))
+    along, across = np.array([np.cos(yaw), np.sin(yaw)]), np.array([-np.sin(yaw), np.cos(yaw)])
+    half = 0.5 * np.exp(state[3:5]) * signs
+    return state[:2] + half[:, :1] * along + half[:, 1:] * across
+
+
+def _centre_covariance(covariance: Float[ndarray, "D D"], is_3d: bool) -> Float[ndarray, "2 2"]:
+    if is_3d:
+        return covariance[:2, :2]
+    middle = 0.5 * np.array([[1, 0, 1, 0], [0, 1, 0, 1]])
+    return middle @ covariance @ middle.T
+
+
+def _draw_ellipse(
+    axes: Axes, centre: Float[ndarray, "2"], covariance: Float[ndarray, "2 2"], alpha: float
+) -> None:
+    variance, direction = np.linalg.eigh(covariance)
+    width, height = 2 * SIGMAS * np.sqrt(variance)
+    angle = np.degrees(np.arctan2(direction[1, 0], direction[0, 0]))
+    axes.add_patch(
+        Ellipse(
+            (float(centre[0]), float(centre[1])),
+            width,
+            height,
+            angle=angle,
+            color=DETECTION,
+            alpha=0.25 * alpha,
+        )
+    )
+
+
+TITLES = {
+    "d_ece": "Score and hits (2 m, or overlap 0.5)",
+    "existence": "Existence and associations",
+}
+
+
+def draw_reliability(name: str, diagram: Reliability) -> Figure:
+    """Draw outcome over confidence, with the diagonal of perfect calibration; bars show each bin's share."""
+    figure = Figure(figsize=(4.6, 4.0), layout="constrained")
+    axes = figure.subplots()
+    full = diagram.count > 0
+    centre = (np.arange(len(diagram.count)) + 0.5) / len(diagram.count)
+    share = diagram.count / max(diagram.count.sum(), 1)
+    axes.bar(centre, share, 0.9 / len(centre), color="#3f8efc40")
+    axes.plot([0, 1], [0, 1], color=INK_MARK, linewidth=0.8, alpha=0.5)
+    axes.plot(diagram.confidence[full], diagram.outcome[full], "o-", color="#3f8efc", markersize=4)
+    axes.set(xlim=(0, 1), ylim=(0, 1))
+    title = f"{TITLES.get(name, name)}: error {diagram.error:.3f}"
+    style_axes(axes, title, "confidence", "observed frequency")
+    return figure
+
 
 REPORT = "report.html"
 SHOWN = {

@@ -6,9 +6,9 @@ from collections.abc import Sequence
 
 from rich.console import Console
 
-from foredrive.evaluation.summary import Summary
-from foredrive.metrics.occupancy import ABOVE_GROUND_M
-from foredrive.metrics.protocols import HORIZON_NAMES, PROTOCOLS
+from foredrive.engine.summary import Summary
+from foredrive.tasks.occupancy.scores import ABOVE_GROUND_M
+from foredrive.tasks.planning.protocols import HORIZON_NAMES, PROTOCOLS
 from foredrive.view.table import (
     MISSING,
     Cell,

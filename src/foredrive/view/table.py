@@ -13,7 +13,7 @@ from rich.measure import Measurement
 from rich.table import Table as RichTable
 from rich.text import Text
 
-from foredrive.evaluation.summary import Value
+from foredrive.engine.summary import Value
 
 MISSING = "\N{EN DASH}"
 MIN_TEXT_WIDTH, MAX_WIDTH = 16, 1000

@@ -17,14 +17,14 @@ from numpy import ndarray
 from PIL import Image
 from torch import Tensor
 
-from foredrive.evaluation.predictor import Prediction
-from foredrive.metrics.maps.lines import CLASSES
 from foredrive.runs import ExamplePrediction
 from foredrive.scene import Boxes, Category, Clip, VoxelSpec
 from foredrive.scene.agents import Agents
 from foredrive.scene.boxes import unlabelled
 from foredrive.scene.map_elements import ElementKind
 from foredrive.scene.semantics import VOXEL_CLASSES, Taxonomy
+from foredrive.tasks.evaluation.predictor import Prediction
+from foredrive.tasks.maps.lines import CLASSES
 from foredrive.view import palette
 from foredrive.view.bev import draw_boxes, draw_ego, start_bev
 from foredrive.view.html import Picture, picture

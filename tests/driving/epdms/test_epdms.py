@@ -10,15 +10,9 @@ import math
 import numpy as np
 import pytest
 
-from foredrive.errors import InputError
-from foredrive.metrics.epdms.comfort import extended_comfort, history_comfort
-from foredrive.metrics.epdms.score import (
-    DriverScores,
-    follow_up_weights,
-    score_plan,
-    two_stage_score,
-)
-from foredrive.metrics.epdms.subscores import (
+from foredrive.driving.epdms.comfort import extended_comfort, history_comfort
+from foredrive.driving.epdms.score import DriverScores, follow_up_weights, score_plan, two_stage_score
+from foredrive.driving.epdms.subscores import (
     driving_direction_compliance,
     ego_areas,
     ego_progress,
@@ -27,7 +21,8 @@ from foredrive.metrics.epdms.subscores import (
     time_to_collision,
     traffic_light_compliance,
 )
-from foredrive.metrics.epdms.world import EgoBody, EgoMotion, Roads, Surroundings
+from foredrive.driving.epdms.world import EgoBody, EgoMotion, Roads, Surroundings
+from foredrive.errors import InputError
 from foredrive.scene.road_map import RoadMap
 
 STEPS = 41

@@ -5,23 +5,10 @@ import dataclasses
 import numpy as np
 import pytest
 import torch
-from test_agents_of_logs import YAW, logged, seen
+from driving.replay.test_agents_of_logs import YAW, logged, seen
 
-from foredrive.errors import InputError
-from foredrive.metrics.epdms.comfort import history_comfort
-from foredrive.metrics.epdms.world import Roads
-from foredrive.rendering.gaussians import Gaussians
-from foredrive.rendering.gaussians.content import GaussianContent
-from foredrive.rendering.gaussians.scene import GaussianScene
-from foredrive.rendering.renderer import RebuiltRenderer
-from foredrive.rendering.scene_graph import SceneGraph
-from foredrive.rendering.tracks import ActorTracks
-from foredrive.rendering.vehicle import LoggedVehicle
-from foredrive.scene import Category, Clip, Trajectory
-from foredrive.scene.road_map import RoadMap
-from foredrive.simulation.logged_drive import LoggedDrive
-from foredrive.simulation.ncap.running import Place
-from foredrive.simulation.pseudo_simulation import (
+from foredrive.driving.epdms.comfort import history_comfort
+from foredrive.driving.epdms.pseudo_simulation import (
     BODY,
     FOLLOW_UPS,
     PseudoSimulation,
@@ -29,9 +16,22 @@ from foredrive.simulation.pseudo_simulation import (
     past_motion,
     simulated,
 )
-from foredrive.simulation.rebuilt import RebuiltSimulator
-from foredrive.simulation.replay_expert import ReplayExpert
-from foredrive.simulation.simple_agents import StraightAgent, plan_of
+from foredrive.driving.epdms.world import Roads
+from foredrive.driving.ncap.running import Place
+from foredrive.driving.replay.logged_drive import LoggedDrive
+from foredrive.driving.replay.rebuilt import RebuiltSimulator
+from foredrive.driving.replay.replay_expert import ReplayExpert
+from foredrive.driving.simple_agents import StraightAgent, plan_of
+from foredrive.errors import InputError
+from foredrive.methods.rebuilding.renderer import RebuiltRenderer
+from foredrive.methods.rebuilding.scene_graph import SceneGraph
+from foredrive.methods.rebuilding.tracks import ActorTracks
+from foredrive.methods.rebuilding.vehicle import LoggedVehicle
+from foredrive.methods.splatad import Gaussians
+from foredrive.methods.splatad.content import GaussianContent
+from foredrive.methods.splatad.scene import GaussianScene
+from foredrive.scene import Category, Clip, Trajectory
+from foredrive.scene.road_map import RoadMap
 
 SPEED = 8.0
 

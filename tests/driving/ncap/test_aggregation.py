@@ -4,9 +4,9 @@ import dataclasses
 
 import pytest
 
-from foredrive.simulation.ncap.aggregation import TestedRun, aggregate
-from foredrive.simulation.ncap.outcome import Outcome, SafetyResult
-from foredrive.simulation.threats import Threat
+from foredrive.driving.ncap.aggregation import TestedRun, aggregate
+from foredrive.driving.ncap.outcome import Outcome, SafetyResult
+from foredrive.driving.replay.threats import Threat
 from foredrive.view.ncap_tables import safety_table
 
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import shapely
 
+from foredrive.driving.ncap.hd import PlanInTraffic, hd_score
 from foredrive.errors import InputError
-from foredrive.metrics.hd_score import PlanInTraffic, hd_score
 
 ROAD = shapely.box(-20.0, -4.0, 200.0, 4.0)
 SIZE = (4.8, 2.0)

@@ -6,9 +6,9 @@ import math
 import numpy as np
 import pytest
 
+from foredrive.driving.ncap.nuplan_lqr import LqrPlan, fitted_profiles, lqr_step
+from foredrive.driving.ncap.rules import PACIFICA
 from foredrive.scene import BicycleState
-from foredrive.simulation.ncap.nuplan_lqr import LqrPlan, fitted_profiles, lqr_step
-from foredrive.simulation.ncap.rules import PACIFICA
 
 ORIGIN = BicycleState(10.0, -4.0, 0.7, 8.0)
 

@@ -8,27 +8,27 @@ import pytest
 import shapely
 import torch
 
+from foredrive.driving.drive import drive_route
+from foredrive.driving.ncap.drawing import draw_run
+from foredrive.driving.ncap.hd import hd_score_of
+from foredrive.driving.ncap.outcome import Outcome, SafetyResult, first_collision, judge
+from foredrive.driving.ncap.proposing import propose
+from foredrive.driving.ncap.rules import OURS, PAPER, RELEASED, RULES, Rules
+from foredrive.driving.ncap.running import Place, drive_without_action, reference_mps, set_up_run
+from foredrive.driving.ncap.scenario import Jitter, Rectilinear, SafetyScenario, ScenarioActor
+from foredrive.driving.ncap.self_test import run_reference, self_test
+from foredrive.driving.replay.threats import Threat
+from foredrive.driving.simple_agents import StraightAgent
 from foredrive.errors import InputError
 from foredrive.geometry.se3 import inverse_se3, matrix_from_yaw
-from foredrive.rendering.gaussians import Gaussians
-from foredrive.rendering.gaussians.content import GaussianContent
-from foredrive.rendering.gaussians.scene import GaussianScene
-from foredrive.rendering.renderer import RebuiltRenderer
-from foredrive.rendering.scene_graph import SceneGraph
-from foredrive.rendering.tracks import ActorTracks, joined_tracks, states_at
-from foredrive.rendering.vehicle import LoggedVehicle
+from foredrive.methods.rebuilding.renderer import RebuiltRenderer
+from foredrive.methods.rebuilding.scene_graph import SceneGraph
+from foredrive.methods.rebuilding.tracks import ActorTracks, joined_tracks, states_at
+from foredrive.methods.rebuilding.vehicle import LoggedVehicle
+from foredrive.methods.splatad import Gaussians
+from foredrive.methods.splatad.content import GaussianContent
+from foredrive.methods.splatad.scene import GaussianScene
 from foredrive.scene import CameraRig, Category
-from foredrive.simulation.drive import drive_route
-from foredrive.simulation.ncap.drawing import draw_run
-from foredrive.simulation.ncap.hd import hd_score_of
-from foredrive.simulation.ncap.outcome import Outcome, SafetyResult, first_collision, judge
-from foredrive.simulation.ncap.proposing import propose
-from foredrive.simulation.ncap.rules import OURS, PAPER, RELEASED, RULES, Rules
-from foredrive.simulation.ncap.running import Place, drive_without_action, reference_mps, set_up_run
-from foredrive.simulation.ncap.scenario import Jitter, Rectilinear, SafetyScenario, ScenarioActor
-from foredrive.simulation.ncap.self_test import run_reference, self_test
-from foredrive.simulation.simple_agents import StraightAgent
-from foredrive.simulation.threats import Threat
 
 SPEED_MPS, END_S, YAW = 8.0, 10.0, 0.6
 ORIGIN = np.array([300.0, -40.0, 5.0])

@@ -6,17 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from foredrive.driving.ncap.drawing import draw_run
+from foredrive.driving.ncap.scenario import Jitter, Polyline, Rectilinear, SafetyScenario, ScenarioActor
+from foredrive.driving.ncap.scenario_file import load_scenarios, outside_protocol, save_scenarios
+from foredrive.driving.replay.threats import Threat
 from foredrive.errors import InputError
-from foredrive.simulation.ncap.drawing import draw_run
-from foredrive.simulation.ncap.scenario import (
-    Jitter,
-    Polyline,
-    Rectilinear,
-    SafetyScenario,
-    ScenarioActor,
-)
-from foredrive.simulation.ncap.scenario_file import load_scenarios, outside_protocol, save_scenarios
-from foredrive.simulation.threats import Threat
 
 THEIRS = """
 general:

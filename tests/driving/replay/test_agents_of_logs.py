@@ -9,14 +9,14 @@ import torch
 from foredrive.data.batches import stack_records
 from foredrive.data.boxes import no_boxes
 from foredrive.data.lidar import empty_sweep
+from foredrive.driving.collisions import RoadUsers
+from foredrive.driving.corridor_agent import CorridorAgent, returns_in_corridor
+from foredrive.driving.observation import KeyFrame, make_clip, no_images
+from foredrive.driving.replay.logged_drive import LoggedDrive
+from foredrive.driving.replay.replay_expert import ReplayExpert
 from foredrive.errors import InputError
-from foredrive.rendering.vehicle import LoggedVehicle
+from foredrive.methods.rebuilding.vehicle import LoggedVehicle
 from foredrive.scene import BicycleState, Boxes, CameraRig, Category, Clip, Command, LidarSweep
-from foredrive.simulation.corridor_agent import CorridorAgent, returns_in_corridor
-from foredrive.simulation.logged_drive import LoggedDrive
-from foredrive.simulation.observation import KeyFrame, make_clip, no_images
-from foredrive.simulation.replay_expert import ReplayExpert
-from foredrive.simulation.road_users import RoadUsers
 
 YAW = 0.7
 

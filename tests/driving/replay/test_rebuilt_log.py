@@ -8,26 +8,26 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
+from foredrive.driving.drive import Drive, drive_route
+from foredrive.driving.dynamics import EGO
+from foredrive.driving.ncap.outcome import Outcome, judge, threat_score
+from foredrive.driving.replay.logged_drive import LoggedDrive
+from foredrive.driving.replay.logged_lanes import LoggedLanes
+from foredrive.driving.replay.rebuilt import STRUCK, RebuiltScenario, RebuiltSimulator
+from foredrive.driving.replay.threats import AFTER_S, Threat, reference_mps, send_threat
+from foredrive.driving.scores import Ending
+from foredrive.driving.simple_agents import ReplayAgent, StraightAgent
 from foredrive.errors import InputError
 from foredrive.geometry.se3 import matrix_from_yaw
-from foredrive.rendering.edits import Edit, ShiftEgo, apply_edits
-from foredrive.rendering.gaussians import Gaussians
-from foredrive.rendering.gaussians.content import GaussianContent
-from foredrive.rendering.gaussians.scene import GaussianScene
-from foredrive.rendering.renderer import RebuiltRenderer
-from foredrive.rendering.scene_graph import SceneGraph
-from foredrive.rendering.tracks import ActorTracks
-from foredrive.rendering.vehicle import LoggedVehicle
+from foredrive.methods.rebuilding.edits import Edit, ShiftEgo, apply_edits
+from foredrive.methods.rebuilding.renderer import RebuiltRenderer
+from foredrive.methods.rebuilding.scene_graph import SceneGraph
+from foredrive.methods.rebuilding.tracks import ActorTracks
+from foredrive.methods.rebuilding.vehicle import LoggedVehicle
+from foredrive.methods.splatad import Gaussians
+from foredrive.methods.splatad.content import GaussianContent
+from foredrive.methods.splatad.scene import GaussianScene
 from foredrive.scene import Agent, BicycleState, CameraRig, Category
-from foredrive.simulation.drive import Drive, drive_route
-from foredrive.simulation.dynamics import EGO
-from foredrive.simulation.logged_drive import LoggedDrive
-from foredrive.simulation.logged_lanes import LoggedLanes
-from foredrive.simulation.ncap.outcome import Outcome, judge, threat_score
-from foredrive.simulation.rebuilt import STRUCK, RebuiltScenario, RebuiltSimulator
-from foredrive.simulation.scores import Ending
-from foredrive.simulation.simple_agents import ReplayAgent, StraightAgent
-from foredrive.simulation.threats import AFTER_S, Threat, reference_mps, send_threat
 
 SPEED_MPS, PERIOD_S, END_S = 8.0, 0.1, 10.0
 WORLD_YAW = 0.7

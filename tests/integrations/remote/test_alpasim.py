@@ -19,14 +19,14 @@ from carla_driver_interface.testing import FakeCamera, FakeLoop
 from test_planner_protocol import observation
 
 from foredrive.data.batches import stack_records
+from foredrive.driving.simple_agents import StraightAgent, plan_of
 from foredrive.errors import InputError
+from foredrive.integrations.remote.alpasim_client import GrpcDriver, check_driver, points_of
+from foredrive.integrations.remote.alpasim_server import AlpasimDriver, route_of, serve_alpasim
+from foredrive.integrations.remote.planner_server import PlannerNeeds
 from foredrive.json_server import Address
 from foredrive.scene import Clip, Command, Trajectory
 from foredrive.scene.clip import TARGET
-from foredrive.simulation.remote.alpasim_client import GrpcDriver, check_driver, points_of
-from foredrive.simulation.remote.alpasim_server import AlpasimDriver, route_of, serve_alpasim
-from foredrive.simulation.remote.planner_server import PlannerNeeds
-from foredrive.simulation.simple_agents import StraightAgent, plan_of
 
 
 @dataclasses.dataclass

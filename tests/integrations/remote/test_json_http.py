@@ -9,8 +9,8 @@ from collections.abc import Iterator
 import pytest
 
 from foredrive.errors import InputError
+from foredrive.integrations.remote.json_http import ask, read_address
 from foredrive.json_server import Address
-from foredrive.simulation.remote.json_http import ask, read_address
 
 
 def is_length(line: bytes) -> bool:

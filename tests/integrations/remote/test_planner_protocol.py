@@ -15,16 +15,16 @@ import torch
 from foredrive.data.batches import stack_records
 from foredrive.data.boxes import no_boxes
 from foredrive.data.lidar import empty_sweep
+from foredrive.driving.observation import KeyFrame, make_clip
+from foredrive.driving.plans import waypoints_of
+from foredrive.driving.simple_agents import plan_of
 from foredrive.errors import InputError
+from foredrive.integrations.remote.planner_client import HttpPlanner, check_planner
+from foredrive.integrations.remote.planner_messages import PlannerInput, T_ego_lidar, canbus, planner_input
+from foredrive.integrations.remote.planner_server import PlannerNeeds, PlannerService
+from foredrive.integrations.remote.sent_tensors import decode_image, encode_tensors
 from foredrive.json_server import Address, JsonServer
 from foredrive.scene import CameraRig, Clip, Command, LidarSweep, Trajectory
-from foredrive.simulation.observation import KeyFrame, make_clip
-from foredrive.simulation.plans import waypoints_of
-from foredrive.simulation.remote.planner_client import HttpPlanner, check_planner
-from foredrive.simulation.remote.planner_messages import PlannerInput, T_ego_lidar, canbus, planner_input
-from foredrive.simulation.remote.planner_server import PlannerNeeds, PlannerService
-from foredrive.simulation.remote.sent_tensors import decode_image, encode_tensors
-from foredrive.simulation.simple_agents import plan_of
 
 YAW = 0.5
 PLAN = [[1.0, 0.1], [2.0, 0.2], [3.0, 0.4], [4.0, 0.7], [5.0, 1.1], [6.0, 1.6]]

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 from foredrive.errors import InputError
+from foredrive.integrations.carla.client import connect, import_carla, require_same_version
+from foredrive.integrations.carla.frames import CarlaPose, matrix_of
+from foredrive.integrations.carla.road import CarlaLaneRules
+from foredrive.integrations.carla.session import CarlaSession
+from foredrive.integrations.carla.simulator import weather_of
 from foredrive.scene.conditions import CONDITIONS
-from foredrive.simulation.carla.client import connect, import_carla, require_same_version
-from foredrive.simulation.carla.frames import CarlaPose, matrix_of
-from foredrive.simulation.carla.road import CarlaLaneRules
-from foredrive.simulation.carla.session import CarlaSession
-from foredrive.simulation.carla.weather import weather_of
 from foredrive.towns.map.town_map import load_town_map
 
 from carla_stand_in import Client, World  # isort: skip

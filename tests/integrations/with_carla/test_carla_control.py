@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from carla_stand_in import lat_lon
 
+from foredrive.driving.dynamics import EGO, STEP_S
 from foredrive.errors import InputError
+from foredrive.integrations.carla.control import CommandedSpeed, actuate, steer_of, steering_rad_of
+from foredrive.integrations.carla.leaderboard import PoseEstimate, fit_geo_frame, locate
 from foredrive.scene import Control
-from foredrive.simulation.carla.control import CommandedSpeed, actuate, steer_of, steering_rad_of
-from foredrive.simulation.carla.localization import PoseEstimate, fit_geo_frame, locate
-from foredrive.simulation.dynamics import EGO, STEP_S
 
 
 def test_pedals_are_never_pressed_together() -> None:

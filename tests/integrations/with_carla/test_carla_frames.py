@@ -5,10 +5,9 @@ import math
 import numpy as np
 import pytest
 
+from foredrive.driving.dynamics import EGO
 from foredrive.errors import InputError
-from foredrive.sensors.rigs import camera_rig
-from foredrive.sensors.vehicle import roof_lidar
-from foredrive.simulation.carla.frames import (
+from foredrive.integrations.carla.frames import (
     MIRROR,
     camera_pose,
     ego_in_actor,
@@ -16,7 +15,7 @@ from foredrive.simulation.carla.frames import (
     pose_of,
     yaw_of_compass,
 )
-from foredrive.simulation.carla.sensors import (
+from foredrive.integrations.carla.sensors import (
     camera_attributes,
     camera_specs,
     image_of,
@@ -24,7 +23,8 @@ from foredrive.simulation.carla.sensors import (
     lidar_pose,
     sweep_of,
 )
-from foredrive.simulation.dynamics import EGO
+from foredrive.sensors.rigs import camera_rig
+from foredrive.sensors.vehicle import roof_lidar
 
 
 def turned(yaw_deg: float, at: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> np.ndarray:

@@ -10,14 +10,13 @@ import pytest
 import torch
 from carla_stand_in import lat_lon
 
+from foredrive.driving.dynamics import STEP_S
+from foredrive.driving.route_progress import RouteProgress
 from foredrive.errors import InputError
+from foredrive.integrations.carla.leaderboard import GPS, IMU, LIDAR, SPEED, GlobalPlan, LeaderboardDriver
 from foredrive.scene import BicycleState, Clip, Command, Trajectory
 from foredrive.sensors.rigs import camera_rig
 from foredrive.sensors.vehicle import roof_lidar
-from foredrive.simulation.carla.global_plan import GlobalPlan
-from foredrive.simulation.carla.leaderboard import GPS, IMU, LIDAR, SPEED, LeaderboardDriver
-from foredrive.simulation.dynamics import STEP_S
-from foredrive.simulation.route_progress import RouteProgress
 
 SIZE = (9, 16)
 

@@ -8,17 +8,17 @@ import numpy as np
 import pytest
 from carla_stand_in import Client, Light, World
 
+from foredrive.driving.drive import drive_route
+from foredrive.driving.dynamics import EGO
+from foredrive.driving.route_scenario import RouteScenario
+from foredrive.driving.scores import Ending
+from foredrive.driving.simple_agents import StraightAgent
 from foredrive.errors import InputError
+from foredrive.integrations.carla.simulator import CarlaSimulator
 from foredrive.scene import Category, Command, Control
 from foredrive.scene.conditions import BackgroundTraffic, find_conditions
 from foredrive.sensors.rigs import camera_rig
 from foredrive.sensors.vehicle import VehicleSensors, roof_lidar
-from foredrive.simulation.carla.simulator import CarlaSimulator
-from foredrive.simulation.drive import drive_route
-from foredrive.simulation.dynamics import EGO
-from foredrive.simulation.route_scenario import RouteScenario
-from foredrive.simulation.scores import Ending
-from foredrive.simulation.simple_agents import StraightAgent
 
 SENSORS = VehicleSensors(camera_rig((9, 16)), roof_lidar(channels=2, azimuth_steps=60))
 

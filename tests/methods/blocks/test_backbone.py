@@ -8,8 +8,8 @@ import torch
 from safetensors.torch import save_file
 
 from foredrive.errors import InputError
-from foredrive.models.backbone import BackboneConfig, ImageBackbone, normalise_images
-from foredrive.models.vgg import VggFeatures
+from foredrive.methods.blocks.backbone import BackboneConfig, ImageBackbone, normalise_images
+from foredrive.methods.blocks.vgg import VggFeatures
 
 CONFIG = BackboneConfig(
     embedding_size=8,

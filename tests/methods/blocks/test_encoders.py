@@ -6,16 +6,16 @@ import math
 import pytest
 import torch
 
-from foredrive.models.averaging import AveragingConfig, AveragingEncoder
-from foredrive.models.bev import BevConfig, BevEncoder
-from foredrive.models.lifting import (
+from foredrive.methods.blocks.averaging import AveragingConfig, AveragingEncoder
+from foredrive.methods.blocks.bev import BevConfig, BevEncoder
+from foredrive.methods.blocks.lifting import (
     CameraCrossAttention,
     LiftingConfig,
     LiftingEncoder,
     position_code,
     project_to_cameras,
 )
-from foredrive.models.plane_context import PlaneContext, PlaneContextConfig
+from foredrive.methods.blocks.plane_context import PlaneContext, PlaneContextConfig
 from foredrive.scene import CameraRig, VoxelSpec
 
 SPEC = VoxelSpec(lower_m=(-8.0, -8.0, -1.0), voxel_m=1.0, shape_zyx=(4, 16, 16))

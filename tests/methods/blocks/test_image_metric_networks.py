@@ -9,9 +9,9 @@ from safetensors.torch import save_file
 from torch import nn
 
 from foredrive.errors import InputError
-from foredrive.evaluation.perceptual import PerceptualMetrics, PerceptualWeights
-from foredrive.models.inception import InceptionFeatures, resized
-from foredrive.models.lpips import Lpips
+from foredrive.methods.blocks.inception import InceptionFeatures, resized
+from foredrive.methods.blocks.lpips import Lpips
+from foredrive.methods.rebuilding.perceptual import PerceptualMetrics, PerceptualWeights
 
 ALEXNET = {0: (3, 64, 11), 3: (64, 192, 5), 6: (192, 384, 3), 8: (384, 256, 3), 10: (256, 256, 3)}
 """Convolutions of AlexNet: inputs, outputs, kernel."""

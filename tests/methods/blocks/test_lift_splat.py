@@ -5,7 +5,7 @@ from collections.abc import Callable
 
 import torch
 
-from foredrive.models.lift_splat import LiftSplatConfig, LiftSplatEncoder, splat
+from foredrive.methods.blocks.lift_splat import LiftSplatConfig, LiftSplatEncoder, splat
 from foredrive.scene import CameraRig, Example, VoxelSpec
 
 SPEC = VoxelSpec(lower_m=(-8.0, -8.0, -1.0), voxel_m=1.0, shape_zyx=(4, 16, 16))

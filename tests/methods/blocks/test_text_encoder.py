@@ -7,7 +7,7 @@ import torch
 from transformers import BertConfig, BertModel, BertTokenizerFast, CLIPConfig, CLIPModel
 
 from foredrive.errors import InputError
-from foredrive.models.text_encoder import PACKAGED_MODEL, TextEncoder
+from foredrive.methods.blocks.text_encoder import PACKAGED_MODEL, TextEncoder
 
 WORDS = ["[PAD]", "[UNK]", "[CLS]", "[SEP]", "the", "car", "stops", "at", "night", "rain"]
 SMALL = {"hidden_size": 16, "intermediate_size": 16, "num_hidden_layers": 1, "num_attention_heads": 2}

@@ -10,8 +10,9 @@ import torch
 from torch.distributions import Independent, Normal
 
 from foredrive.errors import InputError
-from foredrive.models.backbone import BackboneConfig
-from foredrive.models.driveworld import (
+from foredrive.methods.blocks.backbone import BackboneConfig
+from foredrive.methods.blocks.lift_splat import LiftSplatConfig
+from foredrive.methods.driveworld import (
     DiagonalGaussian,
     DriveWorld,
     DriveWorldConfig,
@@ -20,16 +21,15 @@ from foredrive.models.driveworld import (
     kl_divergence,
     motion_of,
 )
-from foredrive.models.driveworld.planes import (
+from foredrive.methods.driveworld.planes import (
     PlanesToVolumeConfig,
     PlaneToVectorConfig,
     StaticSceneConfig,
     VectorToPlaneConfig,
     warp_plane,
 )
-from foredrive.models.driveworld.state_space import MotionAwareNorm, StateSpace, StateSpaceConfig
-from foredrive.models.driveworld.task_prompt import PromptConfig
-from foredrive.models.lift_splat import LiftSplatConfig
+from foredrive.methods.driveworld.state_space import MotionAwareNorm, StateSpace, StateSpaceConfig
+from foredrive.methods.driveworld.task_prompt import PromptConfig
 from foredrive.scene import Clip, Example, VoxelSpec, last_frames
 
 SPEC = VoxelSpec(lower_m=(-4.0, -6.0, -1.0), voxel_m=1.0, shape_zyx=(2, 12, 10))

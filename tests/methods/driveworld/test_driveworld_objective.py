@@ -7,12 +7,12 @@ import pytest
 import torch
 from miniature import miniature_driveworld
 
-from foredrive.models.agent import PlanningAgent
-from foredrive.models.driveworld import motion_of
-from foredrive.recipes import find_recipe
+from foredrive.methods.driveworld import motion_of
+from foredrive.methods.driveworld.objective import DriveWorldObjective, nearest_velocities
+from foredrive.methods.planner.agent import PlanningAgent
 from foredrive.runs.build import build_agent
+from foredrive.runs.recipes.known import find_recipe
 from foredrive.scene import Example
-from foredrive.training.driveworld_objective import DriveWorldObjective, nearest_velocities
 
 RECIPE = miniature_driveworld()
 SPEC = RECIPE.clips.voxels

@@ -4,15 +4,15 @@ import pytest
 import torch
 from torch import Tensor
 
-from foredrive.models.image_tower import ImageTower, ImageTowerConfig
-from foredrive.models.lidar_clip import LidarEncoder, LidarEncoderConfig, PointCloud
-from foredrive.training.alignment import (
+from foredrive.methods.lidarclip import LidarEncoder, LidarEncoderConfig, PointCloud
+from foredrive.methods.lidarclip.alignment import (
     CaptionedImages,
     ContrastConfig,
     ContrastObjective,
     DistillationObjective,
     ImagedSweeps,
 )
+from foredrive.methods.lidarclip.image_tower import ImageTower, ImageTowerConfig
 
 IMAGE_TOWER = ImageTowerConfig(widths=(8, 8), depths=(1, 1), heads=2, side_px=24)
 

@@ -4,8 +4,8 @@ import pytest
 import torch
 import torch.nn.functional as F
 
-from foredrive.models.caption_decoder import END, FIRST_WORD, PAD, CaptionDecoder
-from foredrive.training.captioning import CaptionedEmbeddings, CaptionObjective
+from foredrive.methods.lidarclip.caption_decoder import END, FIRST_WORD, PAD, CaptionDecoder
+from foredrive.methods.lidarclip.captioning import CaptionedEmbeddings, CaptionObjective
 
 WORDS = ("a", "car", "in", "night", "rain", "the")
 

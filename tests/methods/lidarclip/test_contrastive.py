@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from foredrive.losses.contrastive import info_nce, is_true
+from foredrive.methods.lidarclip.alignment import info_nce, is_true
 
 
 def test_a_text_is_true_of_what_holds_all_it_says() -> None:

@@ -5,10 +5,10 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from foredrive.models.attention_pool import AttentionPool
-from foredrive.models.lidar_clip import LidarEncoder, LidarEncoderConfig, PillarGrid, PointCloud
-from foredrive.models.lidar_clip.pillars import PillarEncoder, pillar_max
-from foredrive.models.lidar_clip.windows import WindowAttention, Windows
+from foredrive.methods.lidarclip import LidarEncoder, LidarEncoderConfig, PillarGrid, PointCloud
+from foredrive.methods.lidarclip.attention_pool import AttentionPool
+from foredrive.methods.lidarclip.encoder import WindowAttention, Windows
+from foredrive.methods.lidarclip.pillars import PillarEncoder, pillar_max
 from foredrive.scene import LidarSweep
 
 GRID = PillarGrid()

@@ -9,18 +9,18 @@ import torch
 
 from foredrive.errors import InputError
 from foredrive.geometry.se3 import exp_se3
-from foredrive.models.agent import PlanningAgent
-from foredrive.models.bev import BevConfig
-from foredrive.models.lifting import project_to_cameras
-from foredrive.models.nemo import MotionConfig, MotionFlow, Nemo, RendererConfig, VolumeRenderer
-from foredrive.models.nemo.ego_motion import continued_motion
-from foredrive.models.nemo.motion import Motion
+from foredrive.methods.blocks.bev import BevConfig
+from foredrive.methods.blocks.lifting import project_to_cameras
+from foredrive.methods.nemo import MotionConfig, MotionFlow, Nemo, RendererConfig, VolumeRenderer
+from foredrive.methods.nemo.ablations import nemo_ablations
+from foredrive.methods.nemo.motion import Motion
+from foredrive.methods.nemo.objective import NemoStage
+from foredrive.methods.nemo.recipes import NemoRecipe, nemo_base, nemo_tiny
+from foredrive.methods.planner.agent import PlanningAgent
 from foredrive.ops.volume import sample_volume_reference, warp_volume
-from foredrive.recipes.nemo import NemoRecipe, nemo_base, nemo_tiny
-from foredrive.recipes.nemo_ablations import nemo_ablations
 from foredrive.runs.build import build_agent, build_objective
 from foredrive.scene import Command, Example, VoxelSpec, last_frames
-from foredrive.training import NemoStage
+from foredrive.scene.ego_motion import continued_motion
 
 SPEC = VoxelSpec(lower_m=(-8.0, -8.0, -1.0), voxel_m=1.0, shape_zyx=(4, 16, 16))
 

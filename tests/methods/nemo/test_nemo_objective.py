@@ -9,16 +9,16 @@ import torch
 from miniature import miniature
 from safetensors.torch import save_file
 
+from foredrive.data.augmentation import AugmentConfig, mirrored
 from foredrive.errors import InputError
 from foredrive.geometry.projection import project
 from foredrive.geometry.se3 import inverse_se3, transform_points
-from foredrive.models.vgg import VggFeatures
-from foredrive.recipes import find_recipe
+from foredrive.methods.blocks.training_rays import averaged_rays
+from foredrive.methods.blocks.vgg import VggFeatures
+from foredrive.methods.nemo.objective import NemoObjective, NemoStage
 from foredrive.runs.build import build_agent, build_objective
+from foredrive.runs.recipes.known import find_recipe
 from foredrive.scene import Example
-from foredrive.training import NemoObjective, NemoStage
-from foredrive.training.augmentation import AugmentConfig, mirrored
-from foredrive.training.rays import averaged_rays
 
 RECIPE = miniature()
 SPEC = RECIPE.clips.voxels

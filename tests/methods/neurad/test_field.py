@@ -8,8 +8,7 @@ import torch
 from torch import Tensor
 
 from foredrive.geometry.se3 import exp_se3
-from foredrive.losses.field import beam_depth_loss, carving_loss, interlevel_loss
-from foredrive.rendering.field import (
+from foredrive.methods.neurad import (
     FieldActors,
     FieldConfig,
     FieldRays,
@@ -18,20 +17,20 @@ from foredrive.rendering.field import (
     beam_rays,
     pixel_rays,
 )
-from foredrive.rendering.field.config import GridsConfig
-from foredrive.rendering.field.contraction import contract
-from foredrive.rendering.field.decoders import BeamDecoder, PatchDecoder, PatchDecoderConfig
-from foredrive.rendering.field.network import ActorSamples, harmonics, opacity_of_density
-from foredrive.rendering.field.sampling import (
+from foredrive.methods.neurad.config import GridsConfig
+from foredrive.methods.neurad.decoders import BeamDecoder, PatchDecoder, PatchDecoderConfig
+from foredrive.methods.neurad.losses import beam_depth_loss, carving_loss, interlevel_loss
+from foredrive.methods.neurad.network import ActorSamples, contract, harmonics, opacity_of_density
+from foredrive.methods.neurad.sampling import (
     Resampling,
     first_borders,
     resampled_borders,
     to_distance,
     to_position,
 )
-from foredrive.rendering.rebuilt import SensorMotion
-from foredrive.rendering.tracks import ActorTracks
-from foredrive.rendering.views import CameraView, SweepView
+from foredrive.methods.rebuilding.rebuilt import SensorMotion
+from foredrive.methods.rebuilding.tracks import ActorTracks
+from foredrive.methods.rebuilding.views import CameraView, SweepView
 from foredrive.scene import LidarSweep
 
 

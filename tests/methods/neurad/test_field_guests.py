@@ -6,18 +6,18 @@ import pytest
 import torch
 
 from foredrive.geometry.se3 import exp_se3
-from foredrive.rendering.field import FieldActors, FieldConfig, FieldRays, GridConfig, NeuralField
-from foredrive.rendering.field.config import GridsConfig
-from foredrive.rendering.field.content import FieldParts
-from foredrive.rendering.field.decoders import BeamDecoder, PatchDecoder, PatchDecoderConfig
-from foredrive.rendering.field.guests import (
+from foredrive.methods.neurad import FieldActors, FieldConfig, FieldRays, GridConfig, NeuralField
+from foredrive.methods.neurad.config import GridsConfig
+from foredrive.methods.neurad.content import FieldParts
+from foredrive.methods.neurad.decoders import BeamDecoder, PatchDecoder, PatchDecoderConfig
+from foredrive.methods.neurad.guests import (
     Guest,
     SeenOfGuest,
     look_with_guests,
     with_guests_in_image,
     with_guests_in_sweep,
 )
-from foredrive.rendering.tracks import ActorTracks
+from foredrive.methods.rebuilding.tracks import ActorTracks
 
 MARGIN_M = 0.25
 """The boxes are this much longer at each end."""

@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from foredrive.losses.field import (
+from foredrive.methods.neurad.losses import (
     beam_depth_loss,
     carving_loss,
     distortion_loss,

@@ -9,16 +9,16 @@ import synthetic_log as world
 import torch
 
 from foredrive.data.log_writer import CameraSpec
-from foredrive.recipes.field import FieldRecipe
-from foredrive.rendering.field.config import FieldConfig, GridConfig, GridsConfig
-from foredrive.rendering.field.decoders import PatchDecoderConfig
-from foredrive.rendering.field.scene import FieldSceneConfig
-from foredrive.rendering.tracks import ActorTracks
-from foredrive.rendering.views import CameraView
-from foredrive.training.field_training import FieldRates, FieldSchedule
-from foredrive.training.learning_rates import Rate
-from foredrive.training.metrics_log import read_metrics
-from foredrive.training.rebuilding import SensorViews, rebuild
+from foredrive.engine.learning_rates import Rate
+from foredrive.engine.metrics_log import read_metrics
+from foredrive.methods.neurad.config import FieldConfig, GridConfig, GridsConfig
+from foredrive.methods.neurad.decoders import PatchDecoderConfig
+from foredrive.methods.neurad.recipes import FieldRecipe
+from foredrive.methods.neurad.scene import FieldSceneConfig
+from foredrive.methods.neurad.training import FieldRates, FieldSchedule
+from foredrive.methods.rebuilding.tracks import ActorTracks
+from foredrive.methods.rebuilding.training import SensorViews, rebuild
+from foredrive.methods.rebuilding.views import CameraView
 
 STEPS = 150
 DIRECTIONS = ((0.0, 60.0), (0.0, -40.0), (0.0, 0.0))

@@ -7,7 +7,7 @@ import torch
 from small_drives import drives
 
 from foredrive.errors import InputError
-from foredrive.models.ego_mlp import ego_speeds, ego_status
+from foredrive.methods.planner.ego_mlp import ego_speeds, ego_status
 from foredrive.scene import Command
 from foredrive.scene.clip import TARGET
 

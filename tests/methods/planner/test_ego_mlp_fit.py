@@ -7,9 +7,9 @@ import torch
 from small_drives import drives
 
 from foredrive.errors import InputError
-from foredrive.evaluation.baselines import ConstantVelocity
-from foredrive.models.ego_mlp import EgoMLP, EgoMLPConfig
-from foredrive.training import EgoMLPFit, StatusDemonstrations, fit_ego_mlp, read_status
+from foredrive.methods.planner.baselines import ConstantVelocity
+from foredrive.methods.planner.ego_mlp import EgoMLP, EgoMLPConfig
+from foredrive.methods.planner.ego_mlp_fit import EgoMLPFit, StatusDemonstrations, fit_ego_mlp, read_status
 
 
 def fitted(data: StatusDemonstrations, *, steps: int, past_frames: int = 2, seed: int = 0) -> EgoMLP:

@@ -5,9 +5,9 @@ import dataclasses
 import pytest
 import torch
 
-from foredrive.models.path_correction import PathCorrection, PathCorrectionConfig, PathSamples
+from foredrive.methods.planner.path_correction import PathCorrection, PathCorrectionConfig, PathSamples
+from foredrive.methods.planner.path_fit import PathDemonstrations, PathFit, fit_path
 from foredrive.scene import VoxelSpec
-from foredrive.training import PathDemonstrations, PathFit, fit_path
 
 SPEC = VoxelSpec(lower_m=(0.0, 0.0, 0.0), voxel_m=1.0, shape_zyx=(1, 4, 4))
 COUNT, DISTANCES = 400, (2.0, 6.0)

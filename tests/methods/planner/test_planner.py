@@ -6,9 +6,9 @@ from typing import Literal
 import pytest
 import torch
 
-from foredrive.models.ego_mlp import EgoMLPConfig
-from foredrive.models.path_correction import PathCorrection, PathCorrectionConfig, headings
-from foredrive.models.planner import FutureAttention, PlannerConfig, VolumePlanner
+from foredrive.methods.planner.ego_mlp import EgoMLPConfig
+from foredrive.methods.planner.path_correction import PathCorrection, PathCorrectionConfig, headings
+from foredrive.methods.planner.planner import FutureAttention, PlannerConfig, VolumePlanner
 from foredrive.scene import VoxelSpec
 
 SPEC = VoxelSpec(lower_m=(-4.0, -4.0, -1.0), voxel_m=1.0, shape_zyx=(2, 8, 8))

@@ -5,9 +5,9 @@ import math
 import pytest
 import torch
 
-from foredrive.rendering.calibration import sweep_edges
-from foredrive.rendering.tracks import ActorTracks
-from foredrive.rendering.views import SweepView
+from foredrive.methods.rebuilding.calibration import sweep_edges
+from foredrive.methods.rebuilding.tracks import ActorTracks
+from foredrive.methods.rebuilding.views import SweepView
 from foredrive.scene import LidarSweep
 
 STEP_RAD = math.radians(0.5)

@@ -9,7 +9,7 @@ import torch
 from test_scene_graph import graph_of, two_actors
 
 from foredrive.errors import InputError
-from foredrive.rendering.edits import (
+from foredrive.methods.rebuilding.edits import (
     DriveStraight,
     Duplicate,
     Edit,
@@ -22,9 +22,9 @@ from foredrive.rendering.edits import (
     save_edits,
     unused_id,
 )
-from foredrive.rendering.gaussians.content import gaussians_of
-from foredrive.rendering.gaussians.placing import place_gaussians
-from foredrive.rendering.scene_graph import STATIC, SceneGraph
+from foredrive.methods.rebuilding.scene_graph import STATIC, SceneGraph
+from foredrive.methods.splatad.content import gaussians_of
+from foredrive.methods.splatad.placing import place_gaussians
 
 
 def scene() -> SceneGraph:

@@ -7,14 +7,14 @@ import pytest
 import torch
 
 from foredrive.geometry.se3 import exp_se3, transform_points
-from foredrive.rendering.decoders import CameraDecoder, CameraDecoderConfig, LidarDecoder
-from foredrive.rendering.gaussians import Gaussians
-from foredrive.rendering.gaussians.content import GaussianContent
-from foredrive.rendering.gaussians.scene import UNSEEN_RGB, GaussianScene
-from foredrive.rendering.gaussians.scene_config import GaussianSceneConfig
-from foredrive.rendering.scene_graph import STATIC, SceneGraph
-from foredrive.rendering.tracks import ActorTracks
-from foredrive.rendering.views import CameraView, SweepView
+from foredrive.methods.rebuilding.decoders import CameraDecoder, CameraDecoderConfig, LidarDecoder
+from foredrive.methods.rebuilding.scene_graph import STATIC, SceneGraph
+from foredrive.methods.rebuilding.tracks import ActorTracks
+from foredrive.methods.rebuilding.views import CameraView, SweepView
+from foredrive.methods.splatad import Gaussians
+from foredrive.methods.splatad.content import GaussianContent
+from foredrive.methods.splatad.scene import UNSEEN_RGB, GaussianScene
+from foredrive.methods.splatad.scene_config import GaussianSceneConfig
 from foredrive.scene import LidarSweep
 
 FORWARD = torch.tensor([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])

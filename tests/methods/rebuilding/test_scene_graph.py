@@ -11,11 +11,17 @@ from hypothesis import strategies as st
 
 from foredrive.errors import InputError
 from foredrive.geometry.se3 import exp_se3, matrix_from_yaw
-from foredrive.rendering.gaussians import Gaussians
-from foredrive.rendering.gaussians.content import GaussianContent, gaussians_of
-from foredrive.rendering.gaussians.placing import mirrored, place_gaussians
-from foredrive.rendering.scene_graph import STATIC, SceneGraph
-from foredrive.rendering.tracks import ActorTracks, joined_tracks, move_at_least, split_tracks, states_at
+from foredrive.methods.rebuilding.scene_graph import STATIC, SceneGraph
+from foredrive.methods.rebuilding.tracks import (
+    ActorTracks,
+    joined_tracks,
+    move_at_least,
+    split_tracks,
+    states_at,
+)
+from foredrive.methods.splatad import Gaussians
+from foredrive.methods.splatad.content import GaussianContent, gaussians_of
+from foredrive.methods.splatad.placing import mirrored, place_gaussians
 from foredrive.scene import Category
 
 

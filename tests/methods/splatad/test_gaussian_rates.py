@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from foredrive.training.learning_rates import Rate
+from foredrive.engine.learning_rates import Rate
 
 
 def test_a_rate_decays_from_the_first_step_to_the_last() -> None:

@@ -3,12 +3,12 @@
 import pytest
 import torch
 
-from foredrive.rendering.gaussians import Gaussians
-from foredrive.rendering.gaussians.content import GaussianContent
-from foredrive.rendering.gaussians.scene import GaussianScene
-from foredrive.rendering.scene_graph import STATIC, SceneGraph
-from foredrive.rendering.tracks import ActorTracks
-from foredrive.training.gaussian_steps import grow, relocate
+from foredrive.methods.rebuilding.scene_graph import STATIC, SceneGraph
+from foredrive.methods.rebuilding.tracks import ActorTracks
+from foredrive.methods.splatad import Gaussians
+from foredrive.methods.splatad.content import GaussianContent
+from foredrive.methods.splatad.scene import GaussianScene
+from foredrive.methods.splatad.training import grow, relocate
 
 
 @pytest.fixture

@@ -6,9 +6,9 @@ import torch
 
 from benchmarks.splats import street_range_error_mm
 from foredrive.geometry.se3 import exp_se3, inverse_se3, sensor_twist, transform_points
+from foredrive.methods.splatad import Gaussians, project_lidar, tiled_lidar_beams
 from foredrive.ops.splat_points import LANES, beam_points
 from foredrive.ops.splatting import Splats, composite_splats
-from foredrive.rendering.gaussians import Gaussians, project_lidar, tiled_lidar_beams
 from foredrive.sensors import TimedRays, pandar64, vlp16
 
 STILL = torch.zeros(6)

@@ -4,11 +4,11 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from methods.rebuilding.test_scene_graph import graph_of, two_actors
 from plyfile import PlyData
-from test_scene_graph import graph_of, two_actors
 
-from foredrive.rendering.ply import SH_DEGREE_0, write_ply
-from foredrive.rendering.scene_graph import STATIC
+from foredrive.methods.rebuilding.scene_graph import STATIC
+from foredrive.methods.splatad.ply import SH_DEGREE_0, write_ply
 
 NAMES = (
     *("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"),

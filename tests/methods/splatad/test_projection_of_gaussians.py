@@ -11,11 +11,11 @@ from torch import Tensor
 
 from foredrive.geometry.projection import distort, distortion_jacobian, project
 from foredrive.geometry.se3 import exp_se3, inverse_se3, sensor_twist, transform_points
+from foredrive.methods.splatad import Gaussians, project_camera, project_lidar
+from foredrive.methods.splatad.camera import SPREAD_PX2
+from foredrive.methods.splatad.lidar import SPREAD_RAD2
 from foredrive.ops.splat_points import pixel_points
 from foredrive.ops.splatting import Splats, composite_splats
-from foredrive.rendering.gaussians import Gaussians, project_camera, project_lidar
-from foredrive.rendering.gaussians.camera import SPREAD_PX2
-from foredrive.rendering.gaussians.lidar import SPREAD_RAD2
 
 SIZE_HW = (360, 640)
 K = torch.tensor([[500.0, 0, 330], [0, 490, 170], [0, 0, 1]], dtype=torch.float64)

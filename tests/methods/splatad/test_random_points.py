@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from foredrive.rendering.gaussians.random_points import drive_bounds, random_points
+from foredrive.methods.splatad.initial import drive_bounds, random_points
 
 
 def test_bounds_hold_the_padded_poses() -> None:

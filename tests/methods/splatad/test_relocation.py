@@ -5,8 +5,8 @@ import math
 import pytest
 import torch
 
-from foredrive.rendering.gaussians import Gaussians
-from foredrive.rendering.gaussians.relocation import random_walk_m, split_evenly
+from foredrive.methods.splatad import Gaussians
+from foredrive.methods.splatad.relocation import random_walk_m, split_evenly
 
 
 def test_one_alone_stays_as_it_is() -> None:

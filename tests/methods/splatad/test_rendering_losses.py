@@ -4,7 +4,7 @@ import pytest
 import torch
 from torchmetrics.functional.image import structural_similarity_index_measure
 
-from foredrive.losses.rendering import (
+from foredrive.methods.splatad.losses import (
     drop_loss,
     intensity_loss,
     line_of_sight_loss,

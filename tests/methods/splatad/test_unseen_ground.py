@@ -5,12 +5,12 @@ import math
 
 import pytest
 import torch
-from test_rebuilt import FORWARD, scene_of, view
-from test_scene_graph import two_actors
+from methods.rebuilding.test_rebuilt import FORWARD, scene_of, view
+from methods.rebuilding.test_scene_graph import two_actors
 
 from foredrive.geometry.se3 import exp_se3
-from foredrive.rendering.gaussians import Gaussians
-from foredrive.rendering.gaussians.unseen_ground import WITHIN_M, add_unseen_ground, extrapolated_ground
+from foredrive.methods.splatad import Gaussians
+from foredrive.methods.splatad.unseen_ground import WITHIN_M, add_unseen_ground, extrapolated_ground
 
 WAY = torch.eye(4).repeat(21, 1, 1)
 WAY[:, 0, 3] = torch.arange(21.0)

@@ -6,15 +6,10 @@ import math
 import numpy as np
 import pytest
 
-from foredrive.metrics.detection_protocols import (
-    CLASSES,
-    DETECTION_PROTOCOLS,
-    evaluate_detections,
-    hit_errors,
-)
-from foredrive.metrics.object_rows import ObjectRows, counted, inside_racks, make_rows
-from foredrive.metrics.over_recall import running_mean
 from foredrive.scene.boxes import UNKNOWN, Attribute
+from foredrive.tasks.detection.over_recall import running_mean
+from foredrive.tasks.detection.protocols import CLASSES, DETECTION_PROTOCOLS, evaluate_detections, hit_errors
+from foredrive.tasks.tracking.object_rows import ObjectRows, counted, inside_racks, make_rows
 
 NUSCENES, VAD = DETECTION_PROTOCOLS["nuscenes"], DETECTION_PROTOCOLS["vad"]
 

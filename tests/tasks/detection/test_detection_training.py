@@ -9,17 +9,12 @@ import pytest
 import torch
 
 from foredrive.errors import InputError
-from foredrive.metrics.proper_scores import crps_gaussian, crps_laplace
-from foredrive.models.detection import BoxSet, DetectionHead
 from foredrive.scene import VoxelSpec
 from foredrive.sets import Family, LabelledBoxes, PoissonMultiBernoulli, pmb_from_detections, set_nll
-from foredrive.training.detection import fit_head
-from foredrive.training.detection_losses import (
-    MatchingLossConfig,
-    energy_score,
-    matching_loss,
-    set_loss,
-)
+from foredrive.tasks.detection.losses import MatchingLossConfig, energy_score, matching_loss, set_loss
+from foredrive.tasks.detection.network import BoxSet, DetectionHead
+from foredrive.tasks.detection.proper_scores import crps_gaussian, crps_laplace
+from foredrive.tasks.detection.training import fit_head
 
 
 @pytest.fixture(autouse=True)

@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from foredrive.errors import InputError
-from foredrive.metrics.gospa import gospa, wasserstein_distance
 from foredrive.sets import BoxDensity, LabelledBoxes
+from foredrive.tasks.detection.gospa import gospa, wasserstein_distance
 
 
 def test_parts_by_hand() -> None:

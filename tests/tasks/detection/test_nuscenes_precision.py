@@ -8,14 +8,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-from evaluation.detections.files_of_detections import box, write_nuscenes
+from tasks.files_of_detections import box, write_nuscenes
 
-from foredrive.evaluation.detections.files import read_detections
-from foredrive.evaluation.detections.nuscenes_results import BICYCLE_RACK
-from foredrive.evaluation.detections.score import score_frames
-from foredrive.evaluation.detections.summary import summarise_scores
-from foredrive.evaluation.summary import Figures
-from foredrive.metrics.detection_protocols import CLASSES
+from foredrive.engine.summary import Figures
+from foredrive.tasks.detection.files import read_detections
+from foredrive.tasks.detection.nuscenes_results import BICYCLE_RACK
+from foredrive.tasks.detection.protocols import CLASSES
+from foredrive.tasks.detection.score import score_frames
+from foredrive.tasks.detection.summary import summarise_scores
 
 Boxes = list[dict[str, Any]]
 

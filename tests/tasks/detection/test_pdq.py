@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from foredrive.metrics.pdq import PdqCounts, count_pdq, pdq, pixel_quality
+from foredrive.tasks.detection.pdq import PdqCounts, count_pdq, pdq, pixel_quality
 
 BOX = np.array([[10.0, 10.0, 20.0, 30.0]])
 SHARP = np.full((1, 4), 1e-3)

@@ -7,8 +7,8 @@ import pytest
 import torch
 from scipy import integrate, stats
 
-from foredrive.metrics.proper_scores import crps_gaussian, crps_laplace, energy_score, object_brier
 from foredrive.sets import BoxDensity, LabelledBoxes
+from foredrive.tasks.detection.proper_scores import crps_gaussian, crps_laplace, energy_score, object_brier
 
 
 def test_crps_is_the_integral_that_defines_it() -> None:

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from evaluation.detections.files_of_detections import box, write_coco_truth, write_list, write_nuscenes
+from tasks.files_of_detections import box, write_coco_truth, write_list, write_nuscenes
 
 from foredrive.errors import InputError
-from foredrive.evaluation.detections.files import read_detections
+from foredrive.tasks.detection.files import read_detections
 
 
 def test_nuscenes_boxes_around_the_ego_vehicle(tmp_path: Path) -> None:

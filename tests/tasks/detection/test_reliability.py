@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from foredrive.metrics.reliability import reliability
+from foredrive.tasks.detection.reliability import reliability
 
 
 def test_reliability_by_hand() -> None:

@@ -5,13 +5,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from evaluation.detections.files_of_detections import box, write_coco_truth, write_list, write_nuscenes
+from tasks.files_of_detections import box, write_coco_truth, write_list, write_nuscenes
 
 from foredrive.errors import InputError
-from foredrive.evaluation.detections.files import read_detections
-from foredrive.evaluation.detections.frames import DetectionSet
-from foredrive.evaluation.detections.score import ScoreConfig, score_frames
-from foredrive.evaluation.detections.summary import compare_scores, summarise_scores
+from foredrive.tasks.detection.files import read_detections
+from foredrive.tasks.detection.frames import DetectionSet
+from foredrive.tasks.detection.score import ScoreConfig, score_frames
+from foredrive.tasks.detection.summary import compare_scores, summarise_scores
 
 
 def drives(folder: Path, *, error_m: float, seed: int = 0) -> DetectionSet:

@@ -9,11 +9,11 @@ from typing import Any
 import pytest
 
 from foredrive.errors import InputError
-from foredrive.evaluation.maps.files import read_maps
-from foredrive.evaluation.motion.files import read_agents
-from foredrive.evaluation.objects.kitti_boxes import score_kitti_boxes
-from foredrive.evaluation.objects.kitti_tracks import score_kitti_tracks
-from foredrive.evaluation.objects.score import read_objects
+from foredrive.tasks.maps.files import read_maps
+from foredrive.tasks.motion.files import read_agents
+from foredrive.tasks.tracking.kitti_boxes import score_kitti_boxes
+from foredrive.tasks.tracking.kitti_tracks import score_kitti_tracks
+from foredrive.tasks.tracking.score import read_objects
 
 BOX = {
     "translation": [10.0, 0.0, 1.0],

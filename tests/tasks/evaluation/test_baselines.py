@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from foredrive.errors import InputError
-from foredrive.evaluation.baselines import ConstantVelocity, StandStill
+from foredrive.methods.planner.baselines import ConstantVelocity, StandStill
 from foredrive.scene import Example
 
 MakeExample = Callable[..., Example]

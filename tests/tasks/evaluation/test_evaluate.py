@@ -9,12 +9,12 @@ import torch
 from torch.utils.data import DataLoader, Dataset
 
 from foredrive.errors import InputError
-from foredrive.evaluation.baselines import ConstantVelocity, StandStill
-from foredrive.evaluation.predictor import Prediction
-from foredrive.evaluation.run import evaluate
-from foredrive.metrics.occupancy import OccupancyPrior
-from foredrive.metrics.protocols import PROTOCOLS
+from foredrive.methods.planner.baselines import ConstantVelocity, StandStill
 from foredrive.scene import Clip, Example, Trajectory, VoxelGrid
+from foredrive.tasks.evaluation.predictor import Prediction
+from foredrive.tasks.evaluation.run import evaluate
+from foredrive.tasks.occupancy.scores import OccupancyPrior
+from foredrive.tasks.planning.protocols import PROTOCOLS
 
 MakeExample = Callable[..., Example]
 FRAMES = 3

@@ -6,12 +6,12 @@ import pytest
 from torch.utils.data import DataLoader
 
 from foredrive.data import ClipConfig, ClipDataset, collate
-from foredrive.data.convert import convert
-from foredrive.evaluation.baselines import ConstantVelocity, StandStill
-from foredrive.evaluation.predictor import Prediction
-from foredrive.evaluation.run import evaluate
-from foredrive.metrics.protocols import PROTOCOLS
+from foredrive.data.formats.convert import convert
+from foredrive.methods.planner.baselines import ConstantVelocity, StandStill
 from foredrive.scene import Clip, VoxelSpec
+from foredrive.tasks.evaluation.predictor import Prediction
+from foredrive.tasks.evaluation.run import evaluate
+from foredrive.tasks.planning.protocols import PROTOCOLS
 
 
 class GoOn:

@@ -2,7 +2,7 @@
 
 After a change that is meant to change them, write them anew and look at the difference:
 
-    FOREDRIVE_WRITE_GOLDEN=1 .venv/bin/python -m pytest tests/evaluation/test_golden_summary.py
+    FOREDRIVE_WRITE_GOLDEN=1 .venv/bin/python -m pytest tests/tasks/evaluation/test_golden_summary.py
 """
 
 import json
@@ -13,11 +13,11 @@ from pathlib import Path
 import pytest
 import torch
 
-from foredrive.evaluation.baselines import ConstantVelocity, StandStill
-from foredrive.evaluation.predictor import Prediction
-from foredrive.evaluation.run import evaluate
-from foredrive.metrics.occupancy import OccupancyPrior
+from foredrive.methods.planner.baselines import ConstantVelocity, StandStill
 from foredrive.scene import Clip, Example, Trajectory
+from foredrive.tasks.evaluation.predictor import Prediction
+from foredrive.tasks.evaluation.run import evaluate
+from foredrive.tasks.occupancy.scores import OccupancyPrior
 
 GOLDEN = Path(__file__).with_name("golden_summary.json")
 FRAMES, FUTURES = 3, 4

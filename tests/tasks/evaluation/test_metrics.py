@@ -8,13 +8,13 @@ from typing import get_args
 import pytest
 import torch
 
-from foredrive.evaluation.baselines import ConstantVelocity, StandStill
-from foredrive.evaluation.metric import EvaluationContext, Figures
-from foredrive.evaluation.metrics import METRICS
-from foredrive.evaluation.metrics.images import ImageMetric
-from foredrive.evaluation.predictor import Part, Prediction
-from foredrive.evaluation.run import evaluate
+from foredrive.methods.planner.baselines import ConstantVelocity, StandStill
 from foredrive.scene import Clip, Example
+from foredrive.tasks.evaluation.metric import EvaluationContext, Figures
+from foredrive.tasks.evaluation.metrics import METRICS
+from foredrive.tasks.evaluation.predictor import Part, Prediction
+from foredrive.tasks.evaluation.run import evaluate
+from foredrive.tasks.rendering.metric import ImageMetric
 
 MakeExample = Callable[..., Example]
 

@@ -8,23 +8,23 @@ import pytest
 import torch
 from recorded_street import near_truth, read_batch, record
 
-from foredrive.data.task_truth import TaskTruthConfig
-from foredrive.evaluation.maps.files import read_maps
-from foredrive.evaluation.maps.score import score_map_files
-from foredrive.evaluation.metric import EvaluationContext, Figures
-from foredrive.evaluation.metrics.detection import DetectionMetric
-from foredrive.evaluation.metrics.maps import MapLinesMetric
-from foredrive.evaluation.metrics.motion import MotionMetric
-from foredrive.evaluation.metrics.semantics import SemanticVoxelMetric
-from foredrive.evaluation.metrics.tracking import TrackingMetric
-from foredrive.evaluation.motion.files import read_agents
-from foredrive.evaluation.motion.score import score_agent_files
-from foredrive.evaluation.objects.score import read_objects, score_detections, score_tracks
-from foredrive.evaluation.predictor import Prediction
-from foredrive.evaluation.results_files import ResultsFiles
-from foredrive.evaluation.voxels.log_results import score_against_logs
+from foredrive.data.truth.store import TaskTruthConfig
 from foredrive.files import together
 from foredrive.scene import Example, VoxelSpec
+from foredrive.tasks.detection.metric import DetectionMetric
+from foredrive.tasks.evaluation.metric import EvaluationContext, Figures
+from foredrive.tasks.evaluation.predictor import Prediction
+from foredrive.tasks.evaluation.results_files import ResultsFiles
+from foredrive.tasks.maps.files import read_maps
+from foredrive.tasks.maps.metric import MapLinesMetric
+from foredrive.tasks.maps.score import score_map_files
+from foredrive.tasks.motion.files import read_agents
+from foredrive.tasks.motion.metric import MotionMetric
+from foredrive.tasks.motion.score import score_agent_files
+from foredrive.tasks.occupancy.log_results import score_against_logs
+from foredrive.tasks.occupancy.semantics_metric import SemanticVoxelMetric
+from foredrive.tasks.tracking.metric import TrackingMetric
+from foredrive.tasks.tracking.score import read_objects, score_detections, score_tracks
 
 
 @pytest.fixture(scope="module")

@@ -11,16 +11,16 @@ from test_agent_futures import on_circle
 from test_agent_futures import write as write_tracks
 from test_map_elements import log_with
 
-from foredrive.data.agent_futures import read_futures
 from foredrive.data.boxes import read_boxes
 from foredrive.data.logs import Log
-from foredrive.data.map_elements import read_map_elements
+from foredrive.data.truth.agent_futures import read_futures
+from foredrive.data.truth.map_elements import read_map_elements
 from foredrive.errors import InputError
-from foredrive.evaluation.maps.files import read_maps
-from foredrive.evaluation.maps.score import score_map_files
-from foredrive.evaluation.motion.files import STEPS, read_agents
-from foredrive.evaluation.motion.score import score_agent_files
 from foredrive.scene.map_elements import ElementKind
+from foredrive.tasks.maps.files import read_maps
+from foredrive.tasks.maps.score import score_map_files
+from foredrive.tasks.motion.files import STEPS, read_agents
+from foredrive.tasks.motion.score import score_agent_files
 
 NAMES = {
     ElementKind.DIVIDER: "divider",

@@ -7,19 +7,19 @@ from collections.abc import Callable
 import pytest
 import torch
 
-from foredrive.evaluation.metric import EvaluationContext
-from foredrive.evaluation.metrics.detection import DetectionMetric
-from foredrive.evaluation.metrics.maps import MapLinesMetric, MapRasterMetric
-from foredrive.evaluation.metrics.motion import MotionMetric
-from foredrive.evaluation.metrics.semantics import SemanticVoxelMetric
-from foredrive.evaluation.predictor import Prediction
-from foredrive.evaluation.task_priors import TaskPriors, best_mask, fit_task_priors
 from foredrive.scene import Attribute, Boxes, Category, Example, VoxelSpec
 from foredrive.scene.agent_futures import AgentFutures
 from foredrive.scene.agents import Agents, MapLines
 from foredrive.scene.map_elements import ElementKind, MapElements, MapRaster, PlaneSpec
 from foredrive.scene.semantics import SemanticVoxels
 from foredrive.scene.task_truth import TaskTruth
+from foredrive.tasks.detection.metric import DetectionMetric
+from foredrive.tasks.evaluation.metric import EvaluationContext
+from foredrive.tasks.evaluation.predictor import Prediction
+from foredrive.tasks.evaluation.task_priors import TaskPriors, best_mask, fit_task_priors
+from foredrive.tasks.maps.metric import MapLinesMetric, MapRasterMetric
+from foredrive.tasks.motion.metric import MotionMetric
+from foredrive.tasks.occupancy.semantics_metric import SemanticVoxelMetric
 
 SPEC = VoxelSpec(lower_m=(-4.0, -4.0, -1.0), voxel_m=1.0, shape_zyx=(2, 8, 8))
 RASTER = PlaneSpec((-4.0, -4.0), 1.0, (8, 8))

@@ -7,12 +7,14 @@ import pytest
 import torch
 
 from foredrive.geometry.se3 import matrix_from_yaw
-from foredrive.models.tasks.agents import AgentHeadConfig
-from foredrive.models.tasks.decoder import DecoderConfig
-from foredrive.models.tasks.heads import TaskHeads, TaskHeadsConfig, TaskVolume
-from foredrive.models.tasks.maps import MapHeadConfig, RasterHeadConfig, _on_canvas
-from foredrive.models.tasks.motion import MotionConfig, kinematic_motion
-from foredrive.models.tasks.plane import (
+from foredrive.scene import Task, VoxelSpec
+from foredrive.scene.map_elements import PlaneSpec
+from foredrive.scene.semantics import VOXEL_CLASSES
+from foredrive.tasks.detection.agents_head import AgentHeadConfig
+from foredrive.tasks.detection.proposals import CentreMap, best_proposals
+from foredrive.tasks.heads.decoder import DecoderConfig
+from foredrive.tasks.heads.heads import TaskHeads, TaskHeadsConfig, TaskVolume
+from foredrive.tasks.heads.plane import (
     Plane,
     PlaneFeatures,
     PlanePyramid,
@@ -20,11 +22,9 @@ from foredrive.models.tasks.plane import (
     halvings,
     spread_points,
 )
-from foredrive.models.tasks.proposals import CentreMap, best_proposals
-from foredrive.models.tasks.voxels import VoxelHeadConfig
-from foredrive.scene import Task, VoxelSpec
-from foredrive.scene.map_elements import PlaneSpec
-from foredrive.scene.semantics import VOXEL_CLASSES
+from foredrive.tasks.maps.head import MapHeadConfig, RasterHeadConfig, _on_canvas
+from foredrive.tasks.motion.head import MotionConfig, kinematic_motion
+from foredrive.tasks.occupancy.head import VoxelHeadConfig
 
 SPEC = VoxelSpec(lower_m=(-4.0, -8.0, -1.0), voxel_m=1.0, shape_zyx=(2, 16, 24))
 RASTER = PlaneSpec((-10.0, -10.0), 1.0, (20, 20))

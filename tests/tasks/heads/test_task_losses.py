@@ -5,9 +5,14 @@ import math
 import pytest
 import torch
 
-from foredrive.losses.map_elements import equivalent_orders, map_element_losses, sigmoid_focal_loss
-from foredrive.losses.motion import motion_losses
-from foredrive.losses.semantics import class_weights, raster_loss, semantic_affinity, voxel_cross_entropy
+from foredrive.tasks.maps.losses import equivalent_orders, map_element_losses, sigmoid_focal_loss
+from foredrive.tasks.motion.losses import motion_losses
+from foredrive.tasks.occupancy.semantic_losses import (
+    class_weights,
+    raster_loss,
+    semantic_affinity,
+    voxel_cross_entropy,
+)
 
 SQUARE = torch.tensor([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0], [0.0, 0.0]])
 LINE = torch.tensor([[0.0, 0.0], [1.0, 0.0], [3.0, 0.0]])

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from foredrive.errors import InputError
-from foredrive.evaluation.maps.files import read_maps
-from foredrive.evaluation.maps.score import score_map_files
+from foredrive.tasks.maps.files import read_maps
+from foredrive.tasks.maps.score import score_map_files
 
 LINE = [[-20.0, 3.0], [0.0, 3.5], [20.0, 3.0]]
 OTHER = [[-20.0, -6.0], [20.0, -6.0]]

@@ -7,18 +7,14 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from metrics.map_scenes import elements, random_maps
-from metrics.maps_by_hand import chamfer, points_of, precision
+from tasks.map_scenes import elements, random_maps
+from tasks.maps_by_hand import chamfer, points_of, precision
 
 from foredrive.errors import InputError
-from foredrive.metrics.maps.lines import CLASSES, LineSet, chamfer_distances, resample
-from foredrive.metrics.maps.precision import (
-    average_precision_area,
-    mean_precision,
-    score_maps,
-)
-from foredrive.metrics.maps.protocols import PROTOCOLS, Area
 from foredrive.scene.map_elements import ElementKind
+from foredrive.tasks.maps.lines import CLASSES, LineSet, chamfer_distances, resample
+from foredrive.tasks.maps.precision import average_precision_area, mean_precision, score_maps
+from foredrive.tasks.maps.protocols import PROTOCOLS, Area
 
 DIVIDER, CROSSING, BOUNDARY = CLASSES
 

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from foredrive.metrics.maps.raster import count_raster, raster_figures
 from foredrive.scene.map_elements import RasterLayer
+from foredrive.tasks.maps.metric import count_raster, raster_figures
 
 NOTHING = np.zeros((1, len(RasterLayer), 4, 4), dtype=bool)
 

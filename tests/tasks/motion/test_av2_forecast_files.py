@@ -11,9 +11,8 @@ import pyarrow.parquet as parquet
 import pytest
 
 from foredrive.errors import InputError
-from foredrive.evaluation.motion.av2_challenge import OBSERVED, PREDICTED, read_challenge
-from foredrive.evaluation.motion.av2_sensor import CLASSES, read_end_to_end
-from foredrive.evaluation.motion.score import score_motion_results
+from foredrive.tasks.motion.av2_sensor import CLASSES, read_end_to_end
+from foredrive.tasks.motion.score import OBSERVED, PREDICTED, read_challenge, score_motion_results
 
 LOG = "7fab2350-7eaf-3b7e-a39d-6937a4c1bede"
 

@@ -6,7 +6,6 @@ import math
 
 import numpy as np
 import pytest
-from metrics.motion_scenes import joined, joined_truth, one_agent, perfect, random_predictions, random_truth
 from oracles.av2_forecasting import (
     GOLDEN,
     check_forecasting,
@@ -14,16 +13,17 @@ from oracles.av2_forecasting import (
     forecasting_scene,
     single_agents,
 )
+from tasks.motion_scenes import joined, joined_truth, one_agent, perfect, random_predictions, random_truth
 
-from foredrive.metrics.motion.argoverse import (
+from foredrive.scene import Category
+from foredrive.tasks.motion.argoverse import (
     NON_LINEAR,
     STATIC,
     forecast_errors,
     forecast_precision,
     kind_of_motion,
 )
-from foredrive.metrics.motion.moving import is_moving, score_moving
-from foredrive.scene import Category
+from foredrive.tasks.motion.moving import is_moving, score_moving
 
 
 def test_the_best_future_ends_nearest() -> None:

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from foredrive.errors import InputError
-from foredrive.evaluation.motion.files import STEPS, read_agents
-from foredrive.evaluation.motion.score import score_agent_files
+from foredrive.tasks.motion.files import STEPS, read_agents
+from foredrive.tasks.motion.score import score_agent_files
 
 EGO = (400.0, 1000.0)
 HALF_TURN = [0.0, 0.0, 0.0, 1.0]

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from metrics.motion_by_hand import uniad, vad
-from metrics.motion_scenes import (
+from tasks.motion_by_hand import uniad, vad
+from tasks.motion_scenes import (
     joined,
     joined_truth,
     one_agent,
@@ -18,12 +18,12 @@ from metrics.motion_scenes import (
 )
 
 from foredrive.errors import InputError
-from foredrive.metrics.motion.agents import PredictedAgents, TrueAgents, displacement_errors
-from foredrive.metrics.motion.matching import match_by_distance, match_by_score
-from foredrive.metrics.motion.protocols import PROTOCOLS
-from foredrive.metrics.motion.scores import MotionScores, motion_figures, score_motion
-from foredrive.metrics.over_recall import error_over_recall
 from foredrive.scene import Category
+from foredrive.tasks.detection.over_recall import error_over_recall
+from foredrive.tasks.motion.agents import PredictedAgents, TrueAgents, displacement_errors
+from foredrive.tasks.motion.matching import match_by_distance, match_by_score
+from foredrive.tasks.motion.protocols import PROTOCOLS
+from foredrive.tasks.motion.scores import MotionScores, motion_figures, score_motion
 
 KEYS = ("min_ade_m", "min_fde_m", "miss_rate", "epa")
 

@@ -6,12 +6,12 @@ from collections.abc import Callable
 import pytest
 import torch
 
-from foredrive.evaluation.metric import EvaluationContext
-from foredrive.evaluation.metrics.occupancy import OccupancyMetric
-from foredrive.evaluation.predictor import Prediction
 from foredrive.geometry.se3 import exp_se3
-from foredrive.metrics.forecasts import ego_compensated
 from foredrive.scene import Example, VoxelGrid, VoxelSpec
+from foredrive.tasks.evaluation.metric import EvaluationContext
+from foredrive.tasks.evaluation.predictor import Prediction
+from foredrive.tasks.occupancy.forecasts import ego_compensated
+from foredrive.tasks.occupancy.occupancy_metric import OccupancyMetric
 
 SPEC = VoxelSpec((-8.0, -12.0, -1.0), 1.0, (3, 24, 32))
 TWIST = torch.tensor([3.0, 0.0, 0.0, 0.0, 0.0, 0.3], dtype=torch.float64)

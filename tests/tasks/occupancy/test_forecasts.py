@@ -5,9 +5,9 @@ import math
 import torch
 
 from foredrive.geometry.se3 import matrix_from_yaw
-from foredrive.metrics.forecasts import count_futures, ego_compensated
-from foredrive.metrics.occupancy import count_occupancy
 from foredrive.scene import VoxelGrid, VoxelSpec
+from foredrive.tasks.occupancy.forecasts import count_futures, ego_compensated
+from foredrive.tasks.occupancy.scores import count_occupancy
 
 SPEC = VoxelSpec(lower_m=(-2.0, -2.0, 0.0), voxel_m=1.0, shape_zyx=(1, 4, 4))
 

@@ -8,14 +8,21 @@ import pytest
 import torch
 from torch import nn
 
-from foredrive.evaluation.metric import EvaluationContext
-from foredrive.evaluation.metrics.instances import InstanceMetric, drawn_boxes
-from foredrive.evaluation.predictor import Prediction
 from foredrive.geometry.se3 import matrix_from_yaw
-from foredrive.models.detection import BoxSet
-from foredrive.models.tasks.agents import AGENT_CLASSES, AgentHeadConfig, AgentSet, CarriedConfig
-from foredrive.models.tasks.heads import TaskHeads, TaskHeadsConfig, TaskVolume
-from foredrive.models.tasks.instances import (
+from foredrive.scene import Boxes, Category, Example, VoxelSpec
+from foredrive.scene.boxes import unlabelled
+from foredrive.scene.map_elements import InstanceRaster, PlaneSpec
+from foredrive.scene.task_truth import TaskTruth
+from foredrive.tasks.detection.agents_head import AGENT_CLASSES, AgentHeadConfig, AgentSet, CarriedConfig
+from foredrive.tasks.detection.losses import MatchingLossConfig
+from foredrive.tasks.detection.network import BoxSet
+from foredrive.tasks.evaluation.metric import EvaluationContext
+from foredrive.tasks.evaluation.predictor import Prediction
+from foredrive.tasks.heads.heads import TaskHeads, TaskHeadsConfig, TaskVolume
+from foredrive.tasks.heads.losses import TaskWeights, task_losses
+from foredrive.tasks.heads.plane import Plane, PlanePyramid, cell_middles
+from foredrive.tasks.occupancy.instance_losses import instance_loss
+from foredrive.tasks.occupancy.instances_head import (
     MARGIN_M,
     InstanceHead,
     InstanceHeadConfig,
@@ -23,14 +30,7 @@ from foredrive.models.tasks.instances import (
     instance_logits,
     instance_raster,
 )
-from foredrive.models.tasks.plane import Plane, PlanePyramid, cell_middles
-from foredrive.scene import Boxes, Category, Example, VoxelSpec
-from foredrive.scene.boxes import unlabelled
-from foredrive.scene.map_elements import InstanceRaster, PlaneSpec
-from foredrive.scene.task_truth import TaskTruth
-from foredrive.training.detection_losses import MatchingLossConfig
-from foredrive.training.instance_losses import instance_loss
-from foredrive.training.task_losses import TaskWeights, task_losses
+from foredrive.tasks.occupancy.instances_metric import InstanceMetric, drawn_boxes
 
 SPEC = VoxelSpec((-8.0, -12.0, -1.0), 1.0, (2, 24, 32))
 GRID = PlaneSpec((-50.0, -50.0), 0.5, (200, 200))

@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 from torchmetrics.detection import PanopticQuality
 
 from foredrive.errors import InputError
-from foredrive.metrics.voxels.instances import InstanceCounts, count_instances, count_rasters
-from foredrive.metrics.voxels.protocols import UNIAD_INSTANCES, InstanceProtocol
 from foredrive.scene.map_elements import InstanceRaster, PlaneSpec
+from foredrive.tasks.occupancy.instances_metric import InstanceCounts, count_instances, count_rasters
+from foredrive.tasks.occupancy.protocols import UNIAD_INSTANCES, InstanceProtocol
 
 UNIAD = UNIAD_INSTANCES
 

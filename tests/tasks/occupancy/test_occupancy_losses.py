@@ -4,7 +4,7 @@ import math
 
 import torch
 
-from foredrive.losses import occupancy_bce, occupancy_loss, scene_class_affinity
+from foredrive.tasks.occupancy.losses import occupancy_bce, occupancy_loss, scene_class_affinity
 
 
 def grid(*values: float) -> torch.Tensor:

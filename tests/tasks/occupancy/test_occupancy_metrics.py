@@ -8,13 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from foredrive.errors import InputError
-from foredrive.metrics.occupancy import (
-    OccupancyPrior,
-    above_ground,
-    count_occupancy,
-    flow_errors,
-)
 from foredrive.scene import VoxelGrid, VoxelSpec
+from foredrive.tasks.occupancy.scores import OccupancyPrior, above_ground, count_occupancy, flow_errors
 
 SPEC = VoxelSpec(lower_m=(-1.0, -1.0, -0.5), voxel_m=0.5, shape_zyx=(3, 4, 4))
 

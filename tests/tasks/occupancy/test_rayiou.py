@@ -6,23 +6,16 @@ import numpy as np
 import pytest
 
 from foredrive.errors import InputError
-from foredrive.metrics.voxels.protocols import (
+from foredrive.ops.voxel_rays import first_hits_reference
+from foredrive.sensors.ray_origins import ray_origins
+from foredrive.tasks.occupancy.protocols import (
     GRID,
     OCC3D_CLASSES,
     OPENOCC_CLASSES,
     RAY_PROTOCOLS,
     RayProtocol,
 )
-from foredrive.metrics.voxels.rays import (
-    RayCounts,
-    Seen,
-    cast_rays,
-    count_rays,
-    lidar_rays,
-    score_rays,
-)
-from foredrive.ops.voxel_rays import first_hits_reference
-from foredrive.sensors.ray_origins import ray_origins
+from foredrive.tasks.occupancy.score import RayCounts, Seen, cast_rays, count_rays, lidar_rays, score_rays
 
 OPENOCC, SERVER = (RAY_PROTOCOLS[name] for name in ("openocc", "openocc_server"))
 CAR, TRUCK, BUILDING = (OPENOCC_CLASSES.index(name) for name in ("car", "truck", "manmade"))

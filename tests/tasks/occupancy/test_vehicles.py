@@ -4,9 +4,9 @@ import math
 
 import torch
 
-from foredrive.metrics.vehicles import car_columns, count_car_columns, count_found_columns
 from foredrive.scene import Boxes, Category, VoxelGrid, VoxelSpec
 from foredrive.scene.boxes import unlabelled
+from foredrive.tasks.occupancy.vehicles_metric import car_columns, count_car_columns, count_found_columns
 
 SPEC = VoxelSpec(lower_m=(-10.0, -10.0, -1.0), voxel_m=1.0, shape_zyx=(3, 20, 20))
 """Two of the three layers have centres at -0.5 and 0.5 m; the third at 1.5 m."""

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from evaluation.voxels.folders_of_voxels import (
+from tasks.folders_of_voxels import (
     LIDAR_M,
     OCC3D_FREE,
     OPENOCC_FREE,
@@ -21,10 +21,9 @@ from evaluation.voxels.folders_of_voxels import (
 )
 
 from foredrive.errors import InputError
-from foredrive.evaluation.voxels.files import VoxelFiles, find_voxels, read_frame
-from foredrive.evaluation.voxels.poses import LIDAR_POSITION_M, read_poses
-from foredrive.evaluation.voxels.score import score_voxels
-from foredrive.metrics.voxels.protocols import OCC3D_CLASSES, OPENOCC_CLASSES
+from foredrive.tasks.occupancy.files import LIDAR_POSITION_M, VoxelFiles, find_voxels, read_frame, read_poses
+from foredrive.tasks.occupancy.protocols import OCC3D_CLASSES, OPENOCC_CLASSES
+from foredrive.tasks.occupancy.score import score_voxels
 
 ROAD, WALL = (OCC3D_CLASSES.index(name) for name in ("driveable_surface", "manmade"))
 OPEN_ROAD, OPEN_WALL, OPEN_CAR = (

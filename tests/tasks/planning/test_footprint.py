@@ -12,10 +12,16 @@ from shapely import affinity
 from shapely.geometry import Point
 from shapely.geometry import box as shapely_box
 
-from foredrive.metrics.footprint import cells_in_quads, grid_hits, path_headings, polygon_hits, rectangle
-from foredrive.metrics.protocols import PROTOCOLS, ObstacleGrid, PlanningProtocol
 from foredrive.scene import Boxes, Category
 from foredrive.scene.boxes import unlabelled
+from foredrive.tasks.planning.protocols import PROTOCOLS, ObstacleGrid, PlanningProtocol
+from foredrive.tasks.planning.scores import (
+    cells_in_quads,
+    grid_hits,
+    path_headings,
+    polygon_hits,
+    rectangle,
+)
 
 
 def some_boxes(rows: list[tuple[float, float, float, float, float]]) -> Boxes:

@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 
 from foredrive.errors import InputError
 from foredrive.geometry.se3 import exp_se3, inverse_se3, matrix_from_yaw, transform_points
-from foredrive.metrics.obstacles import boxes_at_now, future_obstacles
 from foredrive.scene import Boxes, CameraRig, Clip, LidarSweep, Trajectory
 from foredrive.scene.boxes import unlabelled
+from foredrive.tasks.planning.obstacles import boxes_at_now, future_obstacles
 
 
 def drive(t_s: list[float], T_world_ego: torch.Tensor, centre: torch.Tensor, valid: torch.Tensor) -> Clip:

@@ -9,11 +9,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from foredrive.errors import InputError
-from foredrive.metrics.obstacles import Obstacles
-from foredrive.metrics.planning import PlanScores, score_plan
-from foredrive.metrics.protocols import LIDAR_FORWARD_M, PROTOCOLS, STEP_S, STEPS
 from foredrive.scene import Boxes, Category, Trajectory
 from foredrive.scene.boxes import unlabelled
+from foredrive.tasks.planning.obstacles import Obstacles
+from foredrive.tasks.planning.protocols import LIDAR_FORWARD_M, PROTOCOLS, STEP_S, STEPS
+from foredrive.tasks.planning.scores import PlanScores, score_plan
 
 NAMES = sorted(PROTOCOLS)
 

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from foredrive.metrics.images import psnr_db, ssim
+from foredrive.tasks.rendering.image_scores import psnr_db, ssim
 
 
 def test_psnr_by_hand() -> None:

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from foredrive.metrics.lidar_rendering import chamfer_m2, score_sweep
+from foredrive.tasks.rendering.lidar_scores import chamfer_m2, score_sweep
 
 
 def test_chamfer_is_over_the_real_points() -> None:

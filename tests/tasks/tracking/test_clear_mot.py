@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from foredrive.errors import InputError
-from foredrive.metrics.tracking.clear import (
+from foredrive.tasks.tracking.clear import (
     MATCH,
     MISS,
     SWITCH,

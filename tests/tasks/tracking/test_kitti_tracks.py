@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from foredrive.errors import InputError
-from foredrive.evaluation.objects.kitti_tracks import counted_boxes, read_sequence, score_kitti_tracks
+from foredrive.tasks.tracking.kitti_tracks import counted_boxes, read_sequence, score_kitti_tracks
 
 HIGH, LOW = 40, 20
 

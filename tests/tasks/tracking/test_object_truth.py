@@ -10,11 +10,10 @@ import pytest
 from foredrive.data.boxes import read_boxes
 from foredrive.data.logs import Log
 from foredrive.errors import InputError
-from foredrive.evaluation.objects.log_truth import read_log_truth
-from foredrive.evaluation.objects.nuscenes_tables import find_tables
-from foredrive.evaluation.objects.score import read_objects, score_detections, score_tracks
-from foredrive.metrics.detection_protocols import CLASSES
 from foredrive.scene import Category
+from foredrive.tasks.detection.protocols import CLASSES
+from foredrive.tasks.tracking.nuscenes_tables import find_tables
+from foredrive.tasks.tracking.score import read_log_truth, read_objects, score_detections, score_tracks
 
 if TYPE_CHECKING:
     from foredrive.data import LogPath

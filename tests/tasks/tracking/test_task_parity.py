@@ -10,7 +10,7 @@ from oracles.make_golden import GOLDEN, REGIONS, SEEDS
 from oracles.track_sequences import make_sequence
 
 from benchmarks.common.object_drives import make_drives
-from foredrive.metrics.tracking.protocols import TRACKING_PROTOCOLS
+from foredrive.tasks.tracking.protocols import TRACKING_PROTOCOLS
 
 
 @pytest.fixture(params=SEEDS)

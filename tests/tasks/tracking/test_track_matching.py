@@ -2,11 +2,11 @@
 
 import torch
 
-from foredrive.models.detection import BoxSet
-from foredrive.models.tasks.agents import AGENT_CLASSES
 from foredrive.sets import LabelledBoxes
-from foredrive.training.detection_losses import MatchingLossConfig
-from foredrive.training.track_matching import NOBODY, held_objects, matching_beside, owners
+from foredrive.tasks.detection.agents_head import AGENT_CLASSES
+from foredrive.tasks.detection.losses import MatchingLossConfig
+from foredrive.tasks.detection.network import BoxSet
+from foredrive.tasks.tracking.matching import NOBODY, held_objects, matching_beside, owners
 
 
 def queries(x: list[float]) -> BoxSet:

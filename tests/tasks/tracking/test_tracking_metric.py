@@ -9,16 +9,15 @@ import pytest
 import torch
 from recorded_street import near_truth, read_batch, record
 
-from foredrive.evaluation.frame_keys import continues
-from foredrive.evaluation.metric import EvaluationContext, Figures
-from foredrive.evaluation.metrics.tracking import BASELINE, TrackingMetric
-from foredrive.evaluation.objects.greedy_tracks import greedy_tracks
-from foredrive.evaluation.objects.score import read_objects, score_tracks
-from foredrive.evaluation.predictor import Prediction
-from foredrive.evaluation.results_files import ResultsFiles
-from foredrive.metrics.object_rows import Frames, ObjectRows, make_rows
 from foredrive.scene import Example
 from foredrive.scene.agents import Agents
+from foredrive.tasks.evaluation.frame_keys import continues
+from foredrive.tasks.evaluation.metric import EvaluationContext, Figures
+from foredrive.tasks.evaluation.predictor import Prediction
+from foredrive.tasks.evaluation.results_files import ResultsFiles
+from foredrive.tasks.tracking.metric import BASELINE, TrackingMetric, greedy_tracks
+from foredrive.tasks.tracking.object_rows import Frames, ObjectRows, make_rows
+from foredrive.tasks.tracking.score import read_objects, score_tracks
 
 CLASSES = ("car", "pedestrian", "traffic_cone")
 

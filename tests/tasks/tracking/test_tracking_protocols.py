@@ -8,13 +8,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from foredrive.metrics.object_rows import Frames, ObjectRows, make_rows
-from foredrive.metrics.tracking.interpolation import mean_scores, whole_tracks
-from foredrive.metrics.tracking.protocols import (
+from foredrive.tasks.tracking.object_rows import Frames, ObjectRows, make_rows
+from foredrive.tasks.tracking.protocols import (
     TRACKING_PROTOCOLS,
     TrackingFigures,
     evaluate_tracking,
+    mean_scores,
     recall_thresholds,
+    whole_tracks,
 )
 
 NUSCENES = TRACKING_PROTOCOLS["nuscenes"]

@@ -5,13 +5,13 @@ import math
 
 import numpy as np
 
+from foredrive.driving.dynamics import EGO
 from foredrive.scene import Control, Event
 from foredrive.scene.conditions import BackgroundTraffic
-from foredrive.simulation.dynamics import EGO
-from foredrive.simulation.routes import DriveRoute
-from foredrive.simulation.scenarios.kinematics import BRAKING_MPS2, REACTION_S
-from foredrive.simulation.scenarios.scenario import Scenario
-from foredrive.simulation.town import TownScenario, TownSimulator, TownState
+from foredrive.towns.driving.routes import DriveRoute
+from foredrive.towns.driving.town import TownScenario, TownSimulator, TownState
+from foredrive.towns.scenarios.kinematics import BRAKING_MPS2, REACTION_S
+from foredrive.towns.scenarios.scenario import Scenario
 
 SEED = 3
 LOOK_S, LOOK_M = 0.6, 3.0

@@ -7,16 +7,16 @@ import pytest
 import torch
 
 from foredrive.data.batches import stack_records
+from foredrive.driving.observation import KeyFrame, make_clip, no_images
+from foredrive.driving.simple_agents import StraightAgent
 from foredrive.scene import Clip, Command, Trajectory
 from foredrive.scene.actors import boxes_in_ego_frame
-from foredrive.simulation.demonstrations import (
+from foredrive.towns.driving.demonstrations import (
     STEERED_SHARE,
     STEERS_RAD,
     AlternatingStudent,
     DisturbedExpert,
 )
-from foredrive.simulation.observation import KeyFrame, make_clip, no_images
-from foredrive.simulation.simple_agents import StraightAgent
 
 STEP_S, HOURS_S = 0.5, 3600.0
 

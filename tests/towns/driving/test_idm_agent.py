@@ -3,17 +3,18 @@
 import numpy as np
 import torch
 
-from foredrive.data.affordances import PathAhead, path_ahead
+from foredrive.data.truth.affordances import PathAhead, path_ahead
+from foredrive.driving.drive import drive_route
+from foredrive.driving.scores import Ending
+from foredrive.driving.speed_rule import waypoints_along
 from foredrive.geometry.polylines import arc_lengths
 from foredrive.scene import Boxes, Category
 from foredrive.scene.affordances import CELLS, TIMES, PathEstimate
 from foredrive.scene.boxes import unlabelled
 from foredrive.scene.conditions import BackgroundTraffic
 from foredrive.scene.traffic_light import LightState
-from foredrive.simulation.drive import drive_route
-from foredrive.simulation.idm_agent import IdmAgent, estimated_view, true_view, waypoints_along
-from foredrive.simulation.scores import Ending
-from foredrive.simulation.town import TownScenario, TownSimulator
+from foredrive.towns.driving.idm_agent import IdmAgent, estimated_view, true_view
+from foredrive.towns.driving.town import TownScenario, TownSimulator
 from foredrive.towns.map.town_map import load_town_map
 from foredrive.towns.traffic.traffic import Traffic
 

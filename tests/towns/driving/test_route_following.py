@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 import torch
 
+from foredrive.driving.controller import ControllerState, follow
+from foredrive.driving.dynamics import STEP_S, step
+from foredrive.driving.plans import fixed_in_world
+from foredrive.driving.route_sets import load_route_set
 from foredrive.scene import BicycleState, Trajectory
-from foredrive.simulation.controller import ControllerState, follow
-from foredrive.simulation.dynamics import STEP_S, step
-from foredrive.simulation.plans import fixed_in_world
-from foredrive.simulation.route_sets import load_route_set
-from foredrive.simulation.routes import DriveRoute, snap_route
+from foredrive.towns.driving.routes import DriveRoute, snap_route
 
 SPEED_MPS, LATENCY_S, DT_S = 4.5, 0.15, 0.5
 

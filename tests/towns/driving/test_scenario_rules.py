@@ -5,15 +5,15 @@ import dataclasses
 import numpy as np
 import pytest
 
+from foredrive.driving.time_to_collision import MovingBoxes
 from foredrive.scene import Category
 from foredrive.scene.traffic_light import LightState
-from foredrive.simulation.scenarios.context import ScenarioContext, ScenarioEgo, ScenarioProgress
-from foredrive.simulation.scenarios.crossing_actors import pace_among
-from foredrive.simulation.scenarios.kinematics import arrival_s, cruise_mps, stopping_m
-from foredrive.simulation.scenarios.scenario import MEETINGS, Scenario, ScenarioKind, Way
-from foredrive.simulation.scenarios.vehicle_orders import give_orders
-from foredrive.simulation.time_to_collision import MovingBoxes
 from foredrive.towns.map.town_map import load_town_map
+from foredrive.towns.scenarios.context import ScenarioContext, ScenarioEgo, ScenarioProgress
+from foredrive.towns.scenarios.director import pace_among
+from foredrive.towns.scenarios.kinematics import arrival_s, cruise_mps, stopping_m
+from foredrive.towns.scenarios.scenario import MEETINGS, Scenario, ScenarioKind, Way
+from foredrive.towns.scenarios.vehicle_orders import give_orders
 from foredrive.towns.traffic.external_ego import EgoPose
 from foredrive.towns.traffic.fleet import ego_vehicle
 from foredrive.towns.traffic.orders import Orders

@@ -7,15 +7,15 @@ import numpy as np
 import pytest
 from driver import SEED, Driver, drive, town_scenario
 
-from foredrive.simulation.drive import drive_route
-from foredrive.simulation.route_sets import RouteWaypoints, load_route_set
-from foredrive.simulation.routes import DriveRoute, snap_route
-from foredrive.simulation.scenarios.kinematics import REACTION_S
-from foredrive.simulation.scenarios.places import possible_scenarios, scenarios_on
-from foredrive.simulation.scenarios.scenario import Scenario, ScenarioKind
-from foredrive.simulation.town import TownSimulator, grow
-from foredrive.simulation.town_expert import TownExpert
+from foredrive.driving.drive import drive_route
+from foredrive.driving.route_sets import RouteWaypoints, load_route_set
+from foredrive.towns.driving.routes import DriveRoute, snap_route
+from foredrive.towns.driving.town import TownSimulator, grow
+from foredrive.towns.driving.town_expert import TownExpert
 from foredrive.towns.map.town_map import load_town_map
+from foredrive.towns.scenarios.kinematics import REACTION_S
+from foredrive.towns.scenarios.places import possible_scenarios, scenarios_on
+from foredrive.towns.scenarios.scenario import Scenario, ScenarioKind
 from foredrive.towns.traffic.lane_graph import TURN_RAD, build_lane_graph
 
 STRAIGHT_ON = (ScenarioKind.CROSSING_PEDESTRIAN, ScenarioKind.CROSSING_CYCLIST, ScenarioKind.LEAD_BRAKES)

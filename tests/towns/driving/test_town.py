@@ -8,18 +8,17 @@ import numpy as np
 import pytest
 import torch
 
+from foredrive.driving.collisions import Contacts, RoadUsers
+from foredrive.driving.controller import ControllerState, follow
+from foredrive.driving.dynamics import STEP_S
+from foredrive.driving.plans import fixed_in_world
 from foredrive.errors import InputError
 from foredrive.scene import Category, Clip, Command, Control, Event, Trajectory
 from foredrive.scene.conditions import BackgroundTraffic
 from foredrive.sensors.rigs import camera_rig
 from foredrive.sensors.vehicle import roof_lidar
-from foredrive.simulation import town
-from foredrive.simulation.collisions import Contacts
-from foredrive.simulation.controller import ControllerState, follow
-from foredrive.simulation.dynamics import STEP_S
-from foredrive.simulation.plans import fixed_in_world
-from foredrive.simulation.road_users import RoadUsers
-from foredrive.simulation.town import TownScenario, TownSimulator
+from foredrive.towns.driving import town
+from foredrive.towns.driving.town import TownScenario, TownSimulator
 from foredrive.towns.map.town_map import TownMap, load_town_map
 from foredrive.towns.sensing.capture import SensorSuite
 from foredrive.towns.traffic.traffic import Traffic

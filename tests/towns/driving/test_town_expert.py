@@ -6,13 +6,13 @@ import math
 import numpy as np
 import pytest
 
+from foredrive.driving.collisions import RoadUsers
+from foredrive.driving.dynamics import EGO
 from foredrive.scene import Category
 from foredrive.scene.conditions import BackgroundTraffic
 from foredrive.scene.traffic_light import LightState
-from foredrive.simulation.dynamics import EGO
-from foredrive.simulation.road_users import RoadUsers
-from foredrive.simulation.town import TownScenario, TownSimulator
-from foredrive.simulation.town_expert import TownExpert, _is_free, _is_too_late, _rejoined
+from foredrive.towns.driving.town import TownScenario, TownSimulator
+from foredrive.towns.driving.town_expert import TownExpert, _is_free, _is_too_late, _rejoined
 from foredrive.towns.map.town_map import load_town_map
 from foredrive.towns.traffic.external_ego import EgoPose
 from foredrive.towns.traffic.fleet import ego_vehicle

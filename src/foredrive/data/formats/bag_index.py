@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 from jaxtyping import Int64
 
-from foredrive.data.raw.bag_files import Bag, Message
-from foredrive.data.raw.bag_messages import Calibration, Placed, read_calibration, read_placed, stamp_us
-from foredrive.data.raw.bag_topics import BagTopics
-from foredrive.data.raw.frame_tree import FrameTree
-from foredrive.data.raw.guard import PartReader
+from foredrive.data.formats.bag_files import Bag, Message
+from foredrive.data.formats.bag_messages import Calibration, Placed, read_calibration, read_placed, stamp_us
+from foredrive.data.formats.bag_topics import BagTopics
+from foredrive.data.formats.frame_tree import FrameTree
+from foredrive.data.formats.guard import PartReader
 
 
 @dataclass

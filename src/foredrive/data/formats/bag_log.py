@@ -12,12 +12,9 @@ from py123d.datatypes import LogMetadata
 from scipy.spatial.transform import Rotation
 
 from foredrive.data.camera_streams import CameraSpec
-from foredrive.data.log_paths import LogPath
-from foredrive.data.notices import note
-from foredrive.data.own_logs import Points, write_log
-from foredrive.data.raw.bag_files import Bag, Message, open_bag
-from foredrive.data.raw.bag_index import BagIndex, index_bag, transforms
-from foredrive.data.raw.bag_messages import (
+from foredrive.data.formats.bag_files import Bag, Message, open_bag
+from foredrive.data.formats.bag_index import BagIndex, index_bag, transforms
+from foredrive.data.formats.bag_messages import (
     Calibration,
     frame_of,
     read_cloud,
@@ -27,7 +24,7 @@ from foredrive.data.raw.bag_messages import (
     stamp_us,
     time_unit,
 )
-from foredrive.data.raw.bag_topics import (
+from foredrive.data.formats.bag_topics import (
     DEFAULT_PERIOD_S,
     BagTopics,
     CameraTopics,
@@ -35,10 +32,13 @@ from foredrive.data.raw.bag_topics import (
     read_topics,
     topics_file,
 )
-from foredrive.data.raw.frame_tree import FrameTree
-from foredrive.data.raw.guard import PartSequence
-from foredrive.data.raw.images import check_size
-from foredrive.data.raw.raw_log import RawLog
+from foredrive.data.formats.frame_tree import FrameTree
+from foredrive.data.formats.guard import PartSequence
+from foredrive.data.formats.raw_log import RawLog
+from foredrive.data.images import check_size
+from foredrive.data.log_paths import LogPath
+from foredrive.data.notices import note
+from foredrive.data.own_logs import Points, write_log
 from foredrive.errors import InputError
 
 

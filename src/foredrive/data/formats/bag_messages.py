@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float64, Shaped, UInt8
 from scipy.spatial.transform import Rotation
 
-from foredrive.data.raw.images import decoded, grey_to_rgb
+from foredrive.data.images import decoded, grey_to_rgb
 from foredrive.errors import InputError
 
 _NUMPY_OF_ROS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}

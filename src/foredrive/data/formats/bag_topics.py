@@ -19,9 +19,8 @@ from pydantic import (
     model_validator,
 )
 
-from foredrive.data.notices import collecting
-from foredrive.data.raw.bag_files import Bag, Topic, open_bag
-from foredrive.data.raw.bag_messages import (
+from foredrive.data.formats.bag_files import Bag, Topic, open_bag
+from foredrive.data.formats.bag_messages import (
     Placed,
     frame_of,
     read_calibration,
@@ -31,7 +30,8 @@ from foredrive.data.raw.bag_messages import (
     stamp_us,
     time_unit,
 )
-from foredrive.data.raw.frame_tree import FrameTree
+from foredrive.data.formats.frame_tree import FrameTree
+from foredrive.data.notices import collecting
 from foredrive.errors import InputError
 from foredrive.files import atomic_path
 from foredrive.plain_yaml import read_yaml

@@ -10,12 +10,12 @@ from py123d.api.scene.arrow.utils.log_writer_config import LogWriterConfig
 from py123d.datatypes import LogMetadata
 from py123d.parser.base_dataset_parser import BaseLogParser, BaseMapParser, ModalitiesSync
 
+from foredrive.data.formats.bag_log import find_bags
+from foredrive.data.formats.datasets import DATASETS
+from foredrive.data.formats.guard import SensorFiles, check_finite, check_inside, check_names, reading_raw
+from foredrive.data.formats.raw_log import OwnLog, RawLog
 from foredrive.data.log_paths import LogPath
 from foredrive.data.notices import collecting, write_notices
-from foredrive.data.raw.bag_log import find_bags
-from foredrive.data.raw.datasets import DATASETS
-from foredrive.data.raw.guard import SensorFiles, check_finite, check_inside, check_names, reading_raw
-from foredrive.data.raw.raw_log import OwnLog, RawLog
 from foredrive.errors import InputError
 from foredrive.files import atomic_path
 

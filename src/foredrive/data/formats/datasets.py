@@ -7,15 +7,15 @@ from pathlib import Path
 from py123d.parser.av2.av2_map_parser import Av2MapParser
 
 from foredrive.data.av2_sensor import Av2SensorParser
-from foredrive.data.kitti_object import KittiObjectParser
-from foredrive.data.kitti_raw import KittiRawParser
-from foredrive.data.nuscenes_keyframe import NuScenesKeyframeParser
-from foredrive.data.pandaset import PandasetParser
-from foredrive.data.raw import py123d_datasets
-from foredrive.data.raw.bag_log import find_bags
-from foredrive.data.raw.images import is_image
-from foredrive.data.raw.nerfstudio import find_nerfstudio
-from foredrive.data.raw.raw_log import RawLog, folders_with
+from foredrive.data.formats import py123d_datasets
+from foredrive.data.formats.bag_log import find_bags
+from foredrive.data.formats.kitti_object import KittiObjectParser
+from foredrive.data.formats.kitti_raw import KittiRawParser
+from foredrive.data.formats.nerfstudio import find_nerfstudio
+from foredrive.data.formats.nuscenes_keyframe import NuScenesKeyframeParser
+from foredrive.data.formats.pandaset import PandasetParser
+from foredrive.data.formats.raw_log import RawLog, folders_with
+from foredrive.data.images import is_image
 
 
 @dataclass(frozen=True)

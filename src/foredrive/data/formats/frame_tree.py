@@ -6,8 +6,8 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from foredrive.data.ego_path import interpolated_poses
+from foredrive.data.formats.bag_messages import Placed
 from foredrive.data.notices import note
-from foredrive.data.raw.bag_messages import Placed
 from foredrive.errors import InputError
 
 

@@ -18,9 +18,9 @@ from py123d.datatypes.sensors.lidar import LidarMergedMetadata
 from py123d.parser.base_dataset_parser import ParsedCamera, ParsedLidar, ParsedRadar
 
 from foredrive.data.arrow_files import REFUSES_WRITING
+from foredrive.data.formats.point_files import NUSCENES, read_points
+from foredrive.data.images import read_rgb
 from foredrive.data.notices import note
-from foredrive.data.raw.images import read_rgb
-from foredrive.data.raw.point_files import NUSCENES, read_points
 from foredrive.errors import InputError
 
 T = TypeVar("T")

@@ -36,12 +36,12 @@ from py123d.parser.kitti360.utils.kitti360_constants import KITTI360_EGO_STATE_S
 from py123d.parser.registry import NuScenesBoxDetectionLabel
 
 from foredrive.data.category_names import category_or_other
+from foredrive.data.formats.guard import PartReader
+from foredrive.data.formats.point_files import KITTI, IntensityScale, read_points
+from foredrive.data.images import is_image, read_rgb
 from foredrive.data.logs import imu_from_ego
 from foredrive.data.modalities import attributes_modality
 from foredrive.data.notices import note
-from foredrive.data.raw.guard import PartReader
-from foredrive.data.raw.images import is_image, read_rgb
-from foredrive.data.raw.point_files import KITTI, IntensityScale, read_points
 from foredrive.data.written_boxes import LABEL_OF_CATEGORY
 from foredrive.errors import InputError
 from foredrive.scene import Attribute

@@ -36,10 +36,10 @@ from py123d.parser.base_dataset_parser import BaseLogParser, ModalitiesSync
 from py123d.parser.kitti360.utils.kitti360_constants import KITTI360_EGO_STATE_SE3_METADATA
 from scipy.spatial.transform import Rotation, Slerp
 
+from foredrive.data.formats.guard import PartReader
+from foredrive.data.formats.point_files import KITTI, IntensityScale, read_points
+from foredrive.data.images import is_image, read_rgb
 from foredrive.data.notices import note
-from foredrive.data.raw.guard import PartReader
-from foredrive.data.raw.images import is_image, read_rgb
-from foredrive.data.raw.point_files import KITTI, IntensityScale, read_points
 from foredrive.errors import InputError
 
 _CAMERAS = {"image_02": ("02", CameraID.PCAM_STEREO_L), "image_03": ("03", CameraID.PCAM_STEREO_R)}

@@ -21,13 +21,13 @@ from py123d.datatypes import LogMetadata
 
 from foredrive.data.camera_streams import CameraSpec
 from foredrive.data.ego_path import interpolated_poses
+from foredrive.data.formats.camera_split import PosedImage, RigCamera, split_into_cameras
+from foredrive.data.formats.guard import PartReader, PartSequence
+from foredrive.data.formats.raw_log import RawLog, folders_with
+from foredrive.data.images import check_size, decoded, read_rgb
 from foredrive.data.log_paths import LogPath
 from foredrive.data.notices import note
 from foredrive.data.own_logs import write_log
-from foredrive.data.raw.camera_split import PosedImage, RigCamera, split_into_cameras
-from foredrive.data.raw.guard import PartReader, PartSequence
-from foredrive.data.raw.images import check_size, decoded, read_rgb
-from foredrive.data.raw.raw_log import RawLog, folders_with
 from foredrive.errors import InputError
 
 HEIGHT_M = 1.5

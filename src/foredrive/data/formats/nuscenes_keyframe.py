@@ -38,13 +38,13 @@ from py123d.parser.nuscenes.utils.nuscenes_constants import (
 )
 from scipy.spatial import KDTree
 
-from foredrive.data.modalities import attributes_modality, visibility_modality
-from foredrive.data.nuscenes_tables import (
+from foredrive.data.formats.nuscenes_tables import (
     attribute_of_row,
     matrix_of_row,
     pose_of_matrix,
     visible_share,
 )
+from foredrive.data.modalities import attributes_modality, visibility_modality
 from foredrive.data.safe_pickle import load_pickle
 from foredrive.data.written_boxes import LABEL_OF_CATEGORY
 from foredrive.scene import Category

@@ -39,10 +39,10 @@ from py123d.parser.nuscenes.utils.nuscenes_constants import (
 
 from foredrive.data.camera_streams import CameraSpec, camera_ids
 from foredrive.data.category_names import category_or_other
+from foredrive.data.formats.guard import reading_raw
+from foredrive.data.formats.nuscenes_names import camera_of_channel
 from foredrive.data.modalities import attributes_modality, visibility_modality
 from foredrive.data.notices import note
-from foredrive.data.nuscenes_names import camera_of_channel
-from foredrive.data.raw.guard import reading_raw
 from foredrive.data.written_boxes import LABEL_OF_CATEGORY
 from foredrive.scene import Attribute
 from foredrive.scene.boxes import UNKNOWN

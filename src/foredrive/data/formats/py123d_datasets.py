@@ -16,8 +16,8 @@ from py123d.datatypes import BoxDetectionSE3, BoxDetectionsSE3, EgoStateSE3, Log
 from py123d.datatypes.modalities.base_modality import BaseModality
 from py123d.parser.base_dataset_parser import BaseDatasetParser, BaseLogParser, ModalitiesSync
 
-from foredrive.data.nuscenes_tables import NuScenesTablesParser, nuscenes_tables
-from foredrive.data.raw.raw_log import RawLog, folders_with
+from foredrive.data.formats.nuscenes_tables import NuScenesTablesParser, nuscenes_tables
+from foredrive.data.formats.raw_log import RawLog, folders_with
 from foredrive.data.safe_pickle import PlainPickle, load_records
 from foredrive.errors import InputError
 

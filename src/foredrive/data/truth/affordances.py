@@ -13,12 +13,12 @@ from jaxtyping import Bool, Float, Float64, Int64
 from py123d.datatypes import Lane, MapLayer, TrafficLightStatus
 from torch import Tensor
 
-from foredrive.data.agent_futures import annotated_at, read_futures
 from foredrive.data.arrow_files import reading
 from foredrive.data.boxes import read_boxes, read_tracks
 from foredrive.data.commands import route_at
 from foredrive.data.logs import Log
 from foredrive.data.recorded import read_signal_lamps, read_traffic_lights, read_visibility
+from foredrive.data.truth.agent_futures import annotated_at, read_futures
 from foredrive.geometry.path_frame import along_path, path_headings
 from foredrive.geometry.path_occupancy import cells_covered
 from foredrive.geometry.polylines import arc_lengths, points_at
@@ -40,7 +40,7 @@ POINTS = 72
 """Points of the path, a metre apart."""
 PASSED_M = 4.4
 """A light counts until the front bumper is this far beyond its line: until then the point whose crossing is
-judged, near the rear axle, has not crossed it (`simulation.lane_rules`)."""
+judged, near the rear axle, has not crossed it (`driving.lane_rules`)."""
 BESIDE_M = 1.75
 ALIGNED_COS = 0.5
 LEVEL_M = 2.5

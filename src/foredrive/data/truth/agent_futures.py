@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float64, Int64
 
 from foredrive.data.boxes import Tracks, box_row, read_boxes, read_tracks
 from foredrive.data.logs import Log
-from foredrive.data.raster import fill_polygon
+from foredrive.data.truth.raster import fill_polygon
 from foredrive.scene.agent_futures import AgentFutures
 from foredrive.scene.boxes import VEHICLES
 from foredrive.scene.map_elements import InstanceRaster, PlaneSpec

@@ -12,7 +12,7 @@ from shapely import LinearRing, LineString, Polygon
 
 from foredrive.data.arrow_files import reading
 from foredrive.data.logs import Log
-from foredrive.data.map_lines import (
+from foredrive.data.truth.map_lines import (
     Line,
     clipped,
     coordinates,
@@ -22,7 +22,7 @@ from foredrive.data.map_lines import (
     united,
     without_near,
 )
-from foredrive.data.raster import draw_lines, fill_polygon
+from foredrive.data.truth.raster import draw_lines, fill_polygon
 from foredrive.scene.map_elements import ElementKind, MapElements, MapRaster, PlaneSpec, RasterLayer
 
 REACH_M = 110.0

@@ -15,14 +15,14 @@ from py123d.common.utils.msgpack_utils import msgpack_decode_with_numpy, msgpack
 from py123d.datatypes import PinholeCameraMetadata
 from torch import Tensor
 
-from foredrive.data.affordances import read_affordances
-from foredrive.data.agent_futures import read_futures, read_instances
 from foredrive.data.logs import Log
-from foredrive.data.map_elements import read_map_elements, read_map_raster
 from foredrive.data.maps import map_file
 from foredrive.data.modalities import expand_array, squeeze_array
-from foredrive.data.ray_truth import read_rays
-from foredrive.data.semantic_labels import read_semantics
+from foredrive.data.truth.affordances import read_affordances
+from foredrive.data.truth.agent_futures import read_futures, read_instances
+from foredrive.data.truth.map_elements import read_map_elements, read_map_raster
+from foredrive.data.truth.rays import read_rays
+from foredrive.data.truth.semantic_labels import read_semantics
 from foredrive.files import atomic_path
 from foredrive.scene import VoxelSpec
 from foredrive.scene.map_elements import InstanceRaster, MapElements, MapRaster, PlaneSpec

@@ -9,7 +9,7 @@ from foredrive.data.cameras import pinhole_cameras
 from foredrive.data.logs import Log
 from foredrive.data.maps import map_file
 from foredrive.data.modalities import BOX_ATTRIBUTE, BOX_VISIBILITY, FULL_OCCUPANCY
-from foredrive.data.semantic_labels import NEVER_IN_TOWNS
+from foredrive.data.truth.semantic_labels import NEVER_IN_TOWNS
 from foredrive.scene.boxes import UNKNOWN, VEHICLES
 
 MOTION_S = 6.0

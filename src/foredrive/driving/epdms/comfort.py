@@ -7,8 +7,8 @@ lateral part at all, so that nuPlan's bound of it holds always; we keep that.
 import numpy as np
 from jaxtyping import Float64
 
+from foredrive.driving.epdms.world import STEP_S, EgoBody, EgoMotion
 from foredrive.errors import InputError
-from foredrive.metrics.epdms.world import STEP_S, EgoBody, EgoMotion
 
 MIN_ALONG_MPS2, MAX_ALONG_MPS2 = -4.05, 2.40
 MAX_JERK_MPS3, MAX_ALONG_JERK_MPS3 = 8.37, 4.13

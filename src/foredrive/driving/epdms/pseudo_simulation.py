@@ -21,24 +21,24 @@ import torch
 from jaxtyping import Float64
 
 from foredrive.data.batches import stack_records
+from foredrive.driving.dynamics import EGO, yaw_rate_radps
+from foredrive.driving.epdms.comfort import extended_comfort
+from foredrive.driving.epdms.score import DriverScores, score_plan, two_stage_score
+from foredrive.driving.epdms.subscores import progress_m
+from foredrive.driving.epdms.world import STEP_S, EgoBody, EgoMotion, Roads, Surroundings
+from foredrive.driving.ncap.nuplan_lqr import LqrPlan, lqr_step
+from foredrive.driving.ncap.running import Place
+from foredrive.driving.observation import FRAME_DT_S
+from foredrive.driving.plans import waypoints_of
+from foredrive.driving.replay.logged_drive import LoggedDrive
+from foredrive.driving.replay.rebuilt import RebuiltScenario, RebuiltSimulator
+from foredrive.driving.replay.replay_expert import ReplayExpert
+from foredrive.driving.replay.replayed import users_at
+from foredrive.driving.simple_agents import ReplayAgent
 from foredrive.errors import InputError
 from foredrive.geometry.se3 import matrix_from_yaw
-from foredrive.metrics.epdms.comfort import extended_comfort
-from foredrive.metrics.epdms.score import DriverScores, score_plan, two_stage_score
-from foredrive.metrics.epdms.subscores import progress_m
-from foredrive.metrics.epdms.world import STEP_S, EgoBody, EgoMotion, Roads, Surroundings
 from foredrive.scene import Agent, BicycleState, Category, Trajectory
 from foredrive.scene.boxes import VEHICLES
-from foredrive.simulation.dynamics import EGO, yaw_rate_radps
-from foredrive.simulation.logged_drive import LoggedDrive
-from foredrive.simulation.ncap.nuplan_lqr import LqrPlan, lqr_step
-from foredrive.simulation.ncap.running import Place
-from foredrive.simulation.observation import FRAME_DT_S
-from foredrive.simulation.plans import waypoints_of
-from foredrive.simulation.rebuilt import RebuiltScenario, RebuiltSimulator
-from foredrive.simulation.replay_expert import ReplayExpert
-from foredrive.simulation.replayed import users_at
-from foredrive.simulation.simple_agents import ReplayAgent
 
 HORIZON_S, PAST_S = 3.0, 1.5
 """Time for which a plan is simulated, and time before it that comfort looks at, s."""

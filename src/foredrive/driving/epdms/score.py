@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64
 
+from foredrive.driving.epdms import comfort, subscores
+from foredrive.driving.epdms.world import EgoBody, EgoMotion, Roads, Surroundings
 from foredrive.errors import InputError
-from foredrive.metrics.epdms import comfort, subscores
-from foredrive.metrics.epdms.world import EgoBody, EgoMotion, Roads, Surroundings
 
 MULTIPLIERS = ("nc", "dac", "ddc", "tlc")
 WEIGHTS = {"ep": 5.0, "ttc": 5.0, "lk": 2.0, "hc": 2.0, "ec": 2.0}

@@ -8,7 +8,7 @@ import numpy as np
 import shapely
 from jaxtyping import Bool, Float64
 
-from foredrive.metrics.epdms.world import STEP_S, EgoBody, EgoMotion, Roads, Surroundings
+from foredrive.driving.epdms.world import STEP_S, EgoBody, EgoMotion, Roads, Surroundings
 
 STOPPED_EGO_MPS, STOPPED_TRACK_MPS, TTC_STOPPED_MPS = 0.05, 0.05, 0.005
 TTC_STEPS = (0, 3, 6, 9)

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from foredrive.simulation.ncap.outcome import Outcome, SafetyResult
-from foredrive.simulation.threats import Threat
+from foredrive.driving.ncap.outcome import Outcome, SafetyResult
+from foredrive.driving.replay.threats import Threat
 
 RESAMPLES, LEVEL = 2000, 0.95
 

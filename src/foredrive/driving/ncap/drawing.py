@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from foredrive.simulation.ncap.scenario import Jitter, Polyline, SafetyScenario, ScenarioActor
+from foredrive.driving.ncap.scenario import Jitter, Polyline, SafetyScenario, ScenarioActor
 
 
 @dataclass(frozen=True)

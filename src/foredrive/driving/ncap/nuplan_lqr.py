@@ -15,8 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64
 
+from foredrive.driving.dynamics import Vehicle
 from foredrive.scene import BicycleState
-from foredrive.simulation.dynamics import Vehicle
 
 STEP_S = 0.1
 """Time between two commands, step of the bicycle and of the fits, s."""

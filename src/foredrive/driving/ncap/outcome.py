@@ -9,11 +9,11 @@ import enum
 import math
 from dataclasses import dataclass
 
+from foredrive.driving.drive import Drive
+from foredrive.driving.replay.threats import Threat
+from foredrive.driving.scores import Ending
 from foredrive.errors import InputError
 from foredrive.scene import Event
-from foredrive.simulation.drive import Drive
-from foredrive.simulation.scores import Ending
-from foredrive.simulation.threats import Threat
 
 BEST, AFTER_COLLISION = 5.0, 4.0
 LEFT_WAY_SCORE = 0.0

@@ -9,14 +9,14 @@ from jaxtyping import Float64
 from scipy.interpolate import interp1d
 from torch import Tensor
 
+from foredrive.driving.ncap.drawing import DrawnActor, DrawnRun
+from foredrive.driving.ncap.scenario import Polyline
+from foredrive.driving.observation import FRAME_DT_S
 from foredrive.errors import InputError
 from foredrive.geometry.se3 import inverse_se3
-from foredrive.rendering.edits import Duplicate, Remove, apply_edits, unused_id
-from foredrive.rendering.scene_graph import SceneGraph
-from foredrive.rendering.tracks import MOVES_M, move_at_least
-from foredrive.simulation.ncap.drawing import DrawnActor, DrawnRun
-from foredrive.simulation.ncap.scenario import Polyline
-from foredrive.simulation.observation import FRAME_DT_S
+from foredrive.methods.rebuilding.edits import Duplicate, Remove, apply_edits, unused_id
+from foredrive.methods.rebuilding.scene_graph import SceneGraph
+from foredrive.methods.rebuilding.tracks import MOVES_M, move_at_least
 
 STANDS_M = 1e-3
 """An actor that moves less than this in `FRAME_DT_S`, m, stands."""

@@ -22,18 +22,18 @@ import shapely
 import torch
 from jaxtyping import Float64
 
+from foredrive.driving.dynamics import EGO
+from foredrive.driving.ncap.placing import way_points
+from foredrive.driving.ncap.running import Place
+from foredrive.driving.ncap.scenario import Jitter, Polyline, Rectilinear, SafetyScenario, ScenarioActor
+from foredrive.driving.observation import FRAME_DT_S
+from foredrive.driving.replay.logged_drive import LoggedDrive
+from foredrive.driving.replay.replayed import users_at
+from foredrive.driving.replay.threats import Threat
 from foredrive.errors import InputError
 from foredrive.geometry.polylines import arc_lengths, points_at
-from foredrive.rendering.tracks import states_at
+from foredrive.methods.rebuilding.tracks import states_at
 from foredrive.scene import Category
-from foredrive.simulation.dynamics import EGO
-from foredrive.simulation.logged_drive import LoggedDrive
-from foredrive.simulation.ncap.placing import way_points
-from foredrive.simulation.ncap.running import Place
-from foredrive.simulation.ncap.scenario import Jitter, Polyline, Rectilinear, SafetyScenario, ScenarioActor
-from foredrive.simulation.observation import FRAME_DT_S
-from foredrive.simulation.replayed import users_at
-from foredrive.simulation.threats import Threat
 
 PRIMING_FRAMES, EVERY_FRAMES = 2, 2
 """Priming of each test, and distance between two starts that are tried, key frames."""

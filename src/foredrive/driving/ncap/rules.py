@@ -11,12 +11,12 @@ import math
 from dataclasses import dataclass
 from typing import Literal
 
+from foredrive.driving.collisions import EgoContact
+from foredrive.driving.dynamics import EGO, Vehicle
+from foredrive.driving.ncap.outcome import BEST, LEFT_WAY_SCORE
 from foredrive.errors import InputError
 from foredrive.scene import Category
 from foredrive.scene.boxes import VEHICLES
-from foredrive.simulation.collisions import EgoContact
-from foredrive.simulation.dynamics import EGO, Vehicle
-from foredrive.simulation.ncap.outcome import BEST, LEFT_WAY_SCORE
 
 PACIFICA = Vehicle(
     wheelbase_m=3.089,
@@ -58,8 +58,8 @@ class Rules:
     vehicle: Vehicle
     """Motion, limits, and the box that collides."""
     controller: Literal["lqr", "own"]
-    """lqr: nuPlan's LQR tracker and kinematic bicycle (`nuplan_lqr`). own: `simulation.controller`, which
-    smooths the plan, and `simulation.dynamics`, whose actuators lag."""
+    """lqr: nuPlan's LQR tracker and kinematic bicycle (`nuplan_lqr`). own: `driving.controller`, which
+    smooths the plan, and `driving.dynamics`, whose actuators lag."""
     step_s: float
     """Time between two commands of the controller, s."""
     pose_feedback: bool

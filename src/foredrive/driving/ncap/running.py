@@ -7,24 +7,24 @@ import numpy as np
 import shapely
 import torch
 
+from foredrive.driving.drive import FollowingPilot, Pilot, drive_route
+from foredrive.driving.dynamics import STEP_S
+from foredrive.driving.ncap.drawing import DrawnRun, draw_run
+from foredrive.driving.ncap.nuplan_lqr import LqrPlan, lqr_step
+from foredrive.driving.ncap.outcome import first_collision
+from foredrive.driving.ncap.placing import place_actors, way_velocity
+from foredrive.driving.ncap.rules import Reference, Rules
+from foredrive.driving.ncap.scenario import SafetyScenario
+from foredrive.driving.observation import FRAME_DT_S, HORIZON_STEPS
+from foredrive.driving.plans import waypoints_of
+from foredrive.driving.replay.logged_drive import LoggedDrive
+from foredrive.driving.replay.logged_lanes import LoggedLanes
+from foredrive.driving.replay.rebuilt import RebuiltScenario, RebuiltSimulator
+from foredrive.driving.simple_agents import plan_of
 from foredrive.errors import InputError
-from foredrive.rendering.scene_graph import SceneGraph
-from foredrive.rendering.vehicle import LoggedVehicle
+from foredrive.methods.rebuilding.scene_graph import SceneGraph
+from foredrive.methods.rebuilding.vehicle import LoggedVehicle
 from foredrive.scene import BicycleState, Clip, Renderer, Step, Trajectory
-from foredrive.simulation.drive import FollowingPilot, Pilot, drive_route
-from foredrive.simulation.dynamics import STEP_S
-from foredrive.simulation.logged_drive import LoggedDrive
-from foredrive.simulation.logged_lanes import LoggedLanes
-from foredrive.simulation.ncap.drawing import DrawnRun, draw_run
-from foredrive.simulation.ncap.nuplan_lqr import LqrPlan, lqr_step
-from foredrive.simulation.ncap.outcome import first_collision
-from foredrive.simulation.ncap.placing import place_actors, way_velocity
-from foredrive.simulation.ncap.rules import Reference, Rules
-from foredrive.simulation.ncap.scenario import SafetyScenario
-from foredrive.simulation.observation import FRAME_DT_S, HORIZON_STEPS
-from foredrive.simulation.plans import waypoints_of
-from foredrive.simulation.rebuilt import RebuiltScenario, RebuiltSimulator
-from foredrive.simulation.simple_agents import plan_of
 
 REFERENCE_S = 4.0
 """Time after the first key frame at which the paper takes the speeds, s."""

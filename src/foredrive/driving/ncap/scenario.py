@@ -8,9 +8,9 @@ import math
 from dataclasses import dataclass, field
 from typing import Literal
 
+from foredrive.driving.observation import FRAME_DT_S
+from foredrive.driving.replay.threats import Threat
 from foredrive.errors import InputError
-from foredrive.simulation.observation import FRAME_DT_S
-from foredrive.simulation.threats import Threat
 
 Point = tuple[float, float, float]
 """x, y, z, m, world frame."""

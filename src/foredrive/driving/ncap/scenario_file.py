@@ -13,12 +13,12 @@ from typing import Any
 import yaml
 from pydantic import TypeAdapter, ValidationError
 
+from foredrive.driving.ncap.scenario import Jitter, Point, Polyline, SafetyScenario, ScenarioActor
+from foredrive.driving.observation import FRAME_DT_S
+from foredrive.driving.replay.threats import Threat
 from foredrive.errors import InputError
 from foredrive.files import atomic_path
 from foredrive.plain_yaml import read_yaml
-from foredrive.simulation.ncap.scenario import Jitter, Point, Polyline, SafetyScenario, ScenarioActor
-from foredrive.simulation.observation import FRAME_DT_S
-from foredrive.simulation.threats import Threat
 
 UNREAD = ("start_pose", "start_velo", "smooth_actors", "actor_framerate")
 """Settings of neuro-ncap's files that its code does not read, or that have one value in all of its files."""

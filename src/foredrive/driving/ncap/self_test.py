@@ -9,12 +9,12 @@ from dataclasses import dataclass
 
 import torch
 
+from foredrive.driving.ncap.drawing import draw_run
+from foredrive.driving.ncap.rules import Rules
+from foredrive.driving.ncap.running import Place, drive_without_action, reference_mps
+from foredrive.driving.ncap.scenario import SafetyScenario
+from foredrive.driving.replay.logged_drive import LoggedDrive
 from foredrive.errors import InputError
-from foredrive.simulation.logged_drive import LoggedDrive
-from foredrive.simulation.ncap.drawing import draw_run
-from foredrive.simulation.ncap.rules import Rules
-from foredrive.simulation.ncap.running import Place, drive_without_action, reference_mps
-from foredrive.simulation.ncap.scenario import SafetyScenario
 
 MIN_REFERENCE_MPS = 0.1
 """Smallest reference speed by which an impact can be judged, m/s."""

@@ -8,10 +8,10 @@ import shapely
 from jaxtyping import Float, Float64
 from torch import Tensor
 
+from foredrive.driving.dynamics import EGO
 from foredrive.errors import InputError
-from foredrive.rendering.vehicle import LoggedVehicle
+from foredrive.methods.rebuilding.vehicle import LoggedVehicle
 from foredrive.scene import BicycleState
-from foredrive.simulation.dynamics import EGO
 
 SPEED_OVER_S = 0.2
 """Speeds are averaged from this long before to this long after a time, s, because logged poses are noisy."""

@@ -6,7 +6,7 @@ import numpy as np
 import shapely
 from jaxtyping import Float64
 
-from foredrive.simulation.lane_rules import OUTSIDE_BY_M
+from foredrive.driving.lane_rules import OUTSIDE_BY_M
 
 
 class LoggedLanes:

@@ -7,18 +7,18 @@ import numpy as np
 import torch
 from jaxtyping import Float64
 
+from foredrive.driving.collisions import Contacts, EgoContact, blocked, collide, ego_box
+from foredrive.driving.dynamics import STEP_S, step, yaw_rate_radps
+from foredrive.driving.observation import FRAME_DT_S, FRAME_STEPS, KeyFrame, no_images
+from foredrive.driving.replay.logged_drive import LoggedDrive
+from foredrive.driving.replay.logged_lanes import LoggedLanes
+from foredrive.driving.replay.replayed import comes_from_behind, users_at
+from foredrive.driving.route_progress import ARRIVED_M, RouteLine, RouteProgress
 from foredrive.errors import InputError
 from foredrive.geometry.se3 import inverse_se3
-from foredrive.rendering.tracks import ActorTracks, boxes_at
+from foredrive.methods.rebuilding.tracks import ActorTracks, boxes_at
 from foredrive.scene import BicycleState, Clip, Control, DriveProgress, Event, Renderer, Step
 from foredrive.scene.actors import BOX_RANGE_M
-from foredrive.simulation.collisions import Contacts, EgoContact, blocked, collide, ego_box
-from foredrive.simulation.dynamics import STEP_S, step, yaw_rate_radps
-from foredrive.simulation.logged_drive import LoggedDrive
-from foredrive.simulation.logged_lanes import LoggedLanes
-from foredrive.simulation.observation import FRAME_DT_S, FRAME_STEPS, KeyFrame, no_images
-from foredrive.simulation.replayed import comes_from_behind, users_at
-from foredrive.simulation.route_progress import ARRIVED_M, RouteLine, RouteProgress
 
 REACH_M = 6.0
 """Maximum distance from the logged path, m. Further away, sensors would mostly show unobserved space, so

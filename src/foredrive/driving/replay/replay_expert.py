@@ -21,18 +21,18 @@ import numpy as np
 import torch
 from jaxtyping import Float64
 
+from foredrive.driving.collisions import Box, RoadUsers, touched
+from foredrive.driving.controller import ControllerState, follow
+from foredrive.driving.dynamics import EGO, STEP_S, step
+from foredrive.driving.observation import FRAME_DT_S, HORIZON_STEPS
+from foredrive.driving.plans import fixed_in_world
+from foredrive.driving.replay.logged_drive import LoggedDrive
+from foredrive.driving.replay.rebuilt import RebuiltSimulator
+from foredrive.driving.replay.replayed import users_at
+from foredrive.driving.simple_agents import plan_of
 from foredrive.errors import InputError
 from foredrive.geometry.polylines import arc_lengths, points_at
 from foredrive.scene import BicycleState, Boxes, Clip, Trajectory
-from foredrive.simulation.controller import ControllerState, follow
-from foredrive.simulation.dynamics import EGO, STEP_S, step
-from foredrive.simulation.logged_drive import LoggedDrive
-from foredrive.simulation.observation import FRAME_DT_S, HORIZON_STEPS
-from foredrive.simulation.plans import fixed_in_world
-from foredrive.simulation.rebuilt import RebuiltSimulator
-from foredrive.simulation.replayed import users_at
-from foredrive.simulation.road_users import Box, RoadUsers, touched
-from foredrive.simulation.simple_agents import plan_of
 
 LOOK_DT_S = 0.25
 LOOK_TIMES_S = LOOK_DT_S * np.arange(1, 17)

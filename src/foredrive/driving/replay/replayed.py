@@ -5,9 +5,9 @@ import torch
 from jaxtyping import Bool, Float64
 from torch import Tensor
 
+from foredrive.driving.collisions import Box, RoadUsers
 from foredrive.geometry.se3 import rotate_vectors, yaw_from_matrix
-from foredrive.rendering.tracks import ActorTracks, states_at
-from foredrive.simulation.road_users import Box, RoadUsers
+from foredrive.methods.rebuilding.tracks import ActorTracks, states_at
 
 
 def users_at(tracks: ActorTracks, T_world_scene: Float64[Tensor, "4 4"], t_s: float) -> RoadUsers:

@@ -11,14 +11,14 @@ import math
 import numpy as np
 import torch
 
+from foredrive.driving.dynamics import EGO
+from foredrive.driving.replay.logged_drive import LoggedDrive
+from foredrive.driving.route_progress import ARRIVED_M
 from foredrive.errors import InputError
 from foredrive.geometry.se3 import inverse_se3
-from foredrive.rendering.edits import DriveStraight, Offset, unused_id
-from foredrive.rendering.scene_graph import SceneGraph
+from foredrive.methods.rebuilding.edits import DriveStraight, Offset, unused_id
+from foredrive.methods.rebuilding.scene_graph import SceneGraph
 from foredrive.scene import Category
-from foredrive.simulation.dynamics import EGO
-from foredrive.simulation.logged_drive import LoggedDrive
-from foredrive.simulation.route_progress import ARRIVED_M
 
 AFTER_S = 4.0
 """Time after the start at which an ego vehicle that drives on as in the log is hit, s."""

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
+from foredrive.integrations.carla.frames import matrix_of, xyz_of
 from foredrive.scene import Category, Event
 from foredrive.scene.actors import ActorState
-from foredrive.simulation.carla.frames import matrix_of, xyz_of
 
 CATEGORY_OF_BASE_TYPE = {
     "car": Category.CAR,

@@ -5,9 +5,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
+from foredrive.integrations.carla.frames import CarlaPose, xyz_of
+from foredrive.integrations.carla.session import CarlaSession
 from foredrive.scene.conditions import BackgroundTraffic
-from foredrive.simulation.carla.frames import CarlaPose, xyz_of
-from foredrive.simulation.carla.session import CarlaSession
 
 NEAR_ROUTE_M = 140.0
 """Maximum distance from the route at which vehicles start, m."""

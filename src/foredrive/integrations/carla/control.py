@@ -10,8 +10,8 @@ import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
+from foredrive.driving.dynamics import EGO, STEP_S
 from foredrive.scene import Control
-from foredrive.simulation.dynamics import EGO, STEP_S
 
 FULL_THROTTLE_MPS2 = 4.0
 """Estimate for the ego vehicle in its lower gears, m/s²."""

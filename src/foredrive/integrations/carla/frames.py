@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float64
 
-from foredrive.simulation.dynamics import EGO
+from foredrive.driving.dynamics import EGO
 
 MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
 _BODY_FROM_OPTICAL = np.array(

@@ -8,11 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64, Int
 
-from foredrive.scene import BicycleState, Event
-from foredrive.scene.traffic_light import LightState
-from foredrive.simulation.carla.client import import_carla
-from foredrive.simulation.carla.frames import matrix_of
-from foredrive.simulation.lane_rules import (
+from foredrive.driving.lane_rules import (
     LINE_MARGIN_M,
     OUTSIDE_BY_M,
     WRONG_WAY_RAD,
@@ -22,6 +18,10 @@ from foredrive.simulation.lane_rules import (
     lines_run,
     way_driven,
 )
+from foredrive.integrations.carla.client import import_carla
+from foredrive.integrations.carla.frames import matrix_of
+from foredrive.scene import BicycleState, Event
+from foredrive.scene.traffic_light import LightState
 
 
 class CarlaLaneRules:

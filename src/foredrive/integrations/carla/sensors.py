@@ -8,11 +8,11 @@ import torch
 from jaxtyping import Float32, Float64, Int, UInt8
 from torch import Tensor
 
+from foredrive.driving.dynamics import STEP_S
 from foredrive.errors import InputError
+from foredrive.integrations.carla.frames import CarlaPose, camera_pose, mirrored, pose_of
 from foredrive.scene import CameraRig, LidarSweep
 from foredrive.sensors import SpinningLidar
-from foredrive.simulation.carla.frames import CarlaPose, camera_pose, mirrored, pose_of
-from foredrive.simulation.dynamics import STEP_S
 
 CAMERA, LIDAR = "sensor.camera.rgb", "sensor.lidar.ray_cast"
 PIXEL_TOLERANCE = 0.01

@@ -6,10 +6,10 @@ import logging
 import queue
 from typing import Any
 
+from foredrive.driving.dynamics import STEP_S
 from foredrive.errors import InputError
-from foredrive.simulation.carla.client import answering, import_carla
-from foredrive.simulation.carla.frames import CarlaPose
-from foredrive.simulation.dynamics import STEP_S
+from foredrive.integrations.carla.client import answering, import_carla
+from foredrive.integrations.carla.frames import CarlaPose
 
 TRAFFIC_PORT = 8000
 _log = logging.getLogger(__name__)

@@ -11,25 +11,58 @@ import torch
 from jaxtyping import Float64, UInt8
 from torch import Tensor
 
+from foredrive.driving.dynamics import EGO, STEP_S
+from foredrive.driving.lane_rules import RuleState
+from foredrive.driving.observation import FRAME_STEPS, KeyFrame, no_images
+from foredrive.driving.route_progress import RouteLine, RouteProgress, first_step
+from foredrive.driving.route_scenario import SETTLE_S, RouteScenario
 from foredrive.errors import InputError
+from foredrive.integrations.carla import sensors as carla_sensors
+from foredrive.integrations.carla.actors import LastCollision, actor_state, collision
+from foredrive.integrations.carla.background_traffic import ABOVE_M, add_background_traffic
+from foredrive.integrations.carla.client import answering, import_carla
+from foredrive.integrations.carla.control import CommandedSpeed, Pedals, actuate, steering_rad_of
+from foredrive.integrations.carla.frames import CarlaPose, ego_in_actor, matrix_of, pose_of, xyz_of
+from foredrive.integrations.carla.road import CarlaLaneRules
+from foredrive.integrations.carla.session import TRAFFIC_PORT, CarlaSession, SensorQueue
 from foredrive.scene import BicycleState, Boxes, Clip, Control, DriveProgress, Event, LidarSweep, Step
 from foredrive.scene.actors import boxes_in_ego_frame, in_box_range
-from foredrive.scene.conditions import draw_daylight
+from foredrive.scene.conditions import Conditions, draw_daylight
 from foredrive.sensors import SpinningLidar
-from foredrive.simulation.carla import sensors as carla_sensors
-from foredrive.simulation.carla.actors import LastCollision, actor_state, collision
-from foredrive.simulation.carla.background_traffic import ABOVE_M, add_background_traffic
-from foredrive.simulation.carla.client import answering, import_carla
-from foredrive.simulation.carla.control import CommandedSpeed, Pedals, actuate, steering_rad_of
-from foredrive.simulation.carla.frames import CarlaPose, ego_in_actor, matrix_of, pose_of, xyz_of
-from foredrive.simulation.carla.road import CarlaLaneRules
-from foredrive.simulation.carla.session import TRAFFIC_PORT, CarlaSession, SensorQueue
-from foredrive.simulation.carla.weather import weather_of
-from foredrive.simulation.dynamics import EGO, STEP_S
-from foredrive.simulation.lane_rules import RuleState
-from foredrive.simulation.observation import FRAME_STEPS, KeyFrame, no_images
-from foredrive.simulation.route_progress import RouteLine, RouteProgress, first_step
-from foredrive.simulation.route_scenario import SETTLE_S, RouteScenario
+
+MAX_SUN_DEG, MIN_SUN_DEG = 75.0, -60.0
+"""Altitude of the sun at noon and at midnight, degrees. It is 0 at 6 and at 18 o'clock."""
+HEAVY_RAIN_MMPH = 50.0
+FOG_VISIBILITY_M = 1000.0
+"""Visibility below which fog begins, m. At a tenth of it or less CARLA's fog has its maximum density."""
+
+
+def weather_of(conditions: Conditions) -> Any:
+    """Return similar `carla.WeatherParameters`.
+
+    CARLA's percentages have no unit, so the conversion is approximate.
+    """
+    carla = import_carla()
+    phase = math.cos(2 * math.pi * (conditions.hour - 12.0) / 24.0)
+    rain = 100.0 * min(conditions.rain_mmph / HEAVY_RAIN_MMPH, 1.0) ** 0.5
+    thinned = math.log(FOG_VISIBILITY_M / min(conditions.visibility_m, FOG_VISIBILITY_M), 10.0)
+    wet = 100.0 * max(conditions.wetness, 0.5 if conditions.rain_mmph > 0 else 0.0)
+    return carla.WeatherParameters(
+        cloudiness=100.0 * conditions.clouds,
+        precipitation=rain,
+        precipitation_deposits=wet if conditions.rain_mmph > 0 else 0.5 * wet,
+        wind_intensity=10.0,
+        sun_azimuth_angle=(15.0 * conditions.hour) % 360.0,
+        sun_altitude_angle=phase * (MAX_SUN_DEG if phase > 0 else -MIN_SUN_DEG),
+        fog_density=100.0 * min(thinned, 1.0),
+        fog_distance=0.0,
+        fog_falloff=0.2,
+        wetness=wet,
+        scattering_intensity=1.0,
+        mie_scattering_scale=0.03,
+        rayleigh_scattering_scale=0.0331,
+    )
+
 
 EGO_BLUEPRINT = "vehicle.lincoln.mkz_2020"
 """Vehicle with the dimensions of `dynamics.EGO`."""

@@ -4,9 +4,9 @@ import numpy as np
 from jaxtyping import Float64
 
 from foredrive.data.boxes import box_row, read_boxes, read_tracks
+from foredrive.data.formats.nuscenes_names import NAME_OF_CATEGORY
 from foredrive.data.logs import Log
-from foredrive.data.nuscenes_names import NAME_OF_CATEGORY
-from foredrive.export.nuscenes.tables import (
+from foredrive.integrations.nuscenes.tables import (
     Row,
     attribute_token,
     category_token,

@@ -15,9 +15,9 @@ from pathlib import Path
 from foredrive.data.log_paths import LogPath
 from foredrive.data.logs import Log
 from foredrive.errors import InputError
-from foredrive.export.nuscenes.scene import SceneOptions, write_scene
-from foredrive.export.nuscenes.tables import TABLES_OF_A_LOG, Row, shared_tables
 from foredrive.files import atomic_path, remove_abandoned
+from foredrive.integrations.nuscenes.scene import SceneOptions, write_scene
+from foredrive.integrations.nuscenes.tables import TABLES_OF_A_LOG, Row, shared_tables
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
 _OPTIONS = "options.json"

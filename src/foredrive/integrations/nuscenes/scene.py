@@ -1,25 +1,148 @@
 """One log as a scene of nuScenes: its sensor files, its mask of the map, and its rows of the tables."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
+import cv2
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float64, Int64, UInt8
 from PIL import Image
 
 from foredrive.data.boxes import frames_with_boxes
 from foredrive.data.lidar import read_sweep
 from foredrive.data.logs import Log
 from foredrive.data.recorded import read_caption
+from foredrive.data.truth.map_elements import log_map, read_shared_drivable
+from foredrive.data.truth.map_lines import Line
 from foredrive.errors import InputError
-from foredrive.export.nuscenes.annotations import annotations_at, instances_of
-from foredrive.export.nuscenes.map_mask import draw_map_mask
-from foredrive.export.nuscenes.samples import Samples, choose_samples
-from foredrive.export.nuscenes.streams import LIDAR, Stream, streams_of
-from foredrive.export.nuscenes.tables import TABLES_OF_A_LOG, Row, link, pose, token
 from foredrive.files import atomic_path
+from foredrive.integrations.nuscenes.annotations import annotations_at, instances_of
+from foredrive.integrations.nuscenes.streams import LIDAR, Stream, streams_of
+from foredrive.integrations.nuscenes.tables import TABLES_OF_A_LOG, Row, link, pose, token
+
+CELL_M = 0.1
+"""The devkit's resolution of masks."""
+MARGIN_M = 100.0
+"""Distance around the driven path, or around a shared map, that a mask covers."""
+MAX_CELLS = 400_000_000
+"""Size of the largest mask: a square of 2 km."""
+
+
+@dataclass(frozen=True)
+class MapMask:
+    """A mask of the drivable area, placed in the world frame."""
+
+    token: str
+    """Logs that share a map have the same mask."""
+    cells: UInt8[np.ndarray, "Y X"]
+    """255 on drivable ground, else 0. The first row is that of the largest y, as in an image."""
+    lower_m: Float64[np.ndarray, "2"]
+    """Lower corner in the world frame, in whole metres. The devkit takes it for the origin."""
+
+
+def draw_map_mask(log: Log) -> MapMask:
+    """Draw the drivable areas of the map that a log shares with others, else those around its path.
+
+    A shared map is drawn whole, unless it is too large or the log leaves it. Without a map nothing is
+    drivable. Around too long a path the mask has a single cell, where nothing is drivable.
+
+    Raises:
+        InputError: the map cannot be read.
+    """
+    driven = log.T_world_ego[:, :2, 3]
+    shared = read_shared_drivable(log)
+    if shared:
+        corners = np.concatenate([ring[:, :2] for area in shared for ring in area])
+        lower_m, size_xy = _grid(corners)
+        upper_m = lower_m + size_xy * CELL_M
+        if size_xy.prod() <= MAX_CELLS and (driven >= lower_m).all() and (driven <= upper_m).all():
+            names = (log.metadata.dataset, log.metadata.location, *lower_m, *size_xy)
+            return MapMask(token("map", *names), _drawn(shared, lower_m, size_xy), lower_m)
+    lower_m, size_xy = _grid(driven)
+    own = token("map", log.path.name)
+    if size_xy.prod() > MAX_CELLS:
+        return MapMask(own, np.zeros((1, 1), dtype=np.uint8), lower_m)
+    found = log_map(log)
+    return MapMask(own, _drawn([] if found is None else found.drivable, lower_m, size_xy), lower_m)
+
+
+def _grid(points: Float64[np.ndarray, "N 2"]) -> tuple[np.ndarray, np.ndarray]:
+    """Return lower corner (whole metres) and size in cells of the grid around points."""
+    lower_m = np.floor(points.min(axis=0) - MARGIN_M)
+    upper_m = np.ceil(points.max(axis=0) + MARGIN_M)
+    return lower_m, np.round((upper_m - lower_m) / CELL_M).astype(np.int64)
+
+
+def _drawn(
+    areas: Sequence[Sequence[Line]], lower_m: np.ndarray, size_xy: np.ndarray
+) -> UInt8[np.ndarray, "Y X"]:
+    cells = np.zeros(size_xy[::-1], dtype=np.uint8)
+    for area in areas:
+        rings = [(ring[:, :2] - lower_m) / CELL_M for ring in area]
+        upside_down = [np.column_stack([ring[:, 0], len(cells) - ring[:, 1]]) for ring in rings]
+        cv2.fillPoly(cells, [np.round(ring).astype(np.int32) for ring in upside_down], 255)
+    return cells
+
+
+@dataclass(frozen=True)
+class Samples:
+    """The key frames of a log, in order of time."""
+
+    log_name: str
+    frames: Int64[np.ndarray, "K"]
+    t_us: Int64[np.ndarray, "K"]
+
+    def token_of(self, frame: int) -> str:
+        """Return the sample of a frame: its own or the next one, after the last one that.
+
+        The devkit interpolates boxes of a frame between its sample and the sample before.
+        """
+        at = min(int(np.searchsorted(self.frames, frame)), len(self.frames) - 1)
+        return token("sample", self.log_name, self.t_us[at])
+
+    def rows(self, scene_token: str) -> list[Row]:
+        """Return the table `sample`."""
+        rows: list[Row] = [
+            {"token": self.token_of(frame), "timestamp": t_us, "scene_token": scene_token}
+            for frame, t_us in zip(self.frames.tolist(), self.t_us.tolist(), strict=True)
+        ]
+        link(rows)
+        return rows
+
+
+def choose_samples(log: Log, rate_hz: float, present: dict[str, Int64[np.ndarray, "_"]]) -> Samples:
+    """Choose frames at a rate. Each has all that the log has: samples of nuScenes lack no sensor.
+
+    After a gap the next whole frame is chosen.
+
+    Args:
+        log: the log.
+        rate_hz: samples a second.
+        present: the frames at which each sensor has data, by its name; those of the boxes too.
+
+    Raises:
+        InputError: no frame has everything.
+    """
+    whole = np.arange(len(log))
+    for frames in present.values():
+        whole = np.intersect1d(whole, frames)
+    if not len(whole):
+        found = ", ".join(f"{name} {len(frames)}" for name, frames in present.items())
+        raise InputError(f"{log.path.folder}: no frame has all sensors and boxes (frames with: {found})")
+    t_us, step_us, slack_us = log.t_us[whole], 1e6 / rate_hz, 0.5e6 * log.period_s
+    chosen = [0]
+    while True:
+        wanted_us = t_us[chosen[-1]] + step_us
+        at = max(int(np.searchsorted(t_us, wanted_us - slack_us)), chosen[-1] + 1)
+        if at >= len(t_us):
+            break
+        if at + 1 < len(t_us) and abs(t_us[at + 1] - wanted_us) < abs(t_us[at] - wanted_us):
+            at += 1
+        chosen.append(at)
+    return Samples(log.path.name, whole[chosen], t_us[chosen])
+
 
 Tables = dict[str, list[Row]]
 

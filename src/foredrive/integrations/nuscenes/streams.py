@@ -13,10 +13,10 @@ from scipy.spatial.transform import Rotation
 
 from foredrive.data.arrow_files import reading
 from foredrive.data.cameras import CameraFrame, camera_mount, encoded_image, pinhole_cameras, read_camera
+from foredrive.data.formats.nuscenes_names import camera_channel
 from foredrive.data.lidar import frames_with_lidar, main_lidar_mount
 from foredrive.data.logs import Log
-from foredrive.data.nuscenes_names import camera_channel
-from foredrive.export.nuscenes.tables import Row, pose, token
+from foredrive.integrations.nuscenes.tables import Row, pose, token
 from foredrive.scene import LidarSweep
 
 LIDAR = "LIDAR_TOP"

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float64
 from scipy.spatial.transform import Rotation
 
-from foredrive.data.nuscenes_names import CATEGORY_NAMES
+from foredrive.data.formats.nuscenes_names import CATEGORY_NAMES
 from foredrive.scene import Attribute, Visibility
 
 Row = dict[str, Any]

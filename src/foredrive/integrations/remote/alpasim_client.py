@@ -24,13 +24,13 @@ from jaxtyping import Float64
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
+from foredrive.driving.observation import FRAME_DT_S, HORIZON_STEPS
+from foredrive.driving.simple_agents import plan_of
 from foredrive.errors import InputError
 from foredrive.geometry.polylines import arc_lengths, points_at
+from foredrive.integrations.remote.planner_client import FIRST_US
 from foredrive.json_server import Address
 from foredrive.scene import CameraRig, Clip, Command, Trajectory
-from foredrive.simulation.observation import FRAME_DT_S, HORIZON_STEPS
-from foredrive.simulation.remote.planner_client import FIRST_US
-from foredrive.simulation.simple_agents import plan_of
 
 STEP_M, LENGTH_M = 2.0, 40.0
 TURN_M = {Command.LEFT: 6.0, Command.RIGHT: -6.0, Command.STRAIGHT: 0.0}

@@ -16,15 +16,15 @@ from jaxtyping import Float64
 from foredrive.data.batches import stack_records
 from foredrive.data.boxes import no_boxes
 from foredrive.data.commands import RouteAhead, command_of, route_ahead
+from foredrive.driving.observation import FRAME_DT_S, KeyFrame, no_images
+from foredrive.driving.plans import waypoints_of
+from foredrive.driving.simple_agents import StraightAgent
 from foredrive.errors import InputError
 from foredrive.geometry.polylines import arc_lengths
+from foredrive.integrations.remote.planner_messages import nuscenes_name
+from foredrive.integrations.remote.planner_server import PlannerNeeds, seen_clip
 from foredrive.scene import Agent, CameraRig, Command, Trajectory
 from foredrive.scene.clip import TARGET
-from foredrive.simulation.observation import FRAME_DT_S, KeyFrame, no_images
-from foredrive.simulation.plans import waypoints_of
-from foredrive.simulation.remote.planner_messages import nuscenes_name
-from foredrive.simulation.remote.planner_server import PlannerNeeds, seen_clip
-from foredrive.simulation.simple_agents import StraightAgent
 
 LATE_US = 60_000
 """Largest difference between a key frame's time and that of an image, microseconds."""

@@ -4,12 +4,12 @@ import dataclasses
 import time
 from collections.abc import Callable
 
+from foredrive.driving.simple_agents import plan_of
 from foredrive.errors import InputError
+from foredrive.integrations.remote.json_http import ask
+from foredrive.integrations.remote.planner_messages import PlannerOutput, planner_input, waypoints
 from foredrive.json_server import Address, validated
 from foredrive.scene import Clip, Trajectory
-from foredrive.simulation.remote.json_http import ask
-from foredrive.simulation.remote.planner_messages import PlannerOutput, planner_input, waypoints
-from foredrive.simulation.simple_agents import plan_of
 
 FIRST_US = 1_000_000_000
 """Time of the start of a drive that planners are told, µs. Key frames before it have positive times too."""

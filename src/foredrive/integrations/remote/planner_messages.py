@@ -12,10 +12,10 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
+from foredrive.driving.observation import FRAME_DT_S, HORIZON_STEPS
 from foredrive.errors import InputError
+from foredrive.integrations.remote.sent_tensors import encode_tensors
 from foredrive.scene import Clip, Command
-from foredrive.simulation.observation import FRAME_DT_S, HORIZON_STEPS
-from foredrive.simulation.remote.sent_tensors import encode_tensors
 
 NUSCENES_CAMERAS = {
     "PCAM_F0": "CAM_FRONT",

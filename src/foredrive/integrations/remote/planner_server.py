@@ -10,15 +10,15 @@ import torch
 from foredrive.data.batches import stack_records
 from foredrive.data.boxes import no_boxes
 from foredrive.data.commands import RouteAhead
+from foredrive.driving.observation import KeyFrame, make_clip, no_images
+from foredrive.driving.plans import waypoints_of
+from foredrive.driving.simple_agents import StraightAgent
 from foredrive.errors import InputError
+from foredrive.integrations.remote.planner_messages import COMMANDS, PlannerInput, nuscenes_name
+from foredrive.integrations.remote.sent_matrices import read_matrix
+from foredrive.integrations.remote.sent_tensors import decode_image
 from foredrive.json_server import Answer, validated
 from foredrive.scene import Agent, CameraRig, Clip, Command, Trajectory
-from foredrive.simulation.observation import KeyFrame, make_clip, no_images
-from foredrive.simulation.plans import waypoints_of
-from foredrive.simulation.remote.planner_messages import COMMANDS, PlannerInput, nuscenes_name
-from foredrive.simulation.remote.sent_matrices import read_matrix
-from foredrive.simulation.remote.sent_tensors import decode_image
-from foredrive.simulation.simple_agents import StraightAgent
 
 COMMAND_OF = {number: command for command, number in COMMANDS.items()}
 SPEED = 13

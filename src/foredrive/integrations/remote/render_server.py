@@ -19,19 +19,19 @@ from torch import Tensor
 
 from foredrive.errors import InputError
 from foredrive.geometry.se3 import inverse_se3, transform_points
+from foredrive.integrations.remote.planner_messages import nuscenes_name
+from foredrive.integrations.remote.sent_matrices import read_pose
+from foredrive.integrations.remote.sent_tensors import encode_tensors
 from foredrive.json_server import Answer, Raw, validated
-from foredrive.rendering.edits import Edit, Remove, apply_edits
-from foredrive.rendering.novel_views import novel_camera_view
-from foredrive.rendering.rebuilt import RebuiltScene
-from foredrive.rendering.renderer import render_sweep
-from foredrive.rendering.scene_graph import SceneGraph
-from foredrive.rendering.tracks import poses_at
-from foredrive.rendering.vehicle import EgoState, LoggedVehicle
+from foredrive.methods.rebuilding.edits import Edit, Remove, apply_edits
+from foredrive.methods.rebuilding.novel_views import novel_camera_view
+from foredrive.methods.rebuilding.rebuilt import RebuiltScene
+from foredrive.methods.rebuilding.renderer import render_sweep
+from foredrive.methods.rebuilding.scene_graph import SceneGraph
+from foredrive.methods.rebuilding.tracks import poses_at
+from foredrive.methods.rebuilding.vehicle import EgoState, LoggedVehicle
 from foredrive.sensors import SpinningLidar
 from foredrive.sensors.vehicle import LIDARS
-from foredrive.simulation.remote.planner_messages import nuscenes_name
-from foredrive.simulation.remote.sent_matrices import read_pose
-from foredrive.simulation.remote.sent_tensors import encode_tensors
 
 OWN_LIDAR = "LIDAR_TOP"
 """Name of the log's own lidar. Others are those of `sensors.vehicle.LIDARS`, at its place."""

@@ -8,8 +8,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from foredrive.models.lifting import position_code, project_to_cameras
-from foredrive.models.plane_context import PlaneContextConfig, plane_context
+from foredrive.methods.blocks.lifting import position_code, project_to_cameras
+from foredrive.methods.blocks.plane_context import PlaneContextConfig, plane_context
 from foredrive.ops.lifting import lift
 from foredrive.scene import CameraRig, VoxelSpec
 

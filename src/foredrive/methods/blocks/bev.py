@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from foredrive.models.lifting import (
+from foredrive.methods.blocks.lifting import (
     CameraCrossAttention,
     LiftingLayer,
     NeighbourhoodAttention,

@@ -13,7 +13,7 @@ from torch.utils.checkpoint import checkpoint
 
 from foredrive.geometry.projection import project
 from foredrive.geometry.se3 import inverse_se3, transform_points
-from foredrive.models.plane_context import PlaneContextConfig, plane_context
+from foredrive.methods.blocks.plane_context import PlaneContextConfig, plane_context
 from foredrive.ops.attention3d import attend_volume
 from foredrive.ops.lifting import lift
 from foredrive.scene import CameraRig, Frames, VoxelSpec

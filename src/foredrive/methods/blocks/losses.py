@@ -6,7 +6,7 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from foredrive.losses.masked import masked_mean
+from foredrive.ops.masked import masked_mean
 
 ImageFeatures = Callable[[Float[Tensor, "n 3 H W"]], Sequence[Float[Tensor, "n _c _h _w"]]]
 

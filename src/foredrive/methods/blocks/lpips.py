@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from foredrive.models.published_weights import load_published, load_state
+from foredrive.methods.blocks.published_weights import load_published, load_state
 
 _SHIFT, _SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
 _TAPS = (1, 4, 7, 9, 11)

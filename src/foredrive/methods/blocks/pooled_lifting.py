@@ -7,7 +7,7 @@ from typing import Literal
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from foredrive.models.lifting import LiftingConfig, LiftingEncoder
+from foredrive.methods.blocks.lifting import LiftingConfig, LiftingEncoder
 from foredrive.scene import CameraRig, VoxelSpec
 
 

@@ -7,8 +7,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from foredrive.models.backbone import normalise_rgb
-from foredrive.models.published_weights import load_published, load_state
+from foredrive.methods.blocks.backbone import normalise_rgb
+from foredrive.methods.blocks.published_weights import load_published, load_state
 
 
 class _Kind(NamedTuple):

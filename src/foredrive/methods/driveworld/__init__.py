@@ -1,8 +1,8 @@
 """DriveWorld (Min et al. 2024): a world model with a memory of past states and a static scene branch."""
 
-from foredrive.models.driveworld.actions import actions_of, motion_of
-from foredrive.models.driveworld.gaussian import DiagonalGaussian, balanced_kl, kl_divergence
-from foredrive.models.driveworld.world_model import DriveWorld, DriveWorldConfig, LiftedFrames, Unrolled
+from foredrive.methods.driveworld.actions import actions_of, motion_of
+from foredrive.methods.driveworld.gaussian import DiagonalGaussian, balanced_kl, kl_divergence
+from foredrive.methods.driveworld.world_model import DriveWorld, DriveWorldConfig, LiftedFrames, Unrolled
 
 __all__ = [
     "DiagonalGaussian",

@@ -2,8 +2,8 @@
 
 from dataclasses import replace
 
-from foredrive.recipes.config import named_after
-from foredrive.recipes.driveworld import DriveWorldRecipe
+from foredrive.methods.driveworld.recipes import DriveWorldRecipe
+from foredrive.methods.recipe import named_after
 
 
 def driveworld_ablations(full: DriveWorldRecipe) -> dict[str, DriveWorldRecipe]:

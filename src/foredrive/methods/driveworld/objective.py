@@ -9,13 +9,15 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from foredrive.losses import masked_mean, occupancy_loss, waypoint_loss
-from foredrive.models.agent import PlanningAgent
-from foredrive.models.driveworld import DriveWorld, Unrolled, actions_of, balanced_kl
+from foredrive.engine.loop import Schedule
+from foredrive.methods.driveworld import DriveWorld, Unrolled, actions_of, balanced_kl
+from foredrive.methods.planner.agent import PlanningAgent
+from foredrive.methods.planner.planner import set_planner_trainable
+from foredrive.ops.masked import masked_mean
 from foredrive.scene import Belief, Boxes, Clip, Example, last_frames
-from foredrive.training.joint_tasks import TaskTerms
-from foredrive.training.loop import Schedule
-from foredrive.training.objective import set_planner_trainable
+from foredrive.tasks.heads.joint import TaskTerms
+from foredrive.tasks.occupancy.losses import occupancy_loss
+from foredrive.tasks.planning.losses import waypoint_loss
 
 
 @dataclass(frozen=True)

@@ -3,23 +3,24 @@
 from dataclasses import replace
 
 from foredrive.data import ClipConfig
-from foredrive.models.backbone import BackboneConfig
-from foredrive.models.driveworld import DriveWorldConfig
-from foredrive.models.driveworld.planes import (
+from foredrive.engine.loop import Schedule
+from foredrive.methods.blocks.backbone import BackboneConfig
+from foredrive.methods.blocks.lift_splat import LiftSplatConfig
+from foredrive.methods.blocks.lifting import LiftingConfig
+from foredrive.methods.blocks.pooled_lifting import PooledLiftingConfig
+from foredrive.methods.blocks.text_encoder import PACKAGED_MODEL
+from foredrive.methods.driveworld import DriveWorldConfig
+from foredrive.methods.driveworld.objective import DriveWorldStage, DriveWorldWeights
+from foredrive.methods.driveworld.planes import (
     PlanesToVolumeConfig,
     PlaneToVectorConfig,
     StaticSceneConfig,
     VectorToPlaneConfig,
 )
-from foredrive.models.driveworld.state_space import StateSpaceConfig
-from foredrive.models.driveworld.task_prompt import PROMPTS, PromptConfig
-from foredrive.models.lift_splat import LiftSplatConfig
-from foredrive.models.lifting import LiftingConfig
-from foredrive.models.pooled_lifting import PooledLiftingConfig
-from foredrive.models.text_encoder import PACKAGED_MODEL
-from foredrive.recipes.config import Recipe, rescheduled
-from foredrive.recipes.nemo import nemo_base, nemo_tiny, nemo_town
-from foredrive.training import DriveWorldStage, DriveWorldWeights, Schedule
+from foredrive.methods.driveworld.state_space import StateSpaceConfig
+from foredrive.methods.driveworld.task_prompt import PROMPTS, PromptConfig
+from foredrive.methods.nemo.recipes import nemo_base, nemo_tiny, nemo_town
+from foredrive.methods.recipe import Recipe, rescheduled
 
 DriveWorldRecipe = Recipe[DriveWorldConfig, DriveWorldStage]
 

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from foredrive.models.driveworld.gaussian import DiagonalGaussian
+from foredrive.methods.driveworld.gaussian import DiagonalGaussian
 from foredrive.scene.record import Record
 
 ACTIONS = 2

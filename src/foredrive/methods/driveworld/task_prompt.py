@@ -7,8 +7,8 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from foredrive.errors import InputError
-from foredrive.models.driveworld.planes import VectorToPlane, VectorToPlaneConfig
-from foredrive.models.text_encoder import TextEncoder
+from foredrive.methods.blocks.text_encoder import TextEncoder
+from foredrive.methods.driveworld.planes import VectorToPlane, VectorToPlaneConfig
 
 Prompt = Literal["occupancy", "forecast", "planning", "detection", "tracking", "map", "motion"]
 """A task, or "forecast": the occupancy of an imagined key frame, which the dynamics are trained with."""

@@ -13,10 +13,13 @@ from torch.nn.functional import conv3d
 
 from foredrive.errors import InputError
 from foredrive.geometry.se3 import compose_se3, inverse_se3
-from foredrive.models.backbone import BackboneConfig, ImageBackbone
-from foredrive.models.driveworld.actions import actions_in, motion_of
-from foredrive.models.driveworld.gaussian import DiagonalGaussian
-from foredrive.models.driveworld.planes import (
+from foredrive.methods.blocks.backbone import BackboneConfig, ImageBackbone
+from foredrive.methods.blocks.lift_splat import LiftSplatConfig, LiftSplatEncoder
+from foredrive.methods.blocks.lifting import lift_frames
+from foredrive.methods.blocks.pooled_lifting import PooledLiftingConfig, PooledLiftingEncoder
+from foredrive.methods.driveworld.actions import actions_in, motion_of
+from foredrive.methods.driveworld.gaussian import DiagonalGaussian
+from foredrive.methods.driveworld.planes import (
     PlanesToVolume,
     PlanesToVolumeConfig,
     PlaneToVector,
@@ -27,11 +30,8 @@ from foredrive.models.driveworld.planes import (
     VectorToPlaneConfig,
     warp_plane,
 )
-from foredrive.models.driveworld.state_space import Latent, StateSpace, StateSpaceConfig
-from foredrive.models.driveworld.task_prompt import Prompt, PromptConfig, TaskPrompt, encode_prompts
-from foredrive.models.lift_splat import LiftSplatConfig, LiftSplatEncoder
-from foredrive.models.lifting import lift_frames
-from foredrive.models.pooled_lifting import PooledLiftingConfig, PooledLiftingEncoder
+from foredrive.methods.driveworld.state_space import Latent, StateSpace, StateSpaceConfig
+from foredrive.methods.driveworld.task_prompt import Prompt, PromptConfig, TaskPrompt, encode_prompts
 from foredrive.scene import Belief, Clip, Decoded, Frames, Task, VoxelSpec, last_frames
 from foredrive.scene.record import Record
 

@@ -1,4 +1,7 @@
-"""Training of towers for a common space: images and texts by contrast, sweeps from image embeddings."""
+"""Training of towers for a common space: images and texts by contrast, sweeps from image embeddings.
+
+Contrastive loss between images and texts (Radford et al. 2021, figure 3).
+"""
 
 import math
 from dataclasses import dataclass
@@ -9,11 +12,35 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor, nn
 
-from foredrive.losses.contrastive import info_nce, is_true
-from foredrive.models.image_tower import ImageTower
-from foredrive.models.lidar_clip import LidarEncoder, PointCloud
+from foredrive.methods.lidarclip import LidarEncoder, PointCloud
+from foredrive.methods.lidarclip.image_tower import ImageTower
 from foredrive.ops.precision import computes_bfloat16
 from foredrive.scene.record import Record
+
+
+def is_true(stated: Bool[Tensor, "t V"], holds: Bool[Tensor, "i V"]) -> Bool[Tensor, "i t"]:
+    """Return which of t texts are true of which of i images: all facts that a text states hold.
+
+    Args:
+        stated: of V facts, those that each text states.
+        holds: of V facts, those that hold for each image.
+    """
+    return (~holds).float() @ stated.float().T == 0
+
+
+def info_nce(
+    logits: Float[Tensor, "n n"], true: Bool[Tensor, "n n"]
+) -> tuple[Float[Tensor, ""], Float[Tensor, ""]]:
+    """Return InfoNCE over rows and columns whose pairs lie on the diagonal; other true pairs are left out.
+
+    Returns:
+        The mean loss, and the share of rows whose own text comes first.
+    """
+    own = torch.arange(len(logits), device=logits.device)
+    other_true = true & ~torch.eye(len(logits), dtype=torch.bool, device=logits.device)
+    logits = logits.masked_fill(other_true, -torch.inf)
+    loss = (F.cross_entropy(logits, own) + F.cross_entropy(logits.T, own)) / 2
+    return loss, (logits.argmax(dim=1) == own).float().mean()
 
 
 @dataclass(frozen=True)

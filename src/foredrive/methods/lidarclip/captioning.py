@@ -8,7 +8,7 @@ import torch.nn.functional as F
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from foredrive.models.caption_decoder import PAD, CaptionDecoder
+from foredrive.methods.lidarclip.caption_decoder import PAD, CaptionDecoder
 from foredrive.scene.record import Record
 
 NOISE = 0.4

@@ -7,8 +7,8 @@ import torch.nn.functional as F
 from jaxtyping import Float, UInt8
 from torch import Tensor, nn
 
-from foredrive.models.attention_pool import AttentionPool
-from foredrive.models.backbone import normalise_images, normalise_rgb
+from foredrive.methods.blocks.backbone import normalise_images, normalise_rgb
+from foredrive.methods.lidarclip.attention_pool import AttentionPool
 
 
 @dataclass(frozen=True)

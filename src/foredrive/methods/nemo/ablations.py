@@ -3,9 +3,9 @@
 from dataclasses import replace
 from typing import Literal
 
-from foredrive.models.bev import BevConfig
-from foredrive.recipes.config import named_after
-from foredrive.recipes.nemo import NemoRecipe
+from foredrive.methods.blocks.bev import BevConfig
+from foredrive.methods.nemo.recipes import NemoRecipe
+from foredrive.methods.recipe import named_after
 
 
 def nemo_ablations(full: NemoRecipe, bev: BevConfig) -> dict[str, NemoRecipe]:

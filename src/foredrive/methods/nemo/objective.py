@@ -7,18 +7,19 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from foredrive.data.augmentation import AugmentConfig, augmented
+from foredrive.engine.loop import Schedule
 from foredrive.errors import InputError
-from foredrive.losses import ego_motion_loss, l1_loss, occupancy_loss, perceptual_loss, waypoint_loss
-from foredrive.losses.reconstruction import ImageFeatures
-from foredrive.models.agent import PlanningAgent
-from foredrive.models.lifting import lift_frames
-from foredrive.models.nemo import Nemo
-from foredrive.models.planner import VolumePlanner
+from foredrive.methods.blocks.lifting import lift_frames
+from foredrive.methods.blocks.losses import ImageFeatures, l1_loss, perceptual_loss
+from foredrive.methods.blocks.training_rays import averaged_rays, thinned_rays
+from foredrive.methods.nemo import Nemo
+from foredrive.methods.planner.agent import PlanningAgent
+from foredrive.methods.planner.planner import set_planner_trainable
 from foredrive.scene import Belief, Clip, Example, last_frames
-from foredrive.training.augmentation import AugmentConfig, augmented
-from foredrive.training.joint_tasks import TaskTerms
-from foredrive.training.loop import Schedule
-from foredrive.training.rays import averaged_rays, thinned_rays
+from foredrive.tasks.heads.joint import TaskTerms
+from foredrive.tasks.occupancy.losses import occupancy_loss
+from foredrive.tasks.planning.losses import ego_motion_loss, waypoint_loss
 
 
 @dataclass(frozen=True)
@@ -225,10 +226,3 @@ class NemoObjective(nn.Module):
         believed = world.believe(frames[items], history)
         imagined = world.imagine(believed, steps) if steps else []
         return [believed if looks_back else now, *imagined]
-
-
-def set_planner_trainable(planner: VolumePlanner, trainable: bool) -> None:
-    """Enable or disable the training of a planner. Its ego MLP is never trained here."""
-    planner.requires_grad_(trainable)
-    if planner.ego_mlp is not None:
-        planner.ego_mlp.requires_grad_(False)

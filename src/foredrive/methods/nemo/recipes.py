@@ -3,17 +3,20 @@
 import dataclasses
 
 from foredrive.data import ClipConfig
-from foredrive.models.backbone import BackboneConfig
-from foredrive.models.bev import BevConfig
-from foredrive.models.ego_mlp import EgoMLPConfig
-from foredrive.models.lifting import LiftingConfig
-from foredrive.models.nemo import MotionConfig, NemoConfig, RendererConfig
-from foredrive.models.path_correction import PathCorrectionConfig
-from foredrive.models.plane_context import PlaneContextConfig
-from foredrive.models.planner import PlannerConfig
-from foredrive.recipes.config import Recipe, rescheduled
+from foredrive.data.augmentation import AugmentConfig
+from foredrive.engine.loop import Schedule
+from foredrive.methods.blocks.backbone import BackboneConfig
+from foredrive.methods.blocks.bev import BevConfig
+from foredrive.methods.blocks.lifting import LiftingConfig
+from foredrive.methods.blocks.plane_context import PlaneContextConfig
+from foredrive.methods.nemo import MotionConfig, NemoConfig, RendererConfig
+from foredrive.methods.nemo.objective import NemoStage, NemoWeights
+from foredrive.methods.planner.ego_mlp import EgoMLPConfig
+from foredrive.methods.planner.path_correction import PathCorrectionConfig
+from foredrive.methods.planner.path_fit import PathFit
+from foredrive.methods.planner.planner import PlannerConfig
+from foredrive.methods.recipe import Recipe, rescheduled
 from foredrive.scene import VoxelSpec
-from foredrive.training import AugmentConfig, NemoStage, NemoWeights, PathFit, Schedule
 
 NemoRecipe = Recipe[NemoConfig, NemoStage]
 

@@ -12,15 +12,15 @@ from torch import Tensor, nn
 
 from foredrive.errors import InputError
 from foredrive.geometry.se3 import compose_se3, inverse_se3, rotate_vectors
-from foredrive.models.averaging import AveragingConfig, AveragingEncoder
-from foredrive.models.backbone import BackboneConfig, ImageBackbone
-from foredrive.models.bev import BevConfig, BevEncoder
-from foredrive.models.lifting import LiftingConfig, LiftingEncoder, lift_frames
-from foredrive.models.nemo.ego_motion import continued_motion
-from foredrive.models.nemo.motion import MotionConfig, MotionFlow
-from foredrive.models.nemo.rendering import RendererConfig, VolumeRenderer
+from foredrive.methods.blocks.averaging import AveragingConfig, AveragingEncoder
+from foredrive.methods.blocks.backbone import BackboneConfig, ImageBackbone
+from foredrive.methods.blocks.bev import BevConfig, BevEncoder
+from foredrive.methods.blocks.lifting import LiftingConfig, LiftingEncoder, lift_frames
+from foredrive.methods.nemo.motion import MotionConfig, MotionFlow
+from foredrive.methods.nemo.rendering import RendererConfig, VolumeRenderer
 from foredrive.ops.volume import compose_flows, warp_volume
 from foredrive.scene import Belief, Clip, Decoded, Frames, Task, VoxelSpec, last_frames
+from foredrive.scene.ego_motion import continued_motion
 
 Encoder = LiftingEncoder | BevEncoder | AveragingEncoder
 ENCODERS: Mapping[type, Callable[..., Encoder]] = {

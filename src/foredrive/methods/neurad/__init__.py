@@ -1,8 +1,8 @@
 """Neural fields of driving scenes (Tonderski et al., "NeuRAD", CVPR 2024)."""
 
-from foredrive.rendering.field.config import FieldConfig, GridConfig
-from foredrive.rendering.field.rays import FieldRays, beam_rays, pixel_rays
-from foredrive.rendering.field.render import FieldActors, NeuralField, SeenAlongRays
+from foredrive.methods.neurad.config import FieldConfig, GridConfig
+from foredrive.methods.neurad.rays import FieldRays, beam_rays, pixel_rays
+from foredrive.methods.neurad.render import FieldActors, NeuralField, SeenAlongRays
 
 __all__ = [
     "FieldActors",

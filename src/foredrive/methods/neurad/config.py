@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 from typing import Literal
 
-from foredrive.rendering.field.sampling import Resampling
+from foredrive.methods.neurad.sampling import Resampling
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class GridsConfig:
 
 @dataclass(frozen=True)
 class FieldConfig:
-    """Parts of a `NeuralField`. The defaults are NeuRAD's sizes; docs/architecture.md lists what differs."""
+    """Parts of a `NeuralField`. The defaults are NeuRAD's sizes; CHOICES.md lists what differs."""
 
     grids: GridsConfig = field(
         default_factory=lambda: GridsConfig(

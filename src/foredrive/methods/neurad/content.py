@@ -9,11 +9,11 @@ from jaxtyping import Int
 from torch import Tensor
 
 from foredrive.errors import InputError
-from foredrive.rendering.field.decoders import BeamDecoder, PatchDecoder
-from foredrive.rendering.field.render import NeuralField
-from foredrive.rendering.gaussians.content import GaussianContent
-from foredrive.rendering.gaussians.gaussians import Gaussians
-from foredrive.rendering.scene_graph import Content, SceneGraph
+from foredrive.methods.neurad.decoders import BeamDecoder, PatchDecoder
+from foredrive.methods.neurad.render import NeuralField
+from foredrive.methods.rebuilding.gaussians import Gaussians
+from foredrive.methods.rebuilding.scene_graph import Content, SceneGraph
+from foredrive.methods.splatad.content import GaussianContent
 from foredrive.scene.record import Record
 
 

@@ -13,13 +13,11 @@ from jaxtyping import Float, Int
 from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
-from foredrive.ops.compositing import composite
-from foredrive.ops.ray_boxes import Crossings
-from foredrive.rendering.field.content import FieldContent, FieldParts
-from foredrive.rendering.field.decoders import UPSAMPLING
-from foredrive.rendering.field.network import ActorSamples, ProposalDensity
-from foredrive.rendering.field.rays import FieldRays
-from foredrive.rendering.field.render import (
+from foredrive.methods.neurad.content import FieldContent, FieldParts
+from foredrive.methods.neurad.decoders import UPSAMPLING
+from foredrive.methods.neurad.network import ActorSamples, ProposalDensity
+from foredrive.methods.neurad.rays import FieldRays
+from foredrive.methods.neurad.render import (
     FieldActors,
     Intervals,
     NeuralField,
@@ -27,8 +25,10 @@ from foredrive.rendering.field.render import (
     footprints,
     median_distance,
 )
-from foredrive.rendering.field.sampling import first_borders, interpolated, resampled_borders
-from foredrive.rendering.tracks import ActorTracks
+from foredrive.methods.neurad.sampling import first_borders, interpolated, resampled_borders
+from foredrive.methods.rebuilding.tracks import ActorTracks
+from foredrive.ops.compositing import composite
+from foredrive.ops.ray_boxes import Crossings
 
 _FIRST_SAMPLES = 32
 """Equal intervals of a ray in a guest's box, in which its field proposes where to sample."""

@@ -8,16 +8,16 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from foredrive.engine.learning_rates import Rate
 from foredrive.geometry.se3 import transform_points
-from foredrive.rendering.field.config import FieldConfig, GridConfig, GridsConfig
-from foredrive.rendering.field.decoders import PatchDecoderConfig
-from foredrive.rendering.field.scene import FieldScene, FieldSceneConfig, saved_field
-from foredrive.rendering.gaussians.content import gaussians_of
-from foredrive.rendering.gaussians.initial import AHEAD_LEFT_UP, InitialGaussians, initial_scene
-from foredrive.rendering.tracks import ActorTracks
-from foredrive.training.field_training import FieldRates, FieldSchedule, FieldTraining, FieldWeights
-from foredrive.training.learning_rates import Rate
-from foredrive.training.rebuilding import SensorViews
+from foredrive.methods.neurad.config import FieldConfig, GridConfig, GridsConfig
+from foredrive.methods.neurad.decoders import PatchDecoderConfig
+from foredrive.methods.neurad.scene import FieldScene, FieldSceneConfig, saved_field
+from foredrive.methods.neurad.training import FieldRates, FieldSchedule, FieldTraining, FieldWeights
+from foredrive.methods.rebuilding.tracks import ActorTracks
+from foredrive.methods.rebuilding.training import SensorViews
+from foredrive.methods.splatad.content import gaussians_of
+from foredrive.methods.splatad.initial import AHEAD_LEFT_UP, InitialGaussians, initial_scene
 
 _SHOWN = InitialGaussians(
     lidar_points=20_000,

@@ -6,13 +6,13 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
+from foredrive.methods.neurad.config import FieldConfig
+from foredrive.methods.neurad.network import ActorSamples, FieldLayers, Grids, ProposalDensity
+from foredrive.methods.neurad.rays import FieldRays
+from foredrive.methods.neurad.sampling import first_borders, resampled_borders, to_distance
+from foredrive.methods.rebuilding.tracks import MAX_HOLD_S, ActorTracks
 from foredrive.ops.compositing import composite
 from foredrive.ops.ray_boxes import Crossings, MovingBoxes, cross_boxes
-from foredrive.rendering.field.config import FieldConfig
-from foredrive.rendering.field.network import ActorSamples, FieldLayers, Grids, ProposalDensity
-from foredrive.rendering.field.rays import FieldRays
-from foredrive.rendering.field.sampling import first_borders, resampled_borders, to_distance
-from foredrive.rendering.tracks import MAX_HOLD_S, ActorTracks
 
 
 class FieldActors(NamedTuple):

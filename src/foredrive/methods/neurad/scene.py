@@ -13,10 +13,10 @@ from torch import Tensor, nn
 
 from foredrive.errors import InputError
 from foredrive.geometry.projection import pixels_to_rays
-from foredrive.rendering.field.config import FieldConfig
-from foredrive.rendering.field.content import FieldContent, FieldParts, field_of
-from foredrive.rendering.field.decoders import UPSAMPLING, BeamDecoder, PatchDecoder, PatchDecoderConfig
-from foredrive.rendering.field.guests import (
+from foredrive.methods.neurad.config import FieldConfig
+from foredrive.methods.neurad.content import FieldContent, FieldParts, field_of
+from foredrive.methods.neurad.decoders import UPSAMPLING, BeamDecoder, PatchDecoder, PatchDecoderConfig
+from foredrive.methods.neurad.guests import (
     Guest,
     SeenOfGuest,
     look_with_guests,
@@ -24,15 +24,15 @@ from foredrive.rendering.field.guests import (
     with_guests_in_image,
     with_guests_in_sweep,
 )
-from foredrive.rendering.field.rays import FieldRays, beam_rays, pixel_rays
-from foredrive.rendering.field.render import FieldActors, NeuralField, SeenAlongRays
-from foredrive.rendering.gaussians.content import GaussianContent
-from foredrive.rendering.gaussians.gaussians import Gaussians
-from foredrive.rendering.rebuilt import RebuiltScene, saved_tracks
-from foredrive.rendering.rendered import RenderedImage, RenderedSweep
-from foredrive.rendering.scene_graph import SceneGraph
-from foredrive.rendering.tracks import ActorTracks
-from foredrive.rendering.views import CameraView, SweepView
+from foredrive.methods.neurad.rays import FieldRays, beam_rays, pixel_rays
+from foredrive.methods.neurad.render import FieldActors, NeuralField, SeenAlongRays
+from foredrive.methods.rebuilding.gaussians import Gaussians
+from foredrive.methods.rebuilding.rebuilt import RebuiltScene, saved_tracks
+from foredrive.methods.rebuilding.rendered import RenderedImage, RenderedSweep
+from foredrive.methods.rebuilding.scene_graph import SceneGraph
+from foredrive.methods.rebuilding.tracks import ActorTracks
+from foredrive.methods.rebuilding.views import CameraView, SweepView
+from foredrive.methods.splatad.content import GaussianContent
 
 RAYS_AT_ONCE = 4096
 """Rays of an image or a sweep that are rendered together. More take memory and are not faster."""

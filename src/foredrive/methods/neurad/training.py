@@ -9,8 +9,12 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.optim import Optimizer
 
+from foredrive.engine.learning_rates import Rate
+from foredrive.engine.ranges import check_at_least, check_shares
 from foredrive.errors import InputError
-from foredrive.losses.field import (
+from foredrive.methods.blocks.vgg import VggFeatures
+from foredrive.methods.neurad.decoders import UPSAMPLING
+from foredrive.methods.neurad.losses import (
     beam_depth_loss,
     carving_loss,
     distortion_loss,
@@ -18,15 +22,11 @@ from foredrive.losses.field import (
     interlevel_loss,
     weighted_feature_loss,
 )
-from foredrive.losses.rendering import drop_loss, intensity_loss
-from foredrive.models.vgg import VggFeatures
-from foredrive.rendering.field.decoders import UPSAMPLING
-from foredrive.rendering.field.rays import FieldRays
-from foredrive.rendering.field.render import Intervals, SeenAlongRays
-from foredrive.rendering.field.scene import FieldScene, tables_of
-from foredrive.training.learning_rates import Rate
-from foredrive.training.ranges import check_at_least, check_shares
-from foredrive.training.rebuilding import ParameterGroup, SensorViews, StepLosses
+from foredrive.methods.neurad.rays import FieldRays
+from foredrive.methods.neurad.render import Intervals, SeenAlongRays
+from foredrive.methods.neurad.scene import FieldScene, tables_of
+from foredrive.methods.rebuilding.training import ParameterGroup, SensorViews, StepLosses
+from foredrive.methods.splatad.losses import drop_loss, intensity_loss
 
 PULSES = (0.03, 0.003)
 """Half widths of the blur for the first and for further proposals, in positions on the ray (Zip-NeRF)."""

@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from foredrive.errors import InputError
-from foredrive.models.ego_mlp import ego_speeds
+from foredrive.methods.planner.ego_mlp import ego_speeds
 from foredrive.scene import Clip, Trajectory
 
 

@@ -5,10 +5,10 @@ from dataclasses import dataclass
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from foredrive.losses import l1_waypoint_loss
-from foredrive.models.path_correction import PathCorrection, PathSamples
+from foredrive.engine.in_memory_fit import FitSchedule, fit_in_memory
+from foredrive.methods.planner.path_correction import PathCorrection, PathSamples
 from foredrive.scene.record import Record
-from foredrive.training.in_memory_fit import FitSchedule, fit_in_memory
+from foredrive.tasks.planning.losses import l1_waypoint_loss
 
 
 @dataclass(frozen=True)

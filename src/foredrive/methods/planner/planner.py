@@ -10,12 +10,17 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from foredrive.geometry.precision import full_precision
-from foredrive.models.ego_mlp import EgoMLP, EgoMLPConfig, status_vector
-from foredrive.models.few_queries import FewQueriesDecoderLayer
-from foredrive.models.path_correction import PathCorrection, PathCorrectionConfig, headings, set_to_zero
-from foredrive.models.tasks.heads import TaskHeadsConfig
-from foredrive.models.tasks.scene_tokens import Attended, SceneTokens
+from foredrive.methods.planner.ego_mlp import EgoMLP, EgoMLPConfig, status_vector
+from foredrive.methods.planner.path_correction import (
+    PathCorrection,
+    PathCorrectionConfig,
+    headings,
+    set_to_zero,
+)
 from foredrive.scene import Command, Trajectory, VoxelSpec
+from foredrive.tasks.detection.few_queries import FewQueriesDecoderLayer
+from foredrive.tasks.heads.heads import TaskHeadsConfig
+from foredrive.tasks.heads.scene_tokens import Attended, SceneTokens
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -290,3 +295,10 @@ class VolumePlanner(nn.Module):
         if future is None:
             raise ValueError("this planner needs the next volume too")
         return torch.cat([now, future], 1) if self.fuse_future is None else self.fuse_future(now, future)
+
+
+def set_planner_trainable(planner: VolumePlanner, trainable: bool) -> None:
+    """Enable or disable the training of a planner. Its ego MLP is never trained here."""
+    planner.requires_grad_(trainable)
+    if planner.ego_mlp is not None:
+        planner.ego_mlp.requires_grad_(False)

@@ -20,10 +20,10 @@ from torch import Tensor
 
 from foredrive.geometry.projection import project
 from foredrive.geometry.se3 import exp_se3, inverse_se3, transform_points
-from foredrive.rendering.scene_graph import STATIC
-from foredrive.rendering.seed_points import actor_rows
-from foredrive.rendering.tracks import ActorTracks, states_at
-from foredrive.rendering.views import CameraView, SweepView
+from foredrive.methods.rebuilding.scene_graph import STATIC
+from foredrive.methods.rebuilding.seed_points import actor_rows
+from foredrive.methods.rebuilding.tracks import ActorTracks, states_at
+from foredrive.methods.rebuilding.views import CameraView, SweepView
 from foredrive.scene import LidarSweep
 
 ROTATION_STEPS_RAD = tuple(

@@ -16,8 +16,8 @@ from torch import Tensor
 from foredrive.errors import InputError
 from foredrive.files import atomic_path
 from foredrive.geometry.se3 import inverse_se3, matrix_from_yaw
-from foredrive.rendering.scene_graph import SceneGraph
-from foredrive.rendering.tracks import ActorTracks
+from foredrive.methods.rebuilding.scene_graph import SceneGraph
+from foredrive.methods.rebuilding.tracks import ActorTracks
 
 Offset = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
 """Forward, left, up, m."""

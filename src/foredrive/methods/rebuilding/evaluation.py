@@ -10,11 +10,11 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from foredrive.metrics.images import psnr_db, ssim
-from foredrive.metrics.lidar_rendering import SweepScores, score_sweep
-from foredrive.rendering.rebuilt import RebuiltScene
-from foredrive.rendering.scene_graph import SceneGraph
-from foredrive.rendering.views import CameraView, SweepView
+from foredrive.methods.rebuilding.rebuilt import RebuiltScene
+from foredrive.methods.rebuilding.scene_graph import SceneGraph
+from foredrive.methods.rebuilding.views import CameraView, SweepView
+from foredrive.tasks.rendering.image_scores import psnr_db, ssim
+from foredrive.tasks.rendering.lidar_scores import SweepScores, score_sweep
 
 MOVING_MPS = 0.5
 """From this speed on a vehicle counts as moving."""

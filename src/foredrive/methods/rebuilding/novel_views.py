@@ -5,9 +5,9 @@ import dataclasses
 import torch
 
 from foredrive.geometry.se3 import sensor_twist
-from foredrive.rendering.rendered import RenderedSweep
-from foredrive.rendering.vehicle import EgoState
-from foredrive.rendering.views import CameraView, SweepView
+from foredrive.methods.rebuilding.rendered import RenderedSweep
+from foredrive.methods.rebuilding.vehicle import EgoState
+from foredrive.methods.rebuilding.views import CameraView, SweepView
 from foredrive.scene import CameraRig, LidarSweep
 from foredrive.sensors import SpinningLidar
 

@@ -7,11 +7,11 @@ from statistics import fmean
 
 import torch
 
-from foredrive.models.inception import InceptionFeatures
-from foredrive.models.lpips import Lpips
-from foredrive.models.published_weights import load_published
-from foredrive.rendering.rebuilt import RebuiltScene
-from foredrive.rendering.views import CameraView
+from foredrive.methods.blocks.inception import InceptionFeatures
+from foredrive.methods.blocks.lpips import Lpips
+from foredrive.methods.blocks.published_weights import load_published
+from foredrive.methods.rebuilding.rebuilt import RebuiltScene
+from foredrive.methods.rebuilding.views import CameraView
 
 
 @dataclass(frozen=True)

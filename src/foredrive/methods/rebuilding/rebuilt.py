@@ -11,10 +11,10 @@ from safetensors import safe_open
 from torch import Tensor, nn
 
 from foredrive.geometry.se3 import exp_se3
-from foredrive.rendering.rendered import RenderedImage, RenderedSweep
-from foredrive.rendering.scene_graph import Content, SceneGraph
-from foredrive.rendering.tracks import PER_TRACK, ActorTracks
-from foredrive.rendering.views import CameraView, SweepView
+from foredrive.methods.rebuilding.rendered import RenderedImage, RenderedSweep
+from foredrive.methods.rebuilding.scene_graph import Content, SceneGraph
+from foredrive.methods.rebuilding.tracks import PER_TRACK, ActorTracks
+from foredrive.methods.rebuilding.views import CameraView, SweepView
 
 OBSTACLE = "obstacle_"
 """Beginning of the names of the obstacles' buffers."""

@@ -8,10 +8,10 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 
 from foredrive.geometry.se3 import inverse_se3
-from foredrive.rendering.novel_views import novel_camera_view, novel_sweep_view, rendered_sweep
-from foredrive.rendering.rebuilt import RebuiltScene
-from foredrive.rendering.scene_graph import SceneGraph
-from foredrive.rendering.vehicle import EgoState, LoggedVehicle
+from foredrive.methods.rebuilding.novel_views import novel_camera_view, novel_sweep_view, rendered_sweep
+from foredrive.methods.rebuilding.rebuilt import RebuiltScene
+from foredrive.methods.rebuilding.scene_graph import SceneGraph
+from foredrive.methods.rebuilding.vehicle import EgoState, LoggedVehicle
 from foredrive.scene import CameraRig, LidarSweep, Rendered
 from foredrive.sensors import SpinningLidar
 

@@ -6,9 +6,9 @@ from typing import Any, Protocol, runtime_checkable
 from jaxtyping import Float
 from torch import Tensor
 
-from foredrive.rendering.rebuilt import RebuiltScene
-from foredrive.rendering.tracks import ActorTracks
-from foredrive.training.rebuilding import SceneTraining, SensorViews
+from foredrive.methods.rebuilding.rebuilt import RebuiltScene
+from foredrive.methods.rebuilding.tracks import ActorTracks
+from foredrive.methods.rebuilding.training import SceneTraining, SensorViews
 
 
 @runtime_checkable

@@ -10,8 +10,8 @@ from typing import Protocol, runtime_checkable
 import torch
 
 from foredrive.errors import InputError
-from foredrive.rendering.gaussians.gaussians import Gaussians
-from foredrive.rendering.tracks import ActorTracks, joined_tracks
+from foredrive.methods.rebuilding.gaussians import Gaussians
+from foredrive.methods.rebuilding.tracks import ActorTracks, joined_tracks
 from foredrive.scene.record import Record
 
 STATIC = -1

@@ -11,9 +11,9 @@ from torch import Tensor
 
 from foredrive.geometry.projection import pixels_to_rays, project
 from foredrive.geometry.se3 import inverse_se3, rotate_vectors, transform_points
-from foredrive.rendering.scene_graph import STATIC
-from foredrive.rendering.tracks import ActorStates, ActorTracks, states_at
-from foredrive.rendering.views import CameraView, SweepView
+from foredrive.methods.rebuilding.scene_graph import STATIC
+from foredrive.methods.rebuilding.tracks import ActorStates, ActorTracks, states_at
+from foredrive.methods.rebuilding.views import CameraView, SweepView
 from foredrive.scene.record import Record
 
 GREY = 0.5

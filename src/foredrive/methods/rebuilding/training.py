@@ -15,12 +15,12 @@ import torch
 from torch import Tensor, nn
 from torch.optim import Adam, Optimizer
 
+from foredrive.engine.checkpoints import latest_checkpoint, load_checkpoint, remove_older
+from foredrive.engine.learning_rates import Rate
+from foredrive.engine.loop import CHECKPOINTS, check_finite, step_counter
 from foredrive.errors import InputError
-from foredrive.rendering.rebuilt import RebuiltScene
-from foredrive.rendering.views import CameraView, SweepView
-from foredrive.training.checkpoints import latest_checkpoint, load_checkpoint, remove_older
-from foredrive.training.learning_rates import Rate
-from foredrive.training.loop import CHECKPOINTS, check_finite, step_counter
+from foredrive.methods.rebuilding.rebuilt import RebuiltScene
+from foredrive.methods.rebuilding.views import CameraView, SweepView
 
 _SMOOTHING = 0.05
 """Weight of the newest image in the displayed PSNR."""

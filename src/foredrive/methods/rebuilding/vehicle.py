@@ -14,7 +14,7 @@ from torch import Tensor
 from foredrive.errors import InputError
 from foredrive.files import atomic_path
 from foredrive.geometry.se3 import exp_se3, inverse_se3, sensor_twist
-from foredrive.rendering.tracks import poses_at
+from foredrive.methods.rebuilding.tracks import poses_at
 from foredrive.scene import CameraRig, Clip
 from foredrive.scene.record import Record
 from foredrive.sensors import SpinningLidar

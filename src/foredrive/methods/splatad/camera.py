@@ -5,9 +5,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from foredrive.geometry.projection import distort, distortion_jacobian, pixels_to_rays
+from foredrive.methods.rebuilding.gaussians import Gaussians
+from foredrive.methods.splatad.footprint import footprint, in_sensor, positions_in_sensor, through
 from foredrive.ops.splatting import Splats
-from foredrive.rendering.gaussians.footprint import footprint, in_sensor, positions_in_sensor, through
-from foredrive.rendering.gaussians.gaussians import Gaussians
 
 NEAR_M = 0.2
 """Minimum depth of the centre of a visible Gaussian, m."""

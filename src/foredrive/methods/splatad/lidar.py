@@ -7,16 +7,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from foredrive.methods.rebuilding.gaussians import Gaussians
+from foredrive.methods.splatad.beams import sector_of
+from foredrive.methods.splatad.footprint import InSensor, footprint, in_sensor, positions_in_sensor, through
 from foredrive.ops.splatting import Splats
-from foredrive.rendering.gaussians.beams import sector_of
-from foredrive.rendering.gaussians.footprint import (
-    InSensor,
-    footprint,
-    in_sensor,
-    positions_in_sensor,
-    through,
-)
-from foredrive.rendering.gaussians.gaussians import Gaussians
 
 NEAR_M = 0.2
 """Minimum range of the centre of a visible Gaussian, m."""

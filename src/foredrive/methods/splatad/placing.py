@@ -8,10 +8,10 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from foredrive.geometry.quaternions import multiply_quaternions, quaternion_from_matrix
-from foredrive.rendering.gaussians.content import gaussians_of
-from foredrive.rendering.gaussians.gaussians import Gaussians, joined
-from foredrive.rendering.scene_graph import SceneGraph
-from foredrive.rendering.tracks import states_at
+from foredrive.methods.rebuilding.gaussians import Gaussians, joined
+from foredrive.methods.rebuilding.scene_graph import SceneGraph
+from foredrive.methods.rebuilding.tracks import states_at
+from foredrive.methods.splatad.content import gaussians_of
 from foredrive.scene.record import Record
 
 _MIRROR_XYZ = (1.0, -1.0, 1.0)

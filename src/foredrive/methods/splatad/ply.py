@@ -8,7 +8,7 @@ from numpy.lib.recfunctions import unstructured_to_structured
 from plyfile import PlyData, PlyElement
 
 from foredrive.files import atomic_path
-from foredrive.rendering.gaussians import Gaussians
+from foredrive.methods.splatad import Gaussians
 
 SH_DEGREE_0 = 0.28209479177387814
 """Albedo is 0.5 plus this factor times the constant coefficient."""

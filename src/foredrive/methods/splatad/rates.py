@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from foredrive.training.learning_rates import Rate
+from foredrive.engine.learning_rates import Rate
 
 
 @dataclass(frozen=True)

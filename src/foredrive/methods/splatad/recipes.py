@@ -8,16 +8,16 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from foredrive.rendering.decoders import CameraDecoderConfig
-from foredrive.rendering.gaussians.initial import InitialGaussians, initial_scene
-from foredrive.rendering.gaussians.scene import GaussianScene, saved_scene
-from foredrive.rendering.gaussians.scene_config import GaussianSceneConfig
-from foredrive.rendering.gaussians.unseen_ground import add_unseen_ground
-from foredrive.rendering.tracks import ActorTracks
-from foredrive.training.gaussian_rates import LearningRates
-from foredrive.training.gaussian_training import GaussianSchedule, GaussianTraining
-from foredrive.training.learning_rates import Rate
-from foredrive.training.rebuilding import SensorViews
+from foredrive.engine.learning_rates import Rate
+from foredrive.methods.rebuilding.decoders import CameraDecoderConfig
+from foredrive.methods.rebuilding.tracks import ActorTracks
+from foredrive.methods.rebuilding.training import SensorViews
+from foredrive.methods.splatad.initial import InitialGaussians, initial_scene
+from foredrive.methods.splatad.rates import LearningRates
+from foredrive.methods.splatad.scene import GaussianScene, saved_scene
+from foredrive.methods.splatad.scene_config import GaussianSceneConfig
+from foredrive.methods.splatad.training import GaussianSchedule, GaussianTraining
+from foredrive.methods.splatad.unseen_ground import add_unseen_ground
 
 _COPIES = 14
 """Copies of each number of a Gaussian: the value, its gradient, two moments, and the tensors that autograd

@@ -11,7 +11,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from foredrive.geometry.quaternions import multiply_quaternions
-from foredrive.rendering.gaussians import Gaussians
+from foredrive.methods.splatad import Gaussians
 
 MIN_OPACITY = 0.005
 """Gaussians with a lower opacity are dead."""

@@ -13,20 +13,20 @@ from torch import Tensor, nn
 from foredrive.errors import InputError
 from foredrive.geometry.projection import pixel_centres, pixels_to_rays
 from foredrive.geometry.se3 import exp_se3, inverse_se3, rotate_vectors
+from foredrive.methods.rebuilding.decoders import ALBEDO, CameraDecoder, LidarDecoder
+from foredrive.methods.rebuilding.gaussians import Gaussians
+from foredrive.methods.rebuilding.rebuilt import RebuiltScene, saved_tracks
+from foredrive.methods.rebuilding.rendered import RenderedImage, RenderedSweep
+from foredrive.methods.rebuilding.scene_graph import STATIC, SceneGraph
+from foredrive.methods.rebuilding.views import CameraView, SweepView
+from foredrive.methods.splatad.beams import PreparedSweep, prepared_sweep
+from foredrive.methods.splatad.camera import project_camera
+from foredrive.methods.splatad.content import GaussianContent, gaussians_of
+from foredrive.methods.splatad.lidar import project_lidar
+from foredrive.methods.splatad.placing import place_gaussians
+from foredrive.methods.splatad.scene_config import GaussianSceneConfig
 from foredrive.ops.splat_points import TiledPoints, pixel_points
 from foredrive.ops.splatting import BeforeHit, composite_splats
-from foredrive.rendering.decoders import ALBEDO, CameraDecoder, LidarDecoder
-from foredrive.rendering.gaussians.beams import PreparedSweep, prepared_sweep
-from foredrive.rendering.gaussians.camera import project_camera
-from foredrive.rendering.gaussians.content import GaussianContent, gaussians_of
-from foredrive.rendering.gaussians.gaussians import Gaussians
-from foredrive.rendering.gaussians.lidar import project_lidar
-from foredrive.rendering.gaussians.placing import place_gaussians
-from foredrive.rendering.gaussians.scene_config import GaussianSceneConfig
-from foredrive.rendering.rebuilt import RebuiltScene, saved_tracks
-from foredrive.rendering.rendered import RenderedImage, RenderedSweep
-from foredrive.rendering.scene_graph import STATIC, SceneGraph
-from foredrive.rendering.views import CameraView, SweepView
 
 BACKGROUND = 0.5
 """Albedo of the background, where no Gaussian covers a pixel."""

@@ -3,8 +3,8 @@
 from dataclasses import dataclass, field
 from typing import Literal
 
-from foredrive.rendering.decoders import CameraDecoderConfig
-from foredrive.rendering.gaussians.camera import NEAR_M
+from foredrive.methods.rebuilding.decoders import CameraDecoderConfig
+from foredrive.methods.splatad.camera import NEAR_M
 
 
 @dataclass(frozen=True)

@@ -15,10 +15,10 @@ from torch import Tensor
 
 from foredrive.geometry.projection import project
 from foredrive.geometry.se3 import inverse_se3, transform_points
-from foredrive.rendering.gaussians import Gaussians
-from foredrive.rendering.gaussians.scene import GaussianScene
-from foredrive.rendering.scene_graph import STATIC, SceneGraph
-from foredrive.rendering.views import CameraView
+from foredrive.methods.rebuilding.scene_graph import STATIC, SceneGraph
+from foredrive.methods.rebuilding.views import CameraView
+from foredrive.methods.splatad import Gaussians
+from foredrive.methods.splatad.scene import GaussianScene
 
 WITHIN_M = 25.0
 """Maximum distance from the driven path, m."""

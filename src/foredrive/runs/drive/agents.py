@@ -5,31 +5,105 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 
+from foredrive.data.resizing import shrink_images
 from foredrive.driver.agent import Driver, PartlyTrue, Perception, SightDriver
+from foredrive.driving.observation import FRAME_DT_S
+from foredrive.driving.restarts import RestartingAgent, is_free_ahead
+from foredrive.driving.simple_agents import StraightAgent
 from foredrive.errors import InputError
+from foredrive.integrations.remote.json_http import read_address
+from foredrive.integrations.remote.planner_client import ALIVE_S, HttpPlanner, check_planner
 from foredrive.json_server import Address
-from foredrive.models.ego_mlp import EgoMLP
-from foredrive.runs.drive.seeing_agents import SeeingAgent, following
+from foredrive.methods.planner.agent import PlanningAgent
+from foredrive.methods.planner.ego_mlp import EgoMLP
 from foredrive.runs.shipped import run_folder
 from foredrive.runs.train.baselines import run_baselines
 from foredrive.runs.train.driver import is_driver, load_driver, open_driver
 from foredrive.runs.train.rigs import TrainedRigs, check_rig, read_rigs
 from foredrive.runs.train.run import load_agent, open_run
-from foredrive.scene import Agent
+from foredrive.scene import Agent, Clip, Trajectory
 from foredrive.sensors.rigs import SURROUND, RigPlan
-from foredrive.simulation.demonstrations import AlternatingStudent, DisturbedExpert
-from foredrive.simulation.idm_agent import IdmAgent, TruePerception
-from foredrive.simulation.observation import FRAME_DT_S
-from foredrive.simulation.remote.json_http import read_address
-from foredrive.simulation.remote.planner_client import ALIVE_S, HttpPlanner, check_planner
-from foredrive.simulation.restarts import RestartingAgent
-from foredrive.simulation.simple_agents import StraightAgent
-from foredrive.simulation.town import TownSimulator
-from foredrive.simulation.town_expert import TownExpert
+from foredrive.tasks.evaluation.frame_keys import MAX_GAP_S
+from foredrive.tasks.tracking.following import AgentFollower
+from foredrive.towns.driving.demonstrations import AlternatingStudent, DisturbedExpert
+from foredrive.towns.driving.idm_agent import IdmAgent, TruePerception
+from foredrive.towns.driving.town import TownSimulator
+from foredrive.towns.driving.town_expert import TownExpert
+
+
+@dataclass(frozen=True, eq=False)
+class SeeingAgent:
+    """The agent of a run. Its images may be smaller than the vehicle records them."""
+
+    agent: PlanningAgent[Any]
+    image_hw: tuple[int, int]
+    device: str
+
+    def seen(self, observation: Clip) -> Clip:
+        """Return the observation as the agent reads it."""
+        clip: Clip = shrink_images(observation, self.image_hw).to(self.device)
+        return clip
+
+    def act(self, observation: Clip) -> Trajectory:
+        """Return the plan."""
+        return self.agent.act(self.seen(observation))
+
+    @torch.no_grad()
+    def is_free(self, observation: Clip) -> bool:
+        """Return whether the world model sees nothing right ahead, for an observation of a batch of one."""
+        world = self.agent.world_model
+        decoded = world.decode(self.agent.rollout(self.seen(observation), 0)[0])
+        return is_free_ahead(decoded.occupancy_logit[0], world.spec)
+
+
+class FollowingAgent:
+    """A `SeeingAgent` in one drive whose planner attends to agents that are carried from frame to frame.
+
+    It is trained with the agents of the frames before, and so it drives with them. They are forgotten after
+    a gap in the observations.
+
+    Args:
+        seeing: the agent of the run.
+        follower: the state of the drive.
+        clock: returns the time of the drive, s.
+    """
+
+    def __init__(self, seeing: SeeingAgent, follower: AgentFollower, clock: Callable[[], float]) -> None:
+        self._seeing, self._follower, self._clock = seeing, follower, clock
+        self._before_s: float | None = None
+
+    @torch.no_grad()
+    def act(self, observation: Clip) -> Trajectory:
+        """Return the plan."""
+        agent, clip, now_s = self._seeing.agent, self._seeing.seen(observation), self._clock()
+        dt_s = None if self._before_s is None else now_s - self._before_s
+        if dt_s is not None and not 0 < dt_s <= MAX_GAP_S:
+            dt_s = None
+        beliefs = agent.rollout(clip, agent.planner.imagined_frames)
+        found, _ = self._follower.step(
+            lambda carried: agent.perceived(beliefs[0], carried=carried), clip.T_world_ego[0, clip.now], dt_s
+        )
+        self._before_s = now_s
+        return agent.plan(clip, beliefs, found)
+
+
+def following(seeing: SeeingAgent, clock: Callable[[], float]) -> Agent:
+    """Return the agent for one drive; one with a state if its planner attends to agents that are carried.
+
+    Args:
+        seeing: the agent of the run.
+        clock: returns the time of the drive, s.
+    """
+    agent = seeing.agent
+    heads = None if agent.heads is None else agent.heads.config.agents
+    if agent.planner.scene is None or heads is None or heads.carried is None:
+        return seeing
+    return FollowingAgent(seeing, AgentFollower(heads.carried), clock)
+
 
 CRUISE_MPS = 5.0
 EXPERT, STOP, CONSTANT_VELOCITY, EGO_MLP = "expert", "stop", "constant-velocity", "ego-mlp:"
@@ -47,8 +121,6 @@ DISTURBED, STUDENT = "disturbed", "student:"
 IDM, IDM_BY_SIGHT = "idm", "idm:"
 PARTLY_TRUE = {"true:": (True, True), "true-lights:": (True, False), "true-users:": (False, True)}
 """Prefixes of a driver's run that drives with lights, and with road users, as they truly are."""
-OLD_STUDENT = "pupil:"
-"""The prefix of `STUDENT` in earlier versions, still accepted."""
 
 
 @dataclass(frozen=True)
@@ -170,7 +242,7 @@ def make_agent(
         )
     if agent.startswith(GRPC):
         require_alpasim()
-        from foredrive.simulation.remote.alpasim_client import GrpcDriver
+        from foredrive.integrations.remote.alpasim_client import GrpcDriver
 
         return GrpcDriver(_address_of(agent), clock)
     if agent.startswith(HTTP):
@@ -190,7 +262,7 @@ def make_agent(
             return SightDriver(driver, PartlyTrue(Perception(driver), truth, lights=lights, users=users))
     if agent.startswith(EGO_MLP):
         return RestartingAgent(_fitted(folder), clock)
-    if agent.startswith((STUDENT, OLD_STUDENT)):
+    if agent.startswith(STUDENT):
         driven = SightDriver(_driver(folder)) if is_driver(folder) else following(_seeing(folder), clock)
         return AlternatingStudent(driven, _expert(town), clock, seed)
     if is_driver(folder):
@@ -226,7 +298,7 @@ def check_ready(agent: str) -> None:
     """
     if agent.startswith(GRPC):
         require_alpasim()
-        from foredrive.simulation.remote.alpasim_client import check_driver
+        from foredrive.integrations.remote.alpasim_client import check_driver
 
         check_driver(_address_of(agent), ALIVE_S)
     elif is_remote(agent):
@@ -245,11 +317,7 @@ def _town(town: TownSimulator | None) -> TownSimulator:
 
 def _run_folder(agent: str) -> Path:
     prefix = next(
-        (
-            known
-            for known in (EGO_MLP, STUDENT, OLD_STUDENT, IDM_BY_SIGHT, *PARTLY_TRUE)
-            if agent.startswith(known)
-        ),
+        (known for known in (EGO_MLP, STUDENT, IDM_BY_SIGHT, *PARTLY_TRUE) if agent.startswith(known)),
         "",
     )
     folder = run_folder(Path(agent.removeprefix(prefix)))

@@ -8,12 +8,12 @@ from pathlib import Path
 
 import numpy as np
 
+from foredrive.driving.drive_record import DriveRecord
+from foredrive.driving.scores import Ending, InfractionKind
+from foredrive.engine.folder import DRIVES
 from foredrive.errors import InputError
-from foredrive.metrics.bootstrap import BootstrapMean, bootstrap_mean
 from foredrive.runs.drive.records import read_drive, read_suite
-from foredrive.runs.folder import DRIVES
-from foredrive.simulation.drive_record import DriveRecord
-from foredrive.simulation.scores import Ending, InfractionKind
+from foredrive.tasks.bootstrap import BootstrapMean, bootstrap_mean
 
 COLLISIONS = (
     InfractionKind.COLLISION_PEDESTRIAN,

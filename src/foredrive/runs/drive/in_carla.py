@@ -6,18 +6,18 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+from foredrive.driving.route_scenario import RouteScenario
+from foredrive.driving.scores import timeout_s
 from foredrive.errors import InputError
+from foredrive.integrations.carla.client import connect
+from foredrive.integrations.carla.simulator import CarlaSimulator
 from foredrive.runs.drive.agents import inputs_of, make_agent
 from foredrive.runs.drive.route_source import RouteSource
 from foredrive.runs.drive.suite import DriveJob, DriveSetup, DriveSuite
 from foredrive.scene.conditions import BackgroundTraffic
 from foredrive.sensors.rigs import camera_rig
 from foredrive.sensors.vehicle import VehicleSensors, roof_lidar
-from foredrive.simulation.carla.client import connect
-from foredrive.simulation.carla.simulator import CarlaSimulator
-from foredrive.simulation.drive_log import drive_log, log_frame
-from foredrive.simulation.route_scenario import RouteScenario
-from foredrive.simulation.scores import timeout_s
+from foredrive.towns.driving.drive_log import drive_log, log_frame
 
 PORT = 2000
 

@@ -10,8 +10,17 @@ from pathlib import Path
 
 from foredrive.data.boxes import read_track_ids
 from foredrive.data.logs import Log
+from foredrive.driving.drive import Drive
+from foredrive.driving.ncap.hd import hd_score_of
+from foredrive.driving.ncap.outcome import SafetyResult, judge
+from foredrive.driving.ncap.proposing import propose
+from foredrive.driving.ncap.rules import RULES, Rules
+from foredrive.driving.ncap.running import Place, SafetyRun, set_up_run
+from foredrive.driving.ncap.scenario import SafetyScenario
+from foredrive.driving.ncap.scenario_file import load_scenarios, outside_protocol, save_scenarios
+from foredrive.driving.ncap.self_test import SelfTest, run_reference, self_test
 from foredrive.errors import InputError
-from foredrive.rendering.renderer import RebuiltRenderer
+from foredrive.methods.rebuilding.renderer import RebuiltRenderer
 from foredrive.runs.drive.agents import Sees, check_seeing, is_remote
 from foredrive.runs.drive.in_rebuilt import (
     agent_in,
@@ -23,16 +32,7 @@ from foredrive.runs.drive.in_rebuilt import (
 )
 from foredrive.runs.drive.suite import DriveJob, DriveSetup, DriveSuite
 from foredrive.runs.rebuild.rebuilt_run import open_run_log
-from foredrive.simulation.drive import Drive
-from foredrive.simulation.drive_log import drive_log, log_frame
-from foredrive.simulation.ncap.hd import hd_score_of
-from foredrive.simulation.ncap.outcome import SafetyResult, judge
-from foredrive.simulation.ncap.proposing import propose
-from foredrive.simulation.ncap.rules import RULES, Rules
-from foredrive.simulation.ncap.running import Place, SafetyRun, set_up_run
-from foredrive.simulation.ncap.scenario import SafetyScenario
-from foredrive.simulation.ncap.scenario_file import load_scenarios, outside_protocol, save_scenarios
-from foredrive.simulation.ncap.self_test import SelfTest, run_reference, self_test
+from foredrive.towns.driving.drive_log import drive_log, log_frame
 
 
 @dataclass(frozen=True)

@@ -11,10 +11,20 @@ import torch
 
 from foredrive.data.logs import Log
 from foredrive.data.maps import read_lane_outlines
+from foredrive.driving.corridor_agent import CorridorAgent
+from foredrive.driving.ncap.outcome import judge
+from foredrive.driving.observation import FRAME_DT_S
+from foredrive.driving.replay.logged_drive import LoggedDrive
+from foredrive.driving.replay.logged_lanes import LoggedLanes
+from foredrive.driving.replay.rebuilt import RebuiltScenario, RebuiltSimulator
+from foredrive.driving.replay.replay_expert import ReplayedWorld, ReplayExpert
+from foredrive.driving.replay.threats import Threat, reference_mps, send_threat
+from foredrive.driving.route_progress import RouteLine
+from foredrive.driving.simple_agents import ReplayAgent
 from foredrive.errors import InputError
-from foredrive.rendering.edits import Edit, load_edits
-from foredrive.rendering.renderer import RebuiltRenderer
-from foredrive.rendering.vehicle import LoggedVehicle
+from foredrive.methods.rebuilding.edits import Edit, load_edits
+from foredrive.methods.rebuilding.renderer import RebuiltRenderer
+from foredrive.methods.rebuilding.vehicle import LoggedVehicle
 from foredrive.runs.drive.agents import CORRIDOR, EXPERT, REPLAY, Sees, inputs_of, is_remote, make_agent
 from foredrive.runs.drive.suite import DriveJob, DriveSetup, DriveSuite
 from foredrive.runs.rebuild.rebuilt_run import (
@@ -25,17 +35,7 @@ from foredrive.runs.rebuild.rebuilt_run import (
     open_run_log,
 )
 from foredrive.scene import Agent, Clip, Trajectory
-from foredrive.simulation.corridor_agent import CorridorAgent
-from foredrive.simulation.drive_log import drive_log, log_frame
-from foredrive.simulation.logged_drive import LoggedDrive
-from foredrive.simulation.logged_lanes import LoggedLanes
-from foredrive.simulation.ncap.outcome import judge
-from foredrive.simulation.observation import FRAME_DT_S
-from foredrive.simulation.rebuilt import RebuiltScenario, RebuiltSimulator
-from foredrive.simulation.replay_expert import ReplayedWorld, ReplayExpert
-from foredrive.simulation.route_progress import RouteLine
-from foredrive.simulation.simple_agents import ReplayAgent
-from foredrive.simulation.threats import Threat, reference_mps, send_threat
+from foredrive.towns.driving.drive_log import drive_log, log_frame
 
 
 @dataclass(frozen=True)

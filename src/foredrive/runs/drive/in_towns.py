@@ -5,6 +5,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+from foredrive.driving.scores import timeout_s
 from foredrive.runs.drive.agents import inputs_of, make_agent
 from foredrive.runs.drive.route_source import RouteSource, drive_hash
 from foredrive.runs.drive.suite import DriveJob, DriveSetup, DriveSuite
@@ -12,12 +13,11 @@ from foredrive.scene import Trajectory
 from foredrive.scene.conditions import BackgroundTraffic
 from foredrive.sensors.rigs import camera_rig
 from foredrive.sensors.vehicle import roof_lidar
-from foredrive.simulation.demonstrations import AlternatingStudent, DisturbedExpert
-from foredrive.simulation.drive_log import drive_log, town_log_frame
-from foredrive.simulation.routes import DriveRoute
-from foredrive.simulation.scenarios.places import scenarios_on
-from foredrive.simulation.scores import timeout_s
-from foredrive.simulation.town import TownScenario, TownSimulator, grow
+from foredrive.towns.driving.demonstrations import AlternatingStudent, DisturbedExpert
+from foredrive.towns.driving.drive_log import drive_log, town_log_frame
+from foredrive.towns.driving.routes import DriveRoute
+from foredrive.towns.driving.town import TownScenario, TownSimulator, grow
+from foredrive.towns.scenarios.places import scenarios_on
 from foredrive.towns.sensing.capture import SensorSuite
 
 

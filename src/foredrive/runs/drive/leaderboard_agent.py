@@ -11,11 +11,11 @@ from pathlib import Path
 from typing import Any
 
 from foredrive.files import atomic_path
+from foredrive.integrations.carla.client import import_carla
+from foredrive.integrations.carla.leaderboard import LeaderboardDriver
 from foredrive.runs.drive.agents import inputs_of, make_agent, rig_of
 from foredrive.sensors.rigs import camera_rig
 from foredrive.sensors.vehicle import roof_lidar
-from foredrive.simulation.carla.client import import_carla
-from foredrive.simulation.carla.leaderboard import LeaderboardDriver
 
 SEPARATOR = "+"
 """The separator that Bench2Drive puts between the configuration and the route name. It adds both again with

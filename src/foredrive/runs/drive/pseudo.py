@@ -9,18 +9,18 @@ import torch
 
 from foredrive.data.logs import Log
 from foredrive.data.road_maps import read_road_map
+from foredrive.driving.epdms.pseudo_simulation import PseudoScore, PseudoSimulation, figures_of
+from foredrive.driving.epdms.world import Roads
+from foredrive.driving.replay.logged_drive import LoggedDrive
+from foredrive.driving.replay.rebuilt import RebuiltSimulator
+from foredrive.engine.folder import SUMMARY
+from foredrive.engine.provenance import collect_provenance
+from foredrive.engine.summary import Summary, write_summary
 from foredrive.errors import InputError
-from foredrive.evaluation.provenance import collect_provenance
-from foredrive.evaluation.summary import Summary, write_summary
-from foredrive.metrics.epdms.world import Roads
 from foredrive.runs.drive.agents import check_ready, inputs_of, is_remote
 from foredrive.runs.drive.in_ncap import place_in
 from foredrive.runs.drive.in_rebuilt import agent_in, check_lidar_of
-from foredrive.runs.folder import SUMMARY
 from foredrive.runs.rebuild.rebuilt_run import open_run_log
-from foredrive.simulation.logged_drive import LoggedDrive
-from foredrive.simulation.pseudo_simulation import PseudoScore, PseudoSimulation, figures_of
-from foredrive.simulation.rebuilt import RebuiltSimulator
 
 _log = logging.getLogger(__name__)
 

@@ -15,9 +15,9 @@ import torch
 from foredrive.data.cameras import rig_of_log
 from foredrive.data.log_paths import LogPath
 from foredrive.data.logs import Log
+from foredrive.engine.fan_out import fan_out, reason
 from foredrive.errors import InputError
 from foredrive.files import remove_abandoned, sole_writer
-from foredrive.runs.fan_out import fan_out, reason
 from foredrive.scene.conditions import BackgroundTraffic, find_conditions
 from foredrive.sensors.rigs import RigPlan, camera_rig, same_rig
 from foredrive.sensors.vehicle import roof_lidar

@@ -9,15 +9,15 @@ from pathlib import Path
 
 from pydantic import TypeAdapter, ValidationError
 
+from foredrive.driving.drive_record import DriveRecord
+from foredrive.driving.ncap.aggregation import TestedRun, aggregate
+from foredrive.driving.scores import score_suite
+from foredrive.driving.time_to_collision import NEAR_COLLISION_S
+from foredrive.engine.folder import SUITE
+from foredrive.engine.provenance import collect_provenance
+from foredrive.engine.summary import write_json
 from foredrive.errors import InputError
-from foredrive.evaluation.provenance import collect_provenance
-from foredrive.evaluation.summary import write_json
-from foredrive.runs.folder import SUITE
-from foredrive.simulation.drive_record import DriveRecord
-from foredrive.simulation.ncap.aggregation import TestedRun, aggregate
-from foredrive.simulation.scenarios.scenario import ScenarioKind
-from foredrive.simulation.scores import score_suite
-from foredrive.simulation.time_to_collision import NEAR_COLLISION_S
+from foredrive.towns.scenarios.scenario import ScenarioKind
 
 _RECORD = TypeAdapter(DriveRecord)
 Figures = dict[str, float | int | str | None]
@@ -48,15 +48,13 @@ def read_drive(path: Path) -> DriveRecord:
 
 
 def read_suite(folder: Path) -> dict[str, object]:
-    """Read the description of a suite. Earlier versions wrote the agent's name as "driver".
+    """Read the description of a suite.
 
     Raises:
         InputError: the folder has no suite file, or the file describes no suite.
     """
     try:
         suite: dict[str, object] = json.loads((folder / SUITE).read_text())
-        if "driver" in suite:
-            suite["agent"] = suite.pop("driver")
         if not isinstance(suite["agent"], str) or not isinstance(suite["routes"], str):
             raise TypeError("agent and routes have to be texts")
     except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:

@@ -8,6 +8,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+from foredrive.driving.route_sets import RouteWaypoints, load_route_set
 from foredrive.errors import InputError
 from foredrive.runs.drive.agents import check_rig_of, inputs_of
 from foredrive.runs.drive.suite import DriveJob
@@ -20,8 +21,7 @@ from foredrive.scene.conditions import (
     find_conditions,
 )
 from foredrive.sensors.rigs import SURROUND, RigPlan
-from foredrive.simulation.route_sets import RouteWaypoints, load_route_set
-from foredrive.simulation.routes import DriveRoute, snap_route
+from foredrive.towns.driving.routes import DriveRoute, snap_route
 from foredrive.towns.map.names import TOWNS
 
 _log = logging.getLogger(__name__)

@@ -20,20 +20,20 @@ import torch
 from jaxtyping import Float64
 
 from foredrive.data.log_writer import Frame, LogWriter
+from foredrive.driving.drive import Drive, Pilot, PlanningTiming, drive_route
+from foredrive.driving.drive_record import DriveRecord, record_of
+from foredrive.driving.faults import NO_FAULTS, Faults
+from foredrive.driving.faulty_agent import FaultyAgent
+from foredrive.driving.ncap.outcome import SafetyResult
+from foredrive.engine.fan_out import fan_out, reason
+from foredrive.engine.folder import DRIVES, SUITE, SUMMARY, RunFolder
+from foredrive.engine.interrupts import start_fork_server
+from foredrive.engine.summary import write_summary
 from foredrive.errors import InputError
-from foredrive.evaluation.summary import write_summary
 from foredrive.files import atomic_path, together
 from foredrive.runs.drive.agents import check_ready
 from foredrive.runs.drive.records import read_drive, read_suite, summarise, write_drive
-from foredrive.runs.fan_out import fan_out, reason
-from foredrive.runs.folder import DRIVES, SUITE, SUMMARY, RunFolder
 from foredrive.scene import Agent, Simulator
-from foredrive.simulation.drive import Drive, Pilot, PlanningTiming, drive_route
-from foredrive.simulation.drive_record import DriveRecord, record_of
-from foredrive.simulation.faults import NO_FAULTS, Faults
-from foredrive.simulation.faulty_agent import FaultyAgent
-from foredrive.simulation.ncap.outcome import SafetyResult
-from foredrive.training.interrupts import start_fork_server
 
 
 @dataclass(frozen=True)

@@ -8,16 +8,16 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from foredrive.evaluation.predictor import Prediction
 from foredrive.geometry.se3 import transform_points
-from foredrive.models.agent import PlanningAgent
-from foredrive.models.tasks.heads import TaskHeads
+from foredrive.methods.planner.agent import PlanningAgent
 from foredrive.runs.evaluate.predict import AgentPredictor
 from foredrive.scene import CameraRig, Clip, Decoded, RayRenderer, Trajectory, VoxelSpec
 from foredrive.scene.agents import Agents, MapLines
 from foredrive.scene.record import Record
 from foredrive.scene.semantics import Taxonomy
 from foredrive.sensors import camera_rays
+from foredrive.tasks.evaluation.predictor import Prediction
+from foredrive.tasks.heads.heads import TaskHeads
 
 RAYS_AT_ONCE = 8192
 

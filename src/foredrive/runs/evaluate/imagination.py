@@ -10,10 +10,10 @@ from torch import Tensor
 
 from foredrive.data import LogPath, collate
 from foredrive.errors import InputError
+from foredrive.methods.blocks.training_rays import thinned_rays
 from foredrive.runs.open_clips import open_clips
 from foredrive.runs.train.run import Run, load_agent
 from foredrive.scene import Belief, Clip, Example, RayRenderer, WorldModel
-from foredrive.training import thinned_rays
 
 SEED = 0
 MAX_DEFAULT_S = 4.0

@@ -11,14 +11,14 @@ from typing import Any
 import torch
 
 from foredrive.data import ClipDataset, LogPath, collate
-from foredrive.data.task_truth import TaskTruthConfig
-from foredrive.metrics.protocols import STEP_S, STEPS
-from foredrive.models.agent import PlanningAgent
+from foredrive.data.truth.store import TaskTruthConfig
+from foredrive.methods.planner.agent import PlanningAgent
 from foredrive.runs.evaluate.predict import AgentPredictor
 from foredrive.runs.open_clips import open_clips
 from foredrive.runs.train.run import Run, load_agent
 from foredrive.runs.train.tasks import TrainedHeads, load_heads
 from foredrive.scene import Example
+from foredrive.tasks.planning.protocols import STEP_S, STEPS
 
 RENDER_STRIDE = 2
 """One pixel in this many along rows and columns is rendered and compared."""

@@ -7,16 +7,59 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Float64, Int
 from torch import Tensor
 
-from foredrive.evaluation.predictor import Part, Prediction
-from foredrive.models.agent import PlanningAgent
-from foredrive.models.tasks.heads import HeadOutput, TaskHeads, TaskVolume, volumes_of
-from foredrive.models.tasks.instances import instance_raster
-from foredrive.runs.evaluate.streaming import DriveFollower, together
+from foredrive.methods.blocks.training_rays import thinned_rays
+from foredrive.methods.planner.agent import PlanningAgent
 from foredrive.scene import Belief, Clip, Decoded, RayRenderer, Task, WorldModel
-from foredrive.training import thinned_rays
+from foredrive.tasks.detection.agents_head import CarriedConfig
+from foredrive.tasks.evaluation.frame_keys import continues, time_of
+from foredrive.tasks.evaluation.predictor import Part, Prediction
+from foredrive.tasks.heads.heads import HeadOutput, TaskHeads, TaskVolume, volumes_of
+from foredrive.tasks.occupancy.instances_head import instance_raster
+from foredrive.tasks.tracking.carried import interleaved
+from foredrive.tasks.tracking.following import AgentFollower, Perceive
+
+
+class DriveFollower:
+    """The state between the frames of drives. It begins anew with each log, and where frames are missing.
+
+    Args:
+        config: of the carried agents.
+    """
+
+    def __init__(self, config: CarriedConfig) -> None:
+        self._follower, self._before = AgentFollower(config), ""
+
+    def step(
+        self, perceive: Perceive, key: str, T_world_ego: Float64[Tensor, "4 4"]
+    ) -> tuple[HeadOutput, Int[Tensor, "1 Q"]]:
+        """Return the output of heads for the next frame, and the identity of each agent; -1: none, or hidden.
+
+        Args:
+            perceive: the heads.
+            key: name of the frame, LOG@T_US.
+            T_world_ego: pose at now.
+        """
+        follows = continues(self._before, key)
+        dt_s = 1e-6 * (time_of(key) - time_of(self._before)) if follows else None
+        self._before = key
+        return self._follower.step(perceive, T_world_ego, dt_s)
+
+
+def together(outputs: Sequence[HeadOutput]) -> HeadOutput:
+    """Return outputs for one clip each as that of a batch."""
+    joined: dict[str, Any] = {}
+    for field in dataclasses.fields(HeadOutput):
+        parts = [getattr(output, field.name) for output in outputs]
+        if isinstance(parts[0], list):
+            joined[field.name] = [interleaved([part[n] for part in parts]) for n in range(len(parts[0]))]
+        elif isinstance(parts[0], Tensor):
+            joined[field.name] = torch.cat(parts)
+        else:
+            joined[field.name] = None if parts[0] is None else interleaved(parts)
+    return HeadOutput(**joined)
 
 
 class AgentPredictor:

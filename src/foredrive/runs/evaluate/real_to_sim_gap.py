@@ -11,23 +11,23 @@ from foredrive.data import collate
 from foredrive.data.cameras import find_camera, pinhole_cameras
 from foredrive.data.logs import Log
 from foredrive.data.resizing import shrink_images
+from foredrive.engine.provenance import collect_provenance
+from foredrive.engine.summary import write_summary
 from foredrive.errors import InputError
-from foredrive.evaluation.metric import Figures
-from foredrive.evaluation.metrics.occupancy import PERSISTENT
-from foredrive.evaluation.predictor import Part, Prediction, Predictor
-from foredrive.evaluation.provenance import collect_provenance
-from foredrive.evaluation.run import evaluate
-from foredrive.evaluation.summary import write_summary
-from foredrive.metrics.images import psnr_db
-from foredrive.metrics.protocols import STEP_S, STEPS
-from foredrive.rendering.rebuilt import RebuiltScene
-from foredrive.rendering.views import CameraView
+from foredrive.methods.rebuilding.rebuilt import RebuiltScene
+from foredrive.methods.rebuilding.views import CameraView
 from foredrive.runs.evaluate.predict import AgentPredictor
 from foredrive.runs.open_clips import open_clips
 from foredrive.runs.rebuild.rebuilt_run import camera_indices, open_rebuilt, open_run_log
 from foredrive.runs.rebuild.reconstruct import read_reconstruction_data
 from foredrive.runs.train.run import Run, load_agent
 from foredrive.scene import Clip, Example, VoxelGrid
+from foredrive.tasks.evaluation.metric import Figures
+from foredrive.tasks.evaluation.predictor import Part, Prediction, Predictor
+from foredrive.tasks.evaluation.run import evaluate
+from foredrive.tasks.occupancy.occupancy_metric import PERSISTENT
+from foredrive.tasks.planning.protocols import STEP_S, STEPS
+from foredrive.tasks.rendering.image_scores import psnr_db
 
 GAP = "gap.json"
 REAL, RENDERED, AGREEMENT = "real", "rendered", "agreement"

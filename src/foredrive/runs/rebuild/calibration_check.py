@@ -4,7 +4,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from foredrive.rendering.calibration import (
+from foredrive.methods.rebuilding.calibration import (
     CalibrationViews,
     OffsetFit,
     SweepEdges,
@@ -17,8 +17,8 @@ from foredrive.rendering.calibration import (
     sweep_edges,
     with_images_from,
 )
-from foredrive.rendering.tracks import ActorTracks
-from foredrive.rendering.views import CameraView, SweepView
+from foredrive.methods.rebuilding.tracks import ActorTracks
+from foredrive.methods.rebuilding.views import CameraView, SweepView
 
 MIN_ROTATION_RAD, MIN_TRANSLATION_M, MIN_DELAY_S = math.radians(0.4), 0.15, 0.03
 """Minimum rotation (as it moves edges in the image), translation and delay that are reported."""

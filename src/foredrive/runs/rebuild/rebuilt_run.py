@@ -7,14 +7,14 @@ from pathlib import Path
 from typing import Any
 
 from foredrive.data import LogPath
+from foredrive.engine.checkpoints import load_weights
+from foredrive.engine.folder import CONFIG, LOG, WEIGHTS
 from foredrive.errors import InputError
-from foredrive.recipes.rebuilding import RebuildRecipe, load_rebuild_recipe
-from foredrive.rendering.edits import Edit, EditedScene, apply_edits
-from foredrive.rendering.rebuilt import RebuiltScene
-from foredrive.rendering.vehicle import LoggedVehicle, load_vehicle
-from foredrive.runs.folder import CONFIG, LOG, WEIGHTS
+from foredrive.methods.rebuilding.edits import Edit, EditedScene, apply_edits
+from foredrive.methods.rebuilding.rebuilt import RebuiltScene
+from foredrive.methods.rebuilding.vehicle import LoggedVehicle, load_vehicle
 from foredrive.runs.rebuild.reconstruct import VEHICLE
-from foredrive.training.checkpoints import load_weights
+from foredrive.runs.recipes.rebuilding import RebuildRecipe, load_rebuild_recipe
 
 
 @dataclass(frozen=True)

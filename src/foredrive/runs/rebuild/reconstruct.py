@@ -15,28 +15,28 @@ from foredrive.data import LogPath
 from foredrive.data.cameras import names_of_camera, pinhole_cameras
 from foredrive.data.drives import lidar_of, read_drive
 from foredrive.data.logs import Log
+from foredrive.engine.checkpoints import load_weights, save_weights
+from foredrive.engine.config import save_recipe
+from foredrive.engine.folder import CONFIG, LOG, SUMMARY, WEIGHTS, RunFolder
+from foredrive.engine.metrics_log import read_metrics
+from foredrive.engine.provenance import collect_provenance, peak_rss_gib
+from foredrive.engine.summary import read_summary, write_summary
 from foredrive.errors import InputError
-from foredrive.evaluation.perceptual import PerceptualMetrics
-from foredrive.evaluation.provenance import collect_provenance, peak_rss_gib
-from foredrive.evaluation.rendering import evaluate_cameras, evaluate_sweeps
-from foredrive.evaluation.summary import read_summary, write_summary
 from foredrive.files import atomic_path, together
-from foredrive.recipes.config import save_recipe
-from foredrive.recipes.rebuilding import RebuildRecipe, load_rebuild_recipe
-from foredrive.recipes.representation import Representation
-from foredrive.rendering.ply import write_ply
-from foredrive.rendering.rebuilt import RebuiltScene
-from foredrive.rendering.scene_graph import STATIC
-from foredrive.rendering.tracks import ActorTracks, joined_tracks, read_tracks, split_tracks
-from foredrive.rendering.vehicle import LoggedVehicle, read_vehicle, save_vehicle
-from foredrive.rendering.views import CameraView, SweepView, camera_views, sweep_views
-from foredrive.runs.folder import CONFIG, LOG, SUMMARY, WEIGHTS, RunFolder
+from foredrive.methods.rebuilding.evaluation import evaluate_cameras, evaluate_sweeps
+from foredrive.methods.rebuilding.perceptual import PerceptualMetrics
+from foredrive.methods.rebuilding.rebuilt import RebuiltScene
+from foredrive.methods.rebuilding.representation import Representation
+from foredrive.methods.rebuilding.scene_graph import STATIC
+from foredrive.methods.rebuilding.tracks import ActorTracks, joined_tracks, read_tracks, split_tracks
+from foredrive.methods.rebuilding.training import SensorViews, rebuild
+from foredrive.methods.rebuilding.vehicle import LoggedVehicle, read_vehicle, save_vehicle
+from foredrive.methods.rebuilding.views import CameraView, SweepView, camera_views, sweep_views
+from foredrive.methods.splatad.ply import write_ply
 from foredrive.runs.rebuild.calibration_check import calibration_findings
+from foredrive.runs.recipes.rebuilding import RebuildRecipe, load_rebuild_recipe
 from foredrive.scene import Clip
 from foredrive.sensors.lidar_estimation import estimate_lidar
-from foredrive.training.checkpoints import load_weights, save_weights
-from foredrive.training.metrics_log import read_metrics
-from foredrive.training.rebuilding import SensorViews, rebuild
 
 VEHICLE = "vehicle.json"
 """File of the vehicle's path and sensors, which are needed to render a scene without its log."""

@@ -8,12 +8,20 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from foredrive.errors import InputError
-from foredrive.rendering.edits import DriveStraight, Duplicate, Edit, EditedScene, Insert, Remove, ShiftEgo
-from foredrive.rendering.novel_views import novel_camera_view
-from foredrive.rendering.rebuilt import RebuiltScene
-from foredrive.rendering.renderer import render_sweep
-from foredrive.rendering.tracks import ActorTracks, boxes_at
-from foredrive.rendering.vehicle import LoggedVehicle
+from foredrive.methods.rebuilding.edits import (
+    DriveStraight,
+    Duplicate,
+    Edit,
+    EditedScene,
+    Insert,
+    Remove,
+    ShiftEgo,
+)
+from foredrive.methods.rebuilding.novel_views import novel_camera_view
+from foredrive.methods.rebuilding.rebuilt import RebuiltScene
+from foredrive.methods.rebuilding.renderer import render_sweep
+from foredrive.methods.rebuilding.tracks import ActorTracks, boxes_at
+from foredrive.methods.rebuilding.vehicle import LoggedVehicle
 from foredrive.scene import Boxes, LidarSweep
 from foredrive.sensors import SpinningLidar, hdl32e, pandar64, vlp16
 

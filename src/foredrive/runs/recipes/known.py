@@ -1,37 +1,19 @@
 """The named recipes."""
 
-import difflib
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from foredrive.driver.recipes import DRIVER_RECIPES, DriverRecipe
+from foredrive.engine.config import is_recipe_file, nearest_name, overridden, read_values, validated
 from foredrive.errors import InputError
-from foredrive.recipes.config import (
-    Recipe,
-    is_recipe_file,
-    load_recipe,
-    overridden,
-    read_values,
-    recipe_from,
-    validated,
-)
-from foredrive.recipes.driver import DRIVER_RECIPES, DriverRecipe
-from foredrive.recipes.driveworld import (
-    driveworld_base,
-    driveworld_tiny,
-    driveworld_town,
-)
-from foredrive.recipes.driveworld_ablations import driveworld_ablations
-from foredrive.recipes.nemo import (
-    BASE_BEV,
-    TOWN_BEV,
-    nemo_base,
-    nemo_drive,
-    nemo_tiny,
-    nemo_town,
-)
-from foredrive.recipes.nemo_ablations import nemo_ablations
+from foredrive.methods.driveworld.ablations import driveworld_ablations
+from foredrive.methods.driveworld.recipes import driveworld_base, driveworld_tiny, driveworld_town
+from foredrive.methods.nemo.ablations import nemo_ablations
+from foredrive.methods.nemo.recipes import BASE_BEV, TOWN_BEV, nemo_base, nemo_drive, nemo_tiny, nemo_town
+from foredrive.methods.recipe import Recipe
+from foredrive.runs.recipes.world_models import load_recipe, recipe_from
 
 RECIPES: dict[str, Recipe[Any, Any]] = {
     "nemo_tiny": nemo_tiny(),
@@ -79,10 +61,3 @@ def find_driver_recipe(name: str, settings: Sequence[str] = ()) -> DriverRecipe 
         return None
     recipe: DriverRecipe = validated(DriverRecipe, overridden(values, settings), name)
     return recipe
-
-
-def nearest_name(name: str, known: Sequence[str] | dict[str, Any]) -> str:
-    """Return the end of a sentence about an unknown recipe, with the nearest known names."""
-    near = difflib.get_close_matches(name, known, n=3)
-    hint = f"; near: {', '.join(near)}" if near else ""
-    return f"{hint}; `foredrive recipes` lists all"

@@ -5,20 +5,19 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
+from foredrive.engine.config import is_recipe_file, nearest_name, overridden, read_values, validated
+from foredrive.engine.ranges import check_at_least
 from foredrive.errors import InputError
-from foredrive.recipes.config import is_recipe_file, overridden, read_values, rescheduled, validated
-from foredrive.recipes.field import FieldRecipe, base_field, tiny_field
-from foredrive.recipes.gaussians import (
+from foredrive.methods.neurad.recipes import FieldRecipe, base_field, tiny_field
+from foredrive.methods.rebuilding.representation import Representation
+from foredrive.methods.rebuilding.tracks import MOVES_M
+from foredrive.methods.recipe import rescheduled
+from foredrive.methods.splatad.recipes import (
     GaussianRecipe,
     base_gaussians,
     published_gaussians,
     tiny_gaussians,
 )
-from foredrive.recipes.known import nearest_name
-from foredrive.recipes.old_formats import upgraded_reconstruction
-from foredrive.recipes.representation import Representation
-from foredrive.rendering.tracks import MOVES_M
-from foredrive.training.ranges import check_at_least
 
 R = TypeVar("R", bound=Representation)
 
@@ -81,7 +80,7 @@ def gaussians_base() -> RebuildRecipe[GaussianRecipe]:
 def gaussians_published() -> RebuildRecipe[GaussianRecipe]:
     """Return SplatAD with the choices of its reference implementation, for a GPU.
 
-    docs/architecture.md lists what still differs.
+    methods/splatad/CHOICES.md lists what still differs.
     """
     return RebuildRecipe(
         name="gaussians_published",
@@ -128,8 +127,8 @@ REBUILD_RECIPES: dict[str, RebuildRecipe[Any]] = {
 
 
 def load_rebuild_recipe(path: Path) -> RebuildRecipe[Any]:
-    """Read a recipe from YAML, in today's format or an earlier one. Raises the errors of `load_recipe`."""
-    return _recipe_from(upgraded_reconstruction(read_values(path)), str(path))
+    """Read a recipe from YAML. Raises the errors of `load_recipe`."""
+    return _recipe_from(read_values(path), str(path))
 
 
 def _recipe_from(written: Any, source: str) -> RebuildRecipe[Any]:

@@ -5,20 +5,20 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, TypeVar, get_args
 
-from foredrive.data.task_truth import TaskTruthConfig
+from foredrive.data.truth.store import TaskTruthConfig
+from foredrive.engine.config import overridden, read_values, validated
+from foredrive.engine.loop import Schedule
 from foredrive.errors import InputError
-from foredrive.models.tasks.agents import AgentHeadConfig, CarriedConfig
-from foredrive.models.tasks.decoder import DecoderConfig
-from foredrive.models.tasks.heads import TaskHeadsConfig
-from foredrive.models.tasks.instances import InstanceHeadConfig
-from foredrive.models.tasks.maps import MapHeadConfig
-from foredrive.models.tasks.motion import MotionConfig
-from foredrive.recipes.config import Recipe, overridden, read_values, validated
-from foredrive.recipes.old_formats import upgraded_heads
+from foredrive.methods.recipe import Recipe
 from foredrive.scene import Task
-from foredrive.training.joint_tasks import JointTasks
-from foredrive.training.loop import Schedule
-from foredrive.training.task_losses import TaskWeights
+from foredrive.tasks.detection.agents_head import AgentHeadConfig, CarriedConfig
+from foredrive.tasks.heads.decoder import DecoderConfig
+from foredrive.tasks.heads.heads import TaskHeadsConfig
+from foredrive.tasks.heads.joint import JointTasks
+from foredrive.tasks.heads.losses import TaskWeights
+from foredrive.tasks.maps.head import MapHeadConfig
+from foredrive.tasks.motion.head import MotionConfig
+from foredrive.tasks.occupancy.instances_head import InstanceHeadConfig
 
 R = TypeVar("R", bound="Recipe[Any, Any]")
 
@@ -126,7 +126,7 @@ def load_task_heads(path: Path) -> TaskHeadsRecipe:
     Raises:
         InputError: an entry is wrong, missing or unknown. The message names the file and the entry.
     """
-    recipe: TaskHeadsRecipe = validated(TaskHeadsRecipe, upgraded_heads(read_values(path)), str(path))
+    recipe: TaskHeadsRecipe = validated(TaskHeadsRecipe, read_values(path), str(path))
     return recipe
 
 

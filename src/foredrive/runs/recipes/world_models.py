@@ -1,21 +1,26 @@
 """The world models that recipes can name: their configs, how each is built, and its training objective."""
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any, NamedTuple
 
 from torch import nn
 
 from foredrive.data import ClipConfig
-from foredrive.losses.reconstruction import ImageFeatures
-from foredrive.models.agent import PlanningAgent
-from foredrive.models.driveworld import DriveWorld, DriveWorldConfig
-from foredrive.models.image_tower import ImageTowerFeatures
-from foredrive.models.nemo import Nemo, NemoConfig
-from foredrive.models.vgg import VggFeatures
+from foredrive.engine.config import read_values, validated
+from foredrive.errors import InputError
+from foredrive.methods.blocks.losses import ImageFeatures
+from foredrive.methods.blocks.vgg import VggFeatures
+from foredrive.methods.driveworld import DriveWorld, DriveWorldConfig
+from foredrive.methods.driveworld.objective import DriveWorldObjective, DriveWorldStage
+from foredrive.methods.lidarclip.image_tower import ImageTowerFeatures
+from foredrive.methods.nemo import Nemo, NemoConfig
+from foredrive.methods.nemo.objective import NemoObjective, NemoStage
+from foredrive.methods.planner.agent import PlanningAgent
+from foredrive.methods.recipe import Recipe
 from foredrive.scene import WorldModel
-from foredrive.training import DriveWorldObjective, DriveWorldStage, NemoObjective, NemoStage
-from foredrive.training.joint_tasks import TaskTerms
+from foredrive.tasks.heads.joint import TaskTerms
 
 
 class WorldModelEntry(NamedTuple):
@@ -83,3 +88,31 @@ WORLD_MODELS: dict[str, WorldModelEntry] = {
     "nemo": WorldModelEntry(NemoConfig, NemoStage, build_nemo, nemo_objective),
     "driveworld": WorldModelEntry(DriveWorldConfig, DriveWorldStage, build_driveworld, driveworld_objective),
 }
+
+
+def load_recipe(path: Path) -> Recipe[Any, Any]:
+    """Read a recipe written by `save_recipe`.
+
+    Raises:
+        InputError: an entry is wrong, missing or unknown. The message names the file and the entry.
+    """
+    return recipe_from(read_values(path), str(path))
+
+
+def recipe_from(written: Any, source: str) -> Recipe[Any, Any]:
+    """Validate the plain values of a recipe.
+
+    Args:
+        written: the plain values.
+        source: name of the source in errors.
+
+    Raises:
+        InputError: an entry is wrong, missing or unknown. The message names it.
+    """
+    model = written.get("model") if isinstance(written, Mapping) else None
+    kind = model.get("kind") if isinstance(model, Mapping) else None
+    if kind not in WORLD_MODELS:
+        raise InputError(f"{source}: not a recipe: model.kind: {kind!r} is none of {', '.join(WORLD_MODELS)}")
+    row = WORLD_MODELS[kind]
+    recipe: Recipe[Any, Any] = validated(Recipe[row.config, row.stage], written, source)  # type: ignore[name-defined]
+    return recipe

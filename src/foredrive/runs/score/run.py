@@ -6,13 +6,13 @@ from pathlib import Path
 
 from rich.progress import Progress
 
-from foredrive.evaluation.detections.files import read_detections, write_frame_scores
-from foredrive.evaluation.detections.frames import DetectionSet
-from foredrive.evaluation.detections.score import FrameScore, ScoreConfig, score_frames
-from foredrive.evaluation.detections.summary import ScoreSummary, compare_scores, summarise_scores
-from foredrive.evaluation.provenance import collect_provenance, peak_rss_gib
-from foredrive.evaluation.summary import Figures, write_summary
+from foredrive.engine.provenance import collect_provenance, peak_rss_gib
+from foredrive.engine.summary import Figures, write_summary
 from foredrive.sets import Family
+from foredrive.tasks.detection.files import read_detections, write_frame_scores
+from foredrive.tasks.detection.frames import DetectionSet
+from foredrive.tasks.detection.score import FrameScore, ScoreConfig, score_frames
+from foredrive.tasks.detection.summary import ScoreSummary, compare_scores, summarise_scores
 
 SUMMARY, FRAMES = "summary.json", "frames.jsonl"
 

@@ -6,23 +6,23 @@ from pathlib import Path
 
 from rich.progress import Progress
 
+from foredrive.engine.provenance import collect_provenance, peak_rss_gib
+from foredrive.engine.summary import Figures, write_summary
 from foredrive.errors import InputError
-from foredrive.evaluation.maps.files import read_maps
-from foredrive.evaluation.maps.score import score_map_files
-from foredrive.evaluation.motion.score import score_motion_results
-from foredrive.evaluation.objects.kitti_boxes import score_kitti_boxes
-from foredrive.evaluation.objects.kitti_tracks import score_kitti_tracks
-from foredrive.evaluation.objects.score import read_objects, score_detections, score_tracks
-from foredrive.evaluation.provenance import collect_provenance, peak_rss_gib
-from foredrive.evaluation.summary import Figures, write_summary
-from foredrive.evaluation.voxels.files import find_voxels
-from foredrive.evaluation.voxels.log_results import holds_logs, score_against_logs
-from foredrive.evaluation.voxels.score import score_voxels
 from foredrive.runs.score.run import SUMMARY
+from foredrive.tasks.maps.files import read_maps
+from foredrive.tasks.maps.score import score_map_files
+from foredrive.tasks.motion.score import score_motion_results
+from foredrive.tasks.occupancy.files import find_voxels
+from foredrive.tasks.occupancy.log_results import holds_logs, score_against_logs
+from foredrive.tasks.occupancy.score import score_voxels
+from foredrive.tasks.tracking.kitti_boxes import score_kitti_boxes
+from foredrive.tasks.tracking.kitti_tracks import score_kitti_tracks
+from foredrive.tasks.tracking.score import read_objects, score_detections, score_tracks
 
 
 def score_occupancy(results: Path, truth: Path, poses: Path | None) -> Figures:
-    """Return the figures of folders of semantic voxels, see `evaluation.voxels`. The truth may be of logs."""
+    """Return the figures of folders of semantic voxels, see `tasks.occupancy`. The truth may be of logs."""
     if holds_logs(truth):
         _check_no_poses("occupancy and a truth of logs", poses)
         with Progress(transient=True) as progress:
@@ -35,19 +35,19 @@ def score_occupancy(results: Path, truth: Path, poses: Path | None) -> Figures:
 
 
 def score_map(results: Path, truth: Path, poses: Path | None) -> Figures:
-    """Return the figures of files of vector maps, see `evaluation.maps`."""
+    """Return the figures of files of vector maps, see `tasks.maps`."""
     _check_no_poses("map", poses)
     return score_map_files(read_maps(results, truth))
 
 
 def score_motion(results: Path, truth: Path, poses: Path | None) -> Figures:
-    """Return the figures of files of forecast agents, see `evaluation.motion`."""
+    """Return the figures of files of forecast agents, see `tasks.motion`."""
     _check_no_poses("motion", poses)
     return score_motion_results(results, truth)
 
 
 def score_detection(results: Path, truth: Path, poses: Path | None) -> Figures:
-    """Return the figures of detections, see `evaluation.objects`."""
+    """Return the figures of detections, see `tasks.tracking`."""
     _check_no_poses("detection", poses)
     if results.is_dir():
         return score_kitti_boxes(results, truth)
@@ -55,7 +55,7 @@ def score_detection(results: Path, truth: Path, poses: Path | None) -> Figures:
 
 
 def score_tracking(results: Path, truth: Path, poses: Path | None) -> Figures:
-    """Return the figures of tracks, see `evaluation.objects`."""
+    """Return the figures of tracks, see `tasks.tracking`."""
     _check_no_poses("tracking", poses)
     if results.is_dir():
         return score_kitti_tracks(results, truth)

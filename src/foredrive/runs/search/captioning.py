@@ -13,17 +13,17 @@ from torch.utils.data import Dataset
 
 from foredrive.data import LogPath
 from foredrive.data.batches import stack_records
+from foredrive.engine.loop import Schedule, train
 from foredrive.errors import InputError
 from foredrive.files import atomic_path
-from foredrive.models.caption_decoder import PAD, CaptionDecoder
+from foredrive.methods.lidarclip.caption_decoder import PAD, CaptionDecoder
+from foredrive.methods.lidarclip.captioning import CaptionedEmbeddings, CaptionObjective
 from foredrive.runs.search.sector_views import gather_views
 from foredrive.runs.search.tower_data import image_targets
 from foredrive.runs.search.towers import find_towers
 from foredrive.search.embedding import View, embed_views
 from foredrive.search.phrases import whole_caption
 from foredrive.search.towers import Towers, unit
-from foredrive.training import Schedule, train
-from foredrive.training.captioning import CaptionedEmbeddings, CaptionObjective
 
 CAPTIONS = "captions.safetensors"
 """File of the decoder, in the folder of the towers whose embeddings it reads."""
@@ -58,7 +58,7 @@ def train_captions(
     Raises:
         InputError: the logs cannot be read, or no view has known facts.
     """
-    from foredrive.training import make_fabric  # the import takes seconds
+    from foredrive.engine.fabric import make_fabric  # the import takes seconds
 
     towers = find_towers(str(towers_folder))
     views = gather_views(logs, stride_s, towers.image_side_px, towers.crop, folder / "cache")

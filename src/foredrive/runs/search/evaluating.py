@@ -12,7 +12,6 @@ from jaxtyping import Float
 
 from foredrive.data.log_paths import LogPath
 from foredrive.errors import InputError
-from foredrive.metrics.retrieval import draw_sequences, match_rank, mean_and_interval, mean_of_groups
 from foredrive.runs.search.indexing import opened_log
 from foredrive.search.embedding import embed_views, mean_direction
 from foredrive.search.find import vectors_of
@@ -26,6 +25,7 @@ from foredrive.search.prompts import (
     WEATHER_TEMPLATES,
     WEATHERS,
 )
+from foredrive.search.retrieval import draw_sequences, match_rank, mean_and_interval, mean_of_groups
 from foredrive.search.rows import WHOLE
 from foredrive.search.towers import Towers
 from foredrive.search.zero_shot import class_vectors, classify

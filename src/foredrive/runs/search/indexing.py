@@ -15,9 +15,9 @@ import torch
 
 from foredrive.data.log_paths import LogPath
 from foredrive.data.logs import Log
+from foredrive.engine.fan_out import fan_out, reason
+from foredrive.engine.folder import held
 from foredrive.errors import InputError
-from foredrive.runs.fan_out import fan_out, reason
-from foredrive.runs.folder import held
 from foredrive.runs.search.towers import find_towers
 from foredrive.search.embedding import embed_frames
 from foredrive.search.index import FrameIndex, IndexSettings, Part, Scores

@@ -17,7 +17,7 @@ from foredrive.data.log_paths import LogPath
 from foredrive.data.logs import Log
 from foredrive.errors import InputError
 from foredrive.files import atomic_path
-from foredrive.models.lidar_clip import PointCloud
+from foredrive.methods.lidarclip import PointCloud
 from foredrive.runs.search.indexing import log_digest, moments
 from foredrive.search.crops import Crop
 from foredrive.search.embedding import View, read_views

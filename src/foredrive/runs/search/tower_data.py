@@ -17,12 +17,12 @@ from torch.utils.data import Dataset
 from foredrive.data.batches import stack_records
 from foredrive.errors import InputError
 from foredrive.files import atomic_path
-from foredrive.models.lidar_clip import PointCloud
-from foredrive.models.text_encoder import TextEncoder
+from foredrive.methods.blocks.text_encoder import TextEncoder
+from foredrive.methods.lidarclip import PointCloud
+from foredrive.methods.lidarclip.alignment import CaptionedImages, ImagedSweeps
 from foredrive.runs.search.sector_views import LogViews, ViewRow
 from foredrive.search.phrases import Phrase, phrases
 from foredrive.search.towers import Towers
-from foredrive.training.alignment import CaptionedImages, ImagedSweeps
 
 TEXTS_AT_ONCE = 4096
 

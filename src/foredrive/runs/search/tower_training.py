@@ -11,12 +11,15 @@ import torch
 from pydantic import TypeAdapter
 
 from foredrive.data import LogPath
+from foredrive.engine.folder import RECIPE, RunFolder
+from foredrive.engine.loop import Schedule, train
+from foredrive.engine.one_cycle import OneCycle
 from foredrive.errors import InputError
 from foredrive.files import atomic_path
-from foredrive.models.image_tower import ImageTower, ImageTowerConfig
-from foredrive.models.lidar_clip import LidarEncoder, LidarEncoderConfig
-from foredrive.models.text_encoder import PACKAGED_MODEL
-from foredrive.runs.folder import RECIPE, RunFolder
+from foredrive.methods.blocks.text_encoder import PACKAGED_MODEL
+from foredrive.methods.lidarclip import LidarEncoder, LidarEncoderConfig
+from foredrive.methods.lidarclip.alignment import ContrastConfig, ContrastObjective, DistillationObjective
+from foredrive.methods.lidarclip.image_tower import ImageTower, ImageTowerConfig
 from foredrive.runs.search.sector_views import LogViews, gather_views
 from foredrive.runs.search.tower_data import (
     CaptionedViews,
@@ -29,9 +32,6 @@ from foredrive.runs.search.tower_data import (
 from foredrive.runs.search.towers import find_towers
 from foredrive.search.embedded import LidarTowers, SentenceTowers, TowerCard, load_towers, save_towers
 from foredrive.search.towers import Towers
-from foredrive.training import Schedule, train
-from foredrive.training.alignment import ContrastConfig, ContrastObjective, DistillationObjective
-from foredrive.training.one_cycle import OneCycle
 
 if TYPE_CHECKING:
     from lightning_fabric import Fabric
@@ -118,7 +118,7 @@ def train_towers(
         InputError: `folder` holds another run, or another process writes to it; the logs cannot be read or
             have no known facts.
     """
-    from foredrive.training import make_fabric  # the import takes seconds
+    from foredrive.engine.fabric import make_fabric  # the import takes seconds
 
     with _folder_of(folder, recipe, logs, beside).claimed():
         cache_dir, fabric = cache_dir or folder / "cache", make_fabric("32-true")

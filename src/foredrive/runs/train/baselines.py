@@ -10,12 +10,13 @@ from torch import nn
 from torch.utils.data import DataLoader
 
 from foredrive.data import ClipDataset, LogPath, collate
-from foredrive.evaluation.metric import labels_from_now
-from foredrive.metrics.occupancy import OccupancyPrior
-from foredrive.models.ego_mlp import EgoMLP, EgoMLPConfig
-from foredrive.recipes.config import Recipe
+from foredrive.engine.checkpoints import load_weights
+from foredrive.methods.planner.ego_mlp import EgoMLP, EgoMLPConfig
+from foredrive.methods.planner.ego_mlp_fit import StatusDemonstrations, fit_ego_mlp, read_status
+from foredrive.methods.recipe import Recipe
 from foredrive.scene import Clip, Example
-from foredrive.training import StatusDemonstrations, fit_ego_mlp, load_weights, read_status
+from foredrive.tasks.evaluation.metric import labels_from_now
+from foredrive.tasks.occupancy.scores import OccupancyPrior
 
 
 @lru_cache(maxsize=1)  # training, evaluation and the next arm of a study use the same baselines

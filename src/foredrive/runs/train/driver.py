@@ -18,17 +18,18 @@ from foredrive.driver.judging import missed_by
 from foredrive.driver.objective import SightObjective
 from foredrive.driver.packed import PackedClips, batches, join
 from foredrive.driver.planner_fit import fit_planner
+from foredrive.driver.recipes import DriverRecipe
 from foredrive.driver.speed_planner import SpeedPlanner
 from foredrive.driver.volume_eyes import VolumeEyes
+from foredrive.engine.checkpoints import load_weights
+from foredrive.engine.config import read_values, save_recipe, validated
+from foredrive.engine.folder import CONFIG, LOGS, WEIGHTS, RunFolder
+from foredrive.engine.loop import train
 from foredrive.errors import InputError
 from foredrive.files import atomic_path
-from foredrive.recipes.config import read_values, save_recipe, validated
-from foredrive.recipes.driver import DriverRecipe
-from foredrive.runs.folder import CONFIG, LOGS, WEIGHTS, RunFolder
 from foredrive.runs.open_clips import open_clips
 from foredrive.runs.train.rigs import RIGS, trained_rigs, write_rigs
 from foredrive.runs.train.run import pretrained_weights, read_log, written_log
-from foredrive.training import load_weights, train
 
 SEE, PLAN = "see", "plan"
 """Folders of the stages."""
@@ -145,7 +146,7 @@ def train_driver(
     Raises:
         InputError: the folder holds another run, another process trains it, or a log cannot be read.
     """
-    from foredrive.training import make_fabric  # the import takes seconds
+    from foredrive.engine.fabric import make_fabric  # the import takes seconds
 
     start = None if start is None else start.absolute()
     run = DriverRun(folder, recipe, tuple(log.absolute() for log in logs), start)

@@ -4,13 +4,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from foredrive.models.agent import PlanningAgent
-from foredrive.recipes.config import Recipe
-from foredrive.recipes.task_heads import load_task_heads
-from foredrive.runs.folder import CONFIG, WEIGHTS
+from foredrive.engine.checkpoints import load_weights
+from foredrive.engine.folder import CONFIG, WEIGHTS
+from foredrive.methods.planner.agent import PlanningAgent
+from foredrive.methods.recipe import Recipe
+from foredrive.runs.recipes.task_heads import load_task_heads
 from foredrive.runs.train.task_priors import TASKS
-from foredrive.training import load_weights
-from foredrive.training.joint_tasks import JointTasks
+from foredrive.tasks.heads.joint import JointTasks
 
 
 def with_kept_heads(recipe: Recipe[Any, Any], kept: Recipe[Any, Any], folder: Path) -> Recipe[Any, Any]:

@@ -15,11 +15,11 @@ from torch.utils.data import DataLoader
 
 from foredrive.data import ClipConfig, LogPath, collate
 from foredrive.files import atomic_path
-from foredrive.models.agent import PlanningAgent
-from foredrive.models.ego_mlp import ego_motion, route_target
+from foredrive.methods.planner.agent import PlanningAgent
+from foredrive.methods.planner.ego_mlp import ego_motion, route_target
+from foredrive.methods.planner.path_fit import PathDemonstrations
 from foredrive.runs.open_clips import open_clips
 from foredrive.scene import Example
-from foredrive.training import PathDemonstrations
 
 BATCH_SIZE = 8
 

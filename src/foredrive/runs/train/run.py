@@ -11,14 +11,19 @@ import torch
 from safetensors.torch import save_file
 
 from foredrive.data import ClipDataset, LogPath, collate
+from foredrive.engine.checkpoints import load_weights, save_weights, whole_weights
+from foredrive.engine.config import read_values, save_recipe
+from foredrive.engine.folder import CONFIG, LOGS, WEIGHTS, RunFolder
+from foredrive.engine.loop import CONDITIONS, train
+from foredrive.engine.processes import entered_by_first, naming_lost_processes
 from foredrive.errors import InputError
-from foredrive.evaluation.task_priors import fit_task_priors
 from foredrive.files import atomic_path
-from foredrive.models.agent import PlanningAgent
-from foredrive.recipes.config import Recipe, load_recipe, read_values, save_recipe
+from foredrive.methods.planner.agent import PlanningAgent
+from foredrive.methods.planner.path_fit import PathFit, fit_path
+from foredrive.methods.recipe import Recipe
 from foredrive.runs.build import build_agent, build_objective
-from foredrive.runs.folder import CONFIG, LOGS, WEIGHTS, RunFolder
 from foredrive.runs.open_clips import open_clips
+from foredrive.runs.recipes.world_models import load_recipe
 from foredrive.runs.train.baselines import fit_baselines
 from foredrive.runs.train.kept_parts import load_kept, with_kept_heads
 from foredrive.runs.train.path_features import sample_paths
@@ -26,14 +31,12 @@ from foredrive.runs.train.rigs import RIGS, trained_rigs, write_rigs
 from foredrive.runs.train.sequences import in_sequences
 from foredrive.runs.train.task_priors import PRIORS, TASKS, check_truth, save_priors, semantic_weights
 from foredrive.scene.task_truth import TaskTruth
-from foredrive.training import CONDITIONS, PathFit, fit_path, load_weights, save_weights, train
-from foredrive.training.checkpoints import whole_weights
-from foredrive.training.processes import entered_by_first, naming_lost_processes
+from foredrive.tasks.evaluation.task_priors import fit_task_priors
 
 if TYPE_CHECKING:
     from lightning_fabric import Fabric
 
-    from foredrive.training.fabric import Sharing
+    from foredrive.engine.fabric import Sharing
 
 STAGES = ("pretrain", "finetune")
 PATH = "path"
@@ -125,7 +128,7 @@ def train_run(
             trains it; a log cannot be read; no log has the truth of a task; `start` has not finished
             pre-training, or its world model has other sizes; another process of this training has ended.
     """
-    from foredrive.training import make_fabric  # the import takes seconds; opening a run does without
+    from foredrive.engine.fabric import make_fabric  # the import takes seconds; opening a run does without
 
     start = None if start is None else start.absolute()
     kept: Run | None = None

@@ -11,14 +11,14 @@ from torch import Tensor
 
 from foredrive.data import LogPath
 from foredrive.data.logs import Log
-from foredrive.data.tasks import tasks_of
+from foredrive.data.truth.tasks import tasks_of
 from foredrive.errors import InputError
-from foredrive.evaluation.task_priors import TaskPriors
 from foredrive.files import atomic_path
-from foredrive.losses.semantics import class_weights
-from foredrive.models.tasks.heads import TaskHeadsConfig
 from foredrive.scene.semantics import VOXEL_CLASSES
 from foredrive.scene.task_truth import TaskTruth
+from foredrive.tasks.evaluation.task_priors import TaskPriors
+from foredrive.tasks.heads.heads import TaskHeadsConfig
+from foredrive.tasks.occupancy.semantic_losses import class_weights
 
 TASKS = "tasks"
 """Folder of what belongs to the heads in the folder of a run."""

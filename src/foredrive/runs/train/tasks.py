@@ -9,13 +9,14 @@ from pathlib import Path
 import torch
 
 from foredrive.data import LogPath
+from foredrive.engine.checkpoints import load_weights, save_weights
+from foredrive.engine.config import save_recipe
+from foredrive.engine.folder import CONFIG, WEIGHTS
+from foredrive.engine.loop import train
 from foredrive.errors import InputError
-from foredrive.evaluation.task_priors import TaskPriors, fit_task_priors
 from foredrive.files import atomic_path
-from foredrive.models.tasks.heads import TaskHeads
-from foredrive.recipes.config import Recipe, save_recipe
-from foredrive.recipes.task_heads import TaskHeadsRecipe, load_task_heads
-from foredrive.runs.folder import CONFIG, WEIGHTS
+from foredrive.methods.recipe import Recipe
+from foredrive.runs.recipes.task_heads import TaskHeadsRecipe, load_task_heads
 from foredrive.runs.train.kept_volumes import KeptVolumes, collate_kept
 from foredrive.runs.train.run import Run, begin_run, load_agent, open_run
 from foredrive.runs.train.sequences import in_sequences
@@ -27,8 +28,9 @@ from foredrive.runs.train.task_priors import (
     save_priors,
     semantic_weights,
 )
-from foredrive.training import load_weights, save_weights, train
-from foredrive.training.task_probe import ProbeObjective
+from foredrive.tasks.evaluation.task_priors import TaskPriors, fit_task_priors
+from foredrive.tasks.heads.heads import TaskHeads
+from foredrive.tasks.heads.probe import ProbeObjective
 
 
 @dataclass(frozen=True)
@@ -75,7 +77,7 @@ def train_heads(run: Run, heads: TaskHeadsRecipe) -> TrainedHeads:
         InputError: the run holds other heads, has not finished, a log cannot be read, or no log has the truth
             of a task.
     """
-    from foredrive.training import make_fabric  # the import takes seconds
+    from foredrive.engine.fabric import make_fabric  # the import takes seconds
 
     folder = run.folder / TASKS
     if (folder / CONFIG).is_file() and load_task_heads(folder / CONFIG) != heads:

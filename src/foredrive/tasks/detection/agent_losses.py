@@ -1,24 +1,68 @@
-"""Losses of road users: of the dense map of centres, and of the queries by the best matching."""
+"""Losses of road users: of the dense map of centres, and of the queries by the best matching.
+
+Loss of a dense map of objects' centres (CenterNet, Zhou et al. 2019; CenterPoint, Yin et al. 2021).
+"""
 
 from dataclasses import dataclass, field
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from foredrive.losses.centres import centre_loss, centre_target
-from foredrive.losses.masked import masked_mean
-from foredrive.losses.motion import motion_losses
-from foredrive.models.tasks.agents import AGENT_CLASSES, AgentSet
-from foredrive.models.tasks.carried import Lineage
-from foredrive.models.tasks.plane import cell_middles
-from foredrive.models.tasks.proposals import CentreMap
+from foredrive.ops.masked import masked_mean
 from foredrive.scene import Boxes, VoxelSpec
 from foredrive.scene.task_truth import TaskTruth
-from foredrive.training.detection_losses import MatchingLossConfig, matched_loss
-from foredrive.training.task_targets import AgentTargets, agent_targets
-from foredrive.training.track_matching import NOBODY, held_objects, matching_beside, owners
+from foredrive.tasks.detection.agents_head import AGENT_CLASSES, AgentSet
+from foredrive.tasks.detection.losses import MatchingLossConfig, matched_loss
+from foredrive.tasks.detection.proposals import CentreMap
+from foredrive.tasks.heads.plane import cell_middles
+from foredrive.tasks.heads.targets import AgentTargets, agent_targets
+from foredrive.tasks.motion.losses import motion_losses
+from foredrive.tasks.tracking.carried import Lineage
+from foredrive.tasks.tracking.matching import NOBODY, held_objects, matching_beside, owners
+
+
+def centre_target(
+    xy: Float[Tensor, "N 2"],
+    label: Int[Tensor, "N"],
+    spread_m: Float[Tensor, "N"],
+    middle_m: Float[Tensor, "y x 2"],
+    cell_m: float,
+    classes: int,
+) -> Float[Tensor, "K y x"]:
+    """Return a map with 1 in the cell of each centre and a Gaussian around it; the largest one counts.
+
+    Args:
+        xy: centres inside of the map, m.
+        label: classes.
+        spread_m: standard deviation of each Gaussian.
+        middle_m: middles of the cells.
+        cell_m: edge of a cell.
+        classes: K.
+    """
+    target = xy.new_zeros(classes, *middle_m.shape[:2])
+    away_m = (middle_m[None] - xy[:, None, None]).square().sum(-1)
+    bump = (-0.5 * away_m / spread_m[:, None, None].square()).exp()
+    cell = ((xy - middle_m[0, 0]) / cell_m + 0.5).floor().long()
+    bump[torch.arange(len(xy)), cell[:, 1], cell[:, 0]] = 1.0
+    index = label.long()[:, None, None].expand_as(bump)
+    return target.scatter_reduce(0, index, bump, "amax")
+
+
+def centre_loss(
+    logits: Float[Tensor, "*n K y x"],
+    target: Float[Tensor, "*n K y x"],
+    alpha: float = 2.0,
+    beta: float = 4.0,
+) -> Float[Tensor, ""]:
+    """Return the focal loss, lower near centres, per centre (CornerNet, Law and Deng 2018, eq. 1)."""
+    p = logits.sigmoid()
+    centre = target == 1.0
+    found = (1 - p) ** alpha * F.logsigmoid(logits)
+    empty = (1 - target) ** beta * p**alpha * F.logsigmoid(-logits)
+    return -torch.where(centre, found, empty).sum() / centre.sum().clamp_min(1)
+
 
 SPREAD = 0.25
 """Standard deviation of a centre's Gaussian as a share of the box's mean edge over ground."""

@@ -9,15 +9,15 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from foredrive.errors import InputError
-from foredrive.models.detection import LOG_STD_RANGE, BoxSet
-from foredrive.models.tasks.decoder import DecoderConfig, PlaceEmbedding, QueryDecoderLayer
-from foredrive.models.tasks.motion import MotionConfig, MotionModes
-from foredrive.models.tasks.plane import PlanePyramid, Planes
-from foredrive.models.tasks.proposals import CentreHead, CentreMap, Proposals, best_proposals
-from foredrive.models.tasks.taking import take_proposals
 from foredrive.scene import Attribute, Category
 from foredrive.scene.agents import Agents
 from foredrive.scene.record import Record
+from foredrive.tasks.detection.network import LOG_STD_RANGE, BoxSet
+from foredrive.tasks.detection.proposals import CentreHead, CentreMap, Proposals, best_proposals
+from foredrive.tasks.heads.decoder import DecoderConfig, PlaceEmbedding, QueryDecoderLayer
+from foredrive.tasks.heads.plane import PlanePyramid, Planes
+from foredrive.tasks.heads.taking import take_proposals
+from foredrive.tasks.motion.head import MotionConfig, MotionModes
 
 AGENT_CLASSES = (
     Category.CAR,
@@ -38,7 +38,7 @@ _CHANGES = (len(AGENT_CLASSES), 3, 3, 2, 7, 2, len(Attribute))
 
 @dataclass(frozen=True)
 class CarriedConfig:
-    """Carrying of agents from frame to frame (`models.tasks.carried`)."""
+    """Carrying of agents from frame to frame (`tasks.tracking.carried`)."""
 
     agents: int = 30
     """Number of queries that are carried on; as many fewer begin at proposals then."""

@@ -1,4 +1,6 @@
-"""2-D detections in COCO's results format, and truth in COCO's instances format.
+"""Read files of detections of any known format, and write the scores of their frames.
+
+2-D detections in COCO's results format, and truth in COCO's instances format.
 
 Results are a list of records with `image_id`, `category_id`, `bbox` (x, y, width, height in px) and `score`.
 Results may also be an object with this list under `annotations`. Records of other categories than the truth's
@@ -8,8 +10,10 @@ Beyond the format, a record may have `covariance` (of x1, y1, x2, y2 in px) and 
 category name).
 """
 
+import json
+import math
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +22,9 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from foredrive.errors import InputError
-from foredrive.evaluation.detections.frames import (
+from foredrive.files import atomic_path
+from foredrive.sets import Family
+from foredrive.tasks.detection.frames import (
     STD_OF_SIDE,
     STD_PX,
     DetectionFrame,
@@ -34,7 +40,10 @@ from foredrive.evaluation.detections.frames import (
     read_relevance,
     tell_left_out,
 )
-from foredrive.sets import Family
+from foredrive.tasks.detection.kitti_labels import read_kitti
+from foredrive.tasks.detection.nuscenes_results import read_nuscenes
+from foredrive.tasks.detection.score import FrameScore
+from foredrive.tasks.evaluation.plain_files import read_plain
 
 Record = Mapping[str, Any]
 
@@ -191,3 +200,44 @@ def _named(content: Mapping[str, Any], key: str, path: Path) -> list[Any]:
             raise InputError(f"{path}: {key} {n} has {'no id' if name is None else f'the id {name} again'}")
         known.add(name)
     return records
+
+
+def read_detections(results: Path, truth: Path, family: Family = "gaussian") -> DetectionSet:
+    """Read detections and truth: two folders of KITTI's text, or JSON of nuScenes or COCO.
+
+    `family` is that of the box densities.
+
+    Raises:
+        InputError: a file cannot be read. The message names it.
+    """
+    if results.is_dir() and truth.is_dir():
+        read = read_kitti(results, truth, family)
+    else:
+        predicted, true = read_plain(results), read_plain(truth)
+        if not isinstance(true, dict):
+            raise InputError(f"{truth}: neither an object of boxes by sample (nuScenes) nor of images (COCO)")
+        if isinstance(predicted, dict) and isinstance(predicted.get("annotations"), list):
+            predicted = predicted["annotations"]
+        if isinstance(predicted, dict):
+            read = read_nuscenes(predicted, true, results, truth, family)
+        elif isinstance(predicted, list):
+            read = read_coco(predicted, true, results, truth, family)
+        else:
+            raise InputError(f"{results}: neither a list (COCO) nor an object of boxes by sample (nuScenes)")
+    if not read.frames:
+        raise InputError(f"{truth}: holds no frames")
+    if not read.classes:
+        raise InputError(f"neither {results} nor {truth} holds any box")
+    return read
+
+
+def write_frame_scores(path: Path, scores: Iterable[FrameScore]) -> None:
+    """Write one JSON object a line for `search.scores`: a frame's name, its NLL and the NLL's parts, in nats.
+
+    Infinity, which JSON lacks, is written as text ("inf").
+    """
+    with atomic_path(path) as temporary, temporary.open("w") as file:
+        for score in scores:
+            parts = {"nll": score.nll, **score.parts}
+            values = {name: value if math.isfinite(value) else str(value) for name, value in parts.items()}
+            file.write(json.dumps({"frame": score.name, **values}) + "\n")

@@ -14,7 +14,8 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from foredrive.errors import InputError
-from foredrive.evaluation.detections.frames import (
+from foredrive.sets import Family, MultiBernoulli
+from foredrive.tasks.detection.frames import (
     MAX_NUMBER,
     STD_YAW_RAD,
     DetectionFrame,
@@ -25,8 +26,7 @@ from foredrive.evaluation.detections.frames import (
     order_classes,
     tell_left_out,
 )
-from foredrive.evaluation.detections.nuscenes_results import DEFAULT_COVARIANCE
-from foredrive.sets import Family, MultiBernoulli
+from foredrive.tasks.detection.nuscenes_results import DEFAULT_COVARIANCE
 
 LOWER = np.array([0.0, -60.0, -10.0, -3.0, -3.0, -3.0])
 UPPER = np.array([120.0, 60.0, 10.0, 4.0, 4.0, 4.0])

@@ -4,18 +4,14 @@ import dataclasses
 
 import numpy as np
 
-from foredrive.evaluation.metric import EvaluationContext, Figures
-from foredrive.evaluation.objects.in_world import agent_rows, box_rows, likely, stacked
-from foredrive.evaluation.objects.score import detection_figures
-from foredrive.evaluation.objects.truth import lacking
-from foredrive.evaluation.predictor import Part, Prediction
-from foredrive.metrics.detection_protocols import (
-    CLASSES,
-    DETECTION_PROTOCOLS,
-    evaluate_detections,
-)
-from foredrive.metrics.object_rows import ObjectRows, Region
 from foredrive.scene import Example
+from foredrive.tasks.detection.protocols import CLASSES, DETECTION_PROTOCOLS, evaluate_detections
+from foredrive.tasks.evaluation.metric import EvaluationContext, Figures
+from foredrive.tasks.evaluation.predictor import Part, Prediction
+from foredrive.tasks.tracking.in_world import agent_rows, box_rows, likely, stacked
+from foredrive.tasks.tracking.object_rows import ObjectRows, Region
+from foredrive.tasks.tracking.score import detection_figures
+from foredrive.tasks.tracking.truth import lacking
 
 CAR_30M = dataclasses.replace(
     DETECTION_PROTOCOLS["nuscenes"],

@@ -20,7 +20,9 @@ from jaxtyping import Bool, Float
 from numpy import ndarray
 
 from foredrive.errors import InputError
-from foredrive.evaluation.detections.frames import (
+from foredrive.scene.boxes import UNKNOWN
+from foredrive.sets import Family, MultiBernoulli
+from foredrive.tasks.detection.frames import (
     STD_LOG_SIZE,
     STD_M,
     STD_YAW_RAD,
@@ -38,10 +40,8 @@ from foredrive.evaluation.detections.frames import (
     read_relevance,
     tell_left_out,
 )
-from foredrive.metrics.detection_protocols import DETECTION_PROTOCOLS
-from foredrive.metrics.object_rows import ObjectRows, counted, make_rows
-from foredrive.scene.boxes import UNKNOWN
-from foredrive.sets import Family, MultiBernoulli
+from foredrive.tasks.detection.protocols import DETECTION_PROTOCOLS
+from foredrive.tasks.tracking.object_rows import ObjectRows, counted, make_rows
 
 LOWER = np.array([-60.0, -60.0, -10.0, -3.0, -3.0, -3.0])
 UPPER = np.array([60.0, 60.0, 10.0, 4.0, 4.0, 4.0])

@@ -18,16 +18,16 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 
-from foredrive.metrics.detection import (
+from foredrive.scene.boxes import UNKNOWN
+from foredrive.tasks.detection.matching import (
     NUSCENES_DISTANCES_M,
     descending,
     match_centres,
     mean_of_valid,
     ranked_precision_nuscenes,
 )
-from foredrive.metrics.object_rows import ObjectRows, Region, counted
-from foredrive.metrics.over_recall import error_over_recall
-from foredrive.scene.boxes import UNKNOWN
+from foredrive.tasks.detection.over_recall import error_over_recall
+from foredrive.tasks.tracking.object_rows import ObjectRows, Region, counted
 
 ERRORS = ("ate_m", "ase", "aoe_rad", "ave_mps", "aae")
 """Errors of translation, scale (1 - overlap of sizes), orientation, velocity, attribute (1 - accuracy)."""

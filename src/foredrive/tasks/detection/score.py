@@ -8,18 +8,18 @@ import torch
 from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
-from foredrive.evaluation.detections.frames import DetectionFrame, DetectionSet
-from foredrive.metrics.detection import (
+from foredrive.sets import PoissonMultiBernoulli, SetNll, UniformPoisson, set_nll
+from foredrive.tasks.detection.frames import DetectionFrame, DetectionSet
+from foredrive.tasks.detection.gospa import Gospa, gospa, wasserstein_distance
+from foredrive.tasks.detection.matching import (
     COCO_OVERLAPS,
     NUSCENES_DISTANCES_M,
     descending,
     match_greedily,
     overlaps,
 )
-from foredrive.metrics.gospa import Gospa, gospa, wasserstein_distance
-from foredrive.metrics.pdq import PdqCounts, count_pdq, pixel_quality
-from foredrive.metrics.proper_scores import object_brier
-from foredrive.sets import PoissonMultiBernoulli, SetNll, UniformPoisson, set_nll
+from foredrive.tasks.detection.pdq import PdqCounts, count_pdq, pixel_quality
+from foredrive.tasks.detection.proper_scores import object_brier
 
 PARTS = ("localisation", "classification", "false", "missed", "expected_background", "ambiguity")
 NEAR_M, NEAR_OVERLAP = (1.0, 2.0), (0.5, 0.75)

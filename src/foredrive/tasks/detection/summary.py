@@ -9,22 +9,22 @@ import torch
 from jaxtyping import Float, Int
 from numpy import ndarray
 
+from foredrive.engine.summary import Figures
 from foredrive.errors import InputError
-from foredrive.evaluation.detections.frames import DetectionFrame, DetectionSet
-from foredrive.evaluation.detections.score import PARTS, FrameScore
-from foredrive.evaluation.summary import Figures
-from foredrive.metrics.bootstrap import BootstrapMean, bootstrap_mean
-from foredrive.metrics.detection import (
+from foredrive.sets import BoxDensity, LabelledBoxes, conformal_factor, conformal_scores, fit_scale
+from foredrive.tasks.bootstrap import BootstrapMean, bootstrap_mean
+from foredrive.tasks.detection.frames import DetectionFrame, DetectionSet
+from foredrive.tasks.detection.matching import (
     COCO_OVERLAPS,
     NUSCENES_DISTANCES_M,
     average_precision_coco,
     average_precision_nuscenes,
     mean_of_valid,
 )
-from foredrive.metrics.pdq import pdq
-from foredrive.metrics.proper_scores import brier, crps_gaussian, crps_laplace, energy_score
-from foredrive.metrics.reliability import Reliability, reliability
-from foredrive.sets import BoxDensity, LabelledBoxes, conformal_factor, conformal_scores, fit_scale
+from foredrive.tasks.detection.pdq import pdq
+from foredrive.tasks.detection.proper_scores import brier, crps_gaussian, crps_laplace, energy_score
+from foredrive.tasks.detection.reliability import Reliability, reliability
+from foredrive.tasks.detection.score import PARTS, FrameScore
 
 LENGTHS_M = (0.0, 2.0, 6.0, np.inf)
 SIDES_PX = (0.0, 32.0, 96.0, np.inf)

@@ -8,11 +8,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from foredrive.engine.parameter_groups import parameter_groups
 from foredrive.errors import InputError
-from foredrive.models.detection import DetectionHead
 from foredrive.sets import LabelledBoxes, MultiBernoulli
-from foredrive.training.detection_losses import Loss
-from foredrive.training.parameter_groups import parameter_groups
+from foredrive.tasks.detection.losses import Loss
+from foredrive.tasks.detection.network import DetectionHead
 
 Sample = tuple[Float[Tensor, "D Z Y X"], LabelledBoxes]
 """A volume and its labelled objects."""

@@ -4,12 +4,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
+from foredrive.engine.summary import Figures
 from foredrive.errors import InputError
-from foredrive.evaluation.predictor import Part, Prediction
-from foredrive.evaluation.summary import Figures
-from foredrive.evaluation.task_priors import TaskPriors
-from foredrive.metrics.occupancy import OccupancyPrior
 from foredrive.scene import Clip, Example, VoxelGrid
+from foredrive.tasks.evaluation.predictor import Part, Prediction
+from foredrive.tasks.evaluation.task_priors import TaskPriors
+from foredrive.tasks.occupancy.scores import OccupancyPrior
 
 
 @dataclass(frozen=True)

@@ -20,8 +20,18 @@ from jaxtyping import Float, UInt8
 from numpy import ndarray
 from torch import Tensor
 
-from foredrive.evaluation.metrics.maps import AREA
-from foredrive.evaluation.objects.in_world import (
+from foredrive.engine.summary import write_json
+from foredrive.files import atomic_path
+from foredrive.scene import Attribute, Category, Example
+from foredrive.scene.agents import Agents, MapLines
+from foredrive.scene.map_elements import ElementKind
+from foredrive.scene.semantics import SemanticVoxels
+from foredrive.tasks.detection.protocols import CLASSES
+from foredrive.tasks.evaluation.predictor import Prediction
+from foredrive.tasks.maps.metric import AREA
+from foredrive.tasks.maps.protocols import HALF_XY_M
+from foredrive.tasks.occupancy.log_results import GRID_FILE, VoxelGridOfResults, write_grid, write_voxels
+from foredrive.tasks.tracking.in_world import (
     Pose,
     ego_yaw,
     futures_in_world,
@@ -29,17 +39,7 @@ from foredrive.evaluation.objects.in_world import (
     places_in_world,
     velocities_in_world,
 )
-from foredrive.evaluation.predictor import Prediction
-from foredrive.evaluation.summary import write_json
-from foredrive.evaluation.voxels.log_results import GRID_FILE, VoxelGridOfResults, write_grid, write_voxels
-from foredrive.files import atomic_path
-from foredrive.metrics.detection_protocols import CLASSES
-from foredrive.metrics.maps.protocols import HALF_XY_M
-from foredrive.metrics.tracking.protocols import TRACKING_PROTOCOLS
-from foredrive.scene import Attribute, Category, Example
-from foredrive.scene.agents import Agents, MapLines
-from foredrive.scene.map_elements import ElementKind
-from foredrive.scene.semantics import SemanticVoxels
+from foredrive.tasks.tracking.protocols import TRACKING_PROTOCOLS
 
 MAPTR_NAMES = {
     ElementKind.DIVIDER: "divider",

@@ -10,22 +10,16 @@ import torch
 from jaxtyping import Bool, Int
 from torch import Tensor
 
+from foredrive.engine.provenance import peak_rss_gib
 from foredrive.errors import InputError
-from foredrive.evaluation.metric import EvaluationContext, Figures, MetricFactory
-from foredrive.evaluation.metrics import METRICS
-from foredrive.evaluation.predictor import (
-    DriveFollowing,
-    Part,
-    PlannerPredictor,
-    Prediction,
-    Predictor,
-)
-from foredrive.evaluation.provenance import peak_rss_gib
-from foredrive.evaluation.task_priors import TaskPriors
-from foredrive.metrics.occupancy import OccupancyPrior
-from foredrive.metrics.protocols import STEPS
 from foredrive.scene import Agent, Example, Trajectory
 from foredrive.scene.record import Record
+from foredrive.tasks.evaluation.metric import EvaluationContext, Figures, MetricFactory
+from foredrive.tasks.evaluation.metrics import METRICS
+from foredrive.tasks.evaluation.predictor import DriveFollowing, Part, PlannerPredictor, Prediction, Predictor
+from foredrive.tasks.evaluation.task_priors import TaskPriors
+from foredrive.tasks.occupancy.scores import OccupancyPrior
+from foredrive.tasks.planning.protocols import STEPS
 
 OnPrediction = Callable[[Prediction, Example], None]
 """Called with predictions and their truth."""

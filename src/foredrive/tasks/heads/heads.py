@@ -7,8 +7,16 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor, nn
 
-from foredrive.models.tasks.agents import AgentHead, AgentHeadConfig, AgentSet
-from foredrive.models.tasks.carried import (
+from foredrive.scene import Belief, Task, VoxelSpec, WorldModel
+from foredrive.scene.map_elements import PlaneSpec
+from foredrive.scene.record import Record
+from foredrive.tasks.detection.agents_head import AgentHead, AgentHeadConfig, AgentSet
+from foredrive.tasks.detection.proposals import CentreMap
+from foredrive.tasks.heads.plane import Plane, PlanePyramid, Planes
+from foredrive.tasks.maps.head import MapHead, MapHeadConfig, MapSet, RasterHead, RasterHeadConfig
+from foredrive.tasks.occupancy.head import VoxelHead, VoxelHeadConfig
+from foredrive.tasks.occupancy.instances_head import InstanceHead, InstanceHeadConfig, InstanceSet
+from foredrive.tasks.tracking.carried import (
     CarriedAgents,
     FrameSteps,
     Lineage,
@@ -16,14 +24,6 @@ from foredrive.models.tasks.carried import (
     frame_steps,
     lineage_of,
 )
-from foredrive.models.tasks.instances import InstanceHead, InstanceHeadConfig, InstanceSet
-from foredrive.models.tasks.maps import MapHead, MapHeadConfig, MapSet, RasterHead, RasterHeadConfig
-from foredrive.models.tasks.plane import Plane, PlanePyramid, Planes
-from foredrive.models.tasks.proposals import CentreMap
-from foredrive.models.tasks.voxels import VoxelHead, VoxelHeadConfig
-from foredrive.scene import Belief, Task, VoxelSpec, WorldModel
-from foredrive.scene.map_elements import PlaneSpec
-from foredrive.scene.record import Record
 
 
 @dataclass(frozen=True)

@@ -6,13 +6,13 @@ import torch
 from jaxtyping import Bool, Float, Float64
 from torch import Tensor, nn
 
-from foredrive.models.tasks.heads import TaskHeads, TaskVolume, volumes_of
+from foredrive.data.augmentation import mirrored_boxes, mirrored_pose
+from foredrive.data.truth.mirrored import mirrored_truth
 from foredrive.scene import Belief, Boxes, Task, VoxelSpec, WorldModel
 from foredrive.scene.record import Record
 from foredrive.scene.task_truth import TaskTruth
-from foredrive.training.augmentation import mirrored_boxes, mirrored_pose
-from foredrive.training.mirrored_truth import mirrored_truth
-from foredrive.training.task_losses import TaskWeights, task_losses
+from foredrive.tasks.heads.heads import TaskHeads, TaskVolume, volumes_of
+from foredrive.tasks.heads.losses import TaskWeights, task_losses
 
 
 @dataclass(frozen=True)

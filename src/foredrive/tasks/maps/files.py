@@ -22,13 +22,13 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 
-from foredrive.data.map_elements import read_map_elements
+from foredrive.data.truth.map_elements import read_map_elements
 from foredrive.errors import InputError
-from foredrive.evaluation.frames_of_results import check_known_frames, log_frames
-from foredrive.evaluation.plain_files import read_plain
-from foredrive.metrics.maps.lines import LineSet
-from foredrive.metrics.maps.protocols import HALF_XY_M, Area
 from foredrive.scene.map_elements import ElementKind
+from foredrive.tasks.evaluation.frames_of_results import check_known_frames, log_frames
+from foredrive.tasks.evaluation.plain_files import read_plain
+from foredrive.tasks.maps.lines import LineSet
+from foredrive.tasks.maps.protocols import HALF_XY_M, Area
 
 _KINDS = {
     "divider": ElementKind.DIVIDER,

@@ -9,11 +9,11 @@ from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
 from foredrive.errors import InputError
-from foredrive.metrics.detection import descending, mean_of_valid, precision_recall
-from foredrive.metrics.frames import rows_by_frame
-from foredrive.metrics.maps.lines import CLASSES, LineSet, chamfer_distances, resample
-from foredrive.metrics.maps.protocols import Area, VectorProtocol
 from foredrive.scene.map_elements import ElementKind
+from foredrive.tasks.detection.matching import descending, mean_of_valid, precision_recall
+from foredrive.tasks.frames import rows_by_frame
+from foredrive.tasks.maps.lines import CLASSES, LineSet, chamfer_distances, resample
+from foredrive.tasks.maps.protocols import Area, VectorProtocol
 
 _UNTOUCHED_M = 100.0
 """Distance of a pair whose buffers do not touch, as MapTR has it: farther than any match."""

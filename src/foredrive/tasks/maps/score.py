@@ -1,12 +1,12 @@
 """Vector maps scored under every protocol."""
 
-from foredrive.evaluation.maps.files import MapFiles
-from foredrive.evaluation.summary import Figures
-from foredrive.metrics.detection import mean_of_valid
-from foredrive.metrics.maps.lines import CLASSES
-from foredrive.metrics.maps.precision import MapPrecision, mean_precision, score_maps
-from foredrive.metrics.maps.protocols import PROTOCOLS
+from foredrive.engine.summary import Figures
 from foredrive.scene.map_elements import ElementKind
+from foredrive.tasks.detection.matching import mean_of_valid
+from foredrive.tasks.maps.files import MapFiles
+from foredrive.tasks.maps.lines import CLASSES
+from foredrive.tasks.maps.precision import MapPrecision, mean_precision, score_maps
+from foredrive.tasks.maps.protocols import PROTOCOLS
 
 FIGURES = {
     "maptr": ("maptr", ""),

@@ -12,10 +12,10 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
-from foredrive.metrics.detection import mean_of_valid
-from foredrive.metrics.motion.agents import PredictedAgents, TrueAgents, displacement_errors
-from foredrive.metrics.motion.matching import match_by_score
-from foredrive.metrics.motion.protocols import MISS_M, STEP_S
+from foredrive.tasks.detection.matching import mean_of_valid
+from foredrive.tasks.motion.agents import PredictedAgents, TrueAgents, displacement_errors
+from foredrive.tasks.motion.matching import match_by_score
+from foredrive.tasks.motion.protocols import MISS_M, STEP_S
 
 STEPS = 6
 """Steps of 0.5 s that mAP_F judges."""

@@ -17,12 +17,12 @@ from numpy import ndarray
 from scipy.spatial.transform import Rotation
 
 from foredrive.errors import InputError
-from foredrive.evaluation.arrow_tables import read_table
-from foredrive.evaluation.detections.frames import read_number_rows
-from foredrive.evaluation.plain_files import read_plain
-from foredrive.metrics.motion.agents import PredictedAgents, TrueAgents
-from foredrive.metrics.motion.argoverse import FUTURES, MEAN_SPEED_MPS, STEPS
-from foredrive.metrics.motion.protocols import STEP_S
+from foredrive.tasks.detection.frames import read_number_rows
+from foredrive.tasks.evaluation.arrow_tables import read_table
+from foredrive.tasks.evaluation.plain_files import read_plain
+from foredrive.tasks.motion.agents import PredictedAgents, TrueAgents
+from foredrive.tasks.motion.argoverse import FUTURES, MEAN_SPEED_MPS, STEPS
+from foredrive.tasks.motion.protocols import STEP_S
 
 CLASSES = tuple(MEAN_SPEED_MPS)
 SLACK_NS = 60_000_000

@@ -27,17 +27,17 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
-from foredrive.data.agent_futures import read_futures
 from foredrive.data.boxes import read_boxes
+from foredrive.data.truth.agent_futures import read_futures
 from foredrive.errors import InputError
-from foredrive.evaluation.detections.frames import read_number_rows, read_numbers
-from foredrive.evaluation.frames_of_results import check_known_frames, log_frames
-from foredrive.evaluation.objects.in_world import ego_yaw, futures_in_world, places_in_world
-from foredrive.evaluation.objects.nuscenes_json import read_object
-from foredrive.metrics.motion.agents import PredictedAgents, TrueAgents
-from foredrive.metrics.motion.protocols import STEP_S
 from foredrive.scene import Boxes, Category
 from foredrive.scene.agent_futures import AgentFutures
+from foredrive.tasks.detection.frames import read_number_rows, read_numbers
+from foredrive.tasks.evaluation.frames_of_results import check_known_frames, log_frames
+from foredrive.tasks.motion.agents import PredictedAgents, TrueAgents
+from foredrive.tasks.motion.protocols import STEP_S
+from foredrive.tasks.tracking.in_world import ego_yaw, futures_in_world, places_in_world
+from foredrive.tasks.tracking.nuscenes_json import read_object
 
 STEPS = 12
 NAMES = ("detection_name", "tracking_name", "class_name")

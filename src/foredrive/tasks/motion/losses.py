@@ -7,7 +7,7 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from foredrive.losses.masked import masked_mean
+from foredrive.ops.masked import masked_mean
 
 
 class MotionLosses(NamedTuple):

@@ -9,9 +9,9 @@ from numpy import ndarray
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial.distance import cdist
 
-from foredrive.metrics.detection import descending
-from foredrive.metrics.frames import rows_by_frame
-from foredrive.metrics.motion.agents import PredictedAgents, TrueAgents
+from foredrive.tasks.detection.matching import descending
+from foredrive.tasks.frames import rows_by_frame
+from foredrive.tasks.motion.agents import PredictedAgents, TrueAgents
 
 _APART = 1e6
 """Cost of a pair that is too far apart: more than any sum of distances."""

@@ -8,13 +8,13 @@ from jaxtyping import Float64
 from numpy import ndarray
 from torch import Tensor
 
-from foredrive.evaluation.metric import EvaluationContext, Figures
-from foredrive.evaluation.objects.in_world import futures_in_world, levelled
-from foredrive.evaluation.predictor import Part, Prediction
-from foredrive.metrics.motion.agents import PredictedAgents, TrueAgents
-from foredrive.metrics.motion.protocols import PROTOCOLS, STEP_S
-from foredrive.metrics.motion.scores import score_motion
 from foredrive.scene import Example
+from foredrive.tasks.evaluation.metric import EvaluationContext, Figures
+from foredrive.tasks.evaluation.predictor import Part, Prediction
+from foredrive.tasks.motion.agents import PredictedAgents, TrueAgents
+from foredrive.tasks.motion.protocols import PROTOCOLS, STEP_S
+from foredrive.tasks.motion.scores import score_motion
+from foredrive.tasks.tracking.in_world import futures_in_world, levelled
 
 STEADY = ".constant_velocity"
 FIGURES = ("min_ade_m", "min_fde_m", "miss_rate", "epa")

@@ -12,10 +12,10 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
-from foredrive.metrics.detection import average_precision_nuscenes, precision_recall
-from foredrive.metrics.motion.agents import PredictedAgents, TrueAgents, displacement_errors
-from foredrive.metrics.motion.matching import match_by_distance, match_by_score
 from foredrive.scene import Category
+from foredrive.tasks.detection.matching import average_precision_nuscenes, precision_recall
+from foredrive.tasks.motion.agents import PredictedAgents, TrueAgents, displacement_errors
+from foredrive.tasks.motion.matching import match_by_distance, match_by_score
 
 STEPS = 12
 MATCH_M = 2.0

@@ -20,9 +20,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
-from foredrive.metrics.protocols import LIDAR_FORWARD_M
-from foredrive.metrics.protocols import VEHICLES as VEHICLES_AND_CYCLES
 from foredrive.scene import Category
+from foredrive.tasks.planning.protocols import LIDAR_FORWARD_M
+from foredrive.tasks.planning.protocols import VEHICLES as VEHICLES_AND_CYCLES
 
 STEP_S = 0.5
 PEDESTRIANS = frozenset({Category.PEDESTRIAN})

@@ -8,14 +8,11 @@ from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
 from foredrive.errors import InputError
-from foredrive.metrics.motion.agents import (
-    DisplacementErrors,
-    PredictedAgents,
-    TrueAgents,
-    displacement_errors,
-)
-from foredrive.metrics.motion.matching import match_by_distance, match_by_score
-from foredrive.metrics.motion.protocols import (
+from foredrive.scene import Category
+from foredrive.tasks.detection.over_recall import error_over_recall
+from foredrive.tasks.motion.agents import DisplacementErrors, PredictedAgents, TrueAgents, displacement_errors
+from foredrive.tasks.motion.matching import match_by_distance, match_by_score
+from foredrive.tasks.motion.protocols import (
     FALSE_POSITIVE_COST,
     MATCH_M,
     MISS_M,
@@ -23,8 +20,6 @@ from foredrive.metrics.motion.protocols import (
     MotionProtocol,
     Rectangle,
 )
-from foredrive.metrics.over_recall import error_over_recall
-from foredrive.scene import Category
 
 
 @dataclass(frozen=True)

@@ -15,8 +15,8 @@ from numpy import ndarray
 from numpy.lib import format as npy
 
 from foredrive.errors import InputError
-from foredrive.metrics.voxels.protocols import GRID
 from foredrive.scene import VoxelSpec
+from foredrive.tasks.occupancy.protocols import GRID
 
 
 def array_names(file: Path) -> set[str]:

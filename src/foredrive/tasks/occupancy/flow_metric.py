@@ -1,9 +1,9 @@
 """Flow of moving voxels, beside predicting no motion."""
 
-from foredrive.evaluation.metric import EvaluationContext, Figures, labels_from_now
-from foredrive.evaluation.predictor import Part, Prediction
-from foredrive.metrics.occupancy import FlowErrors, flow_errors
 from foredrive.scene import Example
+from foredrive.tasks.evaluation.metric import EvaluationContext, Figures, labels_from_now
+from foredrive.tasks.evaluation.predictor import Part, Prediction
+from foredrive.tasks.occupancy.scores import FlowErrors, flow_errors
 
 
 class FlowMetric:

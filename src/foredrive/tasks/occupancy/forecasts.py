@@ -11,9 +11,9 @@ from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
 from foredrive.geometry.se3 import transform_points
-from foredrive.metrics.occupancy import OccupancyCounts, count_occupancy
 from foredrive.scene import VoxelGrid, VoxelSpec
 from foredrive.scene.record import Record
+from foredrive.tasks.occupancy.scores import OccupancyCounts, count_occupancy
 
 
 def ego_compensated(

@@ -11,11 +11,11 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from foredrive.models.tasks.agents import AGENT_CLASSES, AgentSet
-from foredrive.models.tasks.plane import Plane, PlanePyramid, cell_middles
 from foredrive.scene.boxes import VEHICLES
 from foredrive.scene.map_elements import PlaneSpec
 from foredrive.scene.record import Record
+from foredrive.tasks.detection.agents_head import AGENT_CLASSES, AgentSet
+from foredrive.tasks.heads.plane import Plane, PlanePyramid, cell_middles
 
 MARGIN_M = 0.25
 """The truth's cells are about half a cell of 0.5 m larger than a box, on each side."""

@@ -16,19 +16,19 @@ from jaxtyping import Float, UInt8
 from numpy import ndarray
 
 from foredrive.data.cameras import find_camera, pinhole_cameras
-from foredrive.data.ray_truth import read_rays
-from foredrive.data.semantic_labels import read_semantics
+from foredrive.data.truth.rays import read_rays
+from foredrive.data.truth.semantic_labels import read_semantics
+from foredrive.engine.summary import Figures, write_json
 from foredrive.errors import InputError
-from foredrive.evaluation.frames_of_results import log_frames
-from foredrive.evaluation.plain_files import read_plain
-from foredrive.evaluation.summary import Figures, write_json
-from foredrive.evaluation.voxels.arrays import array_names, read_labels, read_velocities
-from foredrive.evaluation.voxels.files import PREDICTED_NAMES
-from foredrive.evaluation.voxels.of_logs import LogVoxelCounts
 from foredrive.files import atomic_path
-from foredrive.metrics.voxels.protocols import GRID
 from foredrive.scene import VoxelSpec
 from foredrive.scene.semantics import VOXEL_CLASSES, Taxonomy
+from foredrive.tasks.evaluation.frames_of_results import log_frames
+from foredrive.tasks.evaluation.plain_files import read_plain
+from foredrive.tasks.occupancy.arrays import array_names, read_labels, read_velocities
+from foredrive.tasks.occupancy.files import PREDICTED_NAMES
+from foredrive.tasks.occupancy.of_logs import LogVoxelCounts
+from foredrive.tasks.occupancy.protocols import GRID
 
 GRID_FILE = "grid.json"
 

@@ -5,7 +5,7 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from foredrive.losses.masked import masked_mean
+from foredrive.ops.masked import masked_mean
 
 EPS = 1e-6
 

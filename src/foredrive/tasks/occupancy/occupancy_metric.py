@@ -5,13 +5,13 @@ from jaxtyping import Bool, Float64
 from torch import Tensor
 
 from foredrive.errors import InputError
-from foredrive.evaluation.metric import EvaluationContext, Figures, labels_from_now
-from foredrive.evaluation.predictor import Part, Prediction
 from foredrive.geometry.se3 import inverse_se3
-from foredrive.metrics.forecasts import ego_compensated
-from foredrive.metrics.occupancy import OccupancyCounts, above_ground, count_occupancy
-from foredrive.models.nemo.ego_motion import continued_motion
 from foredrive.scene import Clip, Example, VoxelSpec, last_frames
+from foredrive.scene.ego_motion import continued_motion
+from foredrive.tasks.evaluation.metric import EvaluationContext, Figures, labels_from_now
+from foredrive.tasks.evaluation.predictor import Part, Prediction
+from foredrive.tasks.occupancy.forecasts import ego_compensated
+from foredrive.tasks.occupancy.scores import OccupancyCounts, above_ground, count_occupancy
 
 PERSISTENCE, EGO_COMPENSATED, CONTINUED = ".copy", ".carried_copy", ".continued_copy"
 """Suffixes of persistence: the predicted present in place of the future, the same moved along the driven

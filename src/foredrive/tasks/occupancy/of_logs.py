@@ -5,12 +5,12 @@ from jaxtyping import Bool, Float, Float32, UInt8
 from numpy import ndarray
 from torch import Tensor
 
-from foredrive.evaluation.summary import Figures
-from foredrive.evaluation.voxels.files import VoxelFrame
-from foredrive.evaluation.voxels.score import VoxelCounts
-from foredrive.metrics.voxels.protocols import OCC3D_CLASSES, OPENOCC_CLASSES
+from foredrive.engine.summary import Figures
 from foredrive.scene import VoxelSpec
 from foredrive.scene.semantics import VOXEL_CLASSES, RayTruth, SemanticVoxels, Taxonomy
+from foredrive.tasks.occupancy.files import VoxelFrame
+from foredrive.tasks.occupancy.protocols import OCC3D_CLASSES, OPENOCC_CLASSES
+from foredrive.tasks.occupancy.score import VoxelCounts
 
 _OCC3D_OTHERS, _OPENOCC_FREE = OCC3D_CLASSES.index("others"), len(OPENOCC_CLASSES) - 1
 _AS_OPENOCC = np.array(

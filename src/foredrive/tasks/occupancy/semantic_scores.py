@@ -5,9 +5,9 @@ from jaxtyping import Bool, Float64, Int64, UInt8
 from numpy import ndarray
 from torch import Tensor
 
-from foredrive.metrics.detection import mean_of_valid
-from foredrive.metrics.voxels.protocols import VoxelProtocol
 from foredrive.scene.semantics import VOXEL_CLASSES, SemanticVoxels
+from foredrive.tasks.detection.matching import mean_of_valid
+from foredrive.tasks.occupancy.protocols import VoxelProtocol
 
 
 def count_voxels(

@@ -1,9 +1,9 @@
 """Semantic voxels under the protocols of Occ3D and OpenOcc, beside the commonest class of each voxel."""
 
-from foredrive.evaluation.metric import EvaluationContext, Figures
-from foredrive.evaluation.predictor import Part, Prediction
-from foredrive.evaluation.voxels.of_logs import LogVoxelCounts
 from foredrive.scene import Example
+from foredrive.tasks.evaluation.metric import EvaluationContext, Figures
+from foredrive.tasks.evaluation.predictor import Part, Prediction
+from foredrive.tasks.occupancy.of_logs import LogVoxelCounts
 
 PRIOR = ".best_constant"
 BESIDE_PRIOR = ("miou_pct", "rayiou_pct", "rayiou_1m_pct", "rayiou_2m_pct", "rayiou_4m_pct", "occ_score")

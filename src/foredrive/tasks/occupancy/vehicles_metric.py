@@ -1,4 +1,6 @@
-"""Recall of vehicles in predicted occupancy: do the columns of the grid that hold a car look occupied?
+"""Recall of the columns that hold a car, in the predicted occupancy of now.
+
+Recall of vehicles in predicted occupancy: do the columns of the grid that hold a car look occupied?
 
 IoU hardly counts cars: they are few of the occupied voxels. A planner needs them most. A model that predicts
 everything to be occupied has a recall of 1, so the precision of all predicted columns stands beside it.
@@ -8,8 +10,10 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from foredrive.metrics.occupancy import above_ground
-from foredrive.scene import Boxes, Category, VoxelGrid, VoxelSpec
+from foredrive.scene import Boxes, Category, Example, VoxelGrid, VoxelSpec
+from foredrive.tasks.evaluation.metric import EvaluationContext, Figures, labels_from_now
+from foredrive.tasks.evaluation.predictor import Part, Prediction
+from foredrive.tasks.occupancy.scores import above_ground
 
 CARS = (Category.CAR, Category.TRUCK, Category.BUS, Category.TRAILER, Category.CONSTRUCTION_VEHICLE)
 
@@ -79,3 +83,51 @@ def count_found_columns(
     near = near.to(found.device)
     hits = torch.stack([(found & true & within).sum() for within in near])
     return hits.cpu(), torch.stack([(found & within).sum() for within in near]).cpu()
+
+
+RANGES_M = (10.0, 20.0, 30.0)
+
+
+class VehicleMetric:
+    """Keys: `car_recall_20m` and so on; `car_columns_20m`, the number of columns counted; and
+    `column_precision_20m`, the share of truly occupied ones among all predicted columns.
+
+    Clips whose present frame is not annotated are left out.
+    """
+
+    name = "vehicles"
+    needs: frozenset[Part] = frozenset({"occupancy_logit"})
+
+    def __init__(self, context: EvaluationContext) -> None:
+        self._hits = torch.zeros(len(RANGES_M), dtype=torch.long)
+        self._columns = torch.zeros_like(self._hits)
+        self._true, self._found = torch.zeros_like(self._hits), torch.zeros_like(self._hits)
+
+    def update(self, prediction: Prediction, truth: Example) -> None:
+        """Count the columns of b clips."""
+        assert prediction.occupancy_logit is not None
+        clip = truth.clip
+        boxes, labels = clip.boxes[:, clip.now], labels_from_now(truth.occupancy, clip, 1)[:, 0]
+        annotated = clip.boxes_valid[:, clip.now]
+        hits, columns = count_car_columns(
+            prediction.occupancy_logit[annotated, 0] > 0,
+            boxes[annotated],
+            labels[annotated],
+            torch.tensor(RANGES_M),
+        )
+        self._hits += hits
+        self._columns += columns
+        true, found = count_found_columns(
+            prediction.occupancy_logit[annotated, 0] > 0, labels[annotated], torch.tensor(RANGES_M)
+        )
+        self._true += true
+        self._found += found
+
+    def result(self) -> Figures:
+        """Return the figures by range; NaN where no column holds a car or is predicted."""
+        out: Figures = {}
+        for k, limit_m in enumerate(RANGES_M):
+            out[f"car_recall_{limit_m:.0f}m"] = float(self._hits[k] / self._columns[k])
+            out[f"car_columns_{limit_m:.0f}m"] = int(self._columns[k])
+            out[f"column_precision_{limit_m:.0f}m"] = float(self._true[k] / self._found[k])
+        return out

@@ -6,7 +6,7 @@ from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
 from foredrive.geometry.se3 import inverse_se3, transform_points
-from foredrive.losses.masked import masked_mean
+from foredrive.ops.masked import masked_mean
 from foredrive.scene import Trajectory, VoxelSpec
 
 

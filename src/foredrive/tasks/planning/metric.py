@@ -3,12 +3,12 @@
 import torch
 from torch import Tensor
 
-from foredrive.evaluation.metric import EvaluationContext, Figures
-from foredrive.evaluation.predictor import Part, Prediction
-from foredrive.metrics.obstacles import future_obstacles
-from foredrive.metrics.planning import score_plan
-from foredrive.metrics.protocols import HORIZON_NAMES, PROTOCOLS, STEP_S, STEPS
 from foredrive.scene import Example
+from foredrive.tasks.evaluation.metric import EvaluationContext, Figures
+from foredrive.tasks.evaluation.predictor import Part, Prediction
+from foredrive.tasks.planning.obstacles import future_obstacles
+from foredrive.tasks.planning.protocols import HORIZON_NAMES, PROTOCOLS, STEP_S, STEPS
+from foredrive.tasks.planning.scores import score_plan
 
 COLLISIONS = ("collision", "collision_centre", "driven_collision")
 

@@ -3,10 +3,10 @@
 import torch
 from torch import Tensor
 
-from foredrive.evaluation.metric import EvaluationContext, Figures
-from foredrive.evaluation.predictor import Part, Prediction
-from foredrive.metrics.images import psnr_db, ssim
 from foredrive.scene import Example
+from foredrive.tasks.evaluation.metric import EvaluationContext, Figures
+from foredrive.tasks.evaluation.predictor import Part, Prediction
+from foredrive.tasks.rendering.image_scores import psnr_db, ssim
 
 
 class ImageMetric:

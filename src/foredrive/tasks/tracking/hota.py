@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 from scipy.optimize import linear_sum_assignment
 
-from foredrive.metrics.tracking.clear import Candidates, TrackRows
+from foredrive.tasks.tracking.clear import Candidates, TrackRows
 
 ALPHAS = np.arange(0.05, 0.99, 0.05)
 """Least similarities of a match."""

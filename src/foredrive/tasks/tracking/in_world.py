@@ -6,9 +6,9 @@ import numpy as np
 from jaxtyping import Float, Float64, Int64
 from numpy import ndarray
 
-from foredrive.metrics.object_rows import ObjectRows, make_rows
 from foredrive.scene import Boxes, Category
 from foredrive.scene.agents import Agents
+from foredrive.tasks.tracking.object_rows import ObjectRows, make_rows
 
 MIN_SCORE = 0.01
 """Detections with a lower score are left out. They change no figure by more than this."""

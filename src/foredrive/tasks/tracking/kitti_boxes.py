@@ -9,16 +9,11 @@ from pathlib import Path
 
 import numpy as np
 
-from foredrive.evaluation.detections.frames import tell_left_out
-from foredrive.evaluation.detections.kitti_labels import (
-    KittiLine,
-    box_states,
-    check_type,
-    read_frames,
-)
-from foredrive.evaluation.summary import Figures
-from foredrive.metrics.detection_protocols import DETECTION_PROTOCOLS, evaluate_detections
-from foredrive.metrics.object_rows import ObjectRows, Region, make_rows
+from foredrive.engine.summary import Figures
+from foredrive.tasks.detection.frames import tell_left_out
+from foredrive.tasks.detection.kitti_labels import KittiLine, box_states, check_type, read_frames
+from foredrive.tasks.detection.protocols import DETECTION_PROTOCOLS, evaluate_detections
+from foredrive.tasks.tracking.object_rows import ObjectRows, Region, make_rows
 
 _UNKNOWN = frozenset({"ave_mps", "aae"})
 """Errors of what KITTI's text does not tell."""

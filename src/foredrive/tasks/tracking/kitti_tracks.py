@@ -17,13 +17,13 @@ from jaxtyping import Bool, Float, Int, Shaped
 from numpy import ndarray
 from scipy.optimize import linear_sum_assignment
 
+from foredrive.engine.summary import Figures
 from foredrive.errors import InputError
-from foredrive.evaluation.detections.frames import MAX_NUMBER, tell_left_out
-from foredrive.evaluation.detections.kitti_labels import KITTI_TYPES, check_type, result_files
-from foredrive.evaluation.summary import Figures
-from foredrive.metrics.detection import overlaps
-from foredrive.metrics.tracking.clear import Candidates, TrackRows, clear_mot
-from foredrive.metrics.tracking.hota import hota
+from foredrive.tasks.detection.frames import MAX_NUMBER, tell_left_out
+from foredrive.tasks.detection.kitti_labels import KITTI_TYPES, check_type, result_files
+from foredrive.tasks.detection.matching import overlaps
+from foredrive.tasks.tracking.clear import Candidates, TrackRows, clear_mot
+from foredrive.tasks.tracking.hota import hota
 
 CLASSES: Final = {"car": "van", "pedestrian": "person"}
 """Classes that are judged, each with the class that is neither demanded nor forbidden."""

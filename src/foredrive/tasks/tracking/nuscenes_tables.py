@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 
 from foredrive.errors import InputError
-from foredrive.evaluation.frames_of_results import check_known_frames
-from foredrive.evaluation.objects.nuscenes_json import ObjectTask, Sample, make_truth
-from foredrive.evaluation.objects.truth import RACK, ObjectTruth
+from foredrive.tasks.evaluation.frames_of_results import check_known_frames
+from foredrive.tasks.tracking.nuscenes_json import ObjectTask, Sample, make_truth
+from foredrive.tasks.tracking.truth import RACK, ObjectTruth
 
 Row = Mapping[str, Any]
 _CLASS_OF_CATEGORY = {

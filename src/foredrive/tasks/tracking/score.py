@@ -1,28 +1,71 @@
 """Figures of detections and tracks under every protocol, by flat keys."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
-from foredrive.evaluation.objects.log_truth import read_log_truth
-from foredrive.evaluation.objects.nuscenes_json import (
+import numpy as np
+
+from foredrive.data.boxes import read_boxes
+from foredrive.engine.summary import Figures
+from foredrive.errors import InputError
+from foredrive.tasks.detection.protocols import (
+    DETECTION_PROTOCOLS,
+    ERRORS,
+    DetectionFigures,
+    evaluate_detections,
+)
+from foredrive.tasks.evaluation.frames_of_results import log_frames
+from foredrive.tasks.tracking.in_world import box_rows, stacked
+from foredrive.tasks.tracking.nuscenes_json import (
     ObjectTask,
     boxes_by_frame,
     read_json_truth,
     read_object,
     read_results,
 )
-from foredrive.evaluation.objects.nuscenes_tables import find_tables, read_tables_truth
-from foredrive.evaluation.objects.truth import FoundObjects, ObjectTruth
-from foredrive.evaluation.summary import Figures
-from foredrive.metrics.detection_protocols import (
-    DETECTION_PROTOCOLS,
-    ERRORS,
-    DetectionFigures,
-    evaluate_detections,
-)
-from foredrive.metrics.object_rows import Frames, ObjectRows
-from foredrive.metrics.tracking.protocols import TRACKING_PROTOCOLS, evaluate_tracking
+from foredrive.tasks.tracking.nuscenes_tables import find_tables, read_tables_truth
+from foredrive.tasks.tracking.object_rows import Frames, ObjectRows
+from foredrive.tasks.tracking.protocols import TRACKING_PROTOCOLS, evaluate_tracking
+from foredrive.tasks.tracking.truth import FoundObjects, ObjectTruth, lacking
+
+
+def read_log_truth(folder: Path, listed: Iterable[str], path: Path, classes: Sequence[str]) -> ObjectTruth:
+    """Read the boxes of logs, in their world frame, at the frames that a results file lists.
+
+    Other frames of the logs are not evaluated: results are mostly of fewer frames than a log has.
+
+    Args:
+        folder: with logs, as `find_logs` takes it.
+        listed: names of frames.
+        path: of the results, for messages.
+
+    Raises:
+        InputError: a frame is not in the logs, or not annotated.
+    """
+    wanted = dict.fromkeys(listed)
+    names: list[str] = []
+    rows, ego, scene, time_us = [], [], [], []
+    for each in log_frames(folder, wanted, path):
+        boxes = read_boxes(each.log, each.frame)
+        if boxes is None:
+            raise InputError(f"{path}: frame {each.name} is not annotated in {each.log.path.folder}")
+        T_world_ego = each.log.T_world_ego[each.frame]
+        rows.append(box_rows(boxes, T_world_ego, len(names), classes))
+        names.append(each.name)
+        ego.append(T_world_ego[:2, 3])
+        scene.append(each.drive)
+        time_us.append(int(each.log.t_us[each.frame]))
+    every = stacked(rows)
+    return ObjectTruth(
+        names,
+        every,
+        every[np.zeros(0, np.int64)],
+        Frames(np.array(scene, dtype=np.int64), np.array(time_us, dtype=np.int64)),
+        np.array(ego).reshape(-1, 2),
+        lacking(every),
+    )
+
 
 _NEEDED_BY = {"ave_mps": "velocity", "aae": "attribute"}
 """Column of the ground truth without which an error cannot be judged."""

@@ -9,8 +9,8 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 
 from foredrive.errors import InputError
-from foredrive.metrics.object_rows import Frames, ObjectRows
 from foredrive.scene.boxes import UNKNOWN
+from foredrive.tasks.tracking.object_rows import Frames, ObjectRows
 
 RACK = "static_object.bicycle_rack"
 """Name of the objects in which bicycles and motorcycles are not counted."""

@@ -7,10 +7,10 @@ import numpy as np
 from jaxtyping import Float64
 
 from foredrive.data.log_writer import Frame, LogWriter
+from foredrive.driving.dynamics import yaw_rate_radps
+from foredrive.driving.observation import KeyFrame
 from foredrive.scene import BicycleState, CameraRig, Trajectory
-from foredrive.simulation.dynamics import yaw_rate_radps
-from foredrive.simulation.observation import KeyFrame
-from foredrive.simulation.town import TownSimulator
+from foredrive.towns.driving.town import TownSimulator
 from foredrive.towns.map.town_map import load_town_map
 from foredrive.towns.recorder import (
     FIRST_TIME_US,

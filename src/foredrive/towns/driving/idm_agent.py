@@ -6,9 +6,12 @@ import numpy as np
 import torch
 from jaxtyping import Float64
 
-from foredrive.data.affordances import PASSED_M, PathAhead, lead_of, occupied_by, path_ahead
+from foredrive.data.truth.affordances import PASSED_M, PathAhead, lead_of, occupied_by, path_ahead
+from foredrive.driving.lane_rules import LEVEL_M
+from foredrive.driving.simple_agents import plan_of
+from foredrive.driving.speed_rule import FRONT_M, Obstacle, PathView, rule_progress, waypoints_along
 from foredrive.geometry.path_frame import along_path, path_headings
-from foredrive.geometry.polylines import arc_lengths, points_at
+from foredrive.geometry.polylines import arc_lengths
 from foredrive.scene import Boxes, Clip, Trajectory
 from foredrive.scene.affordances import (
     CELL_M,
@@ -18,17 +21,13 @@ from foredrive.scene.affordances import (
     PathEstimate,
 )
 from foredrive.scene.traffic_light import LightState
-from foredrive.simulation.lane_rules import LEVEL_M
-from foredrive.simulation.simple_agents import plan_of
-from foredrive.simulation.speed_rule import FRONT_M, Obstacle, PathView, rule_progress
-from foredrive.simulation.town import TownSimulator
-from foredrive.simulation.town_lanes import stop_lines
+from foredrive.towns.driving.town import TownSimulator
+from foredrive.towns.driving.town_lanes import stop_lines
 from foredrive.towns.map.town_map import load_town_map
 
 BESIDE_M = 1.75
 """Largest distance of a stop line from the path."""
 PROBABLE = 0.5
-REJOINS_M = 8.0
 
 
 class IdmAgent:
@@ -147,12 +146,3 @@ def lead_in(occupied: np.ndarray) -> Obstacle | None:
     first, later = int(occupied[0].argmax()), round(2.0 / LATER_DT_S)
     moved = int(occupied[later].argmax()) - first if occupied[later].any() else 0
     return Obstacle(max(CELL_M * first + 0.25 * CELL_M, 0.3), max(CELL_M * moved / 2.0, 0.0))
-
-
-def waypoints_along(path: PathAhead, along_m: Float64[np.ndarray, "S"]) -> Float64[np.ndarray, "S 2"]:
-    """Return points of the path, which the vehicle rejoins over `REJOINS_M`."""
-    xy = path.xy[path.valid].double().numpy()
-    if len(xy) < 2:
-        return np.zeros((len(along_m), 2))
-    points = points_at(xy, np.arange(len(xy), dtype=np.float64), along_m)
-    return np.asarray(points - np.exp(-along_m / REJOINS_M)[:, None] * xy[0])

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64, Int
 
+from foredrive.driving.route_sets import RouteWaypoints
 from foredrive.errors import InputError
 from foredrive.geometry.polylines import arc_lengths
-from foredrive.simulation.lane_search import Leg, find_way
-from foredrive.simulation.route_sets import RouteWaypoints
+from foredrive.towns.driving.lane_search import Leg, find_way
 from foredrive.towns.map.town_map import load_town_map
 from foredrive.towns.traffic.lane_graph import TURN_RAD, LaneGraph, build_lane_graph
 from foredrive.towns.traffic.routes import MIN_CHANGE_M, PLANNED_CHANGE_S

@@ -8,22 +8,23 @@ import numpy as np
 import torch
 from jaxtyping import Float64
 
+from foredrive.driving.collisions import Contacts, RoadUsers
+from foredrive.driving.dynamics import EGO, STEP_S, step, yaw_rate_radps
+from foredrive.driving.lane_rules import RuleState
+from foredrive.driving.observation import FRAME_STEPS, KeyFrame, no_images
+from foredrive.driving.route_progress import RouteLine, RouteProgress, first_step
+from foredrive.driving.route_scenario import SETTLE_S, RouteScenario
 from foredrive.errors import InputError
 from foredrive.scene import BicycleState, Clip, Control, DriveProgress, Event, Step
 from foredrive.scene.actors import boxes_in_ego_frame, in_box_range
 from foredrive.scene.conditions import BackgroundTraffic
-from foredrive.simulation.collisions import CollisionSense, Contacts
-from foredrive.simulation.dynamics import EGO, STEP_S, step, yaw_rate_radps
-from foredrive.simulation.lane_rules import RuleState
-from foredrive.simulation.observation import FRAME_STEPS, KeyFrame, no_images
-from foredrive.simulation.road_users import RoadUsers, road_users
-from foredrive.simulation.route_progress import RouteLine, RouteProgress, first_step
-from foredrive.simulation.route_scenario import SETTLE_S, RouteScenario
-from foredrive.simulation.scenarios.context import ScenarioEgo, ScenarioProgress
-from foredrive.simulation.scenarios.director import Director
-from foredrive.simulation.scenarios.scenario import Scenario
-from foredrive.simulation.town_lanes import TownLaneRules
+from foredrive.towns.driving.collision_sense import CollisionSense
+from foredrive.towns.driving.road_users import road_users
+from foredrive.towns.driving.town_lanes import TownLaneRules
 from foredrive.towns.map.town_map import load_town_map
+from foredrive.towns.scenarios.context import ScenarioEgo, ScenarioProgress
+from foredrive.towns.scenarios.director import Director
+from foredrive.towns.scenarios.scenario import Scenario
 from foredrive.towns.sensing.capture import SensorSuite
 from foredrive.towns.traffic.external_ego import EgoPose, find_lane
 from foredrive.towns.traffic.fleet import ego_vehicle

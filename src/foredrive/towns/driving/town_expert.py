@@ -14,11 +14,12 @@ import numpy as np
 import torch
 from jaxtyping import Float64
 
+from foredrive.driving.collisions import Box, RoadUsers, touched
+from foredrive.driving.dynamics import EGO
 from foredrive.geometry.polylines import arc_lengths, points_at
 from foredrive.scene import Clip, Trajectory
-from foredrive.simulation.dynamics import EGO
-from foredrive.simulation.road_users import Box, RoadUsers, road_users, touched
-from foredrive.simulation.town import DECISION_S, PredictedState, TownSimulator, TownState
+from foredrive.towns.driving.road_users import road_users
+from foredrive.towns.driving.town import DECISION_S, PredictedState, TownSimulator, TownState
 from foredrive.towns.traffic.external_ego import EgoPose
 from foredrive.towns.traffic.leaders import find_leaders
 from foredrive.towns.traffic.state import TrafficState

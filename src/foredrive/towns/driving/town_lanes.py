@@ -5,8 +5,7 @@ import dataclasses
 import numpy as np
 from jaxtyping import Float64, Int
 
-from foredrive.scene import BicycleState, Event
-from foredrive.simulation.lane_rules import (
+from foredrive.driving.lane_rules import (
     LINE_MARGIN_M,
     OUTSIDE_BY_M,
     WRONG_WAY_RAD,
@@ -16,6 +15,7 @@ from foredrive.simulation.lane_rules import (
     lines_run,
     way_driven,
 )
+from foredrive.scene import BicycleState, Event
 from foredrive.towns.map.town_map import StopZoneKind, TownMap
 from foredrive.towns.traffic.lane_index import LaneIndex
 from foredrive.towns.traffic.traffic import Traffic

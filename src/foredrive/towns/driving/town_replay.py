@@ -12,7 +12,7 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 
 from foredrive.errors import InputError
-from foredrive.rendering.tracks import ActorTracks, states_at
+from foredrive.methods.rebuilding.tracks import ActorTracks, states_at
 from foredrive.scene import CameraRig, Category, Rendered
 from foredrive.scene.actors import ActorState
 from foredrive.towns.sensing.capture import SensorSuite

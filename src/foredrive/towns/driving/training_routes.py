@@ -1,6 +1,6 @@
 """Foredrive's own routes in the training towns, drawn from a seed and kept in the package's data file.
 
-`python -m foredrive.simulation.training_routes` draws all of them again and writes them there.
+`python -m foredrive.towns.driving.training_routes` draws all of them again and writes them there.
 """
 
 import math
@@ -12,9 +12,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from foredrive.driving.route_sets import SHIPPED, RouteWaypoints, shipped_sets, write_shipped
 from foredrive.errors import InputError
-from foredrive.simulation.route_sets import SHIPPED, RouteWaypoints, shipped_sets, write_shipped
-from foredrive.simulation.routes import DriveRoute, RouteOption, snap_route
+from foredrive.towns.driving.routes import DriveRoute, RouteOption, snap_route
 from foredrive.towns.map.names import TEST_TOWNS, TOWNS
 from foredrive.towns.map.town_map import load_town_map
 from foredrive.towns.traffic.fleet import find_start_points
@@ -106,7 +106,7 @@ def main() -> None:
     for name, spec in ROUTE_SETS.items():
         towns = [town for town in TOWNS if town not in TEST_TOWNS]
         sets[name] = [route for town in towns for route in draw_routes(town, spec)]
-    write_shipped(Path(str(resources.files("foredrive.simulation").joinpath(SHIPPED))), sets)
+    write_shipped(Path(str(resources.files("foredrive.driving").joinpath(SHIPPED))), sets)
 
 
 if __name__ == "__main__":

@@ -7,9 +7,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float64
 
-from foredrive.simulation.dynamics import EGO
-from foredrive.simulation.scenarios.kinematics import arrival_s, stopping_m
-from foredrive.simulation.scenarios.scenario import Scenario, Way
+from foredrive.driving.dynamics import EGO
+from foredrive.towns.scenarios.kinematics import arrival_s, stopping_m
+from foredrive.towns.scenarios.scenario import Scenario, Way
 from foredrive.towns.traffic.leaders import find_leaders
 from foredrive.towns.traffic.orders import Orders
 from foredrive.towns.traffic.state import TrafficState

@@ -7,9 +7,9 @@ from jaxtyping import Float64
 
 from foredrive.scene import Category
 from foredrive.scene.actors import ActorState
-from foredrive.simulation.collisions import SOLID
-from foredrive.simulation.scenarios.road_context import RoadContext, pose
-from foredrive.simulation.scenarios.scenario import Scenario, ScenarioKind
+from foredrive.towns.driving.collision_sense import SOLID
+from foredrive.towns.scenarios.road_context import RoadContext, pose
+from foredrive.towns.scenarios.scenario import Scenario, ScenarioKind
 from foredrive.towns.traffic.scripted_actors import FIRST_TRACK_ID, ScriptedActor
 from foredrive.towns.world import World
 

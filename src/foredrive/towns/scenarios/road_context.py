@@ -6,8 +6,8 @@ import numpy as np
 from jaxtyping import Float64
 
 from foredrive.geometry.polylines import points_at
-from foredrive.simulation.lane_search import Leg
-from foredrive.simulation.routes import DriveRoute
+from foredrive.towns.driving.lane_search import Leg
+from foredrive.towns.driving.routes import DriveRoute
 from foredrive.towns.traffic.lane_graph import LaneGraph
 from foredrive.towns.traffic.lane_index import LaneIndex
 from foredrive.towns.world import World

@@ -4,10 +4,10 @@ import dataclasses
 
 import numpy as np
 
-from foredrive.simulation.scenarios.context import STANDS_MPS, ScenarioContext, ScenarioProgress
-from foredrive.simulation.scenarios.kinematics import SPARE_M, arrival_s, cruise_mps, stopping_m
-from foredrive.simulation.scenarios.scenario import ENDS_BEFORE, MEETINGS, ScenarioKind
-from foredrive.simulation.scenarios.vehicles import RUN_UP_M, is_let_go
+from foredrive.towns.scenarios.context import STANDS_MPS, ScenarioContext, ScenarioProgress
+from foredrive.towns.scenarios.kinematics import SPARE_M, arrival_s, cruise_mps, stopping_m
+from foredrive.towns.scenarios.scenario import ENDS_BEFORE, MEETINGS, ScenarioKind
+from foredrive.towns.scenarios.vehicles import RUN_UP_M, is_let_go
 from foredrive.towns.traffic.lane_changes import change_length_m
 from foredrive.towns.traffic.scenario_vehicles import grant_junction
 

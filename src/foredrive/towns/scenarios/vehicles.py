@@ -7,9 +7,9 @@ from jaxtyping import Float64
 
 from foredrive.geometry.polylines import points_at
 from foredrive.scene.traffic_light import LightState
-from foredrive.simulation.scenarios.context import ScenarioContext
-from foredrive.simulation.scenarios.road_context import RoadContext
-from foredrive.simulation.scenarios.scenario import MEETINGS, ScenarioKind, Way
+from foredrive.towns.scenarios.context import ScenarioContext
+from foredrive.towns.scenarios.road_context import RoadContext
+from foredrive.towns.scenarios.scenario import MEETINGS, ScenarioKind, Way
 from foredrive.towns.traffic.scenario_vehicles import add_vehicle, clear_area, points_along
 from foredrive.towns.traffic.spawning import SPAWN_MIN_M
 

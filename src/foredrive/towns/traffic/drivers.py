@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float64, Int
 
-from foredrive.towns.traffic.car_following import (
+from foredrive.driving.car_following import (
     CRAWL_MPS,
     EMERGENCY_MPS2,
     JERK_DOWN_MPS3,

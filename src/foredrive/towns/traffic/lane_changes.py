@@ -7,7 +7,7 @@ import numba
 import numpy as np
 from jaxtyping import Bool, Float64, Int
 
-from foredrive.towns.traffic.car_following import free_acceleration
+from foredrive.driving.car_following import free_acceleration
 from foredrive.towns.traffic.drivers import DrivingContext, following_acceleration
 from foredrive.towns.traffic.lane_graph import MOTORWAY_LIMIT_MPS, LaneGraph
 from foredrive.towns.traffic.leaders import (

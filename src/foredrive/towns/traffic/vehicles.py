@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float64, Int
 
-from foredrive.towns.traffic.car_following import SLOWING_TIME_S
+from foredrive.driving.car_following import SLOWING_TIME_S
 from foredrive.towns.traffic.centrelines import SLOWING_MPS2
 from foredrive.towns.traffic.lane_graph import LaneGraph
 from foredrive.towns.traffic.slots import Slots

@@ -1,0 +1,1 @@
+"""Ground truth of tasks at the now of a clip."""

@@ -1,0 +1,1 @@
+"""Training loops, checkpoints, processes, run folders and benchmarks; knows no task and no method."""

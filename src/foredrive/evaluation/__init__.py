@@ -1,1 +1,0 @@
-"""Evaluations: predictions and truth in, one flat summary out."""

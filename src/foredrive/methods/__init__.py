@@ -1,0 +1,1 @@
+"""Published methods, a folder each: configuration, network, loss, training and recipes."""

@@ -1,1 +1,0 @@
-"""Maps around the ego vehicle, raster and vector, judged by every published protocol."""

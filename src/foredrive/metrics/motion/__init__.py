@@ -1,1 +1,0 @@
-"""Forecasts of agents' motion, judged by every published protocol."""

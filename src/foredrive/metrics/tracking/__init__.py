@@ -1,1 +1,0 @@
-"""Tracks against true tracks: CLEAR MOT, HOTA, and nuScenes' averages over recalls."""

@@ -1,1 +1,0 @@
-"""The published protocols of occupancy: semantic voxels, rays through them, instances seen from above."""

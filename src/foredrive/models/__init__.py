@@ -1,1 +1,0 @@
-"""Neural networks only: backbones, lifting, NeMo, planners, baselines."""

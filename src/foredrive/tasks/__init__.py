@@ -1,0 +1,1 @@
+"""Tasks, a folder each: truth, head, loss, metric, protocols and files of results."""

@@ -1,0 +1,1 @@
+"""The evaluation that runs a list of metrics over predictions."""

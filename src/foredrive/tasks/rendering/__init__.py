@@ -1,0 +1,1 @@
+"""Rendered images and sweeps against real ones."""
