@@ -23,7 +23,7 @@ from foredrive.driving.scores import Ending, RouteScore
 from foredrive.engine.summary import read_summary
 from foredrive.errors import InputError
 from foredrive.files import atomic_path
-from foredrive.runs.drive.agents import inputs_of
+from foredrive.runs.drive.agents import AGENTS, inputs_of
 from foredrive.runs.drive.in_towns import TownRoutes
 from foredrive.runs.drive.records import read_drive, summarise
 from foredrive.runs.drive.route_source import job_of
@@ -315,3 +315,9 @@ def test_the_report_has_a_film_of_every_drive(suite: DriveSuite, tmp_path: Path)
     (tmp_path / "drives" / f"{HOSTILE}.json").write_text(json.dumps(drive))
     shutil.copy(tmp_path / "videos" / "routea_rep0.webp", tmp_path / "videos" / f"{HOSTILE}.webp")
     assert "<svg onload" not in write_drive_report(tmp_path).read_text()
+
+
+def test_the_page_names_all_agents() -> None:
+    page = (Path(__file__).parents[2] / "docs" / "driving.md").read_text()
+    missing = [kind.name for kind in AGENTS if f"`{kind.name}{kind.argument}`" not in page]
+    assert missing == [""]  # a run folder stands first, in words

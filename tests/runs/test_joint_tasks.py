@@ -17,7 +17,7 @@ from foredrive.integrations.graph import AgentGraph, GraphInputs
 from foredrive.methods.recipe import Recipe
 from foredrive.runs import Run, evaluate_run, load_agent, open_run, train_run
 from foredrive.runs.build import build_agent
-from foredrive.runs.drive.agents import SeeingAgent, following
+from foredrive.runs.drive.seeing_agents import SeeingAgent, following
 from foredrive.runs.export import export_run
 from foredrive.runs.open_clips import open_clips
 from foredrive.runs.recipes.task_heads import base_heads, heads_for, with_joint_heads

@@ -11,6 +11,7 @@ from foredrive.cli.drive_options import InputFaults, InRebuilt, InTowns, Plannin
 from foredrive.cli.failures import listed_failures
 from foredrive.errors import InputError
 from foredrive.lazy import importing
+from foredrive.runs.drive.agents import agents_help
 
 if TYPE_CHECKING:
     from foredrive.driving.drive_record import DriveRecord
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
 
 
 def drive(
-    agent: Annotated[str, tyro.conf.arg(metavar="RUN|embedded|expert|constant-velocity|stop|log|…")],
+    agent: Annotated[str, tyro.conf.arg(metavar="RUN|embedded|expert|idm|…", help=agents_help())],
     out: Path,
     planning: tyro.conf.OmitArgPrefixes[Planning],
     inputs: tyro.conf.OmitArgPrefixes[InputFaults],
@@ -32,16 +33,6 @@ def drive(
     --carla it drives in the towns of a CARLA server.
 
     Args:
-        agent: A run folder; embedded, the driver that comes with the package; expert (it has privileged
-            information); idm (the intelligent driver model on the route, which knows lights and road users)
-            or idm:RUN (which knows what a driver sees of them); true:RUN, true-lights:RUN or true-users:RUN
-            (a driver to which both, or one of them, are told as they are); constant-velocity (straight on at
-            5 m/s); stop (stands still); or ego-mlp:RUN, the MLP that sees only the ego status, fitted to the
-            training data of a run. http://HOST:PORT is a planner in another process that speaks neuro-ncap's
-            model server protocol; ?timeout=S behind it changes the 60 s in which it has to answer. Two more
-            record DAgger demonstrations, with the expert's plan at each key frame in the logs. disturbed is
-            the expert while it is steered aside and slowed. student:RUN is a run in alternation with the
-            expert.
         out: Folder of the suite: summary.json, report.html, drives, logs.
     """
     check_out_folder(out)

@@ -1,126 +1,26 @@
-"""Agents that can drive a town, by the names that the command line accepts."""
+"""The table of agents that can drive, by the names that the command line accepts.
+
+The modules of an agent are imported when it is built, so that the table can be read at once.
+"""
 
 import importlib.util
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Literal
 
-import torch
-
-from foredrive.data.resizing import shrink_images
-from foredrive.driver.agent import Driver, PartlyTrue, Perception, SightDriver
-from foredrive.driving.observation import FRAME_DT_S
-from foredrive.driving.restarts import RestartingAgent, is_free_ahead
-from foredrive.driving.simple_agents import StraightAgent
 from foredrive.errors import InputError
-from foredrive.integrations.remote.json_http import read_address
-from foredrive.integrations.remote.planner_client import ALIVE_S, HttpPlanner, check_planner
-from foredrive.json_server import Address
-from foredrive.methods.planner.agent import PlanningAgent
-from foredrive.methods.planner.ego_mlp import EgoMLP
-from foredrive.runs.shipped import run_folder
-from foredrive.runs.train.baselines import run_baselines
-from foredrive.runs.train.driver import is_driver, load_driver, open_driver
-from foredrive.runs.train.rigs import TrainedRigs, check_rig, read_rigs
-from foredrive.runs.train.run import load_agent, open_run
-from foredrive.scene import Agent, Clip, Trajectory
-from foredrive.sensors.rigs import SURROUND, RigPlan
-from foredrive.tasks.evaluation.frame_keys import MAX_GAP_S
-from foredrive.tasks.tracking.following import AgentFollower
-from foredrive.towns.driving.demonstrations import AlternatingStudent, DisturbedExpert
-from foredrive.towns.driving.idm_agent import IdmAgent, TruePerception
-from foredrive.towns.driving.town import TownSimulator
-from foredrive.towns.driving.town_expert import TownExpert
 
-
-@dataclass(frozen=True, eq=False)
-class SeeingAgent:
-    """The agent of a run. Its images may be smaller than the vehicle records them."""
-
-    agent: PlanningAgent[Any]
-    image_hw: tuple[int, int]
-    device: str
-
-    def seen(self, observation: Clip) -> Clip:
-        """Return the observation as the agent reads it."""
-        clip: Clip = shrink_images(observation, self.image_hw).to(self.device)
-        return clip
-
-    def act(self, observation: Clip) -> Trajectory:
-        """Return the plan."""
-        return self.agent.act(self.seen(observation))
-
-    @torch.no_grad()
-    def is_free(self, observation: Clip) -> bool:
-        """Return whether the world model sees nothing right ahead, for an observation of a batch of one."""
-        world = self.agent.world_model
-        decoded = world.decode(self.agent.rollout(self.seen(observation), 0)[0])
-        return is_free_ahead(decoded.occupancy_logit[0], world.spec)
-
-
-class FollowingAgent:
-    """A `SeeingAgent` in one drive whose planner attends to agents that are carried from frame to frame.
-
-    It is trained with the agents of the frames before, and so it drives with them. They are forgotten after
-    a gap in the observations.
-
-    Args:
-        seeing: the agent of the run.
-        follower: the state of the drive.
-        clock: returns the time of the drive, s.
-    """
-
-    def __init__(self, seeing: SeeingAgent, follower: AgentFollower, clock: Callable[[], float]) -> None:
-        self._seeing, self._follower, self._clock = seeing, follower, clock
-        self._before_s: float | None = None
-
-    @torch.no_grad()
-    def act(self, observation: Clip) -> Trajectory:
-        """Return the plan."""
-        agent, clip, now_s = self._seeing.agent, self._seeing.seen(observation), self._clock()
-        dt_s = None if self._before_s is None else now_s - self._before_s
-        if dt_s is not None and not 0 < dt_s <= MAX_GAP_S:
-            dt_s = None
-        beliefs = agent.rollout(clip, agent.planner.imagined_frames)
-        found, _ = self._follower.step(
-            lambda carried: agent.perceived(beliefs[0], carried=carried), clip.T_world_ego[0, clip.now], dt_s
-        )
-        self._before_s = now_s
-        return agent.plan(clip, beliefs, found)
-
-
-def following(seeing: SeeingAgent, clock: Callable[[], float]) -> Agent:
-    """Return the agent for one drive; one with a state if its planner attends to agents that are carried.
-
-    Args:
-        seeing: the agent of the run.
-        clock: returns the time of the drive, s.
-    """
-    agent = seeing.agent
-    heads = None if agent.heads is None else agent.heads.config.agents
-    if agent.planner.scene is None or heads is None or heads.carried is None:
-        return seeing
-    return FollowingAgent(seeing, AgentFollower(heads.carried), clock)
-
+if TYPE_CHECKING:
+    from foredrive.runs.train.rigs import TrainedRigs
+    from foredrive.scene import Agent
+    from foredrive.sensors.rigs import RigPlan
+    from foredrive.towns.driving.town import TownSimulator
 
 CRUISE_MPS = 5.0
-EXPERT, STOP, CONSTANT_VELOCITY, EGO_MLP = "expert", "stop", "constant-velocity", "ego-mlp:"
-REPLAY = "log"
-"""The agent that repeats the logged drive (log replay)."""
-CORRIDOR = "lidar-corridor"
-"""The agent that follows the logged path and stops if lidar sees something in its corridor."""
-OF_LOGS = (REPLAY, CORRIDOR)
-"""Agents that need the path of a log; `in_rebuilt` makes them, and another expert."""
-HTTP = "http://"
-"""Beginning of the address of a planner behind neuro-ncap's model server protocol."""
-GRPC = "grpc://"
-"""Beginning of the address of a driver behind AlpaSim's contract."""
-DISTURBED, STUDENT = "disturbed", "student:"
-IDM, IDM_BY_SIGHT = "idm", "idm:"
-PARTLY_TRUE = {"true:": (True, True), "true-lights:": (True, False), "true-users:": (False, True)}
-"""Prefixes of a driver's run that drives with lights, and with road users, as they truly are."""
+EXPERT, DISTURBED, IDM, STOP, CONSTANT_VELOCITY = "expert", "disturbed", "idm", "stop", "constant-velocity"
+REPLAY, CORRIDOR = "log", "lidar-corridor"
+NEEDS_TOWN = "the expert and idm read the state of an embedded town and can drive only there"
 
 
 @dataclass(frozen=True)
@@ -138,18 +38,282 @@ Sees = Literal["camera", "lidar", "both"]
 """Sensors that an agent is shown."""
 
 
+@dataclass(frozen=True)
+class AgentSetup:
+    """All that an agent of one drive is built from."""
+
+    agent: str
+    """Its whole name."""
+    argument: str
+    """What follows the kind's name: a run or an address."""
+    clock: Callable[[], float]
+    """Returns the time of the drive, s."""
+    town: "TownSimulator | None"
+    """None: the drive is not in an embedded town."""
+    seed: int
+    sees: Sees | None
+
+    @property
+    def folder(self) -> Path:
+        """The folder of the run."""
+        return _run_folder(self.agent, self.argument)
+
+    def in_town(self) -> "TownSimulator":
+        """Return the town.
+
+        Raises:
+            InputError: the drive is not in a town.
+        """
+        if self.town is None:
+            raise InputError(NEEDS_TOWN)
+        return self.town
+
+
+def _build_expert(setup: AgentSetup) -> "Agent":
+    from foredrive.towns.driving.town_expert import TownExpert
+
+    return TownExpert(setup.in_town())
+
+
+def _build_idm(setup: AgentSetup) -> "Agent":
+    from foredrive.towns.driving.idm_agent import IdmAgent
+
+    return IdmAgent(setup.in_town())
+
+
+def _straight_on(speed_mps: float) -> Callable[[AgentSetup], "Agent"]:
+    def build(setup: AgentSetup) -> "Agent":
+        from foredrive.driving.simple_agents import StraightAgent
+
+        return StraightAgent(speed_mps)
+
+    return build
+
+
+def _build_ego_mlp(setup: AgentSetup) -> "Agent":
+    from foredrive.driving.restarts import RestartingAgent
+    from foredrive.runs.drive.seeing_agents import fitted_mlp
+
+    return RestartingAgent(fitted_mlp(setup.folder), setup.clock)
+
+
+def _build_disturbed(setup: AgentSetup) -> "Agent":
+    from foredrive.towns.driving.demonstrations import DisturbedExpert
+    from foredrive.towns.driving.town_expert import TownExpert
+
+    return DisturbedExpert(TownExpert(setup.in_town()), setup.clock, setup.seed)
+
+
+def _build_student(setup: AgentSetup) -> "Agent":
+    from foredrive.driver.agent import SightDriver
+    from foredrive.runs.drive.seeing_agents import driver_of, following, seeing_agent
+    from foredrive.runs.train.driver import is_driver
+    from foredrive.towns.driving.demonstrations import AlternatingStudent
+    from foredrive.towns.driving.town_expert import TownExpert
+
+    folder = setup.folder
+    seeing = (
+        SightDriver(driver_of(folder)) if is_driver(folder) else following(seeing_agent(folder), setup.clock)
+    )
+    return AlternatingStudent(seeing, TownExpert(setup.in_town()), setup.clock, setup.seed)
+
+
+def _build_run(setup: AgentSetup) -> "Agent":
+    from foredrive.driver.agent import SightDriver
+    from foredrive.driving.restarts import RestartingAgent
+    from foredrive.runs.drive.seeing_agents import driver_of, following, seeing_agent
+    from foredrive.runs.train.driver import is_driver
+
+    folder = setup.folder
+    if is_driver(folder):
+        return SightDriver(driver_of(folder))
+    return RestartingAgent(
+        following(seeing_agent(folder), setup.clock), setup.clock, seeing_agent(folder).is_free
+    )
+
+
+def _build_rules_by_sight(setup: AgentSetup) -> "Agent":
+    from foredrive.driver.agent import Perception
+    from foredrive.runs.drive.seeing_agents import driver_of
+    from foredrive.runs.train.driver import is_driver
+    from foredrive.towns.driving.idm_agent import IdmAgent
+
+    if not is_driver(setup.folder):
+        raise InputError(f"{setup.folder}: idm:RUN needs the run of a driver, such as driver_small")
+    return IdmAgent(setup.in_town(), Perception(driver_of(setup.folder)))
+
+
+def _partly_true(*, lights: bool, users: bool) -> Callable[[AgentSetup], "Agent"]:
+    def build(setup: AgentSetup) -> "Agent":
+        from foredrive.driver.agent import PartlyTrue, Perception, SightDriver
+        from foredrive.runs.drive.seeing_agents import driver_of
+        from foredrive.towns.driving.idm_agent import TruePerception
+
+        driver, truth = driver_of(setup.folder), TruePerception(setup.in_town())
+        return SightDriver(driver, PartlyTrue(Perception(driver), truth, lights=lights, users=users))
+
+    return build
+
+
+def _build_of_log(setup: AgentSetup) -> "Agent":
+    raise InputError(
+        f"the agent {setup.agent} follows the path of a log and can drive only in a reconstruction"
+    )
+
+
+def _build_http(setup: AgentSetup) -> "Agent":
+    from foredrive.integrations.remote.json_http import read_address
+    from foredrive.integrations.remote.planner_client import HttpPlanner
+
+    cameras, lidar = setup.sees != "lidar", setup.sees in ("lidar", "both")
+    return HttpPlanner(read_address(setup.agent, "http"), setup.clock, cameras=cameras, lidar=lidar)
+
+
+def _build_grpc(setup: AgentSetup) -> "Agent":
+    require_alpasim()
+    from foredrive.integrations.remote.alpasim_client import GrpcDriver
+    from foredrive.integrations.remote.json_http import read_address
+
+    return GrpcDriver(read_address(setup.agent, "grpc"), setup.clock)
+
+
+def _check_http(agent: str) -> None:
+    from foredrive.integrations.remote.json_http import read_address
+    from foredrive.integrations.remote.planner_client import check_planner
+
+    check_planner(read_address(agent, "http"))
+
+
+def _check_grpc(agent: str) -> None:
+    require_alpasim()
+    from foredrive.integrations.remote.alpasim_client import check_driver
+    from foredrive.integrations.remote.json_http import read_address
+    from foredrive.integrations.remote.planner_client import ALIVE_S
+
+    check_driver(read_address(agent, "grpc"), ALIVE_S)
+
+
+@dataclass(frozen=True)
+class AgentKind:
+    """A row of the table of agents."""
+
+    name: str
+    """The agent's name. If it ends in ":" or "/", an argument follows it."""
+    knows: str
+    """What it is and what it is told, in one line."""
+    build: Callable[[AgentSetup], "Agent"]
+    """Builds the agent of one drive."""
+    argument: str = ""
+    """Word for the argument in help."""
+    sensors: Literal["none", "lidar", "remote", "trained", "ego"] = "none"
+    """What it is shown: nothing, lidar, what another process asks for, the cameras of its run, or the key
+    frames of its run without images."""
+    ready: Callable[[str], None] | None = None
+    """Waits until an agent in another process is alive; raises `InputError` if it is not."""
+
+
+AGENTS: tuple[AgentKind, ...] = (
+    AgentKind(EXPERT, "reads the town's state and its traffic's plans", _build_expert),
+    AgentKind(
+        IDM,
+        "follows the route by the intelligent driver model, with true lights and road users",
+        _build_idm,
+    ),
+    AgentKind(STOP, "never starts", _straight_on(0.0)),
+    AgentKind(CONSTANT_VELOCITY, "straight on at 5 m/s", _straight_on(CRUISE_MPS)),
+    AgentKind(DISTURBED, "the expert under disturbances, for demonstrations", _build_disturbed),
+    AgentKind(REPLAY, "in a reconstruction: repeats the logged drive", _build_of_log),
+    AgentKind(
+        CORRIDOR,
+        "in a reconstruction: follows the logged path and stops if lidar sees something in its corridor",
+        _build_of_log,
+        sensors="lidar",
+    ),
+    AgentKind(
+        "ego-mlp:",
+        "the MLP that sees only the ego status, fitted to the training data of the run",
+        _build_ego_mlp,
+        "RUN",
+        "ego",
+    ),
+    AgentKind(
+        "student:", "a run in alternation with the expert, for DAgger", _build_student, "RUN", "trained"
+    ),
+    AgentKind("idm:", "idm with the perception of a driver's run", _build_rules_by_sight, "RUN", "trained"),
+    AgentKind(
+        "true:",
+        "a driver with true lights and road users",
+        _partly_true(lights=True, users=True),
+        "RUN",
+        "ego",
+    ),
+    AgentKind(
+        "true-lights:",
+        "a driver with true lights",
+        _partly_true(lights=True, users=False),
+        "RUN",
+        "trained",
+    ),
+    AgentKind(
+        "true-users:",
+        "a driver with true road users",
+        _partly_true(lights=False, users=True),
+        "RUN",
+        "trained",
+    ),
+    AgentKind(
+        "http://",
+        "a planner in another process, behind neuro-ncap's model server protocol; ?timeout=S behind the "
+        "address changes the 60 s in which it has to answer",
+        _build_http,
+        "HOST:PORT",
+        "remote",
+        _check_http,
+    ),
+    AgentKind(
+        "grpc://",
+        "a driver in another process, behind AlpaSim's contract",
+        _build_grpc,
+        "HOST:PORT",
+        "remote",
+        _check_grpc,
+    ),
+    AgentKind(
+        "",
+        "the agent of a run folder; embedded or embedded:NAME comes with the package",
+        _build_run,
+        "RUN",
+        "trained",
+    ),
+)
+"""All agents: a new one is a row. The first whose name fits is taken."""
+
+
+def find_agent(agent: str) -> tuple[AgentKind, str]:
+    """Return the kind of an agent, and what follows the kind's name."""
+    for kind in AGENTS:
+        if agent == kind.name or (kind.argument and agent.startswith(kind.name)):
+            return kind, agent.removeprefix(kind.name)
+    raise AssertionError("the last kind fits every name")
+
+
+def agents_help() -> str:
+    """Return the help of the command line: a sentence about each agent."""
+    return "; ".join(f"{kind.name}{kind.argument}: {kind.knows}" for kind in (AGENTS[-1], *AGENTS[:-1])) + "."
+
+
 def check_seeing(agent: str, sees: Sees | None) -> None:
     """Check that an agent can drive with some sensors alone.
 
     Raises:
         InputError: it needs others, or has no use for those.
     """
-    if sees is not None and agent.startswith(GRPC):
+    if sees is not None and agent.startswith("grpc://"):
         raise InputError("drivers of AlpaSim are sent cameras alone: leave out --sees")
     if sees is None or is_remote(agent):
         return
     inputs = inputs_of(agent)
-    if (inputs.cameras and sees == "lidar") or (agent == CORRIDOR and sees == "camera"):
+    if (inputs.cameras and sees == "lidar") or (inputs.lidar and sees == "camera"):
         needed = "cameras" if inputs.cameras else "lidar"
         raise InputError(f"{agent} needs its {needed}, which --sees {sees} hides")
     if (not inputs.cameras and sees == "camera") or not (inputs.cameras or inputs.lidar):
@@ -160,64 +324,65 @@ def inputs_of(agent: str) -> AgentInputs:
     """Return the inputs that an agent requires.
 
     Args:
-        agent: "expert", "stop", "constant-velocity", a run folder, or "ego-mlp:RUN": the MLP that sees only
-            the ego status, fitted to the training data of the run. For DAgger demonstrations: "disturbed",
-            the expert under disturbances, or "student:RUN", a run that drives in alternation with the expert.
-            "log" and "lidar-corridor" follow the path of a reconstructed log.
-            "http://HOST:PORT" is a planner in another process (`HttpPlanner`), "grpc://HOST:PORT" a driver of
-            AlpaSim (`GrpcDriver`).
-            "idm" follows the route by the intelligent driver model and knows lights and road users;
-            "idm:RUN" knows of them what a driver's run sees. "true:RUN", "true-lights:RUN" and
-            "true-users:RUN" are a driver to whom both, the lights, or the road users are told as they are.
+        agent: a name of `AGENTS`, with its argument.
 
     Raises:
         InputError: there is no such agent, or it was trained on another frame interval.
     """
-    if is_remote(agent):
-        _address_of(agent)
+    from foredrive.driving.observation import FRAME_DT_S
+    from foredrive.integrations.remote.json_http import read_address
+    from foredrive.runs.train.driver import is_driver, open_driver
+    from foredrive.runs.train.run import open_run
+
+    kind, argument = find_agent(agent)
+    if kind.sensors == "remote":
+        read_address(agent, kind.name.removesuffix("://"))
         return AgentInputs(cameras=True, lidar=False, past_frames=1)
-    if agent in (EXPERT, STOP, CONSTANT_VELOCITY, DISTURBED, IDM, *OF_LOGS):
-        return AgentInputs(cameras=False, lidar=agent == CORRIDOR, past_frames=1)
-    folder = _run_folder(agent)
+    if kind.sensors in ("none", "lidar"):
+        return AgentInputs(cameras=False, lidar=kind.sensors == "lidar", past_frames=1)
+    folder = _run_folder(agent, argument)
     clips = (open_driver(folder) if is_driver(folder) else open_run(folder)).recipe.clips
     if abs(clips.frame_dt_s - FRAME_DT_S) > 1e-6:
         raise InputError(f"{agent}: trained on key frames {clips.frame_dt_s} s apart, not {FRAME_DT_S} s")
-    seeing = not agent.startswith((EGO_MLP, "true:"))
+    seeing = kind.sensors == "trained"
     return AgentInputs(seeing, lidar=False, past_frames=clips.past_frames, camera_names=clips.cameras)
 
 
-def rig_of(agent: str) -> RigPlan:
+def rig_of(agent: str) -> "RigPlan":
     """Return the rig that most of an agent's training logs have; the surround rig if the agent has none."""
+    from foredrive.sensors.rigs import SURROUND
+
     rigs = _rigs_of(agent)
     return SURROUND if rigs is None else rigs.usual
 
 
-def check_rig_of(agent: str, rig: RigPlan) -> None:
+def check_rig_of(agent: str, rig: "RigPlan") -> None:
     """Check that an agent knows a rig.
 
     Raises:
         InputError: it was not trained with such a rig.
     """
+    from foredrive.runs.train.rigs import check_rig
+
     rigs = _rigs_of(agent)
     if rigs is not None:
         check_rig(rigs, rig, agent)
 
 
-def _rigs_of(agent: str) -> TrainedRigs | None:
-    if agent in (EXPERT, STOP, CONSTANT_VELOCITY, DISTURBED, IDM, *OF_LOGS) or agent.startswith(
-        (EGO_MLP, HTTP, GRPC)
-    ):
-        return None
-    return read_rigs(_run_folder(agent))
+def _rigs_of(agent: str) -> "TrainedRigs | None":
+    from foredrive.runs.train.rigs import read_rigs
+
+    kind, argument = find_agent(agent)
+    return read_rigs(_run_folder(agent, argument)) if kind.sensors == "trained" else None
 
 
 def make_agent(
     agent: str,
     clock: Callable[[], float],
-    town: TownSimulator | None = None,
+    town: "TownSimulator | None" = None,
     seed: int = 0,
     sees: Sees | None = None,
-) -> Agent:
+) -> "Agent":
     """Create the agent of one drive.
 
     Args:
@@ -230,54 +395,13 @@ def make_agent(
     Raises:
         InputError: there is no such agent, or it needs the expert and there is no town.
     """
-    if agent == EXPERT:
-        return _expert(town)
-    if agent == DISTURBED:
-        return DisturbedExpert(_expert(town), clock, seed)
-    if agent in (STOP, CONSTANT_VELOCITY):
-        return StraightAgent(CRUISE_MPS if agent == CONSTANT_VELOCITY else 0.0)
-    if agent in OF_LOGS:
-        raise InputError(
-            f"the agent {agent} follows the path of a log and can drive only in a reconstruction"
-        )
-    if agent.startswith(GRPC):
-        require_alpasim()
-        from foredrive.integrations.remote.alpasim_client import GrpcDriver
-
-        return GrpcDriver(_address_of(agent), clock)
-    if agent.startswith(HTTP):
-        return HttpPlanner(
-            _address_of(agent), clock, cameras=sees != "lidar", lidar=sees in ("lidar", "both")
-        )
-    if agent == IDM:
-        return IdmAgent(_town(town))
-    folder = _run_folder(agent)
-    if agent.startswith(IDM_BY_SIGHT):
-        if not is_driver(folder):
-            raise InputError(f"{folder}: {IDM_BY_SIGHT}RUN needs the run of a driver, such as driver_small")
-        return IdmAgent(_town(town), Perception(_driver(folder)))
-    for prefix, (lights, users) in PARTLY_TRUE.items():
-        if agent.startswith(prefix):
-            driver, truth = _driver(folder), TruePerception(_town(town))
-            return SightDriver(driver, PartlyTrue(Perception(driver), truth, lights=lights, users=users))
-    if agent.startswith(EGO_MLP):
-        return RestartingAgent(_fitted(folder), clock)
-    if agent.startswith(STUDENT):
-        driven = SightDriver(_driver(folder)) if is_driver(folder) else following(_seeing(folder), clock)
-        return AlternatingStudent(driven, _expert(town), clock, seed)
-    if is_driver(folder):
-        return SightDriver(_driver(folder))
-    return RestartingAgent(following(_seeing(folder), clock), clock, _seeing(folder).is_free)
+    kind, argument = find_agent(agent)
+    return kind.build(AgentSetup(agent, argument, clock, town, seed, sees))
 
 
 def is_remote(agent: str) -> bool:
     """Return whether an agent is in another process. It remembers the frames that it was sent."""
-    return agent.startswith((HTTP, GRPC))
-
-
-def _address_of(agent: str) -> Address:
-    """Return the address of an agent in another process."""
-    return read_address(agent, "grpc" if agent.startswith(GRPC) else "http")
+    return find_agent(agent)[0].sensors == "remote"
 
 
 def require_alpasim() -> None:
@@ -296,56 +420,16 @@ def check_ready(agent: str) -> None:
     Raises:
         InputError: it is not.
     """
-    if agent.startswith(GRPC):
-        require_alpasim()
-        from foredrive.integrations.remote.alpasim_client import check_driver
-
-        check_driver(_address_of(agent), ALIVE_S)
-    elif is_remote(agent):
-        check_planner(_address_of(agent))
+    ready = find_agent(agent)[0].ready
+    if ready is not None:
+        ready(agent)
 
 
-def _expert(town: TownSimulator | None) -> TownExpert:
-    return TownExpert(_town(town))
+def _run_folder(agent: str, argument: str) -> Path:
+    from foredrive.runs.shipped import run_folder
 
-
-def _town(town: TownSimulator | None) -> TownSimulator:
-    if town is None:
-        raise InputError("the expert and idm read the state of an embedded town and can drive only there")
-    return town
-
-
-def _run_folder(agent: str) -> Path:
-    prefix = next(
-        (known for known in (EGO_MLP, STUDENT, IDM_BY_SIGHT, *PARTLY_TRUE) if agent.startswith(known)),
-        "",
-    )
-    folder = run_folder(Path(agent.removeprefix(prefix)))
+    folder = run_folder(Path(argument))
     if not folder.is_dir():
-        partly_true = ", ".join(f"{truth}RUN" for truth in PARTLY_TRUE)
-        known = (
-            f"{EXPERT}, {STOP}, {CONSTANT_VELOCITY}, a run folder, {EGO_MLP}RUN, {HTTP}HOST:PORT, "
-            f"{GRPC}HOST:PORT, {IDM}, {IDM_BY_SIGHT}RUN, {partly_true}, "
-            f"{DISTURBED} or {STUDENT}RUN, and in a reconstruction {REPLAY} or {CORRIDOR}"
-        )
-        raise InputError(f"unknown agent {agent!r}; the agents are {known}")
+        names = ", ".join(f"{kind.name}{kind.argument}" for kind in AGENTS)
+        raise InputError(f"unknown agent {agent!r}; the agents are {names}")
     return folder
-
-
-@lru_cache(maxsize=1)  # a worker drives many routes with the same agent
-def _seeing(folder: Path) -> SeeingAgent:
-    run, device = open_run(folder), "cuda" if torch.cuda.is_available() else "cpu"
-    return SeeingAgent(load_agent(run).to(device), run.recipe.clips.image_hw, device)
-
-
-@lru_cache(maxsize=1)
-def _driver(folder: Path) -> Driver:
-    return load_driver(open_driver(folder))
-
-
-@lru_cache(maxsize=1)
-def _fitted(folder: Path) -> EgoMLP:
-    run = open_run(folder)
-    planner, clips = run.recipe.planner, run.recipe.clips
-    past_frames = clips.past_frames if planner.ego_mlp is None else planner.history
-    return run_baselines(run.folder, run.logs, run.recipe, run.cache_dir, past_frames)[1]
