@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 STAMP := .venv/.installed
 
-.PHONY: install demo docs dist test quick test-slow test-oracles golden lint format clean
+.PHONY: install demo docs dist test quick test-slow test-oracles golden lint types format clean
 
 install: $(STAMP)
 
@@ -35,9 +35,11 @@ dist: install
 	FOREDRIVE_WHEEL=$$(echo dist/*.whl) $(BIN)/python -m pytest -m slow tests/test_package.py
 	@du -h dist/*
 
-lint: install
+lint: types
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+
+types: install
 	$(BIN)/mypy
 
 format: install
