@@ -16,6 +16,7 @@ from foredrive.geometry.se3 import inverse_se3, transform_points
 from foredrive.methods.blocks.training_rays import averaged_rays
 from foredrive.methods.blocks.vgg import VggFeatures
 from foredrive.methods.nemo.objective import NemoObjective, NemoStage
+from foredrive.methods.nemo.sampling import ImaginationSampling
 from foredrive.runs.build import build_agent, build_objective
 from foredrive.runs.recipes.known import find_recipe
 from foredrive.scene import Example
@@ -175,7 +176,7 @@ def test_some_items_of_a_batch_are_imagined_and_all_train_the_present(example: E
     stage = dataclasses.replace(
         RECIPE.pretrain, weights=dataclasses.replace(RECIPE.pretrain.weights, recon=0.0, future=0.5)
     )
-    some = objective_of(dataclasses.replace(stage, imagined_items=1))
+    some = objective_of(dataclasses.replace(stage, imagined=ImaginationSampling(items=1)))
     found = losses_of(some, example)["occ"]
     both = objective_of(dataclasses.replace(stage, imagine=False))
     first = objective_of(stage)
@@ -189,7 +190,7 @@ def test_some_items_of_a_batch_are_imagined_and_all_train_the_present(example: E
 
 def test_every_third_step_imagines_and_the_others_train_the_present(example: Example) -> None:
     stage = RECIPE.pretrain
-    third = objective_of(dataclasses.replace(stage, imagine_every=3)).train()
+    third = objective_of(dataclasses.replace(stage, imagined=ImaginationSampling(every=3))).train()
     always, never = (
         objective_of(stage).train(),
         objective_of(dataclasses.replace(stage, imagine=False)).train(),
@@ -205,7 +206,7 @@ def test_every_third_step_imagines_and_the_others_train_the_present(example: Exa
 
 
 def test_an_interrupted_training_goes_on_with_the_step_that_is_due(example: Example) -> None:
-    stage = dataclasses.replace(RECIPE.pretrain, imagine_every=2)
+    stage = dataclasses.replace(RECIPE.pretrain, imagined=ImaginationSampling(every=2))
     first, second = objective_of(stage).train(), objective_of(stage).train()
     losses_of(first, example)
     second.load_state_dict(first.state_dict())
@@ -216,7 +217,10 @@ def test_past_frames_without_gradients_change_no_loss(example: Example) -> None:
     stage = RECIPE.pretrain
     # The motion is large enough that the loss depends on the past.
     whole, without = (
-        objective_of(dataclasses.replace(stage, past_gradient=on), motion_std=0.15) for on in (True, False)
+        objective_of(
+            dataclasses.replace(stage, imagined=ImaginationSampling(past_gradient=on)), motion_std=0.15
+        )
+        for on in (True, False)
     )
     losses = losses_of(whole, example), losses_of(without, example)
     torch.testing.assert_close(losses[0], losses[1])
@@ -231,14 +235,18 @@ def test_past_frames_without_gradients_change_no_loss(example: Example) -> None:
 
 
 def test_a_planner_that_reads_imagined_frames_needs_them_of_every_item() -> None:
-    stage = dataclasses.replace(RECIPE.finetune, imagined_items=1)
+    stage = dataclasses.replace(RECIPE.finetune, imagined=ImaginationSampling(items=1))
     with pytest.raises(InputError, match="imagined frames of every item"):
         build_objective(RECIPE, stage, build_agent(RECIPE))
     with pytest.raises(InputError, match="imagined frames in every step"):
-        build_objective(RECIPE, dataclasses.replace(RECIPE.finetune, imagine_every=2), build_agent(RECIPE))
+        build_objective(
+            RECIPE,
+            dataclasses.replace(RECIPE.finetune, imagined=ImaginationSampling(every=2)),
+            build_agent(RECIPE),
+        )
     for count in (0, -1):
-        for field in ("imagined_items", "imagine_every"):
-            none = dataclasses.replace(RECIPE.pretrain, **{field: count})
+        for imagined in (ImaginationSampling(items=count), ImaginationSampling(every=count)):
+            none = dataclasses.replace(RECIPE.pretrain, imagined=imagined)
             with pytest.raises(InputError, match="set imagine to false"):
                 build_objective(RECIPE, none, build_agent(RECIPE))
 
@@ -264,7 +272,7 @@ def test_the_ego_motion_learns_from_the_driven_path_of_imagined_items(example: E
     for weight in (0.0, 0.5):
         weights = dataclasses.replace(RECIPE.pretrain.weights, ego=weight)
         stage = dataclasses.replace(
-            RECIPE.pretrain, weights=weights, imagined_items=1, augment=AugmentConfig()
+            RECIPE.pretrain, weights=weights, imagined=ImaginationSampling(items=1), augment=AugmentConfig()
         )
         objective = build_objective(RECIPE, stage, agent).eval()
         losses[weight] = objective(example, torch.Generator().manual_seed(1))

@@ -9,14 +9,13 @@ from torch import Tensor, nn
 
 from foredrive.data.augmentation import AugmentConfig, augmented
 from foredrive.engine.loop import Schedule
-from foredrive.errors import InputError
-from foredrive.methods.blocks.lifting import lift_frames
 from foredrive.methods.blocks.losses import ImageFeatures, l1_loss, perceptual_loss
 from foredrive.methods.blocks.training_rays import averaged_rays, thinned_rays
-from foredrive.methods.nemo import Nemo
+from foredrive.methods.nemo.sampling import ImaginationSampler, ImaginationSampling
+from foredrive.methods.nemo.world_model import Nemo
 from foredrive.methods.planner.agent import PlanningAgent
 from foredrive.methods.planner.planner import set_planner_trainable
-from foredrive.scene import Belief, Clip, Example, last_frames
+from foredrive.scene import Belief, Clip, Example
 from foredrive.tasks.heads.joint import TaskTerms
 from foredrive.tasks.occupancy.losses import occupancy_loss
 from foredrive.tasks.planning.losses import ego_motion_loss, waypoint_loss
@@ -62,14 +61,8 @@ class NemoStage:
     "tower", the image tower that comes with the package. None disables that loss (weight 0)."""
     imagine: bool = True
     """Imagine the future key frames and supervise them. If False, only the present is trained."""
-    imagined_items: int | None = None
-    """Number of items of each batch, or of each part of a step, that are imagined, with their pasts and
-    futures. The other items train the present alone, at a fraction of the cost. None: all items, as in the
-    paper."""
-    imagine_every: int = 1
-    """Imagine in one step of so many, from the first step on. The steps between train the present alone."""
-    past_gradient: bool = True
-    """Train the encoder by past frames too. Only the motion reads them."""
+    imagined: ImaginationSampling = field(default_factory=ImaginationSampling)
+    """The part of a step that is imagined."""
     augment: AugmentConfig = field(default_factory=AugmentConfig)
     """Augmentation of the examples. The paper has none."""
     kind: Literal["nemo"] = "nemo"
@@ -86,11 +79,8 @@ class NemoObjective(nn.Module):
         tasks: losses of the agent's heads, or None if they are not trained.
 
     Raises:
-        InputError: `imagined_items` or `imagine_every` is below 1, or the planner reads imagined frames of
-            items or in steps that have none.
+        InputError: what is imagined does not fit, as `ImaginationSampler` says.
     """
-
-    steps_done: Tensor
 
     def __init__(
         self,
@@ -109,18 +99,8 @@ class NemoObjective(nn.Module):
         world, weights = agent.world_model, stage.weights
         plans = weights.wpts > 0
         set_planner_trainable(agent.planner, plans)
-        if stage.imagined_items is not None and stage.imagined_items < 1:
-            raise InputError(f"imagined_items is {stage.imagined_items}; without any, set imagine to false")
-        if stage.imagine_every < 1:
-            raise InputError(f"imagine_every is {stage.imagine_every}; without any, set imagine to false")
-        if plans and agent.planner.imagined_frames > 0:
-            if stage.imagined_items is not None:
-                raise InputError("the planner reads imagined frames of every item: leave out imagined_items")
-            if stage.imagine_every > 1:
-                raise InputError("the planner reads imagined frames in every step: leave out imagine_every")
+        self.sampler = ImaginationSampler(agent, stage.imagined, looks_back=tasks is not None, plans=plans)
         imagines = self.steps > 0 or (plans and agent.planner.imagined_frames > 0)
-        if stage.imagine_every > 1:
-            self.register_buffer("steps_done", torch.zeros((), dtype=torch.long))
         for parameter in world.imagination():
             parameter.requires_grad_(imagines)
         world.occupancy.requires_grad_(weights.occ > 0 or weights.recon > 0)
@@ -134,8 +114,8 @@ class NemoObjective(nn.Module):
         now, weights = clip.now, self.weights
         observed = clip.observed()
         needed = self.agent.planner.imagined_frames if weights.wpts > 0 else 0
-        steps = self.steps if self._imagines_now() else 0
-        beliefs = self._rollout(observed, max(steps, needed))
+        steps = self.steps if self.sampler.imagines_now() else 0
+        beliefs = self.sampler.rollout(observed, max(steps, needed))
         found = None if self.tasks is None else self.agent.perceive(beliefs[0], clip)
         decoded = [world.decode(belief) for belief in beliefs[: steps + 1]]
 
@@ -174,7 +154,7 @@ class NemoObjective(nn.Module):
             losses["ego"] = self._ego_error(clip, beliefs[1 : steps + 1])
             losses["loss"] = losses["loss"] + weights.ego * losses["ego"]
         if len(beliefs) == 1 and self.steps > 0:
-            losses["loss"] = losses["loss"] + self._no_change()
+            losses["loss"] = losses["loss"] + self.sampler.no_change()
         if weights.wpts > 0:
             plan = self.agent.plan(observed, beliefs, found)
             losses["wpts"] = waypoint_loss(plan, example.clip.future)
@@ -193,36 +173,3 @@ class NemoObjective(nn.Module):
             items = len(future.T_now_ego)
             errors.append(ego_motion_loss(future.T_now_ego, driven[:items, 0], driven[:items, k], spec))
         return torch.stack(errors).mean()
-
-    def _imagines_now(self) -> bool:
-        """Return whether this step imagines, and count it in training."""
-        if self.stage.imagine_every == 1:
-            return True
-        now = int(self.steps_done) % self.stage.imagine_every == 0
-        if self.training:
-            self.steps_done += 1
-        return now
-
-    def _no_change(self) -> Float[Tensor, ""]:
-        """Return 0 with a gradient of 0 for the parameters of imagination: DDP needs one in every step."""
-        unused = self.agent.world_model.imagination()
-        return 0.0 * torch.stack([parameter.sum() for parameter in unused]).sum()
-
-    def _rollout(self, observed: Clip, steps: int) -> list[Belief]:
-        """Return the beliefs about now, and about the next `steps` key frames for the imagined items."""
-        stage, world = self.stage, self.agent.world_model
-        if stage.imagined_items is None and stage.past_gradient:
-            return self.agent.rollout(observed, steps)
-        looks_back = self.tasks is not None  # heads read the past of all items
-        items = slice(None if looks_back else stage.imagined_items)
-        frames = last_frames(observed, world.past_frames if steps or looks_back else 0)
-        present, _ = lift_frames(frames[:, -1:], world.backbone, world.encoder)
-        now = Belief(volume=present[:, -1])
-        if steps == 0 and not looks_back:
-            return [now]
-        with torch.set_grad_enabled(stage.past_gradient and torch.is_grad_enabled()):
-            past, _ = lift_frames(frames[items, :-1], world.backbone, world.encoder)
-        history = torch.cat([past, present[items]], dim=1)
-        believed = world.believe(frames[items], history)
-        imagined = world.imagine(believed, steps) if steps else []
-        return [believed if looks_back else now, *imagined]

@@ -11,6 +11,7 @@ from foredrive.methods.blocks.lifting import LiftingConfig
 from foredrive.methods.blocks.plane_context import PlaneContextConfig
 from foredrive.methods.nemo import MotionConfig, NemoConfig, RendererConfig
 from foredrive.methods.nemo.objective import NemoStage, NemoWeights
+from foredrive.methods.nemo.sampling import ImaginationSampling
 from foredrive.methods.planner.ego_mlp import EgoMLPConfig
 from foredrive.methods.planner.path_correction import PathCorrectionConfig
 from foredrive.methods.planner.path_fit import PathFit
@@ -66,15 +67,14 @@ def nemo_tiny() -> NemoRecipe:
             schedule=Schedule(batch_size=4, lr=3e-3, steps=500, warmup_steps=40, workers=1),
             weights=dataclasses.replace(few_steps, wpts=0.0, recon=2.0, occ=1.0),
             ray_stride=8,
-            imagined_items=1,
-            past_gradient=False,
+            imagined=ImaginationSampling(items=1, past_gradient=False),
             augment=AugmentConfig(mirror=0.5),
         ),
         finetune=NemoStage(
             schedule=Schedule(batch_size=4, lr=1e-3, steps=160, warmup_steps=10, workers=1),
             weights=dataclasses.replace(few_steps, wpts=1.0, recon=1.0, occ=0.5),
             ray_stride=16,
-            past_gradient=False,
+            imagined=ImaginationSampling(past_gradient=False),
         ),
     )
 
@@ -117,7 +117,7 @@ def nemo_town() -> NemoRecipe:
                 tiny.pretrain,
                 weights=dataclasses.replace(tiny.pretrain.weights, future=0.5, ego=1.0),
                 ray_stride=16,
-                imagine_every=2,
+                imagined=dataclasses.replace(tiny.pretrain.imagined, every=2),
             ),
             steps=2400,
             warmup_steps=190,
