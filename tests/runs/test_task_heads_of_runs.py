@@ -8,14 +8,12 @@ from typing import Any
 
 import pytest
 import torch
-import yaml
 from joint_heads import ALL, small_heads, with_small_heads
 from miniature import miniature, miniature_driveworld, with_map
 from safetensors.torch import load_file
 
 from foredrive.data import LogPath
 from foredrive.engine.checkpoints import save_weights
-from foredrive.engine.config import save_recipe
 from foredrive.engine.folder import WEIGHTS
 from foredrive.engine.metrics_log import read_metrics
 from foredrive.errors import InputError
@@ -27,12 +25,10 @@ from foredrive.runs import Run, evaluate_run
 from foredrive.runs.build import build_agent
 from foredrive.runs.recipes.task_heads import (
     base_heads,
-    load_task_heads,
     town_heads,
     with_joint_heads,
     with_settings,
 )
-from foredrive.runs.recipes.world_models import load_recipe
 from foredrive.runs.train.run import begin_run
 from foredrive.runs.train.tasks import TASKS, load_heads, probe_run, train_heads
 from foredrive.scene import Example
@@ -209,23 +205,6 @@ def test_agents_that_are_carried_read_the_prompt_of_their_task(
             logits[name] = output.agents[-1].boxes.logits
     for name in ("tracking", "detection"):
         assert torch.equal(logits[name], logits["none"]) == (name != task)
-
-
-def test_tracking_heads_from_before_they_read_its_prompt_go_on_with_that_of_detection(tmp_path: Path) -> None:
-    recipe, heads = with_small_heads(miniature(), ("tracking",)), small_heads(("tracking",))
-    for written, load, carried_of in (
-        (recipe, load_recipe, lambda opened: opened.tasks.heads.agents.carried),
-        (heads, load_task_heads, lambda opened: opened.heads.agents.carried),
-    ):
-        file = tmp_path / "config.yaml"
-        save_recipe(written, file)
-        assert load(file) == written
-        assert carried_of(written).task == "tracking"
-        values = yaml.safe_load(file.read_text())
-        values_of_heads = values.get("tasks", values)["heads"]
-        del values_of_heads["agents"]["carried"]["task"]
-        file.write_text(yaml.safe_dump(values))
-        assert carried_of(load(file)).task == "detection"
 
 
 @pytest.mark.parametrize("make", [town_heads, base_heads])

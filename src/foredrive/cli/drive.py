@@ -33,6 +33,7 @@ def drive(
     --carla it drives in the towns of a CARLA server.
 
     Args:
+        agent: The agent that drives: a row of the table in `foredrive.runs.drive.agents`.
         out: Folder of the suite: summary.json, report.html, drives, logs.
     """
     check_out_folder(out)

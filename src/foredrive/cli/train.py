@@ -1,7 +1,8 @@
 """`foredrive train`."""
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
@@ -11,17 +12,26 @@ from foredrive.data.log_paths import find_all_logs
 from foredrive.errors import InputError
 from foredrive.lazy import importing
 
+if TYPE_CHECKING:
+    from foredrive.data.log_paths import LogPath
+    from foredrive.driver.recipes import DriverRecipe
+    from foredrive.methods.recipe import Recipe
+    from foredrive.runs.recipes.task_heads import TaskHeadsRecipe
+
+Occupancy = Literal["lidar", "accumulated", "recorded"]
+Strategy = Literal["ddp", "fsdp"]
+
 
 def train(
     recipe: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="RECIPE")],
     logs: SomePaths,
     out: Path,
     cache: OptionalPath = None,
-    occupancy: Literal["lidar", "accumulated", "recorded"] = "lidar",
+    occupancy: Occupancy = "lidar",
     start: OptionalPath = None,
     tasks: str = "",
     probe: bool = False,
-    strategy: Literal["ddp", "fsdp"] = "ddp",
+    strategy: Strategy = "ddp",
     set: Settings = (),
 ) -> None:
     """Train a recipe on logs, or continue an interrupted run.
@@ -62,36 +72,111 @@ def train(
     found = find_all_logs(logs)
 
     with importing():
-        from foredrive.methods.recipe import with_occupancy_source
-        from foredrive.runs import train_run
-        from foredrive.runs.recipes.known import find_driver_recipe, find_recipe
-        from foredrive.runs.recipes.task_heads import heads_for, with_joint_heads, with_settings
-        from foredrive.runs.train.driver import train_driver
-        from foredrive.runs.train.tasks import TASKS, probe_run, train_heads
+        from foredrive.runs.recipes.known import find_driver_recipe
 
     driver = find_driver_recipe(recipe, set)
     if driver is not None:
         if tasks or rank() is not None:
             raise InputError(f"{driver.name} trains a driver: leave out --tasks and torchrun")
-        train_driver(driver, found, out, cache, start, job_progress)
-        print(f"trained {driver.name}: {out}")
-        print(f"next: foredrive drive --agent {out} --routes town05-short --out {out / 'short'}")
-        return
-    of_heads = tuple(entry.removeprefix(TASKS + ".") for entry in set if entry.startswith(TASKS + "."))
-    others = tuple(entry for entry in set if not entry.startswith(TASKS + ".")) if tasks else set
-    chosen = with_occupancy_source(find_recipe(recipe, others), occupancy)
-    heads = heads_for(chosen, tasks.split(",")) if tasks else None
-    if heads is not None and not probe:
-        chosen = with_joint_heads(chosen, heads, of_heads)
-    elif heads is not None:
-        heads = with_settings(heads, of_heads)
-    if probe and start is not None:
-        run = probe_run(chosen, found, out, cache, start)
+        _train_driver(driver, found, out, cache, start)
+    elif probe:
+        chosen, heads = _with_heads(recipe, occupancy, tasks, set)
+        _probe(chosen, heads, tasks, found, out, cache, start)
+    elif tasks:
+        _train_agent(_jointly(recipe, occupancy, tasks, set), found, out, cache, start, strategy)
     else:
-        run = train_run(chosen, found, out, cache, start, strategy)
-    if heads is not None and probe:
-        train_heads(run, heads)
-        print(f"trained heads of {tasks}: {out / TASKS}")
+        _train_agent(_plain(recipe, occupancy, set), found, out, cache, start, strategy)
+
+
+def _train_driver(
+    recipe: "DriverRecipe", logs: "Sequence[LogPath]", out: Path, cache: Path | None, start: Path | None
+) -> None:
+    """Train a driver by sight."""
+    with importing():
+        from foredrive.runs.train.driver import train_driver
+
+    train_driver(recipe, logs, out, cache, start, job_progress)
+    print(f"trained {recipe.name}: {out}")
+    print(f"next: foredrive drive --agent {out} --routes town05-short --out {out / 'short'}")
+
+
+def _train_agent(
+    recipe: "Recipe[Any, Any]",
+    logs: "Sequence[LogPath]",
+    out: Path,
+    cache: Path | None,
+    start: Path | None,
+    strategy: Strategy,
+) -> None:
+    """Train a world model and its planner, with the heads of the recipe if it has any."""
+    with importing():
+        from foredrive.runs import train_run
+
+    run = train_run(recipe, logs, out, cache, start, strategy)
     if not rank():
         print(f"trained {run.recipe.name}: {run.weights}")
         print(f"next: foredrive evaluate {out} --logs ...")
+
+
+def _probe(
+    recipe: "Recipe[Any, Any]",
+    heads: "TaskHeadsRecipe",
+    tasks: str,
+    logs: "Sequence[LogPath]",
+    out: Path,
+    cache: Path | None,
+    start: Path | None,
+) -> None:
+    """Train heads on a frozen world model: that of another run, or one that is trained first."""
+    with importing():
+        from foredrive.runs import train_run
+        from foredrive.runs.train.tasks import TASKS, probe_run, train_heads
+
+    if start is not None:
+        run = probe_run(recipe, logs, out, cache, start)
+    else:
+        run = train_run(recipe, logs, out, cache)
+    train_heads(run, heads)
+    print(f"trained heads of {tasks}: {out / TASKS}")
+    print(f"trained {run.recipe.name}: {run.weights}")
+    print(f"next: foredrive evaluate {out} --logs ...")
+
+
+def _plain(recipe: str, occupancy: Occupancy, settings: Settings) -> "Recipe[Any, Any]":
+    """Return the recipe that is named."""
+    with importing():
+        from foredrive.methods.recipe import with_occupancy_source
+        from foredrive.runs.recipes.known import find_recipe
+
+    return with_occupancy_source(find_recipe(recipe, settings), occupancy)
+
+
+def _with_heads(
+    recipe: str, occupancy: Occupancy, tasks: str, settings: Settings
+) -> "tuple[Recipe[Any, Any], TaskHeadsRecipe]":
+    """Return the recipe that is named, and that of its heads; settings of `tasks.` are theirs."""
+    with importing():
+        from foredrive.runs.recipes.task_heads import heads_for, with_settings
+
+    of_recipe, of_heads = _split(settings)
+    chosen = _plain(recipe, occupancy, of_recipe)
+    return chosen, with_settings(heads_for(chosen, tasks.split(",")), of_heads)
+
+
+def _jointly(recipe: str, occupancy: Occupancy, tasks: str, settings: Settings) -> "Recipe[Any, Any]":
+    """Return the recipe with heads that fine-tuning trains together with the world model."""
+    with importing():
+        from foredrive.runs.recipes.task_heads import heads_for, with_joint_heads
+
+    of_recipe, of_heads = _split(settings)
+    chosen = _plain(recipe, occupancy, of_recipe)
+    return with_joint_heads(chosen, heads_for(chosen, tasks.split(",")), of_heads)
+
+
+def _split(settings: Settings) -> tuple[Settings, Settings]:
+    """Return the settings of the recipe, and those of its heads without their prefix."""
+    of_heads = tuple(entry for entry in settings if entry.startswith("tasks."))
+    return (
+        tuple(entry for entry in settings if entry not in of_heads),
+        tuple(entry.removeprefix("tasks.") for entry in of_heads),
+    )

@@ -299,7 +299,11 @@ def find_agent(agent: str) -> tuple[AgentKind, str]:
 
 def agents_help() -> str:
     """Return the help of the command line: a sentence about each agent."""
-    return "; ".join(f"{kind.name}{kind.argument}: {kind.knows}" for kind in (AGENTS[-1], *AGENTS[:-1])) + "."
+    return (
+        "The agent that drives. "
+        + "; ".join(f"{kind.name}{kind.argument}: {kind.knows}" for kind in (AGENTS[-1], *AGENTS[:-1]))
+        + "."
+    )
 
 
 def check_seeing(agent: str, sees: Sees | None) -> None:
