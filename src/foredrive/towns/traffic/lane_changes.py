@@ -89,6 +89,7 @@ def find_change_ranges(graph: LaneGraph) -> ChangeRanges:
     target = np.where(open_to, sides, -1)
     room = np.where(open_to, graph.length_m, 0.0)
     continues = np.zeros(room.shape, dtype=np.bool_)
+    # Pairs of lanes one after the other whose neighbours also follow each other: a change may go on there.
     pairs = [
         (side, lane, after)
         for side, lane in np.argwhere(open_to).tolist()
@@ -97,6 +98,7 @@ def find_change_ranges(graph: LaneGraph) -> ChangeRanges:
     ]
     for side, _, after in pairs:
         continues[side, after] = True
+    # The room of a lane grows by that of the next one until nothing changes: rings of lanes end at the bound.
     changed = True
     while changed:
         changed = False
@@ -127,9 +129,11 @@ def lane_change_allowed(
     v, lane = vehicles, vehicles.lane
     need = change_length_m(v) + v.wheelbase_m + v.axle_to_centre_m
     stops = v.speed_mps**2 / (2 * STOPPING_MPS2)
+    # After a change, a vehicle drives on for a while before it changes again, unless it has to.
     settled = v.changed_m > v.change_length_m + np.where(mandatory, 0.0, CHANGE_SPACING_M)
     target = change_ranges.target[:, lane]
     begun = (v.rear_m > 0) | change_ranges.continues[:, lane]
+    # Room along the vehicle's own path, which may leave the lanes that go on side by side.
     ahead = v.path[:, BEHIND:]
     onward = (ahead >= 0) & (change_ranges.target[:, ahead] >= 0)
     onward[:, :, 1:] &= change_ranges.continues[:, ahead[:, 1:]]
@@ -168,10 +172,12 @@ def _find_gaps(motion, lanes, target, side):
     for i in range(count):
         if target[i] < 0:
             continue
+        # The vehicle is thought into the target lane, beside its present place.
         half = 0.5 * (front[i] - rear[i])
         centre = project_to_neighbour(
             path[i, BEHIND], 0.5 * (front[i] + rear[i]), 1 if side == LEFT else -1, sides
         )
+        # Ahead: along the lanes beside the path, until the nearest leader or the end of such lanes.
         lane, start = target[i], 0.0
         for k in range(BEHIND + 1, WINDOW):
             entry = on.head[lane]
@@ -188,6 +194,7 @@ def _find_gaps(motion, lanes, target, side):
             lane = beside if beside >= 0 and (ahead == beside).any() else ahead[0]
             if lane < 0:
                 break
+        # Behind: every vehicle whose own path leads into the target lane, however it gets there.
         for j in range(count):
             if not active[j] or j == i:
                 continue
@@ -197,6 +204,7 @@ def _find_gaps(motion, lanes, target, side):
                     break
                 front_j = front[j] - starts[j, k]
                 if lane_j != target[i]:
+                    # It counts too if it is leaving the target lane and not yet clear of it.
                     over = k > BEHIND and -front_j > motion.to_clear_m[j]
                     if over or neighbour_lane(lane_j, motion.beside[j], sides) != target[i]:
                         continue
@@ -233,9 +241,11 @@ def incentive(
     old = following_acceleration(
         v, o, free[o], leaders.leader, leaders.leader_gap_m[o] + length + leaders.leader_gap_m
     )
+    # Nobody gains by an acceleration that a red light or a stop takes away again.
     gain_n = np.where(n >= 0, np.minimum(new, halt[n]) - desired[n], 0.0)
     gain_o = np.where(o >= 0, np.minimum(old, halt[o]) - desired[o], 0.0)
     gain = np.minimum(own, halt) - desired + POLITENESS * (gain_n + gain_o)
+    # MOBIL's safety criterion, and a least gap in the new lane.
     near = (gaps.leader_gap_m < MIN_GAP_M) | (gaps.follower_gap_m < MIN_GAP_M)
     unsafe = (own < -SAFE_BRAKING_MPS2) | ((n >= 0) & (new < -SAFE_BRAKING_MPS2))
     return np.where(near | unsafe, -np.inf, gain)
@@ -289,6 +299,7 @@ def choose_change(
         return None
     v = vehicles
     starts_m = path_starts(graph, v.path)
+    # Room to pull out: the leader moves on by `moves_on` while the vehicle leaves its lane.
     reach = CLEAR_OF_LANE * change_length_m(v) + v.wheelbase_m
     leader = context.leaders.leader
     moves_on = np.where(leader >= 0, v.speed_mps[leader], 0.0) * reach / np.maximum(v.speed_mps, 1.0)
@@ -303,6 +314,7 @@ def choose_change(
         free = np.minimum(
             context.free_mps2, free_acceleration(v.speed_mps, desired, v.accel_mps2, v.decel_mps2)
         )
+        # On motorways the right lane is preferred.
         motorway = graph.limit_mps[v.lane] > MOTORWAY_LIMIT_MPS
         bias = np.where(motorway, KEEP_RIGHT_MPS2 if side == RIGHT else -KEEP_RIGHT_MPS2, 0.0)
         gain = np.where(target >= 0, incentive(v, context, gaps, free) + bias + bonus_mps2[side], -np.inf)
@@ -347,15 +359,18 @@ def begin_change(graph: LaneGraph, vehicles: Vehicles, who: int, side: int) -> V
     v, row = vehicles, np.array([who])
     old, path = v.path[who], np.full(WINDOW, -1)
     path[BEHIND] = graph.sides.lane[side, old[BEHIND]]
+    # Lanes behind: beside the old ones where those lead here, else any that does.
     for column in range(BEHIND - 1, -1, -1):
         before = graph.predecessors[path[column + 1]] if path[column + 1] >= 0 else np.array([-1])
         beside = graph.sides.lane[side, old[column]] if old[column] >= 0 else -1
         path[column] = beside if beside >= 0 and beside in before else before[0]
+    # Lanes ahead: beside the old ones, as long as they follow each other.
     for column in range(BEHIND + 1, WINDOW):
         beside = graph.sides.lane[side, old[column]] if old[column] >= 0 else -1
         if beside < 0 or beside not in graph.successors[path[column - 1]]:
             break
         path[column] = beside
+    # The offset from the new lane starts at the distance between the lanes and is steered to 0.
     s_m = project_to_neighbour(old[BEHIND], v.s_m[who], 1 if side == LEFT else -1, graph.sides)
     here = graph.position(old[BEHIND : BEHIND + 1], v.s_m[row])[0]
     there = graph.position(path[BEHIND : BEHIND + 1], np.array([s_m]))[0]

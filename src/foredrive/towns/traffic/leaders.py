@@ -90,6 +90,7 @@ def find_leaders(graph: LaneGraph, vehicles: Vehicles, starts_m: Float64[np.ndar
 def link_occupants(motion, length, sides, granted):
     """Link the vehicles on each lane. Vehicle i also counts on the next granted[i] lanes of its path."""
     size = 3 * len(motion.active) * WINDOW  # each lane may count once more, by a grant or by a lane change
+    # One pool of entries for all lanes: head[lane] is the last entry, following[] leads to the one before.
     following, who, where = np.empty((3, size), np.int64)
     head, used = np.full(len(length), -1), np.zeros(1, np.int64)
     occupants = Occupants(head, following, who, where, np.empty(size), used)
@@ -100,9 +101,11 @@ def link_occupants(motion, length, sides, granted):
             lane, start = motion.path[i, k], motion.starts_m[i, k]
             if lane < 0:
                 continue
+            # A vehicle lies on every lane between its bumpers; a grant lets it count on lanes ahead too.
             on_it = start < motion.front_m[i] and start + length[lane] > motion.rear_m[i]
             if on_it or BEHIND < k <= BEHIND + granted[i]:
                 add_occupant(occupants, lane, i, k, motion.rear_m[i] - start)
+            # While it changes lanes, it is on the lane beside as well, at the same place along it.
             old = neighbour_lane(lane, motion.beside[i], sides)
             if on_it and old >= 0:
                 rear = project_to_neighbour(lane, motion.rear_m[i] - start, motion.beside[i], sides)
@@ -154,9 +157,11 @@ def _find_leaders(motion, driver, length, sides, siblings):
     for i in range(count):
         if not active[i]:
             continue
+        # Who is ahead is decided by centres, so that of two overlapping vehicles one leads.
         centre, max_braking = 0.5 * (front[i] + rear[i]), 0.0
         for k in range(BEHIND, WINDOW):
             lane = path[i, k]
+            # Lanes come in the order of the path: none behind the nearest leader can hold a nearer one.
             if lane < 0 or starts[i, k] - front[i] > min(gap[i], LOOKAHEAD_M):
                 break
             first = siblings.first[lane]
@@ -169,18 +174,21 @@ def _find_leaders(motion, driver, length, sides, siblings):
                 while entry >= 0:
                     j, rear_j = on.who[entry], on.rear_m[entry]
                     entry = on.following[entry]
-                    if is_old:
+                    if is_old:  # arc lengths of the old lane, as arc lengths of this one
                         rear_j = project_to_neighbour(old, rear_j, -motion.beside[i], sides)
+                    # On a sibling lane it counts until its rear has left the part that overlaps this lane.
                     if j == i or not (is_old or itself or rear_j < siblings.other_clear_m[m]):
                         continue
                     centre_j = starts[i, k] + rear_j + 0.5 * (front[j] - rear[j])
                     if centre_j < centre or (centre_j == centre and j < i):
                         continue
                     gap_j = starts[i, k] + rear_j - front[i]
+                    # Whoever is farther than the way to clear the old lane will not be reached on it.
                     if is_old and gap_j > motion.to_clear_m[i] + PASSING_M:
                         continue
                     if gap_j < gap[i]:
                         leader[i], gap[i] = j, gap_j
+                    # The nearest leads, but a farther and slower one may demand more braking.
                     braking = _desired_gap_m(i, j, motion.speed_mps, driver) / max(gap_j, 0.05)
                     if braking > max_braking:
                         limiting[i], limiting_gap[i], max_braking = j, gap_j, braking
