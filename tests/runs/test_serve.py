@@ -103,7 +103,7 @@ def test_who_is_not_there_is_told_before_driving(
     assert main([*command, "--agent", "nobody"]) == 2
     error = capsys.readouterr().err
     assert "unknown agent 'nobody'" in error
-    assert "in a reconstruction log" in error
+    assert "log, lidar-corridor" in error
 
 
 def text_of(address: Address, path: str, body: object) -> bytes:
