@@ -28,6 +28,7 @@ from foredrive.runs.drive.in_towns import TownRoutes
 from foredrive.runs.drive.records import read_drive, summarise
 from foredrive.runs.drive.route_source import job_of
 from foredrive.runs.drive.suite import DriveJob, DriveSuite, SuiteResult, drive_one, drive_suite, folder_of
+from foredrive.runs.train.run import Run
 from foredrive.scene import VoxelSpec
 from foredrive.scene.conditions import CONDITIONS
 from foredrive.sensors.rigs import SURROUND
@@ -321,3 +322,12 @@ def test_the_page_names_all_agents() -> None:
     page = (Path(__file__).parents[2] / "docs" / "driving.md").read_text()
     missing = [kind.name for kind in AGENTS if f"`{kind.name}{kind.argument}`" not in page]
     assert missing == [""]  # a run folder stands first, in words
+
+
+def test_an_agent_that_cannot_drive_there_is_refused_before_the_first_drive(trained: Run) -> None:
+    for agent in ("log", "lidar-corridor"):
+        with pytest.raises(InputError, match="only in a reconstruction"):
+            TownRoutes("town05-short").jobs(agent)
+    for kind in ("idm:", "true:", "true-lights:", "true-users:"):
+        with pytest.raises(InputError, match=f"{kind}RUN needs the run of a driver"):
+            TownRoutes("town05-short").jobs(f"{kind}{trained.folder}")

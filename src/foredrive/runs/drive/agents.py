@@ -45,7 +45,7 @@ class AgentSetup:
     agent: str
     """Its whole name."""
     argument: str
-    """What follows the kind's name: a run or an address."""
+    """The part of the name behind that of the kind: a run or an address."""
     clock: Callable[[], float]
     """Returns the time of the drive, s."""
     town: "TownSimulator | None"
@@ -135,11 +135,8 @@ def _build_run(setup: AgentSetup) -> "Agent":
 def _build_rules_by_sight(setup: AgentSetup) -> "Agent":
     from foredrive.driver.agent import Perception
     from foredrive.runs.drive.seeing_agents import driver_of
-    from foredrive.runs.train.driver import is_driver
     from foredrive.towns.driving.idm_agent import IdmAgent
 
-    if not is_driver(setup.folder):
-        raise InputError(f"{setup.folder}: idm:RUN needs the run of a driver, such as driver_small")
     return IdmAgent(setup.in_town(), Perception(driver_of(setup.folder)))
 
 
@@ -156,9 +153,8 @@ def _partly_true(*, lights: bool, users: bool) -> Callable[[AgentSetup], "Agent"
 
 
 def _build_of_log(setup: AgentSetup) -> "Agent":
-    raise InputError(
-        f"the agent {setup.agent} follows the path of a log and can drive only in a reconstruction"
-    )
+    check_without_log(setup.agent)
+    raise AssertionError("`in_rebuilt` builds the agents that follow a log")
 
 
 def _build_http(setup: AgentSetup) -> "Agent":
@@ -200,14 +196,18 @@ class AgentKind:
     name: str
     """The agent's name. If it ends in ":" or "/", an argument follows it."""
     knows: str
-    """What it is and what it is told, in one line."""
+    """A line of help: the agent, and the facts that it is told."""
     build: Callable[[AgentSetup], "Agent"]
     """Builds the agent of one drive."""
     argument: str = ""
     """Word for the argument in help."""
     sensors: Literal["none", "lidar", "remote", "trained", "ego"] = "none"
-    """What it is shown: nothing, lidar, what another process asks for, the cameras of its run, or the key
-    frames of its run without images."""
+    """Sensors that it is shown: none, lidar, what another process asks for, the cameras of its run, or the
+    key frames of its run without images."""
+    of_driver: bool = False
+    """Tells whether its run must be that of a driver."""
+    of_log: bool = False
+    """Tells whether it drives only in a reconstruction, along the path of the log."""
     ready: Callable[[str], None] | None = None
     """Waits until an agent in another process is alive; raises `InputError` if it is not."""
 
@@ -222,12 +222,13 @@ AGENTS: tuple[AgentKind, ...] = (
     AgentKind(STOP, "never starts", _straight_on(0.0)),
     AgentKind(CONSTANT_VELOCITY, "straight on at 5 m/s", _straight_on(CRUISE_MPS)),
     AgentKind(DISTURBED, "the expert under disturbances, for demonstrations", _build_disturbed),
-    AgentKind(REPLAY, "in a reconstruction: repeats the logged drive", _build_of_log),
+    AgentKind(REPLAY, "in a reconstruction: repeats the logged drive", _build_of_log, of_log=True),
     AgentKind(
         CORRIDOR,
         "in a reconstruction: follows the logged path and stops if lidar sees something in its corridor",
         _build_of_log,
         sensors="lidar",
+        of_log=True,
     ),
     AgentKind(
         "ego-mlp:",
@@ -239,13 +240,21 @@ AGENTS: tuple[AgentKind, ...] = (
     AgentKind(
         "student:", "a run in alternation with the expert, for DAgger", _build_student, "RUN", "trained"
     ),
-    AgentKind("idm:", "idm with the perception of a driver's run", _build_rules_by_sight, "RUN", "trained"),
+    AgentKind(
+        "idm:",
+        "idm with the perception of a driver's run",
+        _build_rules_by_sight,
+        "RUN",
+        "trained",
+        of_driver=True,
+    ),
     AgentKind(
         "true:",
         "a driver with true lights and road users",
         _partly_true(lights=True, users=True),
         "RUN",
         "ego",
+        of_driver=True,
     ),
     AgentKind(
         "true-lights:",
@@ -253,6 +262,7 @@ AGENTS: tuple[AgentKind, ...] = (
         _partly_true(lights=True, users=False),
         "RUN",
         "trained",
+        of_driver=True,
     ),
     AgentKind(
         "true-users:",
@@ -260,6 +270,7 @@ AGENTS: tuple[AgentKind, ...] = (
         _partly_true(lights=False, users=True),
         "RUN",
         "trained",
+        of_driver=True,
     ),
     AgentKind(
         "http://",
@@ -268,7 +279,7 @@ AGENTS: tuple[AgentKind, ...] = (
         _build_http,
         "HOST:PORT",
         "remote",
-        _check_http,
+        ready=_check_http,
     ),
     AgentKind(
         "grpc://",
@@ -276,7 +287,7 @@ AGENTS: tuple[AgentKind, ...] = (
         _build_grpc,
         "HOST:PORT",
         "remote",
-        _check_grpc,
+        ready=_check_grpc,
     ),
     AgentKind(
         "",
@@ -345,11 +356,25 @@ def inputs_of(agent: str) -> AgentInputs:
     if kind.sensors in ("none", "lidar"):
         return AgentInputs(cameras=False, lidar=kind.sensors == "lidar", past_frames=1)
     folder = _run_folder(agent, argument)
+    if kind.of_driver and not is_driver(folder):
+        raise InputError(f"{folder}: {kind.name}RUN needs the run of a driver, such as driver_small")
     clips = (open_driver(folder) if is_driver(folder) else open_run(folder)).recipe.clips
     if abs(clips.frame_dt_s - FRAME_DT_S) > 1e-6:
         raise InputError(f"{agent}: trained on key frames {clips.frame_dt_s} s apart, not {FRAME_DT_S} s")
     seeing = kind.sensors == "trained"
     return AgentInputs(seeing, lidar=False, past_frames=clips.past_frames, camera_names=clips.cameras)
+
+
+def check_without_log(agent: str) -> None:
+    """Check that an agent can drive where there is no log.
+
+    Raises:
+        InputError: it follows the path of a log.
+    """
+    if find_agent(agent)[0].of_log:
+        raise InputError(
+            f"the agent {agent} follows the path of a log and can drive only in a reconstruction"
+        )
 
 
 def rig_of(agent: str) -> "RigPlan":

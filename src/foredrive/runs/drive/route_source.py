@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 from foredrive.driving.route_sets import RouteWaypoints, load_route_set
 from foredrive.errors import InputError
-from foredrive.runs.drive.agents import check_rig_of, inputs_of
+from foredrive.runs.drive.agents import check_rig_of, check_without_log, inputs_of
 from foredrive.runs.drive.suite import DriveJob
 from foredrive.scene.conditions import (
     ANY_CONDITIONS,
@@ -74,6 +74,7 @@ class RouteSource:
             InputError: there is no such route, a route is in a town that is not here, or the agent has
                 another rig.
         """
+        check_without_log(agent)
         inputs_of(agent)
         if not self.other_rig:
             check_rig_of(agent, self.rig)
