@@ -50,15 +50,15 @@ def accumulated_labels(log: Log, frame: int, spec: VoxelSpec) -> VoxelLabels:
     if read is None:
         return nothing_known(spec)
     own = voxel_labels(read[0], spec, read_boxes(log, frame), log.ego_box)
-    found = np.zeros(spec.shape_zyx, dtype=np.int64)
-    crossed = np.zeros_like(found)
+    hits = np.zeros(spec.shape_zyx, dtype=np.int64)
+    crossed = np.zeros_like(hits)
     for neighbour in _neighbours(log, frame):
         state = _state_from(log, neighbour, frame, spec)
-        found += state == OCCUPIED
+        hits += state == OCCUPIED
         crossed += state == FREE
     added = np.full(spec.shape_zyx, UNKNOWN)
-    added[(crossed > 0) & (found == 0)] = FREE
-    added[(found > 0) & (found >= crossed)] = OCCUPIED
+    added[(crossed > 0) & (hits == 0)] = FREE
+    added[(hits > 0) & (hits >= crossed)] = OCCUPIED
     unseen = ~own.known.numpy()
     return dataclasses.replace(
         own,

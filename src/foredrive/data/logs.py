@@ -72,7 +72,7 @@ class LogScene(ArrowSceneAPI):
 def _read_metadata(folder: Path) -> LogDirectoryMetadata:
     schemas = {file: arrow_schema(file) for file in [folder / "sync.arrow", *sorted(folder.glob("*.arrow"))]}
     with reading(folder, "its metadata"):
-        found = LogDirectoryMetadata(
+        directory = LogDirectoryMetadata(
             get_metadata_from_arrow_schema(schemas[folder / "sync.arrow"], LogMetadata)
         )
         for file, schema in schemas.items():
@@ -82,8 +82,8 @@ def _read_metadata(folder: Path) -> LogDirectoryMetadata:
                 except (ValueError, KeyError) as error:
                     _log.warning("%s is left out: %s", file, error)
                     continue
-                found.modality_metadatas[file.stem] = metadata
-    return found
+                directory.modality_metadatas[file.stem] = metadata
+    return directory
 
 
 _EGO = ModalityType.EGO_STATE_SE3.serialize()

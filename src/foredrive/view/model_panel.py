@@ -162,10 +162,10 @@ LIFT_M = 0.1
 def show_agents(scene: viser.SceneApi, agents: Agents | None) -> None:
     """Draw likely road users of an unbatched frame as thin boxes, each with its name and likely futures."""
     clear(scene, BOXES)
-    found = None if agents is None else found_agents(agents)
-    if found is None or not len(found.names):
+    agents_found = None if agents is None else found_agents(agents)
+    if agents_found is None or not len(agents_found.names):
         return
-    boxes = found.boxes
+    boxes = agents_found.boxes
     corners = box_corners(boxes.centre, boxes.size_lwh, boxes.yaw)
     edges = torch.tensor([*EDGES, (0, 5), (1, 4)])
     pieces, colours = [], []
@@ -173,17 +173,17 @@ def show_agents(scene: viser.SceneApi, agents: Agents | None) -> None:
         colour = palette.rgb255(palette.box_colour(kind))
         x, y, z = boxes.centre[n].tolist()
         lines = [corners[n][edges].numpy()]
-        for xy, _ in found.futures[n]:
+        for xy, _ in agents_found.futures[n]:
             if np.linalg.norm(xy[-1] - (x, y)) >= STILL_M:
                 path = np.concatenate([[(x, y)], xy])
                 path = np.concatenate([path, np.full((len(path), 1), z)], axis=1)
                 lines.append(np.stack([path[:-1], path[1:]], axis=1))
         pieces += lines
-        colours += [np.tile(np.array(colour), (len(each), 2, 1)) for each in lines]
+        colours += [np.tile(np.array(colour), (len(line), 2, 1)) for line in lines]
     scene.add_frame(BOXES, show_axes=False)
     scene.add_line_segments(f"{BOXES}/lines", np.concatenate(pieces), np.concatenate(colours), line_width=1.5)
     tops = boxes.centre[:, 2] + 0.5 * boxes.size_lwh[:, 2] + 0.3
-    for n, name in enumerate(found.names):
+    for n, name in enumerate(agents_found.names):
         x, y, _ = boxes.centre[n].tolist()
         scene.add_label(f"{BOXES}/name {n}", name, position=(x, y, float(tops[n])))
 
@@ -198,8 +198,8 @@ def show_lines(scene: viser.SceneApi, lines: MapLines | None) -> None:
     colours = np.array(
         [palette.rgb255(palette.ELEMENT_COLOURS[ElementKind(kind)]) for kind in kept.kind.tolist()]
     )
-    each = np.broadcast_to(colours[:, None, None], (*pieces.shape[:3], 3)).reshape(-1, 2, 3)
-    scene.add_line_segments(MAP, pieces.flatten(0, 1).numpy(), each, line_width=4.0)
+    line_colours = np.broadcast_to(colours[:, None, None], (*pieces.shape[:3], 3)).reshape(-1, 2, 3)
+    scene.add_line_segments(MAP, pieces.flatten(0, 1).numpy(), line_colours, line_width=4.0)
     return None
 
 

@@ -63,10 +63,10 @@ class GeoFrame:
     ) -> Float64[np.ndarray, "2"]:
         """Return the place in our world or its mirror image in y, m, whichever is nearer to `near_xy`."""
         east, north = _mercator(lat_deg, lon_deg)
-        there = np.array([self.scale_m * east + self.x_m, self.scale_m * north + self.y_m])
-        mirrored = there * [1.0, -1.0]
-        is_nearer = np.hypot(*(mirrored - near_xy)) < np.hypot(*(there - near_xy))
-        return mirrored if is_nearer else there
+        xy = np.array([self.scale_m * east + self.x_m, self.scale_m * north + self.y_m])
+        mirrored = xy * [1.0, -1.0]
+        is_nearer = np.hypot(*(mirrored - near_xy)) < np.hypot(*(xy - near_xy))
+        return mirrored if is_nearer else xy
 
 
 def fit_geo_frame(lat_lon_deg: Float64[np.ndarray, "N 2"], xy: Float64[np.ndarray, "N 2"]) -> GeoFrame:

@@ -64,8 +64,8 @@ def draw_map_mask(log: Log) -> MapMask:
     own = token("map", log.path.name)
     if size_xy.prod() > MAX_CELLS:
         return MapMask(own, np.zeros((1, 1), dtype=np.uint8), lower_m)
-    found = log_map(log)
-    return MapMask(own, _drawn([] if found is None else found.drivable, lower_m, size_xy), lower_m)
+    road_map = log_map(log)
+    return MapMask(own, _drawn([] if road_map is None else road_map.drivable, lower_m, size_xy), lower_m)
 
 
 def _grid(points: Float64[np.ndarray, "N 2"]) -> tuple[np.ndarray, np.ndarray]:
@@ -99,8 +99,8 @@ class Samples:
 
         The devkit interpolates boxes of a frame between its sample and the sample before.
         """
-        at = min(int(np.searchsorted(self.frames, frame)), len(self.frames) - 1)
-        return token("sample", self.log_name, self.t_us[at])
+        nearest = min(int(np.searchsorted(self.frames, frame)), len(self.frames) - 1)
+        return token("sample", self.log_name, self.t_us[nearest])
 
     def rows(self, scene_token: str) -> list[Row]:
         """Return the table `sample`."""
@@ -129,18 +129,18 @@ def choose_samples(log: Log, rate_hz: float, present: dict[str, Int64[np.ndarray
     for frames in present.values():
         whole = np.intersect1d(whole, frames)
     if not len(whole):
-        found = ", ".join(f"{name} {len(frames)}" for name, frames in present.items())
-        raise InputError(f"{log.path.folder}: no frame has all sensors and boxes (frames with: {found})")
+        counts = ", ".join(f"{name} {len(frames)}" for name, frames in present.items())
+        raise InputError(f"{log.path.folder}: no frame has all sensors and boxes (frames with: {counts})")
     t_us, step_us, slack_us = log.t_us[whole], 1e6 / rate_hz, 0.5e6 * log.period_s
     chosen = [0]
     while True:
         wanted_us = t_us[chosen[-1]] + step_us
-        at = max(int(np.searchsorted(t_us, wanted_us - slack_us)), chosen[-1] + 1)
-        if at >= len(t_us):
+        frame = max(int(np.searchsorted(t_us, wanted_us - slack_us)), chosen[-1] + 1)
+        if frame >= len(t_us):
             break
-        if at + 1 < len(t_us) and abs(t_us[at + 1] - wanted_us) < abs(t_us[at] - wanted_us):
-            at += 1
-        chosen.append(at)
+        if frame + 1 < len(t_us) and abs(t_us[frame + 1] - wanted_us) < abs(t_us[frame] - wanted_us):
+            frame += 1
+        chosen.append(frame)
     return Samples(log.path.name, whole[chosen], t_us[chosen])
 
 
@@ -251,8 +251,8 @@ def _write_readings(
     readings: dict[str, list[Row]] = {one.channel: [] for one in streams}
     key, boxes = set(samples.frames.tolist()), []
     for frame in sorted(set().union(*frames_of.values())):
-        found = read_sweep(log, frame) if frame in frames_of.get(LIDAR, ()) else None
-        sweep = None if found is None else found[0]
+        stored = read_sweep(log, frame) if frame in frames_of.get(LIDAR, ()) else None
+        sweep = None if stored is None else stored[0]
         for stream in streams:
             data = stream.encode(frame, sweep) if frame in frames_of[stream.channel] else None
             if data is not None:
@@ -260,8 +260,8 @@ def _write_readings(
                 with atomic_path(dataroot / row["filename"]) as file:
                     file.write_bytes(data)
                 readings[stream.channel].append(row)
-                at = {"token": row["ego_pose_token"], "timestamp": row["timestamp"]}
-                tables["ego_pose"].append(at | pose(stream.T_world_ego(frame)))
+                time = {"token": row["ego_pose_token"], "timestamp": row["timestamp"]}
+                tables["ego_pose"].append(time | pose(stream.T_world_ego(frame)))
         if frame in key:
             boxes += annotations_at(log, frame, samples.token_of(frame), sweep)
         tick()

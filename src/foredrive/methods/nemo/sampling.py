@@ -1,4 +1,4 @@
-"""What of a training step is imagined, where imagining every frame of every item costs too much."""
+"""Draws the part of a training step that is imagined: every frame of every item costs too much."""
 
 from dataclasses import dataclass
 

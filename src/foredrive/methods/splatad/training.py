@@ -75,8 +75,8 @@ def grow(
 def _drawn(weight: Float[Tensor, "N"], count: int, generator: torch.Generator) -> Int[Tensor, "count"]:
     """Draw rows by weight, with replacement. torch.multinomial takes no more than 2**24 rows."""
     total = weight.double().cumsum(0).cpu()
-    at = torch.rand(count, generator=generator, dtype=torch.float64) * total[-1]
-    return torch.searchsorted(total, at).clamp_max(len(total) - 1).to(weight.device)
+    drawn = torch.rand(count, generator=generator, dtype=torch.float64) * total[-1]
+    return torch.searchsorted(total, drawn).clamp_max(len(total) - 1).to(weight.device)
 
 
 def _share(scene: GaussianScene, chosen: Int[Tensor, "count"]) -> None:

@@ -113,8 +113,10 @@ def predict_shard(shard: Shard, source: EvaluationSource, asked: frozenset[Part]
     """
     torch.set_num_threads(threads)
     inputs = _opened(source)
-    found = predict_batches(inputs.predictor, Batches(inputs.dataset, shard.batches), asked, inputs.device)
-    return pickle.dumps([batch.to("cpu") for batch in found])
+    predicted = predict_batches(
+        inputs.predictor, Batches(inputs.dataset, shard.batches), asked, inputs.device
+    )
+    return pickle.dumps([batch.to("cpu") for batch in predicted])
 
 
 @functools.lru_cache(maxsize=1)

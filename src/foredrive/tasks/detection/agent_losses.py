@@ -59,9 +59,9 @@ def centre_loss(
     """Return the focal loss, lower near centres, per centre (CornerNet, Law and Deng 2018, eq. 1)."""
     p = logits.sigmoid()
     centre = target == 1.0
-    found = (1 - p) ** alpha * F.logsigmoid(logits)
+    present = (1 - p) ** alpha * F.logsigmoid(logits)
     empty = (1 - target) ** beta * p**alpha * F.logsigmoid(-logits)
-    return -torch.where(centre, found, empty).sum() / centre.sum().clamp_min(1)
+    return -torch.where(centre, present, empty).sum() / centre.sum().clamp_min(1)
 
 
 SPREAD = 0.25

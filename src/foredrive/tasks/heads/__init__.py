@@ -1,1 +1,1 @@
-"""What the heads of all tasks share: one plane, one decoder, one training."""
+"""Parts of all task heads: one plane, one decoder, one training."""

@@ -21,7 +21,8 @@ from foredrive.tasks.maps.precision import mean_precision, score_maps
 from foredrive.tasks.maps.protocols import PROTOCOLS, Area
 
 FIGURES = ("lanes", "drivable", "divider", "crossing", "boundary")
-"""What is reported. `lanes` is the union of the three layers of lines, and `boundary` UniAD's contour."""
+"""Names of the reported classes. `lanes` is the union of the three layers of lines; `boundary` is UniAD's
+contour."""
 
 
 @dataclass(frozen=True)

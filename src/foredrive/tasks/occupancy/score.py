@@ -202,12 +202,12 @@ class VoxelCounts:
 
     def add(self, frame: VoxelFrame, origins_m: Float64[ndarray, "O 3"] | None) -> None:
         """Add a frame. Without places of the lidar it has no rays."""
-        known = slice(None) if frame.known is None else frame.known
+        judged = slice(None) if frame.known is None else frame.known
         self._voxels += count_voxels(
-            _as_grid(frame.predicted[known]),
-            _as_grid(frame.true[known]),
-            _as_grid(frame.seen_by_camera[known]),
-            _as_grid(frame.seen_by_lidar[known]),
+            _as_grid(frame.predicted[judged]),
+            _as_grid(frame.true[judged]),
+            _as_grid(frame.seen_by_camera[judged]),
+            _as_grid(frame.seen_by_lidar[judged]),
             len(self._classes),
         )
         self._frames += 1
@@ -231,12 +231,12 @@ class VoxelCounts:
         figures: Figures = {}
         for name, protocol in VOXEL_PROTOCOLS.items():
             if protocol.classes == self._classes:
-                found = _voxel_figures(voxel_ious(self._voxels, protocol), self._classes)
-                figures |= {f"{name}.{key}": value for key, value in found.items()}
+                of_protocol = _voxel_figures(voxel_ious(self._voxels, protocol), self._classes)
+                figures |= {f"{name}.{key}": value for key, value in of_protocol.items()}
                 figures[f"{name}.frames_counted"] = self._frames
         for name, counts in self._rays.items():
-            found = {"frames_counted": self._ray_frames} | _ray_figures(counts, RAY_PROTOCOLS[name])
-            figures |= {f"{name}.{key}": value for key, value in found.items()}
+            of_protocol = {"frames_counted": self._ray_frames} | _ray_figures(counts, RAY_PROTOCOLS[name])
+            figures |= {f"{name}.{key}": value for key, value in of_protocol.items()}
         return figures
 
 

@@ -207,9 +207,9 @@ class PlanScores(Record):
     plan_complete: Bool[Tensor, "b"]
     """True if the plan has all its steps, finite. Otherwise it is a failure, not a score."""
     future_complete: Bool[Tensor, "b"]
-    """Whether the driven future has all its steps."""
+    """Tells whether the driven future has all its steps."""
     counted: Bool[Tensor, "b"]
-    """Whether the protocol counts the frame."""
+    """Tells whether the protocol counts the frame."""
     collision_counted: Bool[Tensor, "b"]
     """True if its collisions count too: boxes are annotated at now and at every driven step."""
 
@@ -235,10 +235,10 @@ def score_plan(
 
     distance_m = torch.where(driven_valid, (plan_xy - driven_xy).norm(dim=-1), 0.0)
     boxes = _relevant_boxes(obstacles, protocol)
-    known = driven_valid & obstacles.annotated
+    annotated = driven_valid & obstacles.annotated
     driven_box, _ = _hits(driven_xy, driven_yaw, boxes, protocol)
     plan_box, plan_point = _hits(plan_xy.nan_to_num(), plan_yaw.nan_to_num(), boxes, protocol)
-    scored = known & ~driven_box
+    scored = annotated & ~driven_box
     collision_counted = counted & obstacles.annotated_now & (obstacles.annotated | ~driven_valid).all(dim=-1)
 
     def masked(values: Tensor, mask: Tensor) -> Tensor:
@@ -248,7 +248,7 @@ def score_plan(
         l2_m=masked(_at_horizons(distance_m, protocol.l2), counted),
         collision=masked(_at_horizons(plan_box & scored, protocol.collision), collision_counted),
         collision_centre=masked(_at_horizons(plan_point & scored, protocol.collision), collision_counted),
-        driven_collision=masked(_at_horizons(driven_box & known, protocol.collision), collision_counted),
+        driven_collision=masked(_at_horizons(driven_box & annotated, protocol.collision), collision_counted),
         plan_complete=plan_complete,
         future_complete=future_complete,
         counted=counted,

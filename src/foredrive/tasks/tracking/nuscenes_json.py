@@ -85,9 +85,9 @@ def read_scores(
 
 def read_velocities(boxes: Sequence[Box], names: Sequence[str]) -> Float[ndarray, "n 2"]:
     """Return velocities over ground, m/s. NaN, null, or no `velocity` at all: unknown."""
-    known = [n for n, box in enumerate(boxes) if _states_velocity(box.get("velocity"))]
+    stated = [n for n, box in enumerate(boxes) if _states_velocity(box.get("velocity"))]
     velocity = np.full((len(boxes), 2), np.nan)
-    velocity[known] = read_number_rows([boxes[n] for n in known], "velocity", 2, _Chosen(names, known))
+    velocity[stated] = read_number_rows([boxes[n] for n in stated], "velocity", 2, _Chosen(names, stated))
     return velocity
 
 
@@ -95,12 +95,12 @@ def _states_velocity(value: object) -> bool:
     """Return whether a velocity is stated: neither missing nor NaN, which is what the devkit writes."""
     if value is None:
         return False
-    return not (isinstance(value, list | tuple) and any(each is None or each != each for each in value))
+    return not (isinstance(value, list | tuple) and any(x is None or x != x for x in value))
 
 
 def read_attributes(boxes: Sequence[Box], names: Sequence[str]) -> Int[ndarray, "n"]:
     """Return indices of attributes; `UNKNOWN` for the empty name, or none."""
-    number = {"": int(UNKNOWN), **{each.label: int(each) for each in Attribute}}
+    number = {"": int(UNKNOWN), **{attribute.label: int(attribute) for attribute in Attribute}}
     stated = [box.get("attribute_name", "") for box in boxes]
     for n, name in enumerate(stated):
         if name not in number:

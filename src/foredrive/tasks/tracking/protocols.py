@@ -89,7 +89,7 @@ def _identities(boxes: ObjectRows, frames: Frames) -> Int[ndarray, "n"]:
 
 def _between(left: ObjectRows, right: ObjectRows, frame: Int[ndarray, "n"], frames: Frames) -> ObjectRows:
     """Return the boxes of gaps, weighted as the devkit weights them; angles go the shorter way round."""
-    time, end, begin = (frames.time_us[at] for at in (frame, right.frame, left.frame))
+    time, end, begin = (frames.time_us[k] for k in (frame, right.frame, left.frame))
     ratio = (end - time) / (end - begin)
 
     def mix(a: Float[ndarray, "n ..."], b: Float[ndarray, "n ..."]) -> Float[ndarray, "n ..."]:

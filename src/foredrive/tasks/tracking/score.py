@@ -46,16 +46,16 @@ def read_log_truth(folder: Path, listed: Iterable[str], path: Path, classes: Seq
     wanted = dict.fromkeys(listed)
     names: list[str] = []
     rows, ego, scene, time_us = [], [], [], []
-    for each in log_frames(folder, wanted, path):
-        boxes = read_boxes(each.log, each.frame)
+    for named in log_frames(folder, wanted, path):
+        boxes = read_boxes(named.log, named.frame)
         if boxes is None:
-            raise InputError(f"{path}: frame {each.name} is not annotated in {each.log.path.folder}")
-        T_world_ego = each.log.T_world_ego[each.frame]
+            raise InputError(f"{path}: frame {named.name} is not annotated in {named.log.path.folder}")
+        T_world_ego = named.log.T_world_ego[named.frame]
         rows.append(box_rows(boxes, T_world_ego, len(names), classes))
-        names.append(each.name)
+        names.append(named.name)
         ego.append(T_world_ego[:2, 3])
-        scene.append(each.drive)
-        time_us.append(int(each.log.t_us[each.frame]))
+        scene.append(named.drive)
+        time_us.append(int(named.log.t_us[named.frame]))
     every = stacked(rows)
     return ObjectTruth(
         names,
