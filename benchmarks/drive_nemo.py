@@ -38,7 +38,8 @@ from foredrive.driving.drive_record import DriveRecord
 from foredrive.engine.bench import Benchmark, study_identity
 from foredrive.errors import InputError
 from foredrive.methods.recipe import rescheduled
-from foredrive.runs.drive.agents import CONSTANT_VELOCITY, EXPERT, IDM, STOP, rig_of
+from foredrive.runs.drive.agent_inputs import rig_of
+from foredrive.runs.drive.agents import CONSTANT_VELOCITY, EXPERT, IDM, STOP
 from foredrive.runs.drive.compare import values_of
 from foredrive.runs.drive.in_towns import TownRoutes
 from foredrive.runs.drive.suite import DriveSuite, SuiteResult, drive_suite

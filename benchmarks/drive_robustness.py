@@ -15,7 +15,7 @@ from benchmarks.common.study import work_folder
 from foredrive.driving.faults import CameraFault, Faults
 from foredrive.engine.bench import Benchmark
 from foredrive.errors import InputError
-from foredrive.runs.drive.agents import rig_of
+from foredrive.runs.drive.agent_inputs import rig_of
 from foredrive.runs.drive.compare import values_of
 from foredrive.runs.drive.in_towns import TownRoutes
 from foredrive.runs.drive.suite import DriveSuite, drive_suite

@@ -26,7 +26,7 @@ from foredrive.driving.replay.replayed import users_at
 from foredrive.engine.summary import write_json
 from foredrive.methods.rebuilding.scene_graph import SceneGraph
 from foredrive.methods.rebuilding.tracks import ActorTracks
-from foredrive.runs.drive.agents import inputs_of
+from foredrive.runs.drive.agent_inputs import inputs_of
 from foredrive.runs.drive.in_ncap import place_in
 from foredrive.runs.drive.in_rebuilt import agent_in
 from foredrive.scene import Renderer

@@ -15,7 +15,8 @@ from foredrive.driver.recipes import DriverRecipe, driver_nemo, driver_small
 from foredrive.engine.metrics_log import read_metrics
 from foredrive.errors import InputError
 from foredrive.runs import model_card, shipped
-from foredrive.runs.drive.agents import inputs_of, make_agent, rig_of
+from foredrive.runs.drive.agent_inputs import inputs_of, rig_of
+from foredrive.runs.drive.agents import make_agent
 from foredrive.runs.drive.in_towns import TownRoutes
 from foredrive.runs.model_card import find_card, read_card, shipped_weights
 from foredrive.runs.recipes.known import find_driver_recipe, find_recipe

@@ -28,7 +28,7 @@ from foredrive.methods.driveworld.task_prompt import PROMPTS, PromptConfig
 from foredrive.methods.recipe import Recipe
 from foredrive.runs import Run, evaluate_run, open_run, predict_examples, train_run
 from foredrive.runs.build import build_agent
-from foredrive.runs.drive.agents import AgentInputs, inputs_of
+from foredrive.runs.drive.agent_inputs import AgentInputs, inputs_of
 from foredrive.runs.evaluate.display import DisplayPredictor
 from foredrive.runs.evaluate.imagination import imagine_run
 from foredrive.runs.export import export_run

@@ -23,7 +23,8 @@ from foredrive.driving.scores import Ending, RouteScore
 from foredrive.engine.summary import read_summary
 from foredrive.errors import InputError
 from foredrive.files import atomic_path
-from foredrive.runs.drive.agents import AGENTS, inputs_of
+from foredrive.runs.drive.agent_inputs import inputs_of
+from foredrive.runs.drive.agents import AGENTS
 from foredrive.runs.drive.in_towns import TownRoutes
 from foredrive.runs.drive.records import read_drive, summarise
 from foredrive.runs.drive.route_source import job_of

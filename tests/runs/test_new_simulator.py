@@ -16,7 +16,8 @@ from foredrive.driving.dynamics import STEP_S, step
 from foredrive.driving.observation import FRAME_STEPS, KeyFrame, no_images
 from foredrive.driving.route_progress import RouteLine, RouteProgress
 from foredrive.errors import InputError
-from foredrive.runs.drive.agents import inputs_of, make_agent
+from foredrive.runs.drive.agent_inputs import inputs_of
+from foredrive.runs.drive.agents import make_agent
 from foredrive.runs.drive.suite import DriveJob, DriveSetup, DriveSource, DriveSuite, drive_suite
 from foredrive.scene import BicycleState, Clip, Control, DriveProgress, Simulator, Step
 from foredrive.scene.actors import boxes_in_ego_frame

@@ -14,7 +14,7 @@ from foredrive.data import LogPath
 from foredrive.engine.summary import read_summary
 from foredrive.errors import InputError
 from foredrive.runs import Run, evaluate_run, load_agent, open_run, shipped
-from foredrive.runs.drive.agents import inputs_of, rig_of
+from foredrive.runs.drive.agent_inputs import inputs_of, rig_of
 from foredrive.runs.model_card import find_card, read_card, shipped_weights
 from foredrive.runs.ship import MAX_BYTES, ship
 from foredrive.runs.shipped import run_folder

@@ -18,7 +18,7 @@ from foredrive.errors import InputError
 from foredrive.methods.planner.agent import PlanningAgent
 from foredrive.methods.recipe import Recipe
 from foredrive.runs import Run, evaluate_run, open_run, predict_examples, train_run
-from foredrive.runs.drive.agents import rig_of
+from foredrive.runs.drive.agent_inputs import rig_of
 from foredrive.runs.drive.in_towns import TownRoutes
 from foredrive.runs.drive.route_source import job_of
 from foredrive.runs.drive.suite import DriveSuite, drive_one

@@ -148,7 +148,7 @@ class InTowns:
 
     def source(self, agent: str) -> "TownRoutes | CarlaRoutes":
         """Return the source of the drives of an agent."""
-        from foredrive.runs.drive.agents import rig_of
+        from foredrive.runs.drive.agent_inputs import rig_of
 
         rig = rig_of(agent) if self.rig is None else chosen_rig(self.rig, None)
         rig = rig.raised(self.raise_cameras) if self.raise_cameras else rig

@@ -1,10 +1,9 @@
 """Plans of an agent, fixed in the world frame: a path, and the position along it over time.
 
-Turns waypoints into a drivable path: near all of them, with little jerk, from the current pose.
-
-A path through every waypoint has to correct any error of the first waypoint within the first half second.
-With latency this leads to growing oscillations. Regularised least squares averages over several waypoints
-instead (nuPlan's tracker fits speeds and curvatures in this way).
+The path passes near all waypoints, with little jerk, from the current pose. A path through every waypoint has
+to correct any error of the first waypoint within the first half second. With latency this leads to growing
+oscillations. Regularised least squares averages over several waypoints instead (nuPlan's tracker fits speeds
+and curvatures in this way).
 """
 
 import math

@@ -12,7 +12,8 @@ from foredrive.errors import InputError
 from foredrive.integrations.remote.planner_server import PlannerNeeds, PlannerService
 from foredrive.integrations.remote.render_server import RenderService
 from foredrive.json_server import Answer
-from foredrive.runs.drive.agents import inputs_of, make_agent, require_alpasim
+from foredrive.runs.drive.agent_inputs import inputs_of
+from foredrive.runs.drive.agents import make_agent, require_alpasim
 from foredrive.runs.rebuild.rebuilt_run import open_rebuilt, open_run_log
 
 Answers = Mapping[tuple[str, str], Answer]

@@ -1,9 +1,7 @@
-"""Argoverse 2 sensor logs from their public bucket.
+"""Download Argoverse 2 sensor logs from their public S3 bucket, over plain HTTPS and without credentials.
 
-Files of a public S3 bucket over plain HTTPS, without credentials: listing, and downloads that resume.
-
-The listing is S3's ListObjectsV2. The ETag of an object is its MD5 unless it was uploaded in parts (AWS,
-"Amazon S3 API Reference", Object).
+Downloads resume. The listing is S3's ListObjectsV2. The ETag of an object is its MD5 unless it was uploaded
+in parts (AWS, "Amazon S3 API Reference", Object).
 """
 
 import contextlib

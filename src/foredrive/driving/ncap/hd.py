@@ -1,11 +1,10 @@
 """HUGSIM's HD-Score of a drive in a rebuilt log, from its plans and the replayed vehicles.
 
-HUGSIM's HD-Score: mean over all plans of a drive of NC · DAC · (5 TTC + 2 C) / 7, times route completion.
-
-Source: public repository hyzhou404/HUGSIM, `sim/utils/score_calculator.py`; Zhou et al., "HUGSIM", 2024.
-There collisions with the static scene are counted on its points, and DAC by ground points under four quarters
-of the vehicle. Here the drivable area is that of a map, by the middles of these quarters. There objects count
-that are named "car", and its `closed_loop.py` names all objects so. Here all vehicles and cycles count.
+It is the mean over all plans of NC · DAC · (5 TTC + 2 C) / 7, times route completion. Source: public
+repository hyzhou404/HUGSIM, `sim/utils/score_calculator.py`; Zhou et al., "HUGSIM", 2024. There collisions
+with the static scene are counted on its points, and DAC by ground points under four quarters of the vehicle.
+Here the drivable area is that of a map, by the middles of these quarters. There objects count that are named
+"car", and its `closed_loop.py` names all objects so. Here all vehicles and cycles count.
 """
 
 import math

@@ -4,9 +4,8 @@ The data of `run_step` becomes a `Clip` twice a second. Foredrive's controller f
 Hz. Only inputs of the track SENSORS are used: cameras, lidar, satellite navigation, IMU, speedometer and the
 route.
 
-Localization with the sensors that the leaderboard allows: satellite navigation, compass and speedometer.
-
-No map is needed to read the satellite positions. The route is given both in world coordinates and in latitude
+The vehicle is localized by satellite navigation, compass and speedometer, which the leaderboard allows. No
+map is needed to read the satellite positions. The route is given both in world coordinates and in latitude
 and longitude, related by a Mercator projection of unknown scale and origin. CARLA 0.9.16 projects differently
 from the leaderboard's routes: 0.04 % larger, and with north and south exchanged. A reading may therefore mean
 two places, and the one nearer to the expected position is taken.

@@ -1,6 +1,6 @@
 """Training of towers for a common space: images and texts by contrast, sweeps from image embeddings.
 
-Contrastive loss between images and texts (Radford et al. 2021, figure 3).
+The contrast is that of Radford et al. (2021), figure 3.
 """
 
 import math

@@ -1,6 +1,6 @@
 """An encoder of lidar sweeps into the embedding space of an image tower.
 
-Self-attention among occupied pillars within windows of the ground (SST, Fan et al. 2022).
+Occupied pillars attend to each other within windows of the ground (SST, Fan et al. 2022).
 """
 
 import math

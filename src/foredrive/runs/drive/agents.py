@@ -12,26 +12,13 @@ from typing import TYPE_CHECKING, Literal
 from foredrive.errors import InputError
 
 if TYPE_CHECKING:
-    from foredrive.runs.train.rigs import TrainedRigs
     from foredrive.scene import Agent
-    from foredrive.sensors.rigs import RigPlan
     from foredrive.towns.driving.town import TownSimulator
 
 CRUISE_MPS = 5.0
 EXPERT, DISTURBED, IDM, STOP, CONSTANT_VELOCITY = "expert", "disturbed", "idm", "stop", "constant-velocity"
 REPLAY, CORRIDOR = "log", "lidar-corridor"
 NEEDS_TOWN = "the expert and idm read the state of an embedded town and can drive only there"
-
-
-@dataclass(frozen=True)
-class AgentInputs:
-    """The inputs that an agent requires."""
-
-    cameras: bool
-    lidar: bool
-    past_frames: int
-    camera_names: tuple[str, ...] | None = None
-    """Names of the required cameras; None: all cameras."""
 
 
 Sees = Literal["camera", "lidar", "both"]
@@ -56,7 +43,7 @@ class AgentSetup:
     @property
     def folder(self) -> Path:
         """The folder of the run."""
-        return _run_folder(self.agent, self.argument)
+        return agent_folder(self.agent, self.argument)
 
     def in_town(self) -> "TownSimulator":
         """Return the town.
@@ -317,54 +304,6 @@ def agents_help() -> str:
     )
 
 
-def check_seeing(agent: str, sees: Sees | None) -> None:
-    """Check that an agent can drive with some sensors alone.
-
-    Raises:
-        InputError: it needs others, or has no use for those.
-    """
-    if sees is not None and agent.startswith("grpc://"):
-        raise InputError("drivers of AlpaSim are sent cameras alone: leave out --sees")
-    if sees is None or is_remote(agent):
-        return
-    inputs = inputs_of(agent)
-    if (inputs.cameras and sees == "lidar") or (inputs.lidar and sees == "camera"):
-        needed = "cameras" if inputs.cameras else "lidar"
-        raise InputError(f"{agent} needs its {needed}, which --sees {sees} hides")
-    if (not inputs.cameras and sees == "camera") or not (inputs.cameras or inputs.lidar):
-        raise InputError(f"{agent} does not look at what --sees {sees} shows")
-
-
-def inputs_of(agent: str) -> AgentInputs:
-    """Return the inputs that an agent requires.
-
-    Args:
-        agent: a name of `AGENTS`, with its argument.
-
-    Raises:
-        InputError: there is no such agent, or it was trained on another frame interval.
-    """
-    from foredrive.driving.observation import FRAME_DT_S
-    from foredrive.integrations.remote.json_http import read_address
-    from foredrive.runs.train.driver import is_driver, open_driver
-    from foredrive.runs.train.run import open_run
-
-    kind, argument = find_agent(agent)
-    if kind.sensors == "remote":
-        read_address(agent, kind.name.removesuffix("://"))
-        return AgentInputs(cameras=True, lidar=False, past_frames=1)
-    if kind.sensors in ("none", "lidar"):
-        return AgentInputs(cameras=False, lidar=kind.sensors == "lidar", past_frames=1)
-    folder = _run_folder(agent, argument)
-    if kind.of_driver and not is_driver(folder):
-        raise InputError(f"{folder}: {kind.name}RUN needs the run of a driver, such as driver_small")
-    clips = (open_driver(folder) if is_driver(folder) else open_run(folder)).recipe.clips
-    if abs(clips.frame_dt_s - FRAME_DT_S) > 1e-6:
-        raise InputError(f"{agent}: trained on key frames {clips.frame_dt_s} s apart, not {FRAME_DT_S} s")
-    seeing = kind.sensors == "trained"
-    return AgentInputs(seeing, lidar=False, past_frames=clips.past_frames, camera_names=clips.cameras)
-
-
 def check_without_log(agent: str) -> None:
     """Check that an agent can drive where there is no log.
 
@@ -377,34 +316,6 @@ def check_without_log(agent: str) -> None:
         )
 
 
-def rig_of(agent: str) -> "RigPlan":
-    """Return the rig that most of an agent's training logs have; the surround rig if the agent has none."""
-    from foredrive.sensors.rigs import SURROUND
-
-    rigs = _rigs_of(agent)
-    return SURROUND if rigs is None else rigs.usual
-
-
-def check_rig_of(agent: str, rig: "RigPlan") -> None:
-    """Check that an agent knows a rig.
-
-    Raises:
-        InputError: it was not trained with such a rig.
-    """
-    from foredrive.runs.train.rigs import check_rig
-
-    rigs = _rigs_of(agent)
-    if rigs is not None:
-        check_rig(rigs, rig, agent)
-
-
-def _rigs_of(agent: str) -> "TrainedRigs | None":
-    from foredrive.runs.train.rigs import read_rigs
-
-    kind, argument = find_agent(agent)
-    return read_rigs(_run_folder(agent, argument)) if kind.sensors == "trained" else None
-
-
 def make_agent(
     agent: str,
     clock: Callable[[], float],
@@ -415,7 +326,7 @@ def make_agent(
     """Create the agent of one drive.
 
     Args:
-        agent: as for `inputs_of`.
+        agent: a name of `AGENTS`, with its argument.
         clock: returns the time of the drive, s.
         town: the town that the expert drives in; the other agents do not need it.
         seed: seed of the random disturbances and turns in a demonstration.
@@ -454,7 +365,12 @@ def check_ready(agent: str) -> None:
         ready(agent)
 
 
-def _run_folder(agent: str, argument: str) -> Path:
+def agent_folder(agent: str, argument: str) -> Path:
+    """Return the folder of an agent's run.
+
+    Raises:
+        InputError: there is none: the agent is unknown.
+    """
     from foredrive.runs.shipped import run_folder
 
     folder = run_folder(Path(argument))

@@ -11,7 +11,8 @@ from foredrive.driving.scores import timeout_s
 from foredrive.errors import InputError
 from foredrive.integrations.carla.client import connect
 from foredrive.integrations.carla.simulator import CarlaSimulator
-from foredrive.runs.drive.agents import inputs_of, make_agent
+from foredrive.runs.drive.agent_inputs import inputs_of
+from foredrive.runs.drive.agents import make_agent
 from foredrive.runs.drive.route_source import RouteSource
 from foredrive.runs.drive.suite import DriveJob, DriveSetup, DriveSuite
 from foredrive.scene.conditions import BackgroundTraffic

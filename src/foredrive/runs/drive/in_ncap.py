@@ -21,7 +21,8 @@ from foredrive.driving.ncap.scenario_file import load_scenarios, outside_protoco
 from foredrive.driving.ncap.self_test import SelfTest, run_reference, self_test
 from foredrive.errors import InputError
 from foredrive.methods.rebuilding.renderer import RebuiltRenderer
-from foredrive.runs.drive.agents import Sees, check_seeing, is_remote
+from foredrive.runs.drive.agent_inputs import check_seeing
+from foredrive.runs.drive.agents import Sees, is_remote
 from foredrive.runs.drive.in_rebuilt import (
     agent_in,
     check_lidar_of,

@@ -25,7 +25,8 @@ from foredrive.errors import InputError
 from foredrive.methods.rebuilding.edits import Edit, load_edits
 from foredrive.methods.rebuilding.renderer import RebuiltRenderer
 from foredrive.methods.rebuilding.vehicle import LoggedVehicle
-from foredrive.runs.drive.agents import CORRIDOR, EXPERT, REPLAY, Sees, inputs_of, is_remote, make_agent
+from foredrive.runs.drive.agent_inputs import inputs_of
+from foredrive.runs.drive.agents import CORRIDOR, EXPERT, REPLAY, Sees, is_remote, make_agent
 from foredrive.runs.drive.suite import DriveJob, DriveSetup, DriveSuite
 from foredrive.runs.rebuild.rebuilt_run import (
     OpenedReconstruction,

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from foredrive.driving.scores import timeout_s
-from foredrive.runs.drive.agents import inputs_of, make_agent
+from foredrive.runs.drive.agent_inputs import inputs_of
+from foredrive.runs.drive.agents import make_agent
 from foredrive.runs.drive.route_source import RouteSource, drive_hash
 from foredrive.runs.drive.suite import DriveJob, DriveSetup, DriveSuite
 from foredrive.scene import Trajectory

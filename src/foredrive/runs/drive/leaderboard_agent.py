@@ -13,7 +13,8 @@ from typing import Any
 from foredrive.files import atomic_path
 from foredrive.integrations.carla.client import import_carla
 from foredrive.integrations.carla.leaderboard import LeaderboardDriver
-from foredrive.runs.drive.agents import inputs_of, make_agent, rig_of
+from foredrive.runs.drive.agent_inputs import inputs_of, rig_of
+from foredrive.runs.drive.agents import make_agent
 from foredrive.sensors.rigs import camera_rig
 from foredrive.sensors.vehicle import roof_lidar
 

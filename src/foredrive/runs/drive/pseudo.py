@@ -17,7 +17,8 @@ from foredrive.engine.folder import SUMMARY
 from foredrive.engine.provenance import collect_provenance
 from foredrive.engine.summary import Summary, write_summary
 from foredrive.errors import InputError
-from foredrive.runs.drive.agents import check_ready, inputs_of, is_remote
+from foredrive.runs.drive.agent_inputs import inputs_of
+from foredrive.runs.drive.agents import check_ready, is_remote
 from foredrive.runs.drive.in_ncap import place_in
 from foredrive.runs.drive.in_rebuilt import agent_in, check_lidar_of
 from foredrive.runs.rebuild.rebuilt_run import open_run_log

@@ -10,7 +10,8 @@ from dataclasses import dataclass
 
 from foredrive.driving.route_sets import RouteWaypoints, load_route_set
 from foredrive.errors import InputError
-from foredrive.runs.drive.agents import check_rig_of, check_without_log, inputs_of
+from foredrive.runs.drive.agent_inputs import check_rig_of, inputs_of
+from foredrive.runs.drive.agents import check_without_log
 from foredrive.runs.drive.suite import DriveJob
 from foredrive.scene.conditions import (
     ANY_CONDITIONS,

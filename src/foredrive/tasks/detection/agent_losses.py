@@ -1,6 +1,6 @@
 """Losses of road users: of the dense map of centres, and of the queries by the best matching.
 
-Loss of a dense map of objects' centres (CenterNet, Zhou et al. 2019; CenterPoint, Yin et al. 2021).
+The map of centres is that of CenterNet (Zhou et al. 2019) and CenterPoint (Yin et al. 2021).
 """
 
 from dataclasses import dataclass, field

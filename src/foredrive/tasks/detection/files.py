@@ -1,11 +1,8 @@
 """Read files of detections of any known format, and write the scores of their frames.
 
-2-D detections in COCO's results format, and truth in COCO's instances format.
-
-Results are a list of records with `image_id`, `category_id`, `bbox` (x, y, width, height in px) and `score`.
-Results may also be an object with this list under `annotations`. Records of other categories than the truth's
-are left out, as pycocotools does, and so are boxes without width or height.
-
+COCO's results are a list of records with `image_id`, `category_id`, `bbox` (x, y, width, height in px) and
+`score`, or an object with this list under `annotations`; its truth is in the instances format. Records of
+other categories than the truth's are left out, as pycocotools does, and so are boxes without width or height.
 Beyond the format, a record may have `covariance` (of x1, y1, x2, y2 in px) and `class_probabilities` (by
 category name).
 """

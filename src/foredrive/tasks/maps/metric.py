@@ -1,9 +1,8 @@
 """Maps: polylines under the protocols of vectors, raster layers under UniAD's, beside the training set's.
 
-Intersection over union of masks of map elements, as UniAD counts it.
-
-Source: OpenDriveLab/UniAD, dense_heads/panseg_head.py (`IOU`) and nuscenes_e2e_dataset.py, which sums
-intersections and unions over the data set. `data.truth.map_elements.read_map_raster` draws the truth.
+The IoU of raster layers is that of OpenDriveLab/UniAD, dense_heads/panseg_head.py (`IOU`) and
+nuscenes_e2e_dataset.py, which sums intersections and unions over the data set.
+`data.truth.map_elements.read_map_raster` draws the truth.
 """
 
 from dataclasses import dataclass

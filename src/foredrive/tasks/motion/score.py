@@ -1,10 +1,8 @@
-"""Forecast agents scored under every protocol.
+"""Score forecast agents under every protocol.
 
-Forecasts of Argoverse 2's motion forecasting challenge.
-
-The submission is a parquet file with a row for each future (`scenario_id`, `track_id`, `probability`,
-`predicted_trajectory_x`, `predicted_trajectory_y`: 60 steps at 10 Hz), as av2's `ChallengeSubmission` writes
-it. The truth is a folder with the scenarios' parquet files.
+The submission to Argoverse 2's challenge is a parquet file with a row for each future (`scenario_id`,
+`track_id`, `probability`, `predicted_trajectory_x`, `predicted_trajectory_y`: 60 steps at 10 Hz), as av2's
+`ChallengeSubmission` writes it. The truth is a folder with the scenarios' parquet files.
 """
 
 from collections.abc import Sequence

@@ -1,8 +1,7 @@
 """Occupancy of vehicles over time under UniAD's protocol, beside detected boxes that drive on or stay.
 
-IoU and VPQ of instances over time, seen from above, as UniAD counts them.
-
-Video panoptic quality is that of FIERY (Hu et al., ICCV 2021) and its public code.
+IoU and video panoptic quality are counted from above, as UniAD does. The latter is that of FIERY (Hu et al.,
+ICCV 2021) and its public code.
 """
 
 from dataclasses import dataclass, fields

@@ -1,9 +1,8 @@
 """Score folders of semantic voxels under every protocol of their data set.
 
-RayIoU: what a lidar at several places would see in predicted and in true voxels.
-
-Liu et al., Fully Sparse 3D Occupancy Prediction (SparseOcc), section 4. Every number is rounded where the
-public code rounds it, so that rays end in the same voxels.
+RayIoU compares what a lidar at several places would see in predicted and in true voxels: Liu et al., Fully
+Sparse 3D Occupancy Prediction (SparseOcc), section 4. Every number is rounded where the public code rounds
+it, so that rays end in the same voxels.
 """
 
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Recall of the columns that hold a car, in the predicted occupancy of now.
 
-Recall of vehicles in predicted occupancy: do the columns of the grid that hold a car look occupied?
-
 IoU hardly counts cars: they are few of the occupied voxels. A planner needs them most. A model that predicts
 everything to be occupied has a recall of 1, so the precision of all predicted columns stands beside it.
 """

@@ -1,0 +1,89 @@
+"""The inputs that agents require: sensors, key frames, the cameras of their training."""
+
+from dataclasses import dataclass
+
+from foredrive.driving.observation import FRAME_DT_S
+from foredrive.errors import InputError
+from foredrive.integrations.remote.json_http import read_address
+from foredrive.runs.drive.agents import Sees, agent_folder, find_agent, is_remote
+from foredrive.runs.train.driver import is_driver, open_driver
+from foredrive.runs.train.rigs import TrainedRigs, check_rig, read_rigs
+from foredrive.runs.train.run import open_run
+from foredrive.sensors.rigs import SURROUND, RigPlan
+
+
+@dataclass(frozen=True)
+class AgentInputs:
+    """The inputs that an agent requires."""
+
+    cameras: bool
+    lidar: bool
+    past_frames: int
+    camera_names: tuple[str, ...] | None = None
+    """Names of the required cameras; None: all cameras."""
+
+
+def check_seeing(agent: str, sees: Sees | None) -> None:
+    """Check that an agent can drive with some sensors alone.
+
+    Raises:
+        InputError: it needs others, or has no use for those.
+    """
+    if sees is not None and agent.startswith("grpc://"):
+        raise InputError("drivers of AlpaSim are sent cameras alone: leave out --sees")
+    if sees is None or is_remote(agent):
+        return
+    inputs = inputs_of(agent)
+    if (inputs.cameras and sees == "lidar") or (inputs.lidar and sees == "camera"):
+        needed = "cameras" if inputs.cameras else "lidar"
+        raise InputError(f"{agent} needs its {needed}, which --sees {sees} hides")
+    if (not inputs.cameras and sees == "camera") or not (inputs.cameras or inputs.lidar):
+        raise InputError(f"{agent} does not look at what --sees {sees} shows")
+
+
+def inputs_of(agent: str) -> AgentInputs:
+    """Return the inputs that an agent requires.
+
+    Args:
+        agent: a name of `AGENTS`, with its argument.
+
+    Raises:
+        InputError: there is no such agent, or it was trained on another frame interval.
+    """
+    kind, argument = find_agent(agent)
+    if kind.sensors == "remote":
+        read_address(agent, kind.name.removesuffix("://"))
+        return AgentInputs(cameras=True, lidar=False, past_frames=1)
+    if kind.sensors in ("none", "lidar"):
+        return AgentInputs(cameras=False, lidar=kind.sensors == "lidar", past_frames=1)
+    folder = agent_folder(agent, argument)
+    if kind.of_driver and not is_driver(folder):
+        raise InputError(f"{folder}: {kind.name}RUN needs the run of a driver, such as driver_small")
+    clips = (open_driver(folder) if is_driver(folder) else open_run(folder)).recipe.clips
+    if abs(clips.frame_dt_s - FRAME_DT_S) > 1e-6:
+        raise InputError(f"{agent}: trained on key frames {clips.frame_dt_s} s apart, not {FRAME_DT_S} s")
+    seeing = kind.sensors == "trained"
+    return AgentInputs(seeing, lidar=False, past_frames=clips.past_frames, camera_names=clips.cameras)
+
+
+def rig_of(agent: str) -> RigPlan:
+    """Return the rig that most of an agent's training logs have; the surround rig if the agent has none."""
+    rigs = _rigs_of(agent)
+    return SURROUND if rigs is None else rigs.usual
+
+
+def check_rig_of(agent: str, rig: RigPlan) -> None:
+    """Check that an agent knows a rig.
+
+    Raises:
+        InputError: it was not trained with such a rig.
+    """
+    rigs = _rigs_of(agent)
+    if rigs is not None:
+        check_rig(rigs, rig, agent)
+
+
+def _rigs_of(agent: str) -> TrainedRigs | None:
+    kind, argument = find_agent(agent)
+    has_cameras = kind.sensors == "trained" or kind.of_driver  # a driver that is told all still logs its own
+    return read_rigs(agent_folder(agent, argument)) if has_cameras else None
