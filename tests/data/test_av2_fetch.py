@@ -11,7 +11,7 @@ from xml.sax.saxutils import escape
 import pytest
 
 from foredrive.cli.main import main
-from foredrive.data.formats import s3_files
+from foredrive.data.formats import av2_fetch
 from foredrive.data.formats.av2_fetch import ROOT, fetch_log, find_log, log_ids
 from foredrive.errors import InputError
 
@@ -97,7 +97,7 @@ def bucket(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[Bucket, str]]:
         image = f"{ROOT}/val/{LOG}/sensors/cameras/ring_front_center/{START_NS + k * 50_000_000}.jpg"
         held.objects[sweep], held.objects[image] = bytes([k]) * 3000, bytes([k]) * 5000
     held.objects[f"{ROOT}/train/{OTHER}/annotations.feather"] = b"x"
-    monkeypatch.setattr(s3_files, "CHUNK_BYTES", 512)
+    monkeypatch.setattr(av2_fetch, "CHUNK_BYTES", 512)
     yield held, f"http://127.0.0.1:{server.server_address[1]}"
     server.shutdown()
     thread.join()
@@ -149,29 +149,29 @@ def test_a_part_goes_on_where_it_was(bucket: tuple[Bucket, str], tmp_path: Path)
 
 def test_a_connection_that_breaks_is_taken_up_again(bucket: tuple[Bucket, str], tmp_path: Path) -> None:
     held, url = bucket
-    (found,) = s3_files.list_objects(url, f"{ROOT}/val/{LOG}/annotations")
+    (found,) = av2_fetch.list_objects(url, f"{ROOT}/val/{LOG}/annotations")
     held.cut_at[found.key], held.fail[found.key] = 100, []
-    s3_files.download(url, found, tmp_path / "a", none, pause_s=0.0)
+    av2_fetch.download(url, found, tmp_path / "a", none, pause_s=0.0)
     assert held.asked == [(found.key, None), (found.key, "bytes=100-")]
     assert (tmp_path / "a").read_bytes() == held.objects[found.key]
     held.fail[found.key] = [503] * 3
-    s3_files.download(url, found, tmp_path / "b", none, pause_s=0.0)
+    av2_fetch.download(url, found, tmp_path / "b", none, pause_s=0.0)
     held.fail[found.key] = [503] * 4
     with pytest.raises(InputError, match=r"error 503 \(4 tries\); start again to go on"):
-        s3_files.download(url, found, tmp_path / "c", none, pause_s=0.0)
+        av2_fetch.download(url, found, tmp_path / "c", none, pause_s=0.0)
     assert not (tmp_path / "c").exists()
 
 
 def test_an_object_that_changed_is_fetched_anew(bucket: tuple[Bucket, str], tmp_path: Path) -> None:
     held, url = bucket
-    (found,) = s3_files.list_objects(url, f"{ROOT}/val/{LOG}/annotations")
+    (found,) = av2_fetch.list_objects(url, f"{ROOT}/val/{LOG}/annotations")
     (tmp_path / "a.part").write_bytes(b"old" * 40)
     came = []
-    old = s3_files.S3Object(found.key, found.size, found.etag)
+    old = av2_fetch.S3Object(found.key, found.size, found.etag)
     held.etags[found.key] = "0" * 32  # the server's object is another one now
     held.objects[found.key] = b"y" * found.size
     with pytest.raises(InputError, match="not what the listing says"):
-        s3_files.download(url, old, tmp_path / "a", came.append, pause_s=0.0)
+        av2_fetch.download(url, old, tmp_path / "a", came.append, pause_s=0.0)
     assert sum(came) == found.size
     assert not list(tmp_path.iterdir())
 
@@ -180,12 +180,12 @@ def test_objects_uploaded_in_parts_are_checked_by_size(bucket: tuple[Bucket, str
     held, url = bucket
     key = f"{ROOT}/val/{LOG}/annotations.feather"
     held.etags[key] = "0123456789abcdef0123456789abcdef-2"
-    (found,) = s3_files.list_objects(url, key)
+    (found,) = av2_fetch.list_objects(url, key)
     assert found.md5 is None
-    s3_files.download(url, found, tmp_path / "a", none)
-    smaller = s3_files.S3Object(key, found.size - 5, found.etag)
+    av2_fetch.download(url, found, tmp_path / "a", none)
+    smaller = av2_fetch.S3Object(key, found.size - 5, found.etag)
     with pytest.raises(InputError, match="more than the"):
-        s3_files.download(url, smaller, tmp_path / "b", none)
+        av2_fetch.download(url, smaller, tmp_path / "b", none)
 
 
 def test_a_few_seconds_without_images(bucket: tuple[Bucket, str]) -> None:
@@ -235,15 +235,15 @@ def test_what_is_no_bucket_is_told(bucket: tuple[Bucket, str], monkeypatch: pyte
     ):
         monkeypatch.setattr(held, "listing", lambda _, answer=answer: answer)
         with pytest.raises(InputError, match=told):
-            list(s3_files.list_objects(url, "x"))
+            list(av2_fetch.list_objects(url, "x"))
     with pytest.raises(InputError, match="not an address"):
-        list(s3_files.list_objects("nowhere", "x"))
+        list(av2_fetch.list_objects("nowhere", "x"))
 
 
 def test_a_disk_that_is_too_small_is_told_first(bucket: tuple[Bucket, str], tmp_path: Path) -> None:
     held, url = bucket
     log = find_log(LOG, url)
-    huge = s3_files.S3Object(log.files[0].key, 10**18, "x")
+    huge = av2_fetch.S3Object(log.files[0].key, 10**18, "x")
     with pytest.raises(InputError, match="GB are missing, but the disk has"):
         fetch_log(type(log)(log.log_id, log.split, [huge]), tmp_path, 1, none, url)
     assert held.asked == []
