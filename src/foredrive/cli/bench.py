@@ -37,12 +37,12 @@ def bench(
             f"{folder}: no benchmarks here; run this in a checkout of Foredrive, or set --folder"
         )
     if name is None:
-        for found, path in files.items():
+        for benchmark_name, path in files.items():
             benchmark = _load(path)
             if benchmark is None:
-                print(f"{found}: a separate script; run it with python {path}")
+                print(f"{benchmark_name}: a separate script; run it with python {path}")
             else:
-                print(f"{found}: {benchmark.question}\n    arms: {', '.join(benchmark.arms)}")
+                print(f"{benchmark_name}: {benchmark.question}\n    arms: {', '.join(benchmark.arms)}")
         return
     name = name.replace("_", "-")
     if name not in files:

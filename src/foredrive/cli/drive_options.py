@@ -84,8 +84,8 @@ class InputFaults:
         """
         from foredrive.driving.faults import Faults, read_camera_fault
 
-        found = tuple(map(read_camera_fault, self.camera_fault))
-        faults = Faults(found, self.speed_noise, self.position_noise)
+        camera_faults = tuple(map(read_camera_fault, self.camera_fault))
+        faults = Faults(camera_faults, self.speed_noise, self.position_noise)
         if cameras:
             faults.check_cameras(tuple(cameras))
         return faults

@@ -44,8 +44,8 @@ def export_nuscenes(
     check_out_folder(out)
     if not logs:
         raise InputError("export nuscenes needs a log, or a data root with logs")
-    found = find_all_logs(logs)
-    parts = [log.name for log in found if log.parts_s]
+    log_paths = find_all_logs(logs)
+    parts = [log.name for log in log_paths if log.parts_s]
     if parts:
         raise InputError(f"whole logs are exported, not parts of them as of {parts[0]} in a list of clips")
 
@@ -57,7 +57,7 @@ def export_nuscenes(
     folder, failed = NuScenesFolder(out, name, SceneOptions(rate, sweeps)), {}
     with frame_progress("exporting") as tick:
         cores = workers or len(os.sched_getaffinity(0))
-        for done in export_nuscenes(found, folder, cores, overwrite=overwrite, tick=tick):
+        for done in export_nuscenes(log_paths, folder, cores, overwrite=overwrite, tick=tick):
             if done.failure is not None:
                 failed[done.name] = done.failure
             elif done.kept:
@@ -66,4 +66,4 @@ def export_nuscenes(
                 print(f"exported {done.name}", flush=True)
     print(f"wrote {folder.tables}")
     if failed:
-        raise InputError(f"{len(failed)} of {len(found)} logs failed: {listed_failures(failed)}")
+        raise InputError(f"{len(failed)} of {len(log_paths)} logs failed: {listed_failures(failed)}")

@@ -46,9 +46,9 @@ def fetch_av2(
 
     bucket = bucket.rstrip("/")
     if not log:
-        found = log_ids(split, bucket)
-        print("\n".join(found[:SHOWN]))
-        print(f"{min(SHOWN, len(found))} of the {len(found)} logs of {split}; fetch some by --log ID")
+        ids = log_ids(split, bucket)
+        print("\n".join(ids[:SHOWN]))
+        print(f"{min(SHOWN, len(ids))} of the {len(ids)} logs of {split}; fetch some by --log ID")
         return
     wanted = [find_log(one, bucket, seconds=seconds, images=images) for one in log]
     for one in wanted:

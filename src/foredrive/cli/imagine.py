@@ -37,7 +37,7 @@ def imagine(
     check_number("--seconds", seconds, above=0)
     check_number("--samples", samples, low=1)
     check_number("--moments", moments, low=1)
-    found = find_one_log(log)
+    log_path = find_one_log(log)
     run = check_run(run)
 
     with importing():
@@ -46,7 +46,7 @@ def imagine(
         from foredrive.view.imagination_video import write_imagination_video
 
     opened = open_run(run)
-    seen = imagine_run(opened, found, seconds=seconds, samples=samples, moments=moments)
+    seen = imagine_run(opened, log_path, seconds=seconds, samples=samples, moments=moments)
     with job_progress("imagining futures", moments) as tick:
         count = write_imagination_video(out, counted(seen, tick), opened.recipe.clips.frame_dt_s)
     print(f"wrote {out}: {count} frames of {opened.recipe.clips.frame_dt_s:g} s")

@@ -218,8 +218,8 @@ def _disk_reason(error: BaseException) -> str | None:
         number, where = None, None
         if isinstance(cause, OSError):
             number, where = cause.errno, cause.filename2 or cause.filename
-        if number is None and (told := ERROR_NUMBER.search(str(cause))):
-            number = int(told[1] or told[2])
+        if number is None and (match := ERROR_NUMBER.search(str(cause))):
+            number = int(match[1] or match[2])
         if number in DISK_ERRORS:
             where = _written(error) or where
             return f"{where}: {DISK_ERRORS[number]}" if where else DISK_ERRORS[number]

@@ -29,7 +29,7 @@ def models(
         return
     console, weights = Console(), shipped_weights()
     print_table(models_table(weights), console)
-    for each in weights:
-        console.print(f"{each.name}: {each.data}", markup=False, highlight=False)
-        if each.card is not None:
-            print_table(figures_table(each.card), console)
+    for entry in weights:
+        console.print(f"{entry.name}: {entry.data}", markup=False, highlight=False)
+        if entry.card is not None:
+            print_table(figures_table(entry.card), console)

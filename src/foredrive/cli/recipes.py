@@ -26,7 +26,7 @@ def recipes(
         recipe = driver or (find_rebuild_recipe(name) if name in REBUILD_RECIPES else find_recipe(name))
         print(recipe_yaml(recipe), end="")
         return
-    for verb, known in (("train", RECIPES), ("train", DRIVER_RECIPES), ("reconstruct", REBUILD_RECIPES)):
+    for verb, table in (("train", RECIPES), ("train", DRIVER_RECIPES), ("reconstruct", REBUILD_RECIPES)):
         print(f"foredrive {verb}:")
-        for key, entry in known.items():
+        for key, entry in table.items():
             print(f"  {key:28} {entry.about}")

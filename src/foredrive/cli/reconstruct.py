@@ -77,7 +77,7 @@ def reconstruct(
     check_image_size(image_size)
     check_number("--workers", workers, low=1)
     check_out_folder(out)
-    found = find_logs(logs)
+    log_paths = find_logs(logs)
 
     with importing():
         from foredrive.methods.rebuilding.perceptual import PerceptualWeights
@@ -97,10 +97,10 @@ def reconstruct(
         cache=(cache or out / "cache").absolute(),
         weights=PerceptualWeights(lpips_weights, fid_weights),
     )
-    if len(found) == 1 and not ray:
-        print(work((found[0], out)), flush=True)
+    if len(log_paths) == 1 and not ray:
+        print(work((log_paths[0], out)), flush=True)
     else:
-        _rebuild_logs(found, out.absolute(), work, workers, ray)
+        _rebuild_logs(log_paths, out.absolute(), work, workers, ray)
 
 
 def rebuild_log(
@@ -131,14 +131,14 @@ def rebuild_log(
     lines = [f"rebuilt {log.name} by {recipe.representation.kind}: {out}"]
     if not run.held_out.cameras and not run.held_out.sweeps:
         lines.insert(0, f"{log.name} is too short: no frame was held out, so the scene is not evaluated")
-    known = {
+    shared = {
         name: value for name in (*run.scene.sizes, *FIGURES) if (value := run.summary.get(name)) is not None
     }
-    return "\n".join([*lines, *(f"  {name}: {value:.4g}" for name, value in known.items())])
+    return "\n".join([*lines, *(f"  {name}: {value:.4g}" for name, value in shared.items())])
 
 
 def _rebuild_logs(
-    found: Sequence[LogPath], out: Path, work: Callable[..., str], workers: int, on_ray: bool
+    log_paths: Sequence[LogPath], out: Path, work: Callable[..., str], workers: int, on_ray: bool
 ) -> None:
     """Reconstruct several logs, some at a time.
 
@@ -149,7 +149,7 @@ def _rebuild_logs(
 
     from foredrive.engine.fan_out import fan_out, reason
 
-    jobs = [(log, out / log.name) for log in found]
+    jobs = [(log, out / log.name) for log in log_paths]
     work = functools.partial(work, threads=max(1, torch.get_num_threads() // workers))
     failed = {}
     results = fan_out(jobs, work, workers, on_ray=on_ray)

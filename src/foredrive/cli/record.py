@@ -174,7 +174,7 @@ def _conditions(names: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def _range(what: str, text: str) -> tuple[int, int]:
-    found = re.fullmatch(r"(\d+)(?:\.\.(\d+))?", text)
-    if found is None or (found[2] is not None and int(found[2]) < int(found[1])):
+    match = re.fullmatch(r"(\d+)(?:\.\.(\d+))?", text)
+    if match is None or (match[2] is not None and int(match[2]) < int(match[1])):
         raise InputError(f"--{what} must be a number or a range such as 1..8, got {text!r}")
-    return int(found[1]), int(found[2] or found[1])
+    return int(match[1]), int(match[2] or match[1])

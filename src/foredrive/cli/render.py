@@ -67,9 +67,9 @@ def render(
 
     opened = open_rebuilt(run)
     plan = plan_frames(opened.vehicle, cameras, lidar, start_s=start, seconds=seconds, rate_hz=rate_hz)
-    known = [] if edits is None else load_edits(edits)
+    edit_list = [] if edits is None else load_edits(edits)
     tracks = opened.scene.graph.all_tracks
-    changes = [*known, *edits_from_arguments(tracks, known, shift_left, remove, insert)]
+    changes = [*edit_list, *edits_from_arguments(tracks, edit_list, shift_left, remove, insert)]
     write_rebuilt_video(out, opened, changes, plan, colour)
     if save_edits is not None:
         write_edits(changes, save_edits)

@@ -63,9 +63,9 @@ def search(
     if saved is not None:
         asked = _saved(index, saved)
     assert asked is not None
-    found = ask(opened, asked, towers, ensemble=not query.plain)
-    _print_found(opened, found)
-    hits.do(index, asked, found)
+    result = ask(opened, asked, towers, ensemble=not query.plain)
+    _print_found(opened, result)
+    hits.do(index, asked, result)
 
 
 def search_page(index: Place = INDEX, towers: Name = None, host: str = "localhost", port: int = 8090) -> None:
@@ -102,16 +102,16 @@ def _saved(index: str, name: str) -> "Query":
     return Query.from_json(saved[name])
 
 
-def _print_found(index: "FrameIndex", found: "Found") -> None:
+def _print_found(index: "FrameIndex", result: "Found") -> None:
     from rich.console import Console
 
     from foredrive.view.search_sheet import hits_table
     from foredrive.view.table import print_table
 
     rows = index.count()
-    if not found.hits:
+    if not result.hits:
         print(f"nothing found among {rows} rows of {index.uri}")
         return
-    print_table(hits_table(found.hits), Console())
-    how = "all compared" if found.exact else f"{found.compared} compared, the others are less similar"
-    print(f"{len(found.hits)} hits among {rows} rows of {index.uri}; {how}")
+    print_table(hits_table(result.hits), Console())
+    how = "all compared" if result.exact else f"{result.compared} compared, the others are less similar"
+    print(f"{len(result.hits)} hits among {rows} rows of {index.uri}; {how}")

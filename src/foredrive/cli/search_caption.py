@@ -44,7 +44,7 @@ def search_caption(
     decoder = load_captions(Path(chosen.name) / CAPTIONS, chosen)
     views, _ = example_views(opened, like, chosen)
     said = caption_views(views, chosen, decoder)
-    rows = [(name, each.by_image or None, each.by_lidar or None) for name, each in said.items()]
+    rows = [(name, caption.by_image or None, caption.by_lidar or None) for name, caption in said.items()]
     columns = [Column(title, align="left") for title in ("view", "by image", "by lidar")]
     print_table(simple_table(columns, rows), Console())
 
@@ -70,11 +70,11 @@ def search_train_captions(
     check_number("--epochs", epochs, low=1)
     check_number("--seed", seed, low=0)
     check_out_folder(out)
-    found = find_all_logs(logs)
+    log_paths = find_all_logs(logs)
 
     with importing():
         from foredrive.engine.loop import Schedule
         from foredrive.runs.search.captioning import train_captions
 
     schedule = Schedule(batch_size=64, lr=1e-3, epochs=epochs, weight_decay=0.01, warmup_steps=50, seed=seed)
-    print(f"wrote {train_captions(found, towers, out, schedule, stride)}")
+    print(f"wrote {train_captions(log_paths, towers, out, schedule, stride)}")

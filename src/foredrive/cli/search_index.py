@@ -49,16 +49,18 @@ def search_index(
     check_number("--stride", stride, above=0)
     check_number("--workers", workers, low=0)
     check_file(scores)
-    found = find_all_logs(logs)
+    log_paths = find_all_logs(logs)
 
     with importing():
         from foredrive.runs.search.indexing import index_logs
         from foredrive.search.scores import read_scores
 
-    told = None if scores is None else read_scores(scores)
+    log_scores = None if scores is None else read_scores(scores)
     with _progress() as tick:
         cores = len(os.sched_getaffinity(0))
-        done = index_logs(found, index, towers, stride, workers or cores, on_ray=ray, scores=told, tick=tick)
+        done = index_logs(
+            log_paths, index, towers, stride, workers or cores, on_ray=ray, scores=log_scores, tick=tick
+        )
     _print_indexed(done, index)
 
 
@@ -95,14 +97,14 @@ def search_train(
     check_number("--lidar-steps", lidar_steps, low=1)
     check_number("--seed", seed, low=0)
     check_out_folder(out)
-    found = find_all_logs(logs)
+    log_paths = find_all_logs(logs)
 
     with importing():
         from foredrive.runs.search.tower_training import tower_recipe, train_towers
 
     size = size or ("tiny" if beside in (None, TOWERS) else "base")
     recipe = tower_recipe(size, loss, image_steps, lidar_steps, seed)
-    towers = train_towers(recipe, found, out, cache, beside)
+    towers = train_towers(recipe, log_paths, out, cache, beside)
     print(f"next: foredrive search index LOGS --towers {towers}")
 
 

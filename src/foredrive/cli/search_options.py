@@ -117,7 +117,7 @@ class HitOptions:
         if self.out is not None and self.out.suffix not in (".png", ".html"):
             raise InputError(f"{self.out}: a contact sheet ends on .png or .html")
 
-    def do(self, index: str, query: "Query", found: "Found") -> None:
+    def do(self, index: str, query: "Query", result: "Found") -> None:
         """Save the query, tag the hits, and write the files."""
         from foredrive.data.clip_list import write_clip_list
         from foredrive.runs.search.searching import listed_clips
@@ -127,14 +127,14 @@ class HitOptions:
         if self.save is not None:
             save_query(index, self.save, query.to_json())
         if self.tag is not None:
-            add_tag(index, self.tag, [hit.row.key for hit in found.hits])
-        if not found.hits:
+            add_tag(index, self.tag, [hit.row.key for hit in result.hits])
+        if not result.hits:
             return
         if self.clips is not None:
-            write_clip_list(self.clips, listed_clips(found.hits, self.before, self.after))
+            write_clip_list(self.clips, listed_clips(result.hits, self.before, self.after))
             print(f"wrote {self.clips}: foredrive train RECIPE --logs {self.clips}")
         if self.out is not None:
-            write_search_sheet(self.out, query, found.hits)
+            write_search_sheet(self.out, query, result.hits)
             print(f"wrote {self.out}")
 
 

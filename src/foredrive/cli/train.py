@@ -69,7 +69,7 @@ def train(
         raise InputError("--probe trains the heads of --tasks: name the tasks too")
     if probe and rank() is not None:
         raise InputError("--probe trains in one process: start it without torchrun")
-    found = find_all_logs(logs)
+    log_paths = find_all_logs(logs)
 
     with importing():
         from foredrive.runs.recipes.known import find_driver_recipe
@@ -78,14 +78,14 @@ def train(
     if driver is not None:
         if tasks or rank() is not None:
             raise InputError(f"{driver.name} trains a driver: leave out --tasks and torchrun")
-        _train_driver(driver, found, out, cache, start)
+        _train_driver(driver, log_paths, out, cache, start)
     elif probe:
         chosen, heads = _with_heads(recipe, occupancy, tasks, set)
-        _probe(chosen, heads, tasks, found, out, cache, start)
+        _probe(chosen, heads, tasks, log_paths, out, cache, start)
     elif tasks:
-        _train_agent(_jointly(recipe, occupancy, tasks, set), found, out, cache, start, strategy)
+        _train_agent(_jointly(recipe, occupancy, tasks, set), log_paths, out, cache, start, strategy)
     else:
-        _train_agent(_plain(recipe, occupancy, set), found, out, cache, start, strategy)
+        _train_agent(_plain(recipe, occupancy, set), log_paths, out, cache, start, strategy)
 
 
 def _train_driver(

@@ -66,14 +66,14 @@ def view(
         raise InputError(f"{log}: --edits needs the folder of a reconstruction")
     if log.is_file() and log.suffix != ".json":
         raise InputError(f"{log}: {OPENED}")
-    found = find_one_log(log)
+    log_path = find_one_log(log)
     if run is not None:
         run = check_run(run)
 
     with importing():
         from foredrive.view.log_frames import CAMERA_WIDTH_PX, LogFrames
 
-    frames = LogFrames(found, CAMERA_WIDTH_PX, None if run is None else _opened(run))
+    frames = LogFrames(log_path, CAMERA_WIDTH_PX, None if run is None else _opened(run))
     index = frames.nearest(t)
     if save is not None:
         _save(save, frames, index, reach)
@@ -120,9 +120,9 @@ def _serve_rebuilt(folder: Path, edits: Path | None, t_s: float | None, host: st
     run = open_rebuilt(folder)
     if t_s is not None:
         run.vehicle.check_time(t_s)
-    known = [] if edits is None else load_edits(edits)
-    edited_scene(run.scene, known)
-    with closing(RebuiltViewer(run, known, edits or folder / EDITS, host, port)) as viewer:
+    edit_list = [] if edits is None else load_edits(edits)
+    edited_scene(run.scene, edit_list)
+    with closing(RebuiltViewer(run, edit_list, edits or folder / EDITS, host, port)) as viewer:
         if t_s is not None:
             viewer.show(t_s)
         print(f"{folder.name} is at {viewer.url} until you press Ctrl-C", flush=True)

@@ -48,31 +48,31 @@ def cast_beams(
         x, step_x, next_x, delta_x = _start(ox, dx, nx, enter)
         y, step_y, next_y, delta_y = _start(oy, dy, ny, enter)
         z, step_z, next_z, delta_z = _start(oz, dz, nz, enter)
-        at = np.uint64((z * ny + y) * nx + x)
+        cell = np.uint64((z * ny + y) * nx + x)
         while True:
-            if opaque and state[at] >= OCCUPIED:
-                state[at] = SEEN
+            if opaque and state[cell] >= OCCUPIED:
+                state[cell] = SEEN
                 break
             # Step across the nearest voxel border.
-            if state[at] == UNKNOWN:
-                state[at] = FREE
+            if state[cell] == UNKNOWN:
+                state[cell] = FREE
             if next_x <= next_y and next_x <= next_z:
                 x += step_x
                 if next_x >= leave or x < 0 or x >= nx:
                     break
-                at += np.uint64(step_x)
+                cell += np.uint64(step_x)
                 next_x += delta_x
             elif next_y <= next_z:
                 y += step_y
                 if next_y >= leave or y < 0 or y >= ny:
                     break
-                at += np.uint64(step_y * nx)
+                cell += np.uint64(step_y * nx)
                 next_y += delta_y
             else:
                 z += step_z
                 if next_z >= leave or z < 0 or z >= nz:
                     break
-                at += np.uint64(step_z * ny * nx)
+                cell += np.uint64(step_z * ny * nx)
                 next_z += delta_z
 
 
@@ -113,7 +113,7 @@ def box_of_points(
     Returns:
         Int64 [N].
     """
-    found = np.full(len(points), -1, np.int64)
+    box_index = np.full(len(points), -1, np.int64)
     nearest2 = np.full(len(points), np.inf)
     for box in range(len(centre)):
         cos, sin = np.cos(yaw[box]), np.sin(yaw[box])
@@ -130,6 +130,6 @@ def box_of_points(
                 and abs(z) <= half_lwh[box, 2]
                 and flat2 + z * z < nearest2[n]
             ):
-                found[n] = box
+                box_index[n] = box
                 nearest2[n] = flat2 + z * z
-    return found
+    return box_index

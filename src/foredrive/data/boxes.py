@@ -175,8 +175,8 @@ def frames_with_boxes(log: Log) -> Int64[np.ndarray, "_"]:
 def box_row(log: Log, frame: int) -> int | None:
     """Return the row of a frame in the box table. Return None if the frame is not annotated."""
     frames, rows = log.rows(_KEY)
-    at = int(np.searchsorted(frames, frame))
-    return int(rows[at]) if at < len(frames) and frames[at] == frame else None
+    row = int(np.searchsorted(frames, frame))
+    return int(rows[row]) if row < len(frames) and frames[row] == frame else None
 
 
 def _recorded_labels(log: Log, frame: int, kept: Bool[np.ndarray, "K"]) -> dict[str, Tensor]:
@@ -292,14 +292,14 @@ def _track_velocity(
 ) -> Float64[np.ndarray, "N 3"]:
     """Return the difference between the observations before and after each box; one-sided at the ends."""
     order = np.lexsort((t_s, track_id))
-    track, at, xyz = track_id[order], t_s[order], centre[order]
-    joined = (np.diff(track) == 0) & (np.diff(at) <= _MAX_DIFFERENCE_S)
+    track, time_s, xyz = track_id[order], t_s[order], centre[order]
+    joined = (np.diff(track) == 0) & (np.diff(time_s) <= _MAX_DIFFERENCE_S)
     before = np.arange(len(order)) - np.concatenate([[False], joined])[: len(order)]
     after = np.arange(len(order)) + np.concatenate([joined, [False]])[: len(order)]
-    span_s = at[after] - at[before]
+    span_s = time_s[after] - time_s[before]
     velocity = np.full_like(xyz, np.nan)
-    known = span_s > 0
-    velocity[known] = (xyz[after] - xyz[before])[known] / span_s[known, None]
+    moved = span_s > 0
+    velocity[moved] = (xyz[after] - xyz[before])[moved] / span_s[moved, None]
     out = np.empty_like(velocity)
     out[order] = velocity
     return out

@@ -59,8 +59,8 @@ class RollingCameraMetadata(PinholeCameraMetadata):
     @classmethod
     def from_dict(cls, data_dict: dict[str, Any]) -> "RollingCameraMetadata":
         """Read a log's metadata. Without a readout time the shutter is global."""
-        known = PinholeCameraMetadata.from_dict(data_dict)
-        described = {slot[1:]: getattr(known, slot) for slot in PinholeCameraMetadata.__slots__}
+        pinhole = PinholeCameraMetadata.from_dict(data_dict)
+        described = {slot[1:]: getattr(pinhole, slot) for slot in PinholeCameraMetadata.__slots__}
         return cls(data_dict.get("readout_s", 0.0), **described)
 
     def to_dict(self) -> dict[str, Any]:

@@ -111,8 +111,8 @@ def names_of_camera(log: Log, name: str) -> tuple[str, ...]:
 def told_cameras(cameras: Iterable[PinholeCameraMetadata]) -> str:
     """Return a list of cameras for error messages, with both names that `find_camera` accepts."""
     names = dict.fromkeys((metadata.camera_name, metadata.camera_id.serialize()) for metadata in cameras)
-    told = [own if own == shared else f"{own} ({shared})" for own, shared in names]
-    return ", ".join(told) or "none"
+    texts = [own if own == shared else f"{own} ({shared})" for own, shared in names]
+    return ", ".join(texts) or "none"
 
 
 def read_camera(

@@ -31,13 +31,13 @@ def clip_list(
     Args:
         notes: additional entries for each clip. They are not read back.
     """
-    told = notes if notes is not None else [{} for _ in clips]
+    all_notes = notes if notes is not None else [{} for _ in clips]
     entries = [
         {
             "folder": str(clip.folder), "maps_dir": str(clip.maps_dir),
             "start_s": clip.start_s, "end_s": clip.end_s, **note,
         }
-        for clip, note in zip(clips, told, strict=True)
+        for clip, note in zip(clips, all_notes, strict=True)
     ]  # fmt: skip
     return {"format": FORMAT, "clips": entries}
 

@@ -220,8 +220,8 @@ class ClipDataset(Dataset[Example]):
             return tuple(dict.fromkeys(name for cameras in self._cameras for name in cameras))
         for name in self.config.cameras:
             if not any(find_camera(cameras, name) for cameras in self._cameras):
-                there = told_cameras(camera for cameras in self._cameras for camera in cameras.values())
-                raise InputError(f"no log has a camera {name!r}; there are: {there}")
+                names = told_cameras(camera for cameras in self._cameras for camera in cameras.values())
+                raise InputError(f"no log has a camera {name!r}; there are: {names}")
         return self.config.cameras
 
     def _future(self, log: Log, now: int) -> Trajectory:
@@ -266,10 +266,10 @@ def _clip_frames(log: Log, config: ClipConfig) -> Int64[np.ndarray, "N T"]:
     first_us = log.t_us[0] - offset_us[0]
     last_us = log.t_us[-1] - offset_us[-1]
     now_us = np.arange(first_us, last_us + slack_us + 1, config.now_stride_s * 1e6)
-    now, found = log.nearest_frames(now_us)
-    now = np.unique(now[found])
-    frames, found = log.nearest_frames(log.t_us[now][:, None] + offset_us)
-    whole = found.all(-1) & (np.diff(frames, axis=-1) > 0).all(-1)
+    now, valid = log.nearest_frames(now_us)
+    now = np.unique(now[valid])
+    frames, valid = log.nearest_frames(log.t_us[now][:, None] + offset_us)
+    whole = valid.all(-1) & (np.diff(frames, axis=-1) > 0).all(-1)
     if config.part_s is not None:
         t_s = (log.t_us[frames[:, config.past_frames :]] - log.t_us[0]) * 1e-6
         whole &= (t_s[:, 0] >= config.part_s[0]) & (t_s[:, -1] < config.part_s[1])
@@ -291,10 +291,12 @@ def _at_times(plan: Trajectory, times_s: Float64[np.ndarray, "T"]) -> Trajectory
     known_s = plan.dt_s * np.arange(len(plan.xy[0]) + 1)
     yaw = np.unwrap(np.append(0.0, plan.yaw[0].double().numpy()))
     x, y = (np.append(0.0, axis) for axis in plan.xy[0].double().numpy().T)
-    at = torch.from_numpy(np.stack([np.interp(times_s, known_s, values) for values in (x, y, yaw)])).float()
+    sampled = torch.from_numpy(
+        np.stack([np.interp(times_s, known_s, values) for values in (x, y, yaw)])
+    ).float()
     return Trajectory(
-        xy=at[:2].T[None],
-        yaw=at[None, 2],
+        xy=sampled[:2].T[None],
+        yaw=sampled[None, 2],
         valid=torch.from_numpy(times_s <= known_s[-1] + 1e-6)[None],
         log_prob=plan.log_prob,
         dt_s=float(times_s[0]),

@@ -173,6 +173,6 @@ def route_offset_m(
     half_m = 0.5 * HEADING_OVER_M
     at_m = np.clip(progress_m, arc_m[0] + half_m, arc_m[-1] - half_m)
     along_m = [at_m - half_m, at_m + half_m, progress_m, progress_m + LOOKAHEAD_M]
-    behind, ahead, here, there = points_at(xy, arc_m, np.array(along_m))
-    (dx, dy), (x, y) = ahead - behind, there - here
+    behind, ahead, here, beyond = points_at(xy, arc_m, np.array(along_m))
+    (dx, dy), (x, y) = ahead - behind, beyond - here
     return float((dx * y - dy * x) / max(np.hypot(dx, dy), 1e-9))

@@ -55,12 +55,14 @@ def read_drive(
         InputError: the log cannot be read, or it lacks a requested camera.
     """
     log = Log(path)
-    there = pinhole_cameras(log)
-    names = tuple(there) if cameras is None else cameras
-    chosen = [find_camera(there, name) for name in names]
+    cameras_by_name = pinhole_cameras(log)
+    names = tuple(cameras_by_name) if cameras is None else cameras
+    chosen = [find_camera(cameras_by_name, name) for name in names]
     for name, camera in zip(names, chosen, strict=True):
         if camera is None:
-            raise InputError(f"{path.folder}: no camera {name!r}; there are: {told_cameras(there.values())}")
+            raise InputError(
+                f"{path.folder}: no camera {name!r}; there are: {told_cameras(cameras_by_name.values())}"
+            )
     frames = range(len(log)) if frames is None else frames
     store = FrameStore(cache_dir, image_hw, names)
     seen = [store.read(log, frame, chosen, with_points=derived) for frame in frames]

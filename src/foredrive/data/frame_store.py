@@ -81,12 +81,12 @@ class FrameStore:
         Raises:
             InputError: an image, a pose or the boxes cannot be read.
         """
-        there = [camera for camera in cameras if camera is not None]
+        present = [camera for camera in cameras if camera is not None]
         small = self.image_hw[0] * self.image_hw[1]
-        shrinks = any(camera.width * camera.height > small for camera in there)
+        shrinks = any(camera.width * camera.height > small for camera in present)
         if self._folder is None or not (with_images and with_points and shrinks):
             return self._read(log, frame, cameras, with_images, with_points)
-        file = self._file(self._folder, log, frame, there)
+        file = self._file(self._folder, log, frame, present)
         kept = self._read_entry(file)
         if kept is None:
             kept = self._read(log, frame, cameras, with_images, with_points)

@@ -70,8 +70,8 @@ def accumulated_labels(log: Log, frame: int, spec: VoxelSpec) -> VoxelLabels:
 def _neighbours(log: Log, frame: int) -> list[int]:
     """Return the frames nearest to the multiples of `STEP_S` before and after a frame, without itself."""
     offset_s = np.arange(-REACH_S, REACH_S + 0.5 * STEP_S, STEP_S)
-    frames, there = log.nearest_frames(log.t_us[frame] + 1e6 * offset_s)
-    return [int(other) for other in np.unique(frames[there]) if other != frame]
+    frames, valid = log.nearest_frames(log.t_us[frame] + 1e6 * offset_s)
+    return [int(other) for other in np.unique(frames[valid]) if other != frame]
 
 
 def _state_from(log: Log, neighbour: int, frame: int, spec: VoxelSpec) -> UInt8[np.ndarray, "Z Y X"]:

@@ -50,12 +50,12 @@ def read_sweep(log: Log, frame: int) -> tuple[LidarSweep, bool] | None:
 
 def frames_with_lidar(log: Log) -> Int64[np.ndarray, "_"]:
     """Return the frames at which any lidar has a sweep."""
-    found = [
+    frames = [
         log.rows(key)[0]
         for key, metadata in log.scene.get_all_modality_metadatas().items()
         if isinstance(metadata, LidarMetadata | LidarMergedMetadata)
     ]
-    return np.unique(np.concatenate([np.zeros(0, dtype=np.int64), *found]))
+    return np.unique(np.concatenate([np.zeros(0, dtype=np.int64), *frames]))
 
 
 def main_lidar_mount(log: Log) -> Float64[np.ndarray, "4 4"] | None:

@@ -86,12 +86,12 @@ class _Entry:
 
     def is_whole(self, listing: Listing) -> bool:
         try:
-            found = [(self.folder / name).stat() for name, _, _ in listing]
+            stats = [(self.folder / name).stat() for name, _, _ in listing]
         except OSError:
             return False
         return all(
             (facts.st_size, facts.st_mtime_ns) == (size, t_ns)
-            for facts, (_, size, t_ns) in zip(found, listing, strict=True)
+            for facts, (_, size, t_ns) in zip(stats, listing, strict=True)
         )
 
 
@@ -116,14 +116,14 @@ def mirrored_logs(path: Path, depth: int) -> list[Path]:
     url = f"{scheme}://{rest.strip('/')}"
     if any(sign in url for sign in "@?#") or ".." in PurePosixPath(rest).parts:
         raise InputError(f"{url}: only a bucket and a folder; credentials and options are in the environment")
-    base, found = mirror_folder() / scheme / rest.strip("/"), []
+    base, paths = mirror_folder() / scheme / rest.strip("/"), []
     for folder, listing in sorted(_listings(url).items()):
         inside = folder.relative_to(base).parts
         hidden = any(part.startswith(".") for part in inside)
         if any(name == "sync.arrow" for name, _, _ in listing) and len(inside) <= depth and not hidden:
             _Entry(folder).write_listing(listing)
-            found.append(folder)
-    return found
+            paths.append(folder)
+    return paths
 
 
 def hold(folder: Path) -> Hold | None:
@@ -202,17 +202,17 @@ def _make_room(entry: _Entry, size: int) -> None:
         InputError: there is no room.
     """
     limit = _limit_bytes()
-    told = f"the {limit / 1e9:g} GB of {mirror_folder()} (set {SIZE_VARIABLE})"
+    space = f"the {limit / 1e9:g} GB of {mirror_folder()} (set {SIZE_VARIABLE})"
     if size > limit:
-        raise InputError(f"{entry.url}: {size / 1e9:.3g} GB do not fit into {told}")
-    there = []
+        raise InputError(f"{entry.url}: {size / 1e9:.3g} GB do not fit into {space}")
+    entries = []
     for record in entry.note("entries").parent.iterdir():
         if not record.name.startswith("."):
             noted = json.loads(record.read_text())
             other = _Entry(Path(noted["folder"]))
-            there.append((other.note("locks").stat().st_mtime_ns, other, int(noted["bytes"])))
-    used = sum(held for _, _, held in there)
-    for _, other, held in sorted(there, key=lambda one: one[0]):
+            entries.append((other.note("locks").stat().st_mtime_ns, other, int(noted["bytes"])))
+    used = sum(held for _, _, held in entries)
+    for _, other, held in sorted(entries, key=lambda one: one[0]):
         if used + size <= limit:
             return
         lock = _open_lock(other)
@@ -228,16 +228,16 @@ def _make_room(entry: _Entry, size: int) -> None:
             os.close(lock)
     if used + size > limit:
         raise InputError(
-            f"{entry.url}: {size / 1e9:.3g} GB do not fit beside the {used / 1e9:.3g} GB in use into {told}"
+            f"{entry.url}: {size / 1e9:.3g} GB do not fit beside the {used / 1e9:.3g} GB in use into {space}"
         )
 
 
 def _limit_bytes() -> float:
-    told = os.environ.get(SIZE_VARIABLE) or str(DEFAULT_GB)
+    setting = os.environ.get(SIZE_VARIABLE) or str(DEFAULT_GB)
     with contextlib.suppress(ValueError):
-        if float(told) > 0:
-            return float(told) * 1e9
-    raise InputError(f"{SIZE_VARIABLE} must be a number above 0, got {told!r}")
+        if float(setting) > 0:
+            return float(setting) * 1e9
+    raise InputError(f"{SIZE_VARIABLE} must be a number above 0, got {setting!r}")
 
 
 def _open_lock(entry: _Entry) -> int:
@@ -252,10 +252,10 @@ def _listings(url: str, *, allow_missing: bool = False) -> dict[Path, Listing]:
     with _told(url):
         storage, place = _storage(url)
         selector = fs.FileSelector(place, recursive=True, allow_not_found=allow_missing)
-        found = [info for info in storage.get_file_info(selector) if info.type == fs.FileType.File]
+        file_infos = [info for info in storage.get_file_info(selector) if info.type == fs.FileType.File]
     base = mirror_folder() / scheme
     listings: dict[Path, list[tuple[str, int, int]]] = {}
-    for info in found:
+    for info in file_infos:
         path = PurePosixPath(info.path)
         if ".." in path.parts:
             raise InputError(f"{url}: the name {info.path!r} leaves its folder")

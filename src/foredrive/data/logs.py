@@ -192,12 +192,14 @@ class Log:
         self, point_ego: Float[np.ndarray, "3"], t_us: Float64[np.ndarray, "N"]
     ) -> Float64[np.ndarray, "N 3"]:
         """Return world positions of a vehicle-fixed point, with constant velocity beyond the log."""
-        at = self._drive_t_us.astype(np.float64)
+        times_us = self._drive_t_us.astype(np.float64)
         xyz = self._drive_T[:, :3, :3] @ point_ego + self._drive_T[:, :3, 3]
-        if len(at) > 1:
-            at = np.concatenate([[2 * at[0] - at[1]], at, [2 * at[-1] - at[-2]]])
+        if len(times_us) > 1:
+            times_us = np.concatenate(
+                [[2 * times_us[0] - times_us[1]], times_us, [2 * times_us[-1] - times_us[-2]]]
+            )
             xyz = np.concatenate([[2 * xyz[0] - xyz[1]], xyz, [2 * xyz[-1] - xyz[-2]]])
-        return np.stack([np.interp(t_us, at, xyz[:, axis]) for axis in range(3)], axis=-1)
+        return np.stack([np.interp(t_us, times_us, xyz[:, axis]) for axis in range(3)], axis=-1)
 
     def poses_at(
         self, t_us: Float64[np.ndarray, "N"]
@@ -214,11 +216,15 @@ class Log:
 
     def knows_pose_at(self, t_us: Float64[np.ndarray, "*n"]) -> Bool[np.ndarray, "*n"]:
         """Return whether the log has close poses before and after each time."""
-        at = self._drive_t_us
-        if len(at) < 2:
+        times_us = self._drive_t_us
+        if len(times_us) < 2:
             return np.zeros(t_us.shape, dtype=bool)
-        after = np.searchsorted(at, t_us).clip(1, len(at) - 1)
-        return (t_us >= at[0]) & (t_us <= at[-1]) & (at[after] - at[after - 1] <= _MAX_GAP_S * 1e6)
+        after = np.searchsorted(times_us, t_us).clip(1, len(times_us) - 1)
+        return (
+            (t_us >= times_us[0])
+            & (t_us <= times_us[-1])
+            & (times_us[after] - times_us[after - 1] <= _MAX_GAP_S * 1e6)
+        )
 
     def _read_ego(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return times [E] (µs), poses [E 4 4] and logged speeds [E] (NaN if missing) of all ego states."""

@@ -47,8 +47,8 @@ def read_map_patch(log: Log, frame: int) -> MapPatch:
         api = log.scene.get_map_api()
         if api is not None:
             layers = [MapLayer.LANE, MapLayer.ROAD_EDGE, *_OUTLINE_KIND]
-            at = Point2D(*T_world_ego[:2, 3])
-            near = api.get_map_objects_in_radius(at, RADIUS_M, layers)
+            centre = Point2D(*T_world_ego[:2, 3])
+            near = api.get_map_objects_in_radius(centre, RADIUS_M, layers)
             flat = not api.get_map_metadata().map_has_z
             T_ego_world = np.linalg.inv(T_world_ego)
             for kind, line in _lines(item for items in near.values() for item in items):

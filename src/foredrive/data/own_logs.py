@@ -217,12 +217,14 @@ class _Drive:
         """Return poses between the frames, and by the last step's motion beyond them."""
         if self.denser is not None:
             return self.denser.poses_at(t_us)
-        at, T = self.t_us, self.T_world_ego
-        if len(at) == 1:
+        times_us, T = self.t_us, self.T_world_ego
+        if len(times_us) == 1:
             return np.repeat(T, len(t_us), axis=0)
         before, after = T[0] @ np.linalg.inv(T[1]) @ T[0], T[-1] @ np.linalg.inv(T[-2]) @ T[-1]
-        at = np.concatenate([[2 * at[0] - at[1]], at, [2 * at[-1] - at[-2]]])
-        return interpolated_poses(at, np.concatenate([before[None], T, after[None]]), t_us)
+        times_us = np.concatenate(
+            [[2 * times_us[0] - times_us[1]], times_us, [2 * times_us[-1] - times_us[-2]]]
+        )
+        return interpolated_poses(times_us, np.concatenate([before[None], T, after[None]]), t_us)
 
     def exposures(self, t_s: Float64[np.ndarray, "T"]) -> list[tuple[int, Float64[np.ndarray, "4 4"]]]:
         """Return time (µs) and pose at times at which images were taken."""
@@ -334,8 +336,8 @@ def _boxes(labels: Sequence[Box], where: str) -> Boxes:
         if not np.isfinite(numbers).all() or min(box.size_lwh_m) <= 0:
             raise InputError(f"{where}: box {box.track_id} is not finite or has no size")
         if category_named(box.category) is None:
-            known = ", ".join(category.name.lower() for category in Category)
-            raise InputError(f"{where}: unknown category {box.category!r}; there are: {known}")
+            names = ", ".join(category.name.lower() for category in Category)
+            raise InputError(f"{where}: unknown category {box.category!r}; there are: {names}")
     if len({box.track_id for box in labels}) < len(labels):
         raise InputError(f"{where}: two boxes have the same track_id")
     unknown = (float("nan"), float("nan"))

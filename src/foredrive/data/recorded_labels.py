@@ -86,12 +86,12 @@ def held_voxels(
 
 def _voxels_at_middles(spec: VoxelSpec, grid: VoxelSpec) -> list[Int[np.ndarray, "_"]]:
     """Return, along z, y and x, the layer of `grid` at the centre of each layer of `spec`; -1 if outside."""
-    found = []
+    voxels = []
     for axis, count in enumerate(spec.shape_zyx):
         middle_m = spec.lower_m[2 - axis] + (np.arange(count) + 0.5) * spec.voxel_m
         layer = np.floor((middle_m - grid.lower_m[2 - axis]) / grid.voxel_m).astype(np.int64)
-        found.append(np.where((layer >= 0) & (layer < grid.shape_zyx[axis]), layer, -1))
-    return found
+        voxels.append(np.where((layer >= 0) & (layer < grid.shape_zyx[axis]), layer, -1))
+    return voxels
 
 
 def _within(spec: VoxelSpec, grid: VoxelSpec) -> Bool[np.ndarray, "Z Y X"]:

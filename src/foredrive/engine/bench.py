@@ -95,11 +95,11 @@ def spread(runs: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, dict[str, f
 
     Figures of the parts of an arm, ARM@PART, are those of ARM.
     """
-    found: dict[str, dict[str, list[float]]] = {}
+    by_arm: dict[str, dict[str, list[float]]] = {}
     for run in runs:
         for key, value in run["figures"].items():
             if value is not None:
-                found.setdefault(run["arm"].partition("@")[0], {}).setdefault(key, []).append(value)
+                by_arm.setdefault(run["arm"].partition("@")[0], {}).setdefault(key, []).append(value)
     return {
         arm: {
             key: {
@@ -111,7 +111,7 @@ def spread(runs: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, dict[str, f
             }
             for key, values in figures.items()
         }
-        for arm, figures in found.items()
+        for arm, figures in by_arm.items()
     }
 
 

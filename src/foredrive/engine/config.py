@@ -91,19 +91,19 @@ def _nearest(key: str, name: str, siblings: Mapping[str, Any], values: Mapping[s
     if near:
         return f"; {near[0]!r} is near"
     everywhere = list(_names(values))
-    near = [known for known in everywhere if known.split(".")[-1] == key]
+    near = [full_name for full_name in everywhere if full_name.split(".")[-1] == key]
     near = near or difflib.get_close_matches(name, everywhere, n=1, cutoff=0.4)
     return f"; did you mean {near[0]}?" if near else f"; there are {', '.join(siblings)}"
 
 
 def _names(values: Mapping[str, Any], prefix: str = "") -> list[str]:
     """Return the dotted names of all entries."""
-    found = []
+    names = []
     for key, value in values.items():
-        found.append(prefix + key)
+        names.append(prefix + key)
         if isinstance(value, Mapping):
-            found += _names(value, f"{prefix}{key}.")
-    return found
+            names += _names(value, f"{prefix}{key}.")
+    return names
 
 
 def _plain(value: object) -> Any:
@@ -113,8 +113,8 @@ def _plain(value: object) -> Any:
     return [_plain(entry) for entry in value] if isinstance(value, (list, tuple)) else value
 
 
-def nearest_name(name: str, known: Sequence[str] | dict[str, Any]) -> str:
+def nearest_name(name: str, names: Sequence[str] | dict[str, Any]) -> str:
     """Return the end of a sentence about an unknown recipe, with the nearest known names."""
-    near = difflib.get_close_matches(name, known, n=3)
+    near = difflib.get_close_matches(name, names, n=3)
     hint = f"; near: {', '.join(near)}" if near else ""
     return f"{hint}; `foredrive recipes` lists all"

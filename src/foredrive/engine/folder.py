@@ -56,11 +56,11 @@ class RunFolder:
         Raises:
             InputError: it holds something else.
         """
-        found = self.read()
-        for what, value in self.wanted.items() if found is not None else ():
-            if found.get(what) != value:  # type: ignore[union-attr]
+        stored = self.read()
+        for what, value in self.wanted.items() if stored is not None else ():
+            if stored.get(what) != value:  # type: ignore[union-attr]
                 raise InputError(f"{self.path}: holds {what}; choose another folder")
-        return found is not None
+        return stored is not None
 
     @contextlib.contextmanager
     def claimed(self) -> Iterator[None]:

@@ -171,10 +171,10 @@ def train(
         model = fabric.setup_module(objective)
         groups = parameter_groups(objective, schedule.weight_decay)
         optimizer = torch.optim.AdamW(groups, lr=schedule.lr, fused=True)
-        found = fabric.broadcast(latest_checkpoint(folder / CHECKPOINTS))
-        done = 0 if found is None else load_checkpoint(found, objective, optimizer)
-        if found is not None and fabric.is_global_zero:
-            remove_older(found)
+        checkpoint = fabric.broadcast(latest_checkpoint(folder / CHECKPOINTS))
+        done = 0 if checkpoint is None else load_checkpoint(checkpoint, objective, optimizer)
+        if checkpoint is not None and fabric.is_global_zero:
+            remove_older(checkpoint)
         if done >= total:
             return
         if fabric.is_global_zero:
@@ -293,7 +293,7 @@ class _Steps:
         in_parts = parts[0].weight < 1
         if in_parts:
             self.buffers.begin()
-        found, complaint = [], None
+        results, complaint = [], None
         for part in parts:
             last = part is parts[-1]
             example = next(examples)
@@ -301,14 +301,14 @@ class _Steps:
                 losses = self._backward(step, part, example)
             if in_parts:
                 self.buffers.end_part(part.weight, last=last)
-            found.append((part.weight, {name: value.item() for name, value in losses.items()}))
+            results.append((part.weight, {name: value.item() for name, value in losses.items()}))
             complaint = complaint or _not_finite(losses, step, f"the batch {', '.join(example.key)}")
         if in_parts:
             self.buffers.end(processes=self.fabric.world_size)
-        everywhere = gathered((found, complaint), self.fabric)
-        for _, told in everywhere:
-            if told is not None:
-                raise InputError(told)
+        everywhere = gathered((results, complaint), self.fabric)
+        for _, fault in everywhere:
+            if fault is not None:
+                raise InputError(fault)
         self.fabric.clip_gradients(
             self.model, self.optimizer, max_norm=self.schedule.clip_grad_norm, error_if_nonfinite=False
         )

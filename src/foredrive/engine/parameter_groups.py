@@ -17,11 +17,11 @@ def parameter_groups(module: nn.Module, weight_decay: float) -> list[dict[str, A
     """
     decayed: list[nn.Parameter] = []
     kept: list[nn.Parameter] = []
-    found: set[nn.Parameter] = set()
+    seen: set[nn.Parameter] = set()
     for part in module.modules():
         for name, parameter in part.named_parameters(recurse=False):
-            if not parameter.requires_grad or parameter in found:
+            if not parameter.requires_grad or parameter in seen:
                 continue
-            found.add(parameter)
+            seen.add(parameter)
             (decayed if isinstance(part, _DECAYED) and "weight" in name else kept).append(parameter)
     return [{"params": decayed, "weight_decay": weight_decay}, {"params": kept, "weight_decay": 0.0}]

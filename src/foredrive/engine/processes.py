@@ -33,9 +33,9 @@ def gathered(value: T, fabric: "Fabric") -> list[T]:
     """Return the values of all processes, in the order of their ranks."""
     if fabric.world_size == 1:
         return [value]
-    found = [value] * fabric.world_size
-    torch.distributed.all_gather_object(found, value)
-    return found
+    values = [value] * fabric.world_size
+    torch.distributed.all_gather_object(values, value)
+    return values
 
 
 @contextlib.contextmanager

@@ -212,13 +212,13 @@ def search_logs(demo: Demo) -> list[Found]:
     The hits of the texts are written as a list of clips, which `foredrive train` takes as logs.
     """
     index = FrameIndex(str(_indexed(demo)))
-    found = [_found(index, Query(text=text, modality="joint", top=HITS)) for text in TEXTS]
-    hits = [hit for each in found for hit in each.hits]
+    results = [_found(index, Query(text=text, modality="joint", top=HITS)) for text in TEXTS]
+    hits = [hit for result in results for hit in result.hits]
     if hits:
         best = hits[0].row
-        found.append(_found(index, Query(like=f"{best.log}@{best.t_s:.2f}s/{best.view}", top=HITS)))
+        results.append(_found(index, Query(like=f"{best.log}@{best.t_s:.2f}s/{best.view}", top=HITS)))
         write_clip_list(demo.out / "clips.json", listed_clips(hits, BEFORE_S, AFTER_S))
-    return found
+    return results
 
 
 def _indexed(demo: Demo) -> Path:

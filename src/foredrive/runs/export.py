@@ -89,7 +89,7 @@ def export_run(run: Run, logs: Sequence[LogPath], out: Path, clips: int = 8) -> 
         "inputs": _describe(samples[0].inputs),
         "outputs": _describe(truth[0]),
         "clips": len(samples),
-        "largest_difference": {name: _max_difference(truth, found) for name, found in outputs.items()},
+        "largest_difference": {name: _max_difference(truth, result) for name, result in outputs.items()},
         "latency_ms": _latency_ms(agent, runtimes, samples, steps),
         "threads": torch.get_num_threads(),
         **collect_provenance(),

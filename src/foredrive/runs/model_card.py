@@ -59,12 +59,12 @@ def read_card(path: Path) -> ModelCard:
     Raises:
         InputError: the file is no such card.
     """
-    found = _PARTS.fullmatch(path.read_text())
-    if found is None:
+    match = _PARTS.fullmatch(path.read_text())
+    if match is None:
         raise InputError(f"{path}: not a model card")
-    figures = {title: (float(trained), float(small)) for title, trained, small in _ROW.findall(found["rows"])}
-    texts = (found["name"], found["recipe"], found["commit"], found["data"])
-    return ModelCard(*texts, int(found["clips"]), int(found["failed"]), figures, found["limits"])
+    figures = {title: (float(trained), float(small)) for title, trained, small in _ROW.findall(match["rows"])}
+    texts = (match["name"], match["recipe"], match["commit"], match["data"])
+    return ModelCard(*texts, int(match["clips"]), int(match["failed"]), figures, match["limits"])
 
 
 @dataclass(frozen=True)
@@ -89,7 +89,7 @@ def shipped_weights() -> list[ShippedWeights]:
     Raises:
         InputError: a model's card cannot be read.
     """
-    found = []
+    cards = []
     for name in shipped_models():
         card, config = read_card(MODELS / name / CARD), read_yaml(MODELS / name / CONFIG)
         if config.get("kind") == "driver":
@@ -98,10 +98,10 @@ def shipped_weights() -> list[ShippedWeights]:
             kind = f"{config['model']['kind']} world model, planner"
             kind += ", task heads" if config.get("tasks") else ""
         size = _size(MODELS / name)
-        found.append(
+        cards.append(
             ShippedWeights(EMBEDDED + name, kind, card.recipe, card.commit[:7], card.data, size, card)
         )
-    return [*found, _towers()]
+    return [*cards, _towers()]
 
 
 def find_card(name: str) -> Path:

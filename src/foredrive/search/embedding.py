@@ -67,8 +67,8 @@ def _embed_few(log: Log, frames: Sequence[int], towers: Towers) -> pa.Table:
     by_image, by_lidar = [], []
     for now, (frame, views) in enumerate(zip(frames, seen, strict=True)):
         facts, counts = _facts(log, frame), _counts(log, frame, views)
-        found = np.array([vectors[now, name] for name in views], np.float32).reshape(-1, 2, towers.dim)
-        for name, (image, lidar) in zip((WHOLE, *views), [mean_direction(found), *found], strict=True):
+        embedded = np.array([vectors[now, name] for name in views], np.float32).reshape(-1, 2, towers.dim)
+        for name, (image, lidar) in zip((WHOLE, *views), [mean_direction(embedded), *embedded], strict=True):
             azimuth = None if name == WHOLE else math.degrees(views[name].sector.azimuth_rad)
             rows.append({**facts, "view": name, "azimuth_deg": azimuth, **counts[name]})
             by_image.append(image)
@@ -105,8 +105,8 @@ def read_views(log: Log, frame: int, side_px: int, crop: Crop, *, with_lidar: bo
     Args:
         side_px: length of the shorter side of a whole image.
     """
-    found = read_sweep(log, frame) if with_lidar else None
-    sweep = None if found is None else found[0][found[0].valid & found[0].returned]
+    lidar = read_sweep(log, frame) if with_lidar else None
+    sweep = None if lidar is None else lidar[0][lidar[0].valid & lidar[0].returned]
     views = {}
     for name, metadata in pinhole_cameras(log).items():
         scale = side_px / min(metadata.height, metadata.width)
@@ -128,9 +128,9 @@ def embed_views(towers: Towers, views: Sequence[View]) -> Float[np.ndarray, "n 2
         if images:
             embedded = towers.embed_images(torch.stack([image for _, image in images]))
             out[[n for n, _ in images], 0] = unit(embedded).numpy()
-        found = towers.embed_sweeps(stack_records([sweep for _, sweep in sweeps])) if sweeps else None
-        if found is not None:
-            out[[n for n, _ in sweeps], 1] = unit(found).numpy()
+        sweep_vectors = towers.embed_sweeps(stack_records([sweep for _, sweep in sweeps])) if sweeps else None
+        if sweep_vectors is not None:
+            out[[n for n, _ in sweeps], 1] = unit(sweep_vectors).numpy()
     return out
 
 

@@ -66,12 +66,12 @@ class ViewFacts(NamedTuple):
     @property
     def facts(self) -> frozenset[str]:
         """Return all facts as short strings: "night", "two car", "crossing pedestrian", "nobody"."""
-        found = {fact for fact in self[:3] if fact is not None}
+        facts = {fact for fact in self[:3] if fact is not None}
         if self.time_of_day in DAY:
-            found.add("day")
+            facts.add("day")
         if self.things is not None:
-            found |= {EMPTY} if not self.things else set(_counted(self.things))
-        return frozenset(found)
+            facts |= {EMPTY} if not self.things else set(_counted(self.things))
+        return frozenset(facts)
 
 
 def _counted(things: tuple[Thing, ...]) -> Iterator[str]:
@@ -93,14 +93,14 @@ def view_facts(log: Log, frame: int, sectors: dict[str, Sector]) -> dict[str, Vi
     Raises:
         InputError: data cannot be read.
     """
-    told = read_setting(log, frame)
+    recorded = read_setting(log, frame)
     setting: tuple[str | None, str | None, str | None] = (None, None, None)
-    if told is not None:
-        setting = (told.time_of_day.value, told.weather.value, told.place.value)
+    if recorded is not None:
+        setting = (recorded.time_of_day.value, recorded.weather.value, recorded.place.value)
     boxes, visibility = read_boxes(log, frame), read_visibility(log, frame)
     if boxes is None:
         return {name: ViewFacts(*setting, None) for name in sectors}
-    reach_m = IN_FOG_M if told is not None and told.weather is Weather.FOG else AHEAD_M
+    reach_m = IN_FOG_M if recorded is not None and recorded.weather is Weather.FOG else AHEAD_M
     seen = boxes.valid & (boxes.centre[:, :2].norm(dim=-1) < reach_m)
     if visibility is not None:
         seen = seen & ~(visibility < MIN_VISIBILITY)  # NaN: not known

@@ -156,8 +156,8 @@ def _check(query: Query, target: Target | None) -> None:
 
 def _check_view(index: FrameIndex, query: Query) -> None:
     if not index.count(query.where_view) and index.count():
-        there = sorted(set(index.select(None, ["view"])["view"].to_pylist()))
-        raise InputError(f"no view {query.view}; there are {', '.join((ANY_VIEW, ANY_SECTOR, *there))}")
+        views = sorted(set(index.select(None, ["view"])["view"].to_pylist()))
+        raise InputError(f"no view {query.view}; there are {', '.join((ANY_VIEW, ANY_SECTOR, *views))}")
 
 
 def _conditions(index: FrameIndex, query: Query, target: Target | None) -> str | None:
@@ -189,12 +189,12 @@ def _candidates(
     by: tuple[str, ...] = (query.modality,)
     if query.modality == "joint" and query.rule != "features":
         by = ("image", "lidar") if query.rule == "logits" else ("image",)
-    found = [
+    candidates = [
         index.nearest(vector, name, where, columns, limit)
         for name, vector in _vectors(target).items()
         if name in by
     ]
-    return found[0] if len(found) == 1 else _without_twins(pa.concat_tables(found))
+    return candidates[0] if len(candidates) == 1 else _without_twins(pa.concat_tables(candidates))
 
 
 def _without_twins(rows: pa.Table) -> pa.Table:
@@ -253,17 +253,17 @@ def _scores(rows: pa.Table, target: Target | None, query: Query) -> list[dict[st
 
 def _vectors(target: Target) -> dict[str, ndarray]:
     """Return the unit vectors of a target by modality."""
-    there = {"image": target.image, "lidar": target.lidar}
-    vectors = {name: vector for name, vector in there.items() if vector is not None}
+    by_modality = {"image": target.image, "lidar": target.lidar}
+    vectors = {name: vector for name, vector in by_modality.items() if vector is not None}
     return {**vectors, "joint": mean_direction(np.stack(list(vectors.values())))}
 
 
 def _by_rank(values: Float[ndarray, "n"]) -> Float[ndarray, "n"]:
     """Return ranks scaled from 0 (smallest) to 1 (largest). Equal values have equal ranks, NaN stays NaN."""
-    there = ~np.isnan(values)
+    valid = ~np.isnan(values)
     out = np.full(len(values), np.nan)
-    _, rank = np.unique(values[there], return_inverse=True)
-    out[there] = rank / max(rank.max(initial=0), 1)
+    _, rank = np.unique(values[valid], return_inverse=True)
+    out[valid] = rank / max(rank.max(initial=0), 1)
     return out
 
 

@@ -73,10 +73,10 @@ class FrameIndex:
         if table is None:
             raise InputError(f"{uri}: no index here; foredrive search index LOGS --index {uri} makes one")
         self._frames = table
-        told = (table.schema.metadata or {}).get(_REMEMBERED)
-        if told is None:
+        metadata = (table.schema.metadata or {}).get(_REMEMBERED)
+        if metadata is None:
             raise InputError(f"{uri}: the table {FRAMES} was not made by Foredrive")
-        self.settings = IndexSettings(**json.loads(told))
+        self.settings = IndexSettings(**json.loads(metadata))
 
     @classmethod
     def make(cls, uri: str, settings: IndexSettings) -> "FrameIndex":
@@ -117,11 +117,11 @@ class FrameIndex:
     def add(self, parts: Sequence[tuple[Part, pa.Table]]) -> None:
         """Add parts. Rows of the same moments, e.g. from an interrupted call, are replaced."""
         rows = pa.concat_tables([rows for _, rows in parts])
-        told = pa.Table.from_pylist([part._asdict() for part, _ in parts], schema=_PART_SCHEMA)
+        part_table = pa.Table.from_pylist([part._asdict() for part, _ in parts], schema=_PART_SCHEMA)
         with naming(self.uri):
             self._frames.delete(f"key IN ({quoted_list(rows['key'].unique().to_pylist())})")
             self._put(rows)
-            make_table(self.uri, PARTS, _PART_SCHEMA).add(told)
+            make_table(self.uri, PARTS, _PART_SCHEMA).add(part_table)
 
     def drop(self, log: str) -> None:
         """Remove a log, because it has changed."""
@@ -155,12 +155,12 @@ class FrameIndex:
         """
         from lancedb.index import IvfSq
 
-        there = [index.name for index in self._frames.list_indices() if column in index.columns]
-        if any(partitions < GROWN * int(name.removeprefix(f"{column}_")) for name in there):
+        names = [index.name for index in self._frames.list_indices() if column in index.columns]
+        if any(partitions < GROWN * int(name.removeprefix(f"{column}_")) for name in names):
             return
         config = IvfSq(distance_type="cosine", num_partitions=partitions)
         self._frames.create_index(column, config=config, name=f"{column}_{partitions}")
-        for name in there:
+        for name in names:
             self._frames.drop_index(name)
 
     def count(self, where: str | None = None) -> int:
@@ -195,8 +195,8 @@ class FrameIndex:
         query = query.minimum_nprobes(PROBES).maximum_nprobes(0)  # search more if conditions leave too few
         query = query.refine_factor(REFINEMENT)
         with understanding(where):
-            found = (query if where is None else query.where(where, prefilter=True)).to_arrow()
-        return found.select(list(columns))
+            hits = (query if where is None else query.where(where, prefilter=True)).to_arrow()
+        return hits.select(list(columns))
 
     def set_scores(self, scores: Scores) -> int:
         """Replace the scores of moments. Return the number of changed rows."""
@@ -210,8 +210,8 @@ class FrameIndex:
             for name in SCORES:
                 field = FACTS.field(f"score_{name}")
                 values = [scores[key].get(name) for key in rows["key"].to_pylist()]
-                at = rows.schema.get_field_index(field.name)
-                rows = rows.set_column(at, field, pa.array(values, field.type))
+                column = rows.schema.get_field_index(field.name)
+                rows = rows.set_column(column, field, pa.array(values, field.type))
             self._frames.delete(where)
             self._put(rows)
             changed += len(rows)

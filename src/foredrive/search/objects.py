@@ -41,11 +41,11 @@ def read_objects(log: Log, frame: int, side_px: int) -> list[ObjectView]:
     Raises:
         InputError: data cannot be read.
     """
-    boxes, found = read_boxes(log, frame), read_sweep(log, frame)
-    if boxes is None or found is None:
+    boxes, lidar = read_boxes(log, frame), read_sweep(log, frame)
+    if boxes is None or lidar is None:
         return []
     boxes = boxes[boxes.valid]
-    sweep = found[0][found[0].valid & found[0].returned]
+    sweep = lidar[0][lidar[0].valid & lidar[0].returned]
     inside = points_in_boxes(sweep.points_ego, boxes.centre, boxes.size_lwh, boxes.yaw)
     seen_enough = inside.sum(0) >= MIN_RETURNS
     corners = box_corners(boxes.centre, boxes.size_lwh, boxes.yaw)

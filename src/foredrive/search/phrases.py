@@ -89,8 +89,8 @@ def _counted(manners: Sequence[Sequence[str]], noun: str) -> str:
     """Return the number of objects of a noun, with the property of `TOLD` that all of them have."""
     number = COUNTS.get(len(manners), MANY)
     name = noun if len(manners) == 1 else PLURALS.get(noun, f"{noun}s")
-    told = [manner for manner in TOLD if all(manner in those for those in manners)]
-    return MANNERS[told[0]][0].format(f"{number} {name}") if told else f"{number} {name}"
+    shared = [manner for manner in TOLD if all(manner in those for those in manners)]
+    return MANNERS[shared[0]][0].format(f"{number} {name}") if shared else f"{number} {name}"
 
 
 def _phrase(view: ViewFacts, rng: np.random.Generator) -> Phrase:

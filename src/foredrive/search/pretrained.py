@@ -60,8 +60,8 @@ class PretrainedTowers:
         pixels = images.float() / 255
         if images.shape[-2:] != (side, side):
             pixels = F.interpolate(pixels, size=(side, side), mode="bicubic", antialias=True).clamp(0, 1)
-        found = self.model.get_image_features(pixel_values=(pixels - self._mean) / self._std)
-        return _features(found)
+        features = self.model.get_image_features(pixel_values=(pixels - self._mean) / self._std)
+        return _features(features)
 
     def embed_sweeps(self, sweeps: LidarSweep) -> None:
         """Return None, because there is no lidar tower."""
@@ -81,8 +81,8 @@ class PretrainedTowers:
         return _features(self.model.get_text_features(**kept))
 
 
-def _features(found: Any) -> Float[Tensor, "n D"]:
-    return (found if isinstance(found, Tensor) else found.pooler_output).float()
+def _features(output: Any) -> Float[Tensor, "n D"]:
+    return (output if isinstance(output, Tensor) else output.pooler_output).float()
 
 
 def _not_loaded(model: str, error: Exception) -> InputError:
@@ -138,5 +138,5 @@ def _from_files(model: str, *, local_files_only: bool) -> tuple[Any, Any]:
         with torch.random.fork_rng():
             torch.manual_seed(0)
             return AutoModel.from_config(config).eval(), tokenizer
-    found = AutoModel.from_pretrained(model, use_safetensors=True, local_files_only=local_files_only)
-    return found.eval(), tokenizer
+    model_files = AutoModel.from_pretrained(model, use_safetensors=True, local_files_only=local_files_only)
+    return model_files.eval(), tokenizer

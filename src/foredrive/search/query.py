@@ -114,8 +114,8 @@ class Query:
             InputError: the text is not a query, or it is of another version.
         """
         try:
-            told: dict[str, Any] = json.loads(text)
-            return cls(**{field.name: told[field.name] for field in fields(cls)})
+            values: dict[str, Any] = json.loads(text)
+            return cls(**{field.name: values[field.name] for field in fields(cls)})
         except (ValueError, LookupError, TypeError) as error:
             raise InputError(f"not a query: {error}") from error
 
@@ -126,13 +126,13 @@ def parse_like(text: str) -> Like:
     Raises:
         InputError: the text has a wrong format.
     """
-    found = re.fullmatch(r"(.+)@(\d+(?:\.\d*)?)s?(?:/([^:/]+))?(?::(\d+),(\d+),(\d+),(\d+))?", text.strip())
-    if found is None or (found[4] is not None and found[3] is None):
+    match = re.fullmatch(r"(.+)@(\d+(?:\.\d*)?)s?(?:/([^:/]+))?(?::(\d+),(\d+),(\d+),(\d+))?", text.strip())
+    if match is None or (match[4] is not None and match[3] is None):
         raise InputError(f"{text!r}: an example is LOG@12.5s, LOG@12.5s/VIEW or LOG@12.5s/VIEW:10,20,110,90")
     crop = None
-    if found[4] is not None:
-        left, top, right, bottom = (int(found[n]) for n in (4, 5, 6, 7))
+    if match[4] is not None:
+        left, top, right, bottom = (int(match[n]) for n in (4, 5, 6, 7))
         if right <= left or bottom <= top:
             raise InputError(f"{text!r}: a crop is LEFT,TOP,RIGHT,BOTTOM in px, and this one is empty")
         crop = (left, top, right, bottom)
-    return Like(found[1], float(found[2]), found[3] or WHOLE, crop)
+    return Like(match[1], float(match[2]), match[3] or WHOLE, crop)

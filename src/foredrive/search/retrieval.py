@@ -14,11 +14,11 @@ def match_rank(queries: Float[np.ndarray, "n D"], gallery: Float[np.ndarray, "n 
     Both are unit vectors. Items that are as similar as the own one rank before it.
     """
     own = (queries * gallery).sum(axis=1)
-    found = [
+    shares = [
         (queries[start : start + ROWS_AT_ONCE] @ gallery.T >= own[start : start + ROWS_AT_ONCE, None] - _TIE)
         for start in range(0, len(queries), ROWS_AT_ONCE)
     ]
-    return np.concatenate([rows.sum(axis=1) for rows in found])
+    return np.concatenate([rows.sum(axis=1) for rows in shares])
 
 
 def mean_of_groups(
@@ -36,9 +36,9 @@ def mean_of_groups(
     np.add.at(total, (sequence, group), values)
     np.add.at(count, (sequence, group), 1)
     sums, counts = total[drawn].sum(axis=1), count[drawn].sum(axis=1)
-    there = counts > 0
-    means = np.where(there, sums / counts.clip(min=1), 0).sum(axis=1)
-    return np.where(there.any(axis=1), means / there.sum(axis=1).clip(min=1), np.nan)
+    filled = counts > 0
+    means = np.where(filled, sums / counts.clip(min=1), 0).sum(axis=1)
+    return np.where(filled.any(axis=1), means / filled.sum(axis=1).clip(min=1), np.nan)
 
 
 def draw_sequences(sequences: int, draws: int, seed: int) -> Int[np.ndarray, "B S"]:

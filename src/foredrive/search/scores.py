@@ -16,7 +16,7 @@ def read_scores(path: Path) -> dict[str, dict[str, float]]:
     Raises:
         InputError: a line is not such an object.
     """
-    found: dict[str, dict[str, float]] = {}
+    scores: dict[str, dict[str, float]] = {}
     try:
         lines = path.read_text(encoding="utf-8-sig").splitlines()
     except (OSError, UnicodeDecodeError) as error:
@@ -25,9 +25,9 @@ def read_scores(path: Path) -> dict[str, dict[str, float]]:
         if not line.strip():
             continue
         try:
-            told = json.loads(line)
-            log, _, t_us = told["frame"].rpartition("@")
-            found[f"{log}@{int(t_us)}"] = {name: float(told[name]) for name in SCORES if name in told}
+            row = json.loads(line)
+            log, _, t_us = row["frame"].rpartition("@")
+            scores[f"{log}@{int(t_us)}"] = {name: float(row[name]) for name in SCORES if name in row}
         except (ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
             raise InputError(f"{path}: line {number} does not score a frame: {error}") from error
-    return found
+    return scores

@@ -68,8 +68,8 @@ def example_target(index: FrameIndex, like: Like, towers: Towers) -> Target:
         InputError: there is no such log, moment or view, or it cannot be read.
     """
     views, moment = example_views(index, like, towers)
-    each = [embed_views(towers, [view]) for view in views.values()]
-    image, lidar = mean_direction(np.concatenate(each))
+    vectors = [embed_views(towers, [view]) for view in views.values()]
+    image, lidar = mean_direction(np.concatenate(vectors))
     return Target(None if np.isnan(image).any() else image, None if np.isnan(lidar).any() else lidar, moment)
 
 
@@ -83,8 +83,8 @@ def example_views(index: FrameIndex | None, like: Like, towers: Towers) -> Examp
         InputError: as `example_target`.
     """
     log = Log(_find_log(index, like.log))
-    frame, found = log.nearest_frames(np.array([log.t_us[0] + like.t_s * 1e6]))
-    if not found[0]:
+    frame, valid = log.nearest_frames(np.array([log.t_us[0] + like.t_s * 1e6]))
+    if not valid[0]:
         raise InputError(f"{log.path.name}: has nothing at {like.t_s:g} s; it lasts {_length_s(log):.1f} s")
     moment = (log.path.name, int(log.t_us[frame[0]]))
     if like.crop_px is not None:
@@ -108,10 +108,10 @@ def _find_log(index: FrameIndex | None, name: str) -> LogPath:
     if index is None:
         raise InputError(f"{name}: no folder of a log")
     ends = quoted("%/" + name.replace("%", ""))
-    found = index.select(
+    rows = index.select(
         f"view = {quoted(WHOLE)} AND (log = {quoted(name)} OR log LIKE {ends})", ["log", "folder", "maps_dir"]
     ).to_pylist()
-    logs = {row["log"]: LogPath(Path(row["folder"]), Path(row["maps_dir"])) for row in found}
+    logs = {row["log"]: LogPath(Path(row["folder"]), Path(row["maps_dir"])) for row in rows}
     if len(logs) != 1:
         raise InputError(
             f"{name}: no log of this name in the index, and no folder of one"
@@ -125,8 +125,8 @@ def _cropped(log: Log, frame: int, like: Like, towers: Towers) -> View:
     """Return a part of an image as a view. The towers' own crop applies to this part."""
     metadata = find_camera(pinhole_cameras(log), like.view)
     if metadata is None:
-        there = told_cameras(pinhole_cameras(log).values())
-        raise InputError(f"{log.path.name}: no camera {like.view}; there are: {there}")
+        cameras = told_cameras(pinhole_cameras(log).values())
+        raise InputError(f"{log.path.name}: no camera {like.view}; there are: {cameras}")
     camera = read_camera(log, frame, metadata, (metadata.height, metadata.width), with_image=True)
     assert like.crop_px is not None
     left, top, right, bottom = like.crop_px
@@ -137,9 +137,9 @@ def _cropped(log: Log, frame: int, like: Like, towers: Towers) -> View:
             else f"{log.path.name}: no image of {like.view} at {like.t_s:g} s"
         )
     part = cut_camera(camera, like.crop_px)
-    found = read_sweep(log, frame) if towers.has_lidar else None
+    sweep = read_sweep(log, frame) if towers.has_lidar else None
     seen = cut_camera(part, towers.crop.box_px((bottom - top, right - left)))
-    return View.of_camera(seen, None if found is None else found[0])
+    return View.of_camera(seen, None if sweep is None else sweep[0])
 
 
 def _length_s(log: Log) -> float:

@@ -105,14 +105,14 @@ def write_compare_report(path: Path, comparison: Comparison) -> None:
     )
 
 
-def _difference(metric: str, found: BootstrapMean, digits: int) -> Cell:
-    text = f"{found.mean:+z.{digits}f}"
-    if np.isnan(found.low):
+def _difference(metric: str, mean: BootstrapMean, digits: int) -> Cell:
+    text = f"{mean.mean:+z.{digits}f}"
+    if np.isnan(mean.low):
         return Cell(text)
-    text += f" [{found.low:z.{digits}f}, {found.high:z.{digits}f}]"
-    if found.low <= 0 <= found.high or metric in NEUTRAL:
+    text += f" [{mean.low:z.{digits}f}, {mean.high:z.{digits}f}]"
+    if mean.low <= 0 <= mean.high or metric in NEUTRAL:
         return Cell(text)
-    better = (found.mean > 0) != (metric in WORSE_IF_MORE)
+    better = (mean.mean > 0) != (metric in WORSE_IF_MORE)
     return Cell(text, "good" if better else "bad")
 
 

@@ -79,12 +79,12 @@ def _spread(frames: int) -> list[int]:
 
 def _commands(log: Log) -> Counter[str]:
     """Count the frames of each command."""
-    found: Counter[str] = Counter()
+    counts: Counter[str] = Counter()
     for frame in range(len(log)):
         command, _ = command_at(log, frame, log.driven_future(frame, HORIZON_STEPS, HORIZON_DT_S))
         if command is not None:
-            found[palette.label(command)] += 1
-    return found
+            counts[palette.label(command)] += 1
+    return counts
 
 
 def _shares(commands: Counter[str]) -> str:
@@ -140,8 +140,8 @@ def draw_drive_path(ax: Axes, log: Log) -> None:
 def _frames_every(xy: Float[np.ndarray, "F 2"], step_m: float) -> list[int]:
     """Return the first frame, the last, and those that are `step_m` of driving apart."""
     driven_m = arc_lengths(xy)
-    at = np.searchsorted(driven_m, np.arange(0, driven_m[-1], step_m))
-    return sorted({*at.tolist(), len(xy) - 1})
+    frames = np.searchsorted(driven_m, np.arange(0, driven_m[-1], step_m))
+    return sorted({*frames.tolist(), len(xy) - 1})
 
 
 def _lines_world(

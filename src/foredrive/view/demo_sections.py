@@ -177,21 +177,21 @@ def show_rebuilding(demo: Demo) -> Section:
 
 def show_search(demo: Demo) -> Section:
     """Search the recorded drives; show the hits."""
-    found = search_logs(demo)
-    hits = [hit for each in found for hit in each.hits]
+    results = search_logs(demo)
+    hits = [hit for result in results for hit in result.hits]
     return Section(
-        f"{len(hits)} hits for “{TEXTS[0]}” and {len(found) - 1} other queries",
+        f"{len(hits)} hits for “{TEXTS[0]}” and {len(results) - 1} other queries",
         _cover(hit_picture(hits[0])[:, :WIDTH_PX]) if hits else None,
         [
             Block(
-                query_line(each.query),
-                "" if each.hits else "Nothing was found.",
+                query_line(result.query),
+                "" if result.hits else "Nothing was found.",
                 figures=[
-                    picture(hit_picture(hit), f"{hit_name(hit)}: {content_text(hit)}") for hit in each.hits
+                    picture(hit_picture(hit), f"{hit_name(hit)}: {content_text(hit)}") for hit in result.hits
                 ],
                 columns="three",
             )
-            for each in found
+            for result in results
         ],
     )
 
@@ -231,7 +231,7 @@ def _scores(drives: Mapping[str, Driven]) -> Table:
     rows = []
     for title, drive in drives.items():
         record, score = drive.record, drive.record.score
-        wrong = ", ".join(words(each.kind) for each in score.infractions)
+        wrong = ", ".join(words(infraction.kind) for infraction in score.infractions)
         figures = (record.driving_score_1_0, 100 * score.completion, score.duration_s)
         rows.append((title, *figures, words(score.ending), wrong))
     return simple_table(columns, rows)

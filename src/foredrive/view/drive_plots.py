@@ -112,8 +112,8 @@ def _marks(drive: DriveRecord) -> list[tuple[float, Sequence[float], str, dict[s
         for number, event in enumerate(drive.scenario_events, start=1)
     ]
     return marks + [
-        (each.t_s, each.xy_world, LETTERS[each.kind], _style("circle", palette.PLAN))
-        for each in drive.score.infractions
+        (infraction.t_s, infraction.xy_world, LETTERS[infraction.kind], _style("circle", palette.PLAN))
+        for infraction in drive.score.infractions
     ]
 
 

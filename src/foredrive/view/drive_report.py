@@ -248,12 +248,14 @@ def _infraction_text(infraction: Infraction) -> str:
 
 def _show_drive(name: str, drive: DriveRecord) -> ShownDrive:
     score = drive.score
-    events = [DriveEvent(each.t_s, words(each.kind), _infraction_text(each)) for each in score.infractions]
+    events = [
+        DriveEvent(entry.t_s, words(entry.kind), _infraction_text(entry)) for entry in score.infractions
+    ]
     events += [
         DriveEvent(event.t_s, f"scenario {place}", words(event.what))
         for place, event in enumerate(drive.scenario_events, start=1)
     ]
-    events.sort(key=lambda each: each.t_s or 0.0)
+    events.sort(key=lambda entry: entry.t_s or 0.0)
     if drive.threat is not None:
         events.append(DriveEvent(None, f"{words(drive.threat.kind)} threat", threat_text(drive.threat)))
     return ShownDrive(

@@ -114,9 +114,9 @@ def _caption(pen: ImageDraw.ImageDraw, log: Log, index: int, drive: DriveRecord)
     t_s = float(log.t_us[index] - log.t_us[0]) * 1e-6
     font = ImageFont.load_default(size=16)
     pen.text((10, 8), f"{t_s:.1f} s   {log.speed_mps[index]:.1f} m/s", fill=palette.INK, font=font)
-    begun = [each for each in drive.scenario_events if 0.0 <= t_s - each.t_s < SCENARIO_CAPTION_S]
-    for each in begun[-1:]:
-        text = each.what.replace("_", " ")
+    begun = [event for event in drive.scenario_events if 0.0 <= t_s - event.t_s < SCENARIO_CAPTION_S]
+    for event in begun[-1:]:
+        text = event.what.replace("_", " ")
         pen.text((ABOVE_WH[0] - 10, 8), text, fill=palette.SCENARIO, font=font, anchor="ra")
     wrong = [infraction for infraction in drive.score.infractions if infraction.t_s <= t_s + 1e-6]
     for line, infraction in enumerate(wrong[-4:]):

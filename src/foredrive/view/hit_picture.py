@@ -79,15 +79,15 @@ def score_text(hit: Hit) -> str:
 def content_text(hit: Hit) -> str:
     """Return place, weather, speed and objects as text, as far as they are known."""
     row = hit.row
-    known = [fact for fact in (row.place, row.time_of_day, row.weather) if fact is not None]
+    facts = [fact for fact in (row.place, row.time_of_day, row.weather) if fact is not None]
     if row.ego_speed_mps is not None:
-        known.append(f"{row.ego_speed_mps:.1f} m/s")
+        facts.append(f"{row.ego_speed_mps:.1f} m/s")
     objects = [
         _counted(count, palette.label(category))
         for category, count in row.counts.items()
         if count and category in (Category.CAR, Category.TRUCK, Category.BUS, Category.PEDESTRIAN)
     ]
-    return ", ".join([*known, *objects])
+    return ", ".join([*facts, *objects])
 
 
 def _point(above: Image.Image, azimuth_deg: float) -> None:

@@ -51,9 +51,11 @@ def to_image(rgb: Float[Tensor, "3 H W"]) -> UInt8[np.ndarray, "H W 3"]:
     return (255 * rgb.clamp(0, 1)).round().byte().permute(1, 2, 0).cpu().numpy()
 
 
-def write_text(pen: ImageDraw.ImageDraw, at: tuple[int, int], text: str, size: int, colour: str) -> None:
+def write_text(
+    pen: ImageDraw.ImageDraw, corner_px: tuple[int, int], text: str, size: int, colour: str
+) -> None:
     """Write one line of text below and to the right of a point."""
-    pen.text(at, text, fill=colour, font=ImageFont.load_default(size=size))
+    pen.text(corner_px, text, fill=colour, font=ImageFont.load_default(size=size))
 
 
 def resize(image: UInt8[np.ndarray, "H W 3"], size_hw: tuple[int, int]) -> UInt8[np.ndarray, "h w 3"]:
@@ -208,8 +210,8 @@ def _draw_lines(
     canvas = Image.fromarray(image).resize(size, Image.Resampling.NEAREST)
     draw = ImageDraw.Draw(canvas)
     for points, rgb, width in lines:
-        at = [tuple(p) for p in (points * SUPERSAMPLING - 0.5).tolist()]
-        draw.line(at, fill=rgb, width=max(1, round(width * SUPERSAMPLING)))
+        points_px = [tuple(p) for p in (points * SUPERSAMPLING - 0.5).tolist()]
+        draw.line(points_px, fill=rgb, width=max(1, round(width * SUPERSAMPLING)))
     return np.asarray(canvas.resize((image.shape[1], image.shape[0]), Image.Resampling.BOX))
 
 

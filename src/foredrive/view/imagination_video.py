@@ -43,7 +43,7 @@ def draw_imagined(imagined: ImaginedFutures, step: int, frame_dt_s: float) -> Im
     rows = _camera_strips(imagined, step)
     label = imagined.example.occupancy
     frame = imagined.example.clip.now + step
-    truth, known = label.values[frame, 0] > 0.5, label.known[frame]
+    truth, valid = label.values[frame, 0] > 0.5, label.known[frame]
     panels = [("recorded", truth)]
     count = len(imagined.futures)
     panels += [
@@ -63,12 +63,14 @@ def draw_imagined(imagined: ImaginedFutures, step: int, frame_dt_s: float) -> Im
         y += TITLE_PX + strip.shape[0] + GAP_PX
     for number, (title, occupied) in enumerate(panels):
         line, column = divmod(number, COLUMNS)
-        at = (GAP_PX + column * (PANEL_PX + GAP_PX), y + line * cell_h)
-        columns = draw_comparison(occupied, truth, known, label.spec, ABOVE_GROUND_M)
+        corner_px = (GAP_PX + column * (PANEL_PX + GAP_PX), y + line * cell_h)
+        columns = draw_comparison(occupied, truth, valid, label.spec, ABOVE_GROUND_M)
         picture = with_ego(columns, label.spec)
         size_hw = (PANEL_PX * picture.shape[0] // picture.shape[1], PANEL_PX)
-        write_text(pen, (at[0], at[1] + 5), title, 13, palette.INK if number == 0 else palette.FAINT)
-        canvas.paste(Image.fromarray(resize(picture, size_hw)), (at[0], at[1] + TITLE_PX))
+        write_text(
+            pen, (corner_px[0], corner_px[1] + 5), title, 13, palette.INK if number == 0 else palette.FAINT
+        )
+        canvas.paste(Image.fromarray(resize(picture, size_hw)), (corner_px[0], corner_px[1] + TITLE_PX))
     _draw_key(pen, canvas.height - KEY_PX + 6)
     return canvas
 

@@ -129,8 +129,8 @@ class LogFrames:
         if self.run is None or self.taxonomy is None:
             return None
         frame = int(np.searchsorted(self._log.t_us, self.now_us[index]))
-        found = read_semantics(self._log, frame, self.run.recipe.clips.voxels, self.taxonomy, [])
-        return found.index if bool(found.known.any()) else None
+        semantics = read_semantics(self._log, frame, self.run.recipe.clips.voxels, self.taxonomy, [])
+        return semantics.index if bool(semantics.known.any()) else None
 
     def _prediction(self, index: int) -> "DisplayPrediction | None":
         """Predict with the run; None without a run, and at frames without enough past."""

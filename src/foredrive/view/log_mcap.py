@@ -95,9 +95,9 @@ def _write_sensors(mcap: _Mcap, log: Log, frame: int) -> None:
         calibration = foxglove.calibration_message(exposed_us, name, read.K, read.dist, size_hw)
         mcap.write(f"/{own}/calibration", t_us, calibration)
         mcap.write(f"/{own}/image", t_us, foxglove.image_message(exposed_us, name, encoded))
-    found = read_sweep(log, frame)
-    if found is not None:
-        mcap.write("/lidar", t_us, foxglove.cloud_message(t_us, found[0]))
+    sweep = read_sweep(log, frame)
+    if sweep is not None:
+        mcap.write("/lidar", t_us, foxglove.cloud_message(t_us, sweep[0]))
 
 
 def _write_labels(mcap: _Mcap, log: Log, frames: LogFrames, index: int, frame: int) -> None:
@@ -127,10 +127,10 @@ def _write_map(mcap: _Mcap, log: Log, frame: int) -> None:
 
 
 def _write_prediction(mcap: _Mcap, frames: LogFrames, run: Run, index: int, t_us: int) -> None:
-    found = frames.prediction(index)
-    if found is None:
+    prediction = frames.prediction(index)
+    if prediction is None:
         return
-    mcap.write("/plan", t_us, foxglove.path_message(t_us, found.plan))
-    occupied, spec = found.occupancy_logit[0] > 0, run.recipe.clips.voxels
+    mcap.write("/plan", t_us, foxglove.path_message(t_us, prediction.plan))
+    occupied, spec = prediction.occupancy_logit[0] > 0, run.recipe.clips.voxels
     colour = palette.rgb255(palette.PLAN)
     mcap.write("/occupancy", t_us, foxglove.voxels_message(t_us, occupied, spec, colour))

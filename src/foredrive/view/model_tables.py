@@ -17,7 +17,7 @@ def models_table(weights: Sequence[ShippedWeights]) -> Table:
         Column("commit", align="left"),
         Column("MB", digits=1),
     ]
-    rows = [(each.name, each.kind, each.recipe, each.commit, each.size / MB) for each in weights]
+    rows = [(entry.name, entry.kind, entry.recipe, entry.commit, entry.size / MB) for entry in weights]
     return simple_table(columns, rows)
 
 

@@ -69,8 +69,8 @@ def write_overview(path: Path, shown: Overview) -> None:
     for row, cameras in enumerate(rows):
         for column, camera in enumerate(cameras):
             picture = camera_picture(clip, camera, (cell_h, CAMERA_WIDTH_PX), with_boxes=False)
-            at = (GAP_PX + column * (CAMERA_WIDTH_PX + GAP_PX), CAPTION_PX + row * (cell_h + GAP_PX))
-            canvas.paste(Image.fromarray(picture), at)
+            corner_px = (GAP_PX + column * (CAMERA_WIDTH_PX + GAP_PX), CAPTION_PX + row * (cell_h + GAP_PX))
+            canvas.paste(Image.fromarray(picture), corner_px)
     voxels = occupancy_with_paths(shown, (body_h, VOXELS_WIDTH_PX))
     canvas.paste(Image.fromarray(voxels), (2 * GAP_PX + cameras_w, CAPTION_PX))
     seen = "camera images, with lidar returns" if bool(clip.sweep_valid[clip.now]) else "camera images"

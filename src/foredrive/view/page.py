@@ -35,8 +35,8 @@ def free_port(host: str, port: int) -> int:
     candidates = range(port, min(port + PORTS_TRIED, PORTS))
     for candidate in candidates:
         try:
-            with socket.create_server((host, candidate)) as found:
-                return int(found.getsockname()[1])
+            with socket.create_server((host, candidate)) as server:
+                return int(server.getsockname()[1])
         except OSError as error:
             if error.errno != errno.EADDRINUSE:
                 raise InputError(f"cannot serve a page at {host}:{candidate}: {error}") from error

@@ -124,17 +124,17 @@ class RebuiltNodes:
             self._actors.pop(gone).frame.remove()
         states = states_at(graph.tracks, t_s)
         for row, track_id in enumerate(ids):
-            there, own = bool(states.present[row]), graph.content.preview(row)
+            present, own = bool(states.present[row]), graph.content.preview(row)
             node = self._actors.get(track_id)
             if node is not None and not torch.equal(node.own.mean_m, own.mean_m):  # another actor, same id
                 self._actors.pop(track_id).frame.remove()
                 node = None
-            if node is None and there:
+            if node is None and present:
                 node = self._actors[track_id] = self._added(graph, row, own)
             if node is not None:
                 _place(node.frame, states.T_scene_actor[row])
-                node.frame.visible = there
-                if not there:
+                node.frame.visible = present
+                if not present:
                     node.frame.position = HIDDEN_AT_M
         self.show_layers()
 

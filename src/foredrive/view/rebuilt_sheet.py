@@ -46,8 +46,8 @@ def write_rebuilt_sheet(
         assert view.image is not None
         picture = scene.camera(graph or scene.graph, view.to(scene.device))
         real, rgb = view.image.float() / 255, picture.rgb.clamp(0, 1).cpu()
-        known = torch.ones(1, *view.size_hw, dtype=torch.bool)
-        quality = float(psnr_db(rgb[None], real[None], known))
+        valid = torch.ones(1, *view.size_hw, dtype=torch.bool)
+        quality = float(psnr_db(rgb[None], real[None], valid))
         shown = {
             f"recorded at {view.t_s:.1f} s": to_image(real),
             f"rendered, {quality:.1f} dB": to_image(rgb),

@@ -149,9 +149,9 @@ def _tiles(summary: Summary) -> list[MetricTile]:
         ("uniad.collision_avg_pct", "Planning collisions, UniAD, average", "%"),
     ):
         others = {name: summary.get(f"planning.{name}.{metric}") for name in REFERENCES}
-        known = [f"{AGENT_TITLES.get(name, words(name))}: {number(value, 2)} {unit}"
+        baselines = [f"{AGENT_TITLES.get(name, words(name))}: {number(value, 2)} {unit}"
                  for name, value in others.items() if value is not None]  # fmt: skip
-        note = known[0] if known else ""
+        note = baselines[0] if baselines else ""
         add(title, summary.get(f"planning.{metric}"), 2, unit, note)
     add("Cars found, AP at 2 m within 30 m", summary.get("detection.car_ap_2m_30m"), 3)
     add("Semantic voxels, RayIoU", summary.get("occupancy.occ3d.rayiou_pct"), 1, "%")

@@ -47,8 +47,8 @@ def show_boxes(scene: viser.SceneApi, clip: Clip) -> None:
     edges = torch.tensor([*EDGES, (0, 5), (1, 4)])  # corners 0, 1, 5, 4 are the front
     corners = box_corners(boxes.centre, boxes.size_lwh, boxes.yaw)
     colours = np.array([palette.rgb255(palette.box_colour(kind)) for kind in boxes.category.tolist()])
-    each = np.repeat(colours.reshape(-1, 3), 2 * len(edges), axis=0)
-    _lines(scene, "/boxes", corners[:, edges].flatten(0, 1), each.reshape(-1, 2, 3), width=2.5)
+    line_colours = np.repeat(colours.reshape(-1, 3), 2 * len(edges), axis=0)
+    _lines(scene, "/boxes", corners[:, edges].flatten(0, 1), line_colours.reshape(-1, 2, 3), width=2.5)
 
 
 def show_map(scene: viser.SceneApi, clip: Clip) -> None:

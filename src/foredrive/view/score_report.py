@@ -176,7 +176,7 @@ def write_score_report(
         "score_report.html.j2",
         title=title,
         table=score_table(figures),
-        diagrams=[inline_svg(draw_reliability(*each)) for each in scored.summary.diagrams.items()],
+        diagrams=[inline_svg(draw_reliability(*diagram)) for diagram in scored.summary.diagrams.items()],
         frames=[
             (inline_svg(draw_detection_frame(frame, score, scored.detections.is_3d)), _caption(score))
             for frame, score in ranked[:worst]

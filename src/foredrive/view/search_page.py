@@ -173,9 +173,9 @@ class SearchPage:
     def _find(self, asked: Mapping[str, str]) -> ShownHits:
         query = query_of(asked)
         with self._one_at_a_time:
-            found = ask(self._index, query, self._towers)
-        how = "all compared" if found.exact else f"{found.compared} compared"
-        return ShownHits([*map(ShownHit.of, found.hits)], f"{len(found.hits)} hits, {how}")
+            result = ask(self._index, query, self._towers)
+        how = "all compared" if result.exact else f"{result.compared} compared"
+        return ShownHits([*map(ShownHit.of, result.hits)], f"{len(result.hits)} hits, {how}")
 
     def _map(self) -> SceneMap:
         plane = project_scenes(self._index)
@@ -231,8 +231,8 @@ def query_of(asked: Mapping[str, str]) -> Query:
     Raises:
         InputError: the fields make no valid query.
     """
-    known = {field.name for field in fields(Query)}
-    given = {name: value for name, value in asked.items() if name in known and value.strip()}
+    names = {field.name for field in fields(Query)}
+    given = {name: value for name, value in asked.items() if name in names and value.strip()}
     query: Query = validated(Query, given, "the query")
     if query.top > MAX_TOP:
         raise InputError(f"the page shows at most {MAX_TOP} hits")

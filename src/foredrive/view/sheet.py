@@ -34,15 +34,17 @@ class Sheet:
         self, x: int, y: int, text: str, size_pt: float, colour: str = palette.INK, weight: str = "normal"
     ) -> None:
         """Write lines of text below a point; a dollar sign starts no formula."""
-        at = (x / self.width, 1 - y / self.height)
-        written = self.figure.text(*at, text, color=colour, fontsize=size_pt, va="top", parse_math=False)
+        position = (x / self.width, 1 - y / self.height)
+        written = self.figure.text(
+            *position, text, color=colour, fontsize=size_pt, va="top", parse_math=False
+        )
         written.set(linespacing=1.5 if "\n" in text else 1.2, weight=weight)
 
     def head(self, x: int, height: int, text: str, size_pt: float) -> None:
         """Write a title into the middle of the upper margin; shrink a long one to fit."""
         size_pt = min(size_pt, PT_PER_PX * self.width / max(len(text), 1))
-        at = (x / self.width, 1 - height / 2 / self.height)
-        self.figure.text(*at, text, color=palette.INK, fontsize=size_pt, va="center", parse_math=False)
+        position = (x / self.width, 1 - height / 2 / self.height)
+        self.figure.text(*position, text, color=palette.INK, fontsize=size_pt, va="center", parse_math=False)
 
     def save(self, path: Path) -> None:
         """Write the picture as a PNG; it is written completely or not at all."""

@@ -143,8 +143,8 @@ def occupancy_table(summary: Summary) -> Table | None:
     whens = [match[1] for key in summary if (match := _OCCUPANCY.fullmatch(key))]
     if not whens:
         return None
-    found = dict.fromkeys(match[1] for key in summary if (match := _BASELINE.fullmatch(key)))
-    others = [name for name in found if name != PRIOR and "threshold" not in name]
+    names = dict.fromkeys(match[1] for key in summary if (match := _BASELINE.fullmatch(key)))
+    others = [name for name in names if name != PRIOR and "threshold" not in name]
     columns = [
         Column(align="left"),
         *(Column(title, "this model") for title in OCCUPANCY_TITLES.values()),
@@ -174,9 +174,9 @@ def occupancy_table(summary: Summary) -> Table | None:
 def flow_table(summary: Summary) -> Table | None:
     """Compare flow errors on moving voxels, now and later, with the errors of predicting no motion."""
     rows = [
-        (time_title(found[1]), value, summary.get(f"{key}.no_motion"))
+        (time_title(match[1]), value, summary.get(f"{key}.no_motion"))
         for key, value in summary.items()
-        if (found := _FLOW.fullmatch(key))
+        if (match := _FLOW.fullmatch(key))
     ]
     columns = (
         Column(align="left"),
@@ -190,13 +190,13 @@ def vehicle_table(summary: Summary) -> Table | None:
     """List the recall of the columns that hold a car and the precision of all columns, by range."""
     rows = [
         (
-            f"within {found[1]} m",
+            f"within {match[1]} m",
             value,
-            summary.get(f"vehicles.car_columns_{found[1]}m"),
-            summary.get(f"vehicles.column_precision_{found[1]}m"),
+            summary.get(f"vehicles.car_columns_{match[1]}m"),
+            summary.get(f"vehicles.column_precision_{match[1]}m"),
         )
         for key, value in summary.items()
-        if (found := _VEHICLES.fullmatch(key))
+        if (match := _VEHICLES.fullmatch(key))
     ]
     columns = (Column(align="left"), Column("recall"), Column("columns", digits=0), Column("precision, all"))
     return simple_table(columns, rows, "Columns of the grid that hold a car") if rows else None
@@ -255,9 +255,9 @@ def prior_comparison(summary: Summary, key: str) -> str:
 
 def _planning_methods(summary: Summary) -> tuple[list[str], list[str]]:
     """Return the agents, the model first, and the protocols that have planning metrics."""
-    found = [match for key in summary if (match := _PLANNING.match(key))]
-    agents = sorted({match[1] or MODEL for match in found}, key=lambda agent: (agent != MODEL, agent))
-    return agents, [name for name in PROTOCOLS if any(match[2] == name for match in found)]
+    matches = [match for key in summary if (match := _PLANNING.match(key))]
+    agents = sorted({match[1] or MODEL for match in matches}, key=lambda agent: (agent != MODEL, agent))
+    return agents, [name for name in PROTOCOLS if any(match[2] == name for match in matches)]
 
 
 def _planning_rows(summary: Summary, agents: Sequence[str], keys: Sequence[str]) -> list[Row]:

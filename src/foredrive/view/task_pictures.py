@@ -76,8 +76,12 @@ def true_scene(shown: ExamplePrediction) -> SeenScene:
         agents = _kept(SeenAgents(boxes, names, futures), boxes.valid)
     lines = None
     if truth is not None and truth.elements is not None and bool(truth.elements.known):
-        each = zip(truth.elements.kind.tolist(), truth.elements.vertices, truth.elements.valid, strict=True)
-        lines = [(ElementKind(kind), line[valid].numpy()) for kind, line, valid in each if kind in CLASSES]
+        elements = zip(
+            truth.elements.kind.tolist(), truth.elements.vertices, truth.elements.valid, strict=True
+        )
+        lines = [
+            (ElementKind(kind), line[valid].numpy()) for kind, line, valid in elements if kind in CLASSES
+        ]
     semantics = None if truth is None else truth.semantics
     voxels = None if semantics is None or not bool(semantics.known.any()) else semantics.index.numpy()
     return SeenScene(agents, lines, voxels)
@@ -88,9 +92,11 @@ def found_scene(prediction: Prediction) -> SeenScene:
     agents = None if prediction.agents is None else found_agents(prediction.agents[0].to("cpu"))
     lines = None
     if prediction.map_lines is not None:
-        found = prediction.map_lines[0].to("cpu")
-        each = zip(found.kind.tolist(), found.points.numpy(), found.score.tolist(), strict=True)
-        lines = [(ElementKind(kind), line) for kind, line, score in each if score >= MIN_SCORE]
+        map_lines = prediction.map_lines[0].to("cpu")
+        elements = zip(
+            map_lines.kind.tolist(), map_lines.points.numpy(), map_lines.score.tolist(), strict=True
+        )
+        lines = [(ElementKind(kind), line) for kind, line, score in elements if score >= MIN_SCORE]
     voxels = None if prediction.semantics is None else prediction.semantics[0].cpu().numpy()
     return SeenScene(agents, lines, voxels)
 
@@ -114,9 +120,9 @@ def found_agents(agents: Agents) -> SeenAgents:
     futures: list[list[tuple[ndarray, float]]] = [[] for _ in names]
     if agents.future_xy is not None and agents.log_prob is not None:
         for n, (modes, log_prob) in enumerate(zip(agents.future_xy, agents.log_prob, strict=True)):
-            each = zip(modes.numpy(), log_prob.exp().tolist(), strict=True)
+            alternatives = zip(modes.numpy(), log_prob.exp().tolist(), strict=True)
             likeliest = float(log_prob.exp().max())
-            futures[n] = [(mode, p) for mode, p in each if p >= min(MIN_PROBABILITY, likeliest)]
+            futures[n] = [(mode, p) for mode, p in alternatives if p >= min(MIN_PROBABILITY, likeliest)]
     return SeenAgents(boxes, names, futures)
 
 
@@ -134,30 +140,30 @@ def task_pictures(shown: ExamplePrediction, front: int | None) -> list[list[Pict
     """
     if shown.tasks is None:
         return []
-    true, found = true_scene(shown), found_scene(shown.tasks)
+    true, predicted = true_scene(shown), found_scene(shown.tasks)
     spec, clip = shown.example.occupancy.spec, shown.example.clip
     rows = []
-    if found.agents is not None or found.lines is not None:
+    if predicted.agents is not None or predicted.lines is not None:
         rows.append(
             [
                 picture(
                     scene_picture(true, spec), "Truth: boxes with track ids and 6 s, map elements", "png"
                 ),
-                picture(scene_picture(found, spec), f"Found, scores of {MIN_SCORE} and more", "png"),
+                picture(scene_picture(predicted, spec), f"Found, scores of {MIN_SCORE} and more", "png"),
             ]
         )
-    if front is not None and found.agents is not None:
+    if front is not None and predicted.agents is not None:
         titles = (f"{clip.rig.names[front]}: true boxes", "Found boxes")
         rows.append(
             [
                 picture(camera_boxes(clip, front, None if side.agents is None else side.agents.boxes), title)
-                for side, title in zip((true, found), titles, strict=True)
+                for side, title in zip((true, predicted), titles, strict=True)
             ]
         )
     semantics = None if shown.example.truth is None else shown.example.truth.semantics
-    if found.voxels is not None and semantics is not None:
+    if predicted.voxels is not None and semantics is not None:
         captions = ("True classes, the highest voxel of each column", "Predicted classes")
-        sides = (true.voxels, found.voxels)
+        sides = (true.voxels, predicted.voxels)
         rows.append(
             [
                 picture(voxels_picture(voxels, semantics.taxonomy, spec), caption, "png")

@@ -92,7 +92,7 @@ def height_colours(spec: VoxelSpec) -> UInt8[np.ndarray, "Z Y X 3"]:
 def draw_comparison(
     predicted: Bool[Tensor, "Z Y X"],
     label: Bool[Tensor, "Z Y X"],
-    known: Bool[Tensor, "Z Y X"],
+    valid: Bool[Tensor, "Z Y X"],
     spec: VoxelSpec,
     above_m: float,
 ) -> UInt8[np.ndarray, "X Y 3"]:
@@ -102,7 +102,7 @@ def draw_comparison(
     hide everything else. Forward points up, left points left.
     """
     z = spec.lower_m[2] + (torch.arange(spec.shape_zyx[0]) + 0.5) * spec.voxel_m
-    counts = known & (z > above_m)[:, None, None]
+    counts = valid & (z > above_m)[:, None, None]
     truth, guess, seen = (label & counts).any(0), (predicted & counts).any(0), counts.any(0)
     picture = torch.tensor(palette.rgb255(palette.GROUND), dtype=torch.uint8).repeat(*seen.shape, 1)
     for where, colour in (
@@ -183,8 +183,8 @@ def _march(occupied, origin, direction, cell, step, to_next, per_cell):
     if near >= far:
         return -1.0, -1
     for i in range(3):
-        at = origin[i] + (near + 1e-9) * direction[i]
-        cell[i] = min(max(math.floor(at), 0), shape[i] - 1)
+        point = origin[i] + (near + 1e-9) * direction[i]
+        cell[i] = min(max(math.floor(point), 0), shape[i] - 1)
         step[i], per_cell[i], to_next[i] = 0, math.inf, math.inf
         if direction[i] != 0.0:
             step[i] = 1 if direction[i] > 0 else -1

@@ -94,12 +94,12 @@ def _pages(bucket: str, query: dict[str, str]) -> Iterator[ET.Element]:
 
 
 def _text(entry: ET.Element, name: str) -> str:
-    found = entry.find(f"{{*}}{name}")
-    return "" if found is None or found.text is None else found.text
+    child = entry.find(f"{{*}}{name}")
+    return "" if child is None or child.text is None else child.text
 
 
 def download(
-    bucket: str, found: S3Object, file: Path, tick: Callable[[int], None], pause_s: float = 1.0
+    bucket: str, entry: S3Object, file: Path, tick: Callable[[int], None], pause_s: float = 1.0
 ) -> None:
     """Download an object, from where an earlier download of it stopped, and check its size and MD5.
 
@@ -108,7 +108,7 @@ def download(
 
     Args:
         bucket: address of the bucket.
-        found: the object.
+        entry: the object.
         file: where it goes.
         tick: called with the number of bytes that came, which may be negative when a download starts anew.
         pause_s: time before the second try; it doubles with each.
@@ -116,35 +116,35 @@ def download(
     Raises:
         InputError: it cannot be had within `TRIES` tries, or its content is not what the listing says.
     """
-    if file.is_file() and file.stat().st_size == found.size:
-        tick(found.size)
+    if file.is_file() and file.stat().st_size == entry.size:
+        tick(entry.size)
         return
     file.parent.mkdir(parents=True, exist_ok=True)
     part = file.with_name(file.name + ".part")
-    tick(min(part.stat().st_size, found.size) if part.is_file() else 0)
+    tick(min(part.stat().st_size, entry.size) if part.is_file() else 0)
     for attempt in range(TRIES):
         try:
-            _continue(f"{bucket}/{urllib.parse.quote(found.key)}", found, part, tick)
+            _continue(f"{bucket}/{urllib.parse.quote(entry.key)}", entry, part, tick)
             break
         except InputError:
             raise
         except _NETWORK as error:
             if attempt + 1 == TRIES:
                 raise InputError(
-                    f"{bucket}/{found.key}: {_told(error)} ({TRIES} tries); start again to go on"
+                    f"{bucket}/{entry.key}: {_told(error)} ({TRIES} tries); start again to go on"
                 ) from error
             time.sleep(pause_s * 2**attempt)
     os.replace(part, file)
 
 
-def _continue(url: str, found: S3Object, part: Path, tick: Callable[[int], None]) -> None:
+def _continue(url: str, entry: S3Object, part: Path, tick: Callable[[int], None]) -> None:
     """Download what is missing of `part`, and check it."""
     have = part.stat().st_size if part.is_file() else 0
-    if have > found.size:
+    if have > entry.size:
         part.unlink()
         have = 0
-    if have < found.size or not part.is_file():
-        headers = {"Range": f"bytes={have}-", "If-Range": f'"{found.etag}"'} if have else {}
+    if have < entry.size or not part.is_file():
+        headers = {"Range": f"bytes={have}-", "If-Range": f'"{entry.etag}"'} if have else {}
         with _opened(url, headers) as answer:
             if have and answer.status != http.client.PARTIAL_CONTENT:  # it has changed, or knows no ranges
                 tick(-have)
@@ -152,13 +152,13 @@ def _continue(url: str, found: S3Object, part: Path, tick: Callable[[int], None]
             with part.open("ab" if have else "wb") as file:
                 while chunk := answer.read(CHUNK_BYTES):
                     have += len(chunk)
-                    if have > found.size:
-                        raise InputError(f"{url}: it has more than the {found.size} bytes of the listing")
+                    if have > entry.size:
+                        raise InputError(f"{url}: it has more than the {entry.size} bytes of the listing")
                     file.write(chunk)
                     tick(len(chunk))
-        if have < found.size:
-            raise ConnectionError(f"it ended after {have} of {found.size} bytes")
-    if found.md5 is not None and _md5(part) != found.md5:
+        if have < entry.size:
+            raise ConnectionError(f"it ended after {have} of {entry.size} bytes")
+    if entry.md5 is not None and _md5(part) != entry.md5:
         part.unlink()
         raise InputError(
             f"{url}: its content is not what the listing says (MD5); start again to fetch it anew"

@@ -206,8 +206,8 @@ class BagLog:
         stamps = np.unique(index.stamps_us(first))
         for frame in (topics.world_frame, topics.ego_frame):
             if frame not in tree.frames:
-                known = ", ".join(sorted(tree.frames)) or "none"
-                raise InputError(f"{self.bag}: no transform has the frame {frame!r}; there are: {known}")
+                names = ", ".join(sorted(tree.frames)) or "none"
+                raise InputError(f"{self.bag}: no transform has the frame {frame!r}; there are: {names}")
         low, high = tree.span_us(topics.world_frame, topics.ego_frame)
         kept = stamps[(stamps >= low) & (stamps <= high)]
         if not len(kept):

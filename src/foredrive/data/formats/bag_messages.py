@@ -281,15 +281,15 @@ def read_placed(message: Any) -> Iterator[Placed]:
 def _transform(message: Any) -> Placed:
     child = str(message.child_frame_id).lstrip("/")
     if hasattr(message, "parent_frame_id"):
-        parent, at, turn = message.parent_frame_id.lstrip("/"), message.translation, message.rotation
+        parent, xyz, turn = message.parent_frame_id.lstrip("/"), message.translation, message.rotation
     else:
-        parent, at, turn = frame_of(message), message.transform.translation, message.transform.rotation
-    return Placed(parent, child, stamp_us(message), _matrix(at, turn))
+        parent, xyz, turn = frame_of(message), message.transform.translation, message.transform.rotation
+    return Placed(parent, child, stamp_us(message), _matrix(xyz, turn))
 
 
-def _matrix(at: Any, turn: Any) -> Float64[np.ndarray, "4 4"]:
+def _matrix(xyz: Any, turn: Any) -> Float64[np.ndarray, "4 4"]:
     quaternion = np.array([turn.x, turn.y, turn.z, turn.w], np.float64)
-    position = np.array([at.x, at.y, at.z], np.float64)
+    position = np.array([xyz.x, xyz.y, xyz.z], np.float64)
     if not np.isfinite(position).all() or not 0.5 < np.linalg.norm(quaternion) < 2.0:
         raise InputError("a pose that is not finite, or whose quaternion is none")
     T = np.eye(4)

@@ -55,16 +55,16 @@ def find_raw_logs(source: Path, dataset: str, topics: Path | None = None) -> Ite
         raise InputError(f"unknown data set {dataset!r}; there are: {', '.join(DATASETS)}")
     if not source.exists():
         raise InputError(f"{source}: no such folder")
-    kind, found = DATASETS[dataset], False
+    kind, any_log = DATASETS[dataset], False
     logs = iter(kind.find(source) if topics is None else find_bags(source, topics))
     while True:
         with reading_raw(source):
             raw = next(logs, None)
         if raw is None:
             break
-        found = True
+        any_log = True
         yield raw
-    if not found:
+    if not any_log:
         raise InputError(f"{source}: no {dataset} log here (looked for {kind.layout})")
 
 

@@ -30,7 +30,7 @@ class FrameTree:
             else:
                 place = f"{one.child} in {one.parent}, at {one.t_us * 1e-6:.3f} s"
                 note("transforms", f"second parents of a frame, beside {parent}, left out", place)
-        self._times = {child: np.array(sorted(found), np.int64) for child, found in poses.items()}
+        self._times = {child: np.array(sorted(stamped), np.int64) for child, stamped in poses.items()}
         self._poses = {
             child: np.stack([poses[child][t_us] for t_us in times.tolist()])
             for child, times in self._times.items()
@@ -75,8 +75,8 @@ class FrameTree:
         roots = [self._root(first), self._root(second)]
         if roots[0] != roots[1]:
             raise InputError(f"the frames {first!r} and {second!r} are not connected by transforms")
-        at = np.array([float(t_us)])
-        T_root_first, T_root_second = (self.pose(roots[0], name, at)[0] for name in (first, second))
+        time_us = np.array([float(t_us)])
+        T_root_first, T_root_second = (self.pose(roots[0], name, time_us)[0] for name in (first, second))
         return np.asarray(np.linalg.inv(T_root_first) @ T_root_second)
 
     def _root(self, frame: str) -> str:

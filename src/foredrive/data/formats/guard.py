@@ -221,10 +221,10 @@ def _note(event: str, details: tuple[Any, ...]) -> None:
 
 def _place(error: Exception) -> str:
     """Return in which file the error arose, if the error does not say it."""
-    found = _LastOpened.file
-    if found is None or found == _LastOpened.below or Path(found).name in str(error):
+    opened = _LastOpened.file
+    if opened is None or opened == _LastOpened.below or Path(opened).name in str(error):
         return ""
-    return f" (in {os.path.relpath(found, _LastOpened.below)})"
+    return f" (in {os.path.relpath(opened, _LastOpened.below)})"
 
 
 def _reason(error: Exception) -> str:

@@ -127,7 +127,7 @@ class KittiObjectParser(BaseLogParser):
     def _boxes(self, calibration: "_Calibration") -> list[BaseModality]:
         """Return the boxes and their attributes. A row that is none is left out."""
         file = self._file("label_2", "txt")
-        detections, known = [], []
+        detections, kinds = [], []
         read = PartReader(f"label_2/{file.name}", "rows")
         for number, line in enumerate(file.read_text(encoding="utf-8-sig").splitlines()):
             if not line.strip() or line.split()[0] == _NOT_LABELLED:
@@ -140,10 +140,10 @@ class KittiObjectParser(BaseLogParser):
             attributes = BoxDetectionAttributes(LABEL_OF_CATEGORY[category], str(number), None)
             box = BoundingBoxSE3(pose, *label.size_lwh_m)
             detections.append(BoxDetectionSE3(attributes, box, None))
-            known.append(_ATTRIBUTE.get(label.kind, UNKNOWN))
+            kinds.append(_ATTRIBUTE.get(label.kind, UNKNOWN))
         read.check()
         boxes = BoxDetectionsSE3(detections, _NOW, BoxDetectionsSE3Metadata(NuScenesBoxDetectionLabel))
-        return [boxes, attributes_modality(known, _NOW)]
+        return [boxes, attributes_modality(kinds, _NOW)]
 
     def _file(self, kind: str, suffix: str) -> Path:
         return self._folder / kind / f"{self._frame}.{suffix}"

@@ -272,12 +272,12 @@ def _channels(azimuth: Float64[np.ndarray, "P"]) -> np.ndarray | None:
 
 def _numbers(file: Path) -> dict[str, Float64[np.ndarray, "K"]]:
     """Return the entries of a calibration file that are numbers."""
-    found = {}
+    numbers = {}
     for line in file.read_text(encoding="utf-8-sig").splitlines():
         name, _, words = line.partition(":")
         if name.startswith(("R", "T", "P_rect", "S_rect")):
-            found[name] = np.array([float(word) for word in words.split()])
-    return found
+            numbers[name] = np.array([float(word) for word in words.split()])
+    return numbers
 
 
 def _record(file: Path, t_us: int) -> list[float]:
@@ -301,15 +301,15 @@ def _time_of(times_us: Int64[np.ndarray, "N"], frame: int) -> int:
 
 def _times_us(file: Path) -> Int64[np.ndarray, "N"]:
     """Return the times of a file with one in each line. The lines of lost frames are empty; they give 0."""
-    found = []
+    times = []
     for line in file.read_text(encoding="utf-8-sig").rstrip().split("\n"):
         if not line.strip():
-            found.append(0)
+            times.append(0)
         else:
             whole, _, part = line.strip().partition(".")
             seconds = datetime.fromisoformat(whole).replace(tzinfo=UTC).timestamp()
-            found.append(round(seconds) * 1_000_000 + int(part.ljust(6, "0")[:6]))
-    return np.array(found, dtype=np.int64)
+            times.append(round(seconds) * 1_000_000 + int(part.ljust(6, "0")[:6]))
+    return np.array(times, dtype=np.int64)
 
 
 def _rigid(R: Float64[np.ndarray, "9"], t: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, "4 4"]:

@@ -220,9 +220,9 @@ def _number(value: Any, key: str, where: str) -> float:
     return float(value)
 
 
-def _pose(found: dict[str, Any], where: str) -> Float64[np.ndarray, "4 4"]:
+def _pose(entry: dict[str, Any], where: str) -> Float64[np.ndarray, "4 4"]:
     try:
-        T = np.array(found["transform_matrix"], np.float64)
+        T = np.array(entry["transform_matrix"], np.float64)
     except (ValueError, TypeError) as error:
         raise InputError(f"{where}: transform_matrix must be 4 rows of 4 numbers") from error
     if T.shape != (4, 4) or not np.isfinite(T).all():

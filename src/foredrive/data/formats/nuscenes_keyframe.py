@@ -116,15 +116,15 @@ class NuScenesKeyframeParser(BaseLogParser):
 
     def _labels(self, boxes: BoxDetectionsSE3) -> list[BaseModality]:
         """Return attributes and visibilities of the boxes from the annotations at the same places."""
-        rows, found = self._rows.get("sample_annotation", []), list(boxes.box_detections)
-        if not rows or not found:
+        rows, detections = self._rows.get("sample_annotation", []), list(boxes.box_detections)
+        if not rows or not detections:
             return []
-        centres = np.array([box.bounding_box_se3.center_se3.point_3d.array for box in found])
+        centres = np.array([box.bounding_box_se3.center_se3.point_3d.array for box in detections])
         apart_m, nearest = KDTree([row["translation"] for row in rows]).query(centres)
         near_enough = (np.atleast_1d(apart_m) < _SAME_PLACE_M).tolist()
         matched = [
-            rows[at] if near else None
-            for at, near in zip(np.atleast_1d(nearest).tolist(), near_enough, strict=True)
+            rows[row_index] if near else None
+            for row_index, near in zip(np.atleast_1d(nearest).tolist(), near_enough, strict=True)
         ]
         names = {row["token"]: row["name"] for row in self._rows["attribute"]}
         attributes = [attribute_of_row(row, names) for row in matched]

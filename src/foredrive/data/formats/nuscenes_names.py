@@ -23,8 +23,8 @@ def camera_channel(camera: PinholeCameraMetadata) -> str:
     123D's PCAM_F0, B0, L0, R0, L1 and R1 are CAM_FRONT, CAM_BACK, CAM_FRONT_LEFT, …, CAM_BACK_RIGHT. Another
     camera, such as PCAM_L2, is CAM_L2.
     """
-    known: dict[CameraID, str] = NUSCENES_CAMERA_IDS
-    return known.get(camera.camera_id, _OTHER_CAMERA + camera.camera_id.name.removeprefix(_PINHOLE))
+    channels: dict[CameraID, str] = NUSCENES_CAMERA_IDS
+    return channels.get(camera.camera_id, _OTHER_CAMERA + camera.camera_id.name.removeprefix(_PINHOLE))
 
 
 def camera_of_channel(channel: str) -> CameraID | None:

@@ -151,17 +151,17 @@ class NuScenesTablesParser(BaseLogParser):
                 continue
             timestamp = Timestamp.from_us(frame["timestamp"])
             pose = pose_of_matrix(self._ego_pose(frame))
-            found: list[BaseModality] = [
+            modalities: list[BaseModality] = [
                 EgoStateSE3.from_imu(pose, NUSCENES_EGO_STATE_SE3_METADATA, timestamp)
             ]
             if frame["is_key_frame"]:
-                found += self._boxes(frame["sample_token"], timestamp)
+                modalities += self._boxes(frame["sample_token"], timestamp)
             if LIDAR in readings:
-                found.append(self._lidar(frame))
+                modalities.append(self._lidar(frame))
             for camera_id, rows in cameras.items():
                 beside = _beside(frame, rows)
-                found += [] if beside is None else [self._camera(camera_id, beside)]
-            yield ModalitiesSync(timestamp, found)
+                modalities += [] if beside is None else [self._camera(camera_id, beside)]
+            yield ModalitiesSync(timestamp, modalities)
 
     def _camera_ids(self, readings: dict[str, list[Row]]) -> dict[str, CameraID]:
         """Return 123D's cameras of the channels with images: by the names of channels, else by direction."""

@@ -237,13 +237,13 @@ def _check_json(file: Path, schema: Any) -> None:
 def _attributes(cuboids: Path) -> dict[str, int]:
     """Return the attribute of each cuboid by its uuid."""
     table = load_table(cuboids)
-    found = dict.fromkeys(table["uuid"].tolist(), UNKNOWN)
+    attributes = dict.fromkeys(table["uuid"].tolist(), UNKNOWN)
     for column, attribute_of in _ATTRIBUTE_OF_VALUE.items():
         values = table[column].tolist() if column in table.columns else []
         for uuid, value in zip(table["uuid"].tolist(), values, strict=False):
-            if found[uuid] == UNKNOWN and value in attribute_of:
-                found[uuid] = attribute_of[value]
-    return found
+            if attributes[uuid] == UNKNOWN and value in attribute_of:
+                attributes[uuid] = attribute_of[value]
+    return attributes
 
 
 pandaset_sensor_io.read_json = _by_number  # it reads the poses of the front camera and nothing else

@@ -88,10 +88,10 @@ def _leave_unknown_speed_out(parser: Any) -> None:
 
     def speed(bus: Any, scene: str, t_us: int) -> Any:
         try:
-            known = bus is not None and bool(bus.get_messages(scene, "pose"))
+            has_speed = bus is not None and bool(bus.get_messages(scene, "pose"))
         except Exception:  # the devkit's own error for a scene without messages
-            known = False
-        return find(bus, scene, t_us) if known else None
+            has_speed = False
+        return find(bus, scene, t_us) if has_speed else None
 
     extraction._find_dynamic_state_from_can_bus = speed
     parser.NuScenesCanBus = _can_bus
@@ -181,13 +181,13 @@ def griffin(source: Path) -> Iterator[RawLog]:
 
 def truckdrive(source: Path) -> Iterator[RawLog]:
     """Find TruckDrive's scenes. Those of its test split have no poses and are left out."""
-    found = folders_with(source, "calibrations/calib_tf_tree_full.json")
-    for root in dict.fromkeys(folder.parent for folder in found):
+    folders = folders_with(source, "calibrations/calib_tf_tree_full.json")
+    for root in dict.fromkeys(folder.parent for folder in folders):
         constants = _module("truckdrive.truckdrive_constants")
         if not hasattr(constants, "DEFAULT_VEHICLE_HEIGHT_M"):
             constants.DEFAULT_VEHICLE_HEIGHT_M = 4.0  # py123d 0.7.0 has this line at the end of a comment
         module = _module("truckdrive.truckdrive_parser")
-        scenes = [folder.name for folder in found if folder.parent == root]
+        scenes = [folder.name for folder in folders if folder.parent == root]
         for raw in _of(module.TruckDriveDatasetParser(root, scenes), root):
             yield RawLog(raw.source, _WithoutMotion(raw.log), raw.map)
 
@@ -205,16 +205,18 @@ class _WithoutMotion(BaseLogParser):
     def iter_modalities_sync(self) -> Iterator[ModalitiesSync]:
         """Yield the frames."""
         for sync in self._parser.iter_modalities_sync():
-            yield ModalitiesSync(sync.timestamp, [_without_motion(found) for found in sync.modalities])
+            yield ModalitiesSync(sync.timestamp, [_without_motion(modality) for modality in sync.modalities])
 
 
-def _without_motion(found: BaseModality) -> BaseModality:
-    if isinstance(found, EgoStateSE3):
-        return EgoStateSE3.from_imu(found.imu_se3, found.metadata, found.timestamp, None)
-    if isinstance(found, BoxDetectionsSE3):
-        boxes = [BoxDetectionSE3(box.attributes, box.bounding_box_se3, None) for box in found.box_detections]
-        return BoxDetectionsSE3(boxes, found.timestamp, found.metadata)
-    return found
+def _without_motion(modality: BaseModality) -> BaseModality:
+    if isinstance(modality, EgoStateSE3):
+        return EgoStateSE3.from_imu(modality.imu_se3, modality.metadata, modality.timestamp, None)
+    if isinstance(modality, BoxDetectionsSE3):
+        boxes = [
+            BoxDetectionSE3(box.attributes, box.bounding_box_se3, None) for box in modality.box_detections
+        ]
+        return BoxDetectionsSE3(boxes, modality.timestamp, modality.metadata)
+    return modality
 
 
 def physical_ai_av(source: Path) -> Iterator[RawLog]:
@@ -263,10 +265,10 @@ def _of(parser: BaseDatasetParser, source: Path) -> Iterator[RawLog]:
     maps = {_map_key(one.get_map_metadata()): one for one in parser.get_map_parsers()}
     for log in parser.get_log_parsers():
         metadata = log.get_log_metadata()
-        found = maps.get((metadata.split, metadata.log_name)) or maps.get(
+        entry = maps.get((metadata.split, metadata.log_name)) or maps.get(
             (metadata.dataset, metadata.location)
         )
-        yield RawLog(source, log, found)
+        yield RawLog(source, log, entry)
 
 
 def _map_key(metadata: MapMetadata) -> tuple[str | None, str | None]:

@@ -36,7 +36,7 @@ class RawLog:
 def folders_with(source: Path, pattern: str) -> list[Path]:
     """Return `source`, or else the folders one or two levels below it, in which `pattern` is found."""
     for depth in range(3):
-        found = sorted(source.glob("*/" * depth + pattern))
-        if found:
-            return list(dict.fromkeys(item.parents[pattern.count("/")] for item in found))
+        paths = sorted(source.glob("*/" * depth + pattern))
+        if paths:
+            return list(dict.fromkeys(item.parents[pattern.count("/")] for item in paths))
     return []

@@ -137,12 +137,12 @@ def path_ahead(
         given: whether it is a route that the vehicle was given.
     """
     at_m = np.arange(POINTS, dtype=np.float64)
-    there = at_m <= arc_m[-1] - progress_m
-    ahead = _in_frame(points_at(xyz, arc_m, progress_m + at_m), T_world_ego) * there[:, None]
+    on_path = at_m <= arc_m[-1] - progress_m
+    ahead = _in_frame(points_at(xyz, arc_m, progress_m + at_m), T_world_ego) * on_path[:, None]
     return PathAhead(
         torch.from_numpy(ahead[:, :2]).float(),
         ahead[:, 2],
-        torch.from_numpy(there & (there.sum() > 1)),
+        torch.from_numpy(on_path & (on_path.sum() > 1)),
         front_m,
         given,
     )
@@ -155,8 +155,8 @@ def _light(log: Log, frame: int, path: PathAhead) -> tuple[LightState, float, bo
         return LightState.NONE, 0.0, False, None
     if not len(lines.lane):
         return LightState.NONE, 0.0, True, None
-    at = _in_ego_frame(lines.xyz, log, frame)
-    along_m, left_m = along_path(torch.from_numpy(at[:, :2]).float(), path.xy, path.valid)
+    xyz = _in_ego_frame(lines.xyz, log, frame)
+    along_m, left_m = along_path(torch.from_numpy(xyz[:, :2]).float(), path.xy, path.valid)
     heading = path_headings(along_m, path.xy, path.valid).double().numpy()
     ahead = (lines.ahead @ log.T_world_ego[frame, :3, :3])[:, :2]
     distance_m = along_m.double().numpy() - path.front_m
@@ -164,7 +164,7 @@ def _light(log: Log, frame: int, path: PathAhead) -> tuple[LightState, float, bo
     on_path = (
         (left_m.abs().numpy() < BESIDE_M)
         & ((heading * ahead).sum(-1) > ALIGNED_COS)
-        & (np.abs(at[:, 2] - height_m) < LEVEL_M)
+        & (np.abs(xyz[:, 2] - height_m) < LEVEL_M)
         & (distance_m > -PASSED_M)
         & (distance_m <= LIGHT_RANGE_M)
     )
@@ -192,8 +192,8 @@ def _stop_lines(log: Log) -> _StopLines | None:
         api = log.scene.get_map_api()
         if shown is None or api is None:
             return None
-        found = {name: api.get_map_object_in_layer(name, MapLayer.LANE) for name in shown}
-    lanes = {name: lane for name, lane in found.items() if isinstance(lane, Lane)}
+        by_name = {name: api.get_map_object_in_layer(name, MapLayer.LANE) for name in shown}
+    lanes = {name: lane for name, lane in by_name.items() if isinstance(lane, Lane)}
     starts = [np.asarray(lane.centerline_3d.array, dtype=np.float64)[:2] for lane in lanes.values()]
     two = np.array(starts).reshape(-1, 2, 3)
     ahead = two[:, 1] - two[:, 0]

@@ -77,10 +77,10 @@ def read_instances(log: Log, frame: int, steps: int, dt_s: float, spec: PlaneSpe
     states = track_states(tracks, log.T_world_ego[frame], ids, t_us)
     valid = annotated_at(tracks, t_us)
     for step in range(steps + 1):
-        there = np.flatnonzero(states.valid[:, step] & valid[step])
-        size_m = tracks.size_lwh[states.box[there, step], :2]
-        quads = _corners(states.xy[there, step], size_m, states.yaw[there, step])
-        for track, quad in zip(there.tolist(), quads, strict=True):
+        rows = np.flatnonzero(states.valid[:, step] & valid[step])
+        size_m = tracks.size_lwh[states.box[rows, step], :2]
+        quads = _corners(states.xy[rows, step], size_m, states.yaw[rows, step])
+        for track, quad in zip(rows.tolist(), quads, strict=True):
             fill_polygon([quad], track + 1, spec, drawn[step])
     track_id = np.concatenate([[0], ids + 1])[drawn]
     return InstanceRaster(spec, torch.from_numpy(track_id), torch.from_numpy(valid), dt_s)
@@ -98,8 +98,8 @@ def track_states(
     wanted = np.searchsorted(ids, track_id)[:, None] * _TRACK_US
     first = np.searchsorted(key, wanted)
     end = np.searchsorted(key, wanted + _TRACK_US)
-    at = np.searchsorted(key, wanted + np.maximum(t_us - start_us, 0), side="right")
-    before = np.clip(at - 1, first, np.maximum(end - 2, first))
+    row = np.searchsorted(key, wanted + np.maximum(t_us - start_us, 0), side="right")
+    before = np.clip(row - 1, first, np.maximum(end - 2, first))
     after = np.minimum(before + 1, end - 1)
     rows = order[np.stack([before, after])]  # [2 K S]
     time_us = tracks.t_us[rows]

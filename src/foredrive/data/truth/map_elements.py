@@ -71,12 +71,12 @@ def read_map_elements(log: Log, frame: int, patch_lw_m: tuple[float, float]) -> 
     Raises:
         InputError: the map cannot be read.
     """
-    found = log_map(log)
+    own_map = log_map(log)
     pieces: list[tuple[int, Line]] = []
-    if found is not None:
+    if own_map is not None:
         upper = (0.5 * patch_lw_m[0], 0.5 * patch_lw_m[1])
-        for kind, lines in found.lines.items():
-            inside = _inside(lines, log, frame, found.flat, (-upper[0], -upper[1]), upper)
+        for kind, lines in own_map.lines.items():
+            inside = _inside(lines, log, frame, own_map.flat, (-upper[0], -upper[1]), upper)
             pieces += [(int(kind), piece) for piece in inside]
     count, longest = len(pieces), max((len(piece) for _, piece in pieces), default=0)
     vertices = torch.zeros(count, longest, 2)
@@ -85,7 +85,7 @@ def read_map_elements(log: Log, frame: int, patch_lw_m: tuple[float, float]) -> 
         vertices[row, : len(piece)] = torch.from_numpy(piece[:, :2]).float()
         valid[row, : len(piece)] = True
     kinds = torch.tensor([kind for kind, _ in pieces], dtype=torch.int64)
-    return MapElements(vertices, valid, kinds, known=torch.tensor(found is not None))
+    return MapElements(vertices, valid, kinds, known=torch.tensor(own_map is not None))
 
 
 def read_map_raster(log: Log, frame: int, spec: PlaneSpec, line_px: int) -> MapRaster:
@@ -106,22 +106,22 @@ def read_map_raster(log: Log, frame: int, spec: PlaneSpec, line_px: int) -> MapR
         InputError: the map cannot be read.
     """
     layers = np.zeros((len(RasterLayer), *spec.shape_yx), dtype=np.int32)
-    found = log_map(log)
-    if found is not None:
+    own_map = log_map(log)
+    if own_map is not None:
         sources = {
-            RasterLayer.DIVIDER: found.lines[ElementKind.DIVIDER],
-            RasterLayer.CROSSING: found.crossing_edges,
-            RasterLayer.BOUNDARY: found.lines[ElementKind.BOUNDARY],
+            RasterLayer.DIVIDER: own_map.lines[ElementKind.DIVIDER],
+            RasterLayer.CROSSING: own_map.crossing_edges,
+            RasterLayer.BOUNDARY: own_map.lines[ElementKind.BOUNDARY],
         }
         for layer, lines in sources.items():
-            parts = _inside(lines, log, frame, found.flat, spec.lower_m, spec.upper_m)
+            parts = _inside(lines, log, frame, own_map.flat, spec.lower_m, spec.upper_m)
             layers[:layer, draw_lines(parts, line_px + _ERASED_PX, spec) > 0] = 0
             layers[layer] = draw_lines(parts, line_px, spec)
-        for area in found.drivable:
-            rings = _in_ego_frame(area, log, frame, found.flat)
+        for area in own_map.drivable:
+            rings = _in_ego_frame(area, log, frame, own_map.flat)
             if np.abs(rings[0][:, 2]).min() <= LEVEL_M:
                 fill_polygon(rings, 1, spec, layers[RasterLayer.DRIVABLE])
-    return MapRaster(spec, torch.from_numpy(layers > 0), known=torch.tensor(found is not None))
+    return MapRaster(spec, torch.from_numpy(layers > 0), known=torch.tensor(own_map is not None))
 
 
 def read_shared_drivable(log: Log) -> list[list[Line]] | None:

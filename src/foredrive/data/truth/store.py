@@ -86,11 +86,11 @@ class TaskTruthStore:
         Raises:
             InputError: data cannot be read.
         """
-        there = [camera for camera in cameras if camera is not None]
-        file = self._file(log, frame, there)
+        present = [camera for camera in cameras if camera is not None]
+        file = self._file(log, frame, present)
         truth = None if file is None else self._read_entry(file)
         if truth is None:
-            truth = self._make(log, frame, there)
+            truth = self._make(log, frame, present)
             if file is not None:
                 with atomic_path(file, durable=False) as temporary:
                     temporary.write_bytes(_encode(truth))

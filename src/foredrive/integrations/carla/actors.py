@@ -81,10 +81,10 @@ def collision(
         ego_velocity: velocity before the step of the collision, m/s, world frame.
     """
     other, speed_mps = event.other_actor, float(np.hypot(*ego_velocity))
-    known = other.id if other.id != 0 else None
+    actor_id = other.id if other.id != 0 else None
     if last.xy is not None and np.hypot(*(ego_xy - last.xy)) > SAME_M:
         last = dataclasses.replace(last, xy=None)
-    same = known is not None and known == last.actor_id and t_s - last.t_s <= SAME_S
+    same = actor_id is not None and actor_id == last.actor_id and t_s - last.t_s <= SAME_S
     category = category_of(other.type_id, other.attributes)
     if same or last.xy is not None or speed_mps < MIN_MPS or other.type_id.startswith("static.sidewalk"):
         return None, last
@@ -95,4 +95,4 @@ def collision(
         severity = float(np.hypot(*(ego_velocity - xyz_of(other.get_velocity())[:2])))
     where = (float(ego_xy[0]), float(ego_xy[1]))
     text = f"{other.type_id} {other.id} at {severity:.1f} m/s"
-    return Event(kind, t_s, where, text, what, severity), LastCollision(known, t_s, where)
+    return Event(kind, t_s, where, text, what, severity), LastCollision(actor_id, t_s, where)

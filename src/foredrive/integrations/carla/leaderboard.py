@@ -282,7 +282,7 @@ class LeaderboardDriver:
         self._steer = pedals.steer
         return pedals
 
-    def _see(self, input_data: Mapping[str, tuple[int, Any]], at: PoseEstimate, speed_mps: float) -> None:
+    def _see(self, input_data: Mapping[str, tuple[int, Any]], pose: PoseEstimate, speed_mps: float) -> None:
         images = no_images()
         if self._rig is not None:
             images = torch.stack([_image(self._rig, name, input_data[name][1]) for name in self._rig.names])
@@ -290,8 +290,8 @@ class LeaderboardDriver:
         if self._lidar is not None:
             points = np.concatenate(self._points)
             sweep = sweep_of(points, np.array([len(points)]), self._lidar)
-        T = at.T_world_ego
-        frame = KeyFrame(at.t_s, T, speed_mps, images, sweep, boxes_in_ego_frame([], T))
+        T = pose.T_world_ego
+        frame = KeyFrame(pose.t_s, T, speed_mps, images, sweep, boxes_in_ego_frame([], T))
         self._frames = (*self._frames, frame)[-1 - self._past_frames :]
 
     def _clip(self) -> Clip:

@@ -47,11 +47,11 @@ class CarlaLaneRules:
         actors = world.get_actors()
         self._lights: list[Any] = list(actors.filter("traffic.traffic_light*"))
         signs = list(actors.filter("traffic.stop*"))
-        at = [(i, wp) for i, light in enumerate(self._lights) for wp in light.get_stop_waypoints()]
+        stops = [(i, wp) for i, light in enumerate(self._lights) for wp in light.get_stop_waypoints()]
         for i, sign in enumerate(signs, start=len(self._lights)):
             middle = sign.get_transform().transform(sign.trigger_volume.location)
-            at.append((i, self._map.get_waypoint(middle)))
-        self._lines = lines_at(at, len(self._lights))
+            stops.append((i, self._map.get_waypoint(middle)))
+        self._lines = lines_at(stops, len(self._lights))
         self._signs = len(signs)
 
     def lights(self) -> Int[np.ndarray, "Z"]:

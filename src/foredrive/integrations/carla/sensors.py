@@ -31,7 +31,7 @@ def camera_specs(rig: CameraRig, T_actor_ego: Float64[np.ndarray, "4 4"]) -> lis
     height, width = rig.size_hw
     specs = []
     for i, name in enumerate(rig.names):
-        fx, fy, cx, cy = (float(rig.K[i][at]) for at in ((0, 0), (1, 1), (0, 2), (1, 2)))
+        fx, fy, cx, cy = (float(rig.K[i][index]) for index in ((0, 0), (1, 1), (0, 2), (1, 2)))
         wrong = max(abs(fy - fx), abs(cx - 0.5 * width), abs(cy - 0.5 * height))
         if wrong > PIXEL_TOLERANCE or bool(rig.dist[i].any()) or float(rig.readout_s[i]) > 0:
             raise InputError(
@@ -124,14 +124,14 @@ def sweep_of(
     along = mirrored(points[:, :3].astype(np.float64))
     range_m = np.linalg.norm(along, axis=1)
     direction = along / np.maximum(range_m, 1e-6)[:, None] @ T[:3, :3].T
-    known = (range_m >= lidar.min_range_m).tolist()
+    valid = (range_m >= lidar.min_range_m).tolist()
     return LidarSweep(
         origin_ego=torch.from_numpy(np.tile(T[:3, 3], (len(points), 1))).float(),
         dir_ego=torch.from_numpy(direction).float(),
         range_m=torch.from_numpy(range_m).float(),
-        returned=torch.tensor(known, dtype=torch.bool),
+        returned=torch.tensor(valid, dtype=torch.bool),
         intensity=torch.from_numpy(points[:, 3].copy()),
         dt_s=torch.zeros(len(points)),
         beam=torch.from_numpy(np.repeat(np.arange(len(counts)), counts)),
-        valid=torch.tensor(known, dtype=torch.bool),
+        valid=torch.tensor(valid, dtype=torch.bool),
     )

@@ -144,11 +144,11 @@ class SensorQueue:
 
     def all(self) -> list[Any]:
         """Return all data that has arrived since the last call."""
-        found = []
+        values = []
         with contextlib.suppress(queue.Empty):
             while True:
-                found.append(self._sent.get_nowait())
-        return found
+                values.append(self._sent.get_nowait())
+        return values
 
 
 def _load(client: Any, town: str) -> Any:

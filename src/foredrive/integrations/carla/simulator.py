@@ -261,9 +261,9 @@ class CarlaSimulator:
         velocity = before.ego.speed_mps * np.array([np.cos(before.ego.yaw_rad), np.sin(before.ego.yaw_rad)])
         events, contact = list[Event](), before.contact
         for event in self._ego.collisions.all():
-            found, contact = collision(event, middle, velocity, t_s, contact)
-            if found is not None:
-                events.append(found)
+            infraction, contact = collision(event, middle, velocity, t_s, contact)
+            if infraction is not None:
+                events.append(infraction)
         return events, contact
 
     def _with_frame(self, session: CarlaSession, state: CarlaState, frame: int) -> tuple[KeyFrame, ...]:
@@ -282,8 +282,8 @@ class CarlaSimulator:
         return torch.stack([carla_sensors.image_of(carla_sensors.bgra_of(image)) for image in sent])
 
     def _boxes(self, session: CarlaSession, T_world_ego: Float64[np.ndarray, "4 4"]) -> Boxes:
-        found = [actor_state(a) for a in session.world.get_actors() if a.id != self._ego.vehicle.id]
-        near = in_box_range([actor for actor in found if actor is not None], T_world_ego)
+        states = [actor_state(a) for a in session.world.get_actors() if a.id != self._ego.vehicle.id]
+        near = in_box_range([actor for actor in states if actor is not None], T_world_ego)
         return boxes_in_ego_frame(near, T_world_ego)
 
     def _make_clip(self, state: CarlaState) -> Clip:

@@ -32,7 +32,7 @@ def annotations_at(
         return []
     points_world = _points_world(sweep, log.T_world_ego[frame])
     all_rows = np.arange(tracks.first_row[row], tracks.first_row[row + 1])
-    found = []
+    annotations = []
     for at, box in enumerate(all_rows[tracks.is_object[all_rows]].tolist()):
         labels = (boxes.track_id, boxes.attribute, boxes.visibility, boxes.num_points)
         track, attribute, level, points = (int(values[at]) for values in labels)
@@ -52,8 +52,8 @@ def annotations_at(
             "num_lidar_pts": points,
             "num_radar_pts": 0,
         }
-        found.append((track, Category(int(boxes.category[at])), annotation))
-    return found
+        annotations.append((track, Category(int(boxes.category[at])), annotation))
+    return annotations
 
 
 def _points_world(sweep: LidarSweep | None, T_world_ego: Float64[np.ndarray, "4 4"]) -> np.ndarray:
@@ -76,14 +76,14 @@ def _count_inside(
     return int((np.abs(offset @ T_world_box[:3, :3]) <= 0.5 * size).all(-1).sum())
 
 
-def instances_of(log: Log, found: list[tuple[int, Category, Row]]) -> list[Row]:
+def instances_of(log: Log, keyed: list[tuple[int, Category, Row]]) -> list[Row]:
     """Return the table `instance` of all annotations, in order of time, and link those of each instance.
 
     An instance has the category of its first annotation.
     """
     of_track: dict[int, list[Row]] = {}
     category: dict[int, Category] = {}
-    for track, kind, annotation in found:
+    for track, kind, annotation in keyed:
         of_track.setdefault(track, []).append(annotation)
         category.setdefault(track, kind)
     for annotations in of_track.values():

@@ -113,8 +113,8 @@ def _shared_maps(rows: Iterable[Row]) -> Iterable[Row]:
     """Return the rows of maps, each with all logs that share it."""
     maps: dict[str, Row] = {}
     for row in rows:
-        known = maps.setdefault(row["token"], row | {"log_tokens": []})
-        known["log_tokens"] += row["log_tokens"]
+        shared = maps.setdefault(row["token"], row | {"log_tokens": []})
+        shared["log_tokens"] += row["log_tokens"]
     return maps.values()
 
 

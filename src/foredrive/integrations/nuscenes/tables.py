@@ -55,7 +55,8 @@ def shared_tables() -> dict[str, list[Row]]:
             {"token": category_token(name), "name": name, "description": ""} for name in CATEGORY_NAMES
         ],
         "attribute": [
-            {"token": attribute_token(each), "name": each.label, "description": ""} for each in Attribute
+            {"token": attribute_token(attribute), "name": attribute.label, "description": ""}
+            for attribute in Attribute
         ],
         "visibility": [
             {

@@ -92,12 +92,12 @@ class AlpasimDriver(BaseDriver):
         Raises:
             InputError: some were not declared.
         """
-        there = {nuscenes_name(name).lower(): name for name in session.cameras}
+        by_name = {nuscenes_name(name).lower(): name for name in session.cameras}
         wanted = list(session.cameras) if self._needs.cameras is None else list(self._needs.cameras)
-        if missing := [name for name in wanted if nuscenes_name(name).lower() not in there]:
+        if missing := [name for name in wanted if nuscenes_name(name).lower() not in by_name]:
             declared = ", ".join(session.cameras) or "none"
             raise InputError(f"cameras not declared: {', '.join(missing)}; declared: {declared}")
-        return [there[nuscenes_name(name).lower()] for name in wanted]
+        return [by_name[nuscenes_name(name).lower()] for name in wanted]
 
     def _key_frames(self, session: SessionState, cameras: list[str], now_us: int) -> list[KeyFrame] | None:
         """Return the key frames up to now. None while there are too few."""

@@ -78,8 +78,8 @@ def ask(address: Address, path: str, body: object = None, *, max_bytes: int = MA
         raise InputError(f"{where}: the answer is not JSON: {_one_line(error)}") from error
 
 
-def _one_line(told: object) -> str:
-    return " ".join(str(told).split())[:300] or type(told).__name__
+def _one_line(text: object) -> str:
+    return " ".join(str(text).split())[:300] or type(text).__name__
 
 
 @contextlib.contextmanager

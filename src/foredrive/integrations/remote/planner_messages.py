@@ -137,8 +137,8 @@ def T_ego_lidar(clip: Clip, frame: int) -> Float64[Tensor, "4 4"]:
     T = torch.eye(4, dtype=torch.float64)
     T[:2, :2] = torch.tensor([[0.0, 1.0], [-1.0, 0.0]])
     sweep = clip.sweeps[frame]
-    known = bool(clip.sweep_valid[frame]) and bool(sweep.valid.any())
-    T[:3, 3] = sweep.origin_ego[sweep.valid].median(0).values if known else torch.tensor(LIDAR_M)
+    valid = bool(clip.sweep_valid[frame]) and bool(sweep.valid.any())
+    T[:3, 3] = sweep.origin_ego[sweep.valid].median(0).values if valid else torch.tensor(LIDAR_M)
     return T
 
 

@@ -107,12 +107,12 @@ def _key_frame(asked: PlannerInput, wanted: tuple[str, ...] | None) -> tuple[Key
     T_world_ego = read_matrix(asked.ego2world, 4, "ego2world").numpy()
     images, rig = no_images(), None
     if names:
-        found = [decode_image(asked.images[sent[name]]) for name in names]
-        sizes = {tuple(image.shape[:2]) for image in found}
+        decoded = [decode_image(asked.images[sent[name]]) for name in names]
+        sizes = {tuple(image.shape[:2]) for image in decoded}
         if len(sizes) != 1:
             raise InputError(f"images have to be of one size, got {sorted(sizes)}")
-        images = torch.stack(found).permute(0, 3, 1, 2)
-        rig = _rig([sent[name] for name in names], names, asked, (found[0].shape[0], found[0].shape[1]))
+        images = torch.stack(decoded).permute(0, 3, 1, 2)
+        rig = _rig([sent[name] for name in names], names, asked, (decoded[0].shape[0], decoded[0].shape[1]))
     speed_mps = max(0.0, asked.canbus[SPEED])
     return KeyFrame(asked.timestamp * 1e-6, T_world_ego, speed_mps, images, None, no_boxes()), rig
 

@@ -139,10 +139,10 @@ class RenderService:
         tracks, actors = self._graph.tracks.map_tensors(lambda tensor: tensor.detach().cpu()), []
         T_world_actor = self._vehicle.T_world_scene @ tracks.T_scene_actor.double()
         for row, track_id in enumerate(tracks.track_id.tolist()):
-            there = tracks.present[row]
+            present = tracks.present[row]
             length, width, height = tracks.size_lwh[row].tolist()
-            times = [self._start_us + round(t_s * 1e6) for t_s in tracks.t_s[there].tolist()]
-            poses = T_world_actor[row, there].tolist()
+            times = [self._start_us + round(t_s * 1e6) for t_s in tracks.t_s[present].tolist()]
+            poses = T_world_actor[row, present].tolist()
             actors.append(SentActor(self._names[track_id], poses, times, [width, length, height]))
         return actors
 
@@ -152,8 +152,8 @@ class RenderService:
         ids = {name: number for number, name in self._names.items()}
         for actor in sent:
             if actor.uuid not in ids:
-                known = ", ".join(list(ids)[:8]) or "none"
-                raise InputError(f"there is no actor {actor.uuid!r}; some of those in the log: {known}")
+                some_ids = ", ".join(list(ids)[:8]) or "none"
+                raise InputError(f"there is no actor {actor.uuid!r}; some of those in the log: {some_ids}")
         given = {ids[actor.uuid]: actor for actor in sent}
         if len(given) < len(sent):
             raise InputError("an actor is sent twice")
@@ -163,8 +163,8 @@ class RenderService:
         poses, present = tracks.T_scene_actor.clone(), tracks.present.clone()
         for number, actor in given.items():
             row = tracks.index_of(number)
-            on_keys, there = self._on_key_times(actor, tracks.size_lwh[row], tracks.t_s)
-            poses[row], present[row] = on_keys.to(poses), there.to(present.device)
+            on_keys, key_present = self._on_key_times(actor, tracks.size_lwh[row], tracks.t_s)
+            poses[row], present[row] = on_keys.to(poses), key_present.to(present.device)
         self._graph = dataclasses.replace(
             graph, tracks=dataclasses.replace(tracks, T_scene_actor=poses, present=present)
         )
@@ -189,8 +189,8 @@ class RenderService:
         T = (inverse_se3(self._vehicle.T_world_scene) @ T_world_actor).float()[None]
         keys = key_t_s.cpu()
         step_s = float(keys.diff().median()) if len(keys) > 1 else 0.0
-        there = (keys >= t_s[0] - step_s) & (keys <= t_s[-1] + step_s)
-        return torch.stack([poses_at(t_s, T, at_s)[0][0] for at_s in keys.tolist()]), there
+        present = (keys >= t_s[0] - step_s) & (keys <= t_s[-1] + step_s)
+        return torch.stack([poses_at(t_s, T, at_s)[0][0] for at_s in keys.tolist()]), present
 
     @torch.no_grad()
     def _render_image(self, body: object) -> Raw:
@@ -212,8 +212,8 @@ class RenderService:
         asked: SweepRequest = validated(SweepRequest, body, "/render_sweep")
         T_ego_lidar = self._vehicle.T_ego_lidar
         if T_ego_lidar is None or asked.lidar_name not in self._lidar_names():
-            there = ", ".join(self._lidar_names()) or "none, since the log had none"
-            raise InputError(f"no lidar {asked.lidar_name!r}; there are: {there}")
+            names = ", ".join(self._lidar_names()) or "none, since the log had none"
+            raise InputError(f"no lidar {asked.lidar_name!r}; there are: {names}")
         if not all(map(math.isfinite, asked.twist)):
             raise InputError(f"twist has to be finite, got {asked.twist}")
         lidar = self._lidar(asked.lidar_name, T_ego_lidar)

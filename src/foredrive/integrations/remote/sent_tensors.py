@@ -80,10 +80,10 @@ class _ImageUnpickler(pickle.Unpickler):
 
 def _read_image(archive: zipfile.ZipFile, max_bytes: int) -> UInt8[Tensor, "H W 3"]:
     """Read the image in an archive of `torch.save`."""
-    (told,) = [member for member in archive.infolist() if member.filename.endswith("/data.pkl")]
-    if told.file_size > MAX_DESCRIPTION_BYTES:
+    (member_name,) = [member for member in archive.infolist() if member.filename.endswith("/data.pkl")]
+    if member_name.file_size > MAX_DESCRIPTION_BYTES:
         raise InputError("an image has a description that is too long")
-    image = _ImageUnpickler(io.BytesIO(archive.read(told))).load()
+    image = _ImageUnpickler(io.BytesIO(archive.read(member_name))).load()
     if not isinstance(image, _Strided):
         raise InputError(f"an image has to be uint8 [height, width, 3], got {type(image).__name__}")
     if len(image.size) != 3 or len(image.stride) != 3 or image.size[2] != 3:
@@ -91,7 +91,7 @@ def _read_image(archive: zipfile.ZipFile, max_bytes: int) -> UInt8[Tensor, "H W 
     pixels = math.prod(image.size)
     if not 0 < pixels <= max_bytes or min(*image.size, *image.stride, image.offset) < 0:
         raise InputError(f"an image may have 1 to {max_bytes:,} bytes, not {pixels:,}")
-    content = bytearray(archive.read(told.filename.removesuffix("data.pkl") + f"data/{image.member}"))
+    content = bytearray(archive.read(member_name.filename.removesuffix("data.pkl") + f"data/{image.member}"))
     last = image.offset + sum((size - 1) * stride for size, stride in zip(*image[2:], strict=True))
     if last >= len(content):
         raise InputError(f"an image has {len(content):,} bytes, and describes {last + 1:,}")

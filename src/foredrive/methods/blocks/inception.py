@@ -76,13 +76,13 @@ class _Block(nn.Module):
             self.branch_pool = _Convolution(channels, pooled, 1, 1)
 
     def forward(self, x: Tensor) -> Tensor:
-        found = []
+        branches = []
         for branch in self.branches:
             y = x
             for step in branch:
                 y = torch.cat([getattr(self, name)(y) for name in step], dim=1)
-            found.append(y)
-        return torch.cat([*found, self._pooled(x)], dim=1)
+            branches.append(y)
+        return torch.cat([*branches, self._pooled(x)], dim=1)
 
     def _pooled(self, x: Tensor) -> Tensor:
         if self.pool == "halved":
@@ -153,9 +153,9 @@ def _block_e(channels: int, pool: str) -> _Block:
 def resized(images: Float[Tensor, "n 3 H W"]) -> Float[Tensor, "n 3 299 299"]:
     """Resize as TensorFlow 1 did: bilinear, with the corners of the first pixels on each other."""
     for dim in (2, 3):
-        at = torch.arange(SIDE_PX, device=images.device) * (images.shape[dim] / SIDE_PX)
-        low = at.long()
+        position = torch.arange(SIDE_PX, device=images.device) * (images.shape[dim] / SIDE_PX)
+        low = position.long()
         high = (low + 1).clamp(max=images.shape[dim] - 1)
-        share = (at - low).view(-1, *[1] * (3 - dim))
+        share = (position - low).view(-1, *[1] * (3 - dim))
         images = images.index_select(dim, low) * (1 - share) + images.index_select(dim, high) * share
     return images

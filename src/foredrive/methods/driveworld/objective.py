@@ -106,13 +106,13 @@ class DriveWorldObjective(nn.Module):
         terms: dict[str, Float[Tensor, ""]] = {}
         if stage.weights.wpts > 0 or self.tasks is not None:
             now = world.belief_about_now(lifted)
-            found = None if self.tasks is None else self.agent.perceive(now, clip)
+            output = None if self.tasks is None else self.agent.perceive(now, clip)
             if stage.weights.wpts > 0:
                 future = world.imagine(now, 1) if self.agent.planner.imagined_frames else []
-                plan = self.agent.plan(observed, [now, *future], found)
+                plan = self.agent.plan(observed, [now, *future], output)
                 losses["wpts"] = waypoint_loss(plan, example.clip.future)
-            if self.tasks is not None and found is not None:
-                terms |= self.tasks(found, example)
+            if self.tasks is not None and output is not None:
+                terms |= self.tasks(output, example)
         weighted = [getattr(stage.weights, name) * value for name, value in losses.items()]
         total = torch.stack(weighted).sum()
         return losses | terms | {"loss": total + terms["tasks"] if "tasks" in terms else total}

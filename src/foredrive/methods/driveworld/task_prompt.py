@@ -89,6 +89,6 @@ class TaskPrompt(nn.Module):
 
     def forward(self, prompt: Prompt, batch: int) -> Float[Tensor, "b C Y X"]:
         """Return the plane of one prompt, or of the near one that the model knows."""
-        known = prompt if prompt in self.prompts else _STAND_IN[prompt]
-        encoding = self.encodings[self.prompts.index(known)]
+        prompt_name = prompt if prompt in self.prompts else _STAND_IN[prompt]
+        encoding = self.encodings[self.prompts.index(prompt_name)]
         return self.expand(encoding[None]).expand(batch, -1, -1, -1)

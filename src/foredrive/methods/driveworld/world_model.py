@@ -263,7 +263,7 @@ class DriveWorld(nn.Module):
         beliefs = [
             self._belief(latent, statics, "occupancy", T_source_ego[:, k]) for k, latent in enumerate(latents)
         ]
-        policy = [self.states.action(each) for each in latents]
+        policy = [self.states.action(step_latent) for step_latent in latents]
         latent, T = latents[-1], T_source_now
         for _ in range(steps):
             T = compose_se3(T, motion_of(policy[-1], self.dt_s))
@@ -276,7 +276,9 @@ class DriveWorld(nn.Module):
             posteriors=tuple(posteriors),
             priors=tuple(priors),
             actions=torch.stack(policy, dim=1),
-            velocities_mps=torch.stack([self.states.velocities_mps(each.state) for each in latents], dim=1),
+            velocities_mps=torch.stack(
+                [self.states.velocities_mps(step_latent.state) for step_latent in latents], dim=1
+            ),
         )
 
     def single_frame_beliefs(self, lifted: LiftedFrames) -> list[Belief]:

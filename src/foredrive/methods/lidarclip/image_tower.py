@@ -83,8 +83,8 @@ class ImageTowerFeatures(nn.Module):
         """Return features of RGB images in [0, 1]."""
         enlarged = F.interpolate(rgb, scale_factor=float(self.enlarge), mode="bilinear", align_corners=False)
         x = self.embedder(normalise_rgb(enlarged))
-        found = []
+        features = []
         for stage in self.stages:
             x = stage(x)
-            found.append(x)
-        return tuple(found)
+            features.append(x)
+        return tuple(features)

@@ -116,7 +116,7 @@ class NemoObjective(nn.Module):
         needed = self.agent.planner.imagined_frames if weights.wpts > 0 else 0
         steps = self.steps if self.sampler.imagines_now() else 0
         beliefs = self.sampler.rollout(observed, max(steps, needed))
-        found = None if self.tasks is None else self.agent.perceive(beliefs[0], clip)
+        output = None if self.tasks is None else self.agent.perceive(beliefs[0], clip)
         decoded = [world.decode(belief) for belief in beliefs[: steps + 1]]
 
         losses = {name: clip.t_s.new_zeros(()) for name in ("l1", "perc", "occ")}
@@ -156,11 +156,11 @@ class NemoObjective(nn.Module):
         if len(beliefs) == 1 and self.steps > 0:
             losses["loss"] = losses["loss"] + self.sampler.no_change()
         if weights.wpts > 0:
-            plan = self.agent.plan(observed, beliefs, found)
+            plan = self.agent.plan(observed, beliefs, output)
             losses["wpts"] = waypoint_loss(plan, example.clip.future)
             losses["loss"] = losses["loss"] + weights.wpts * losses["wpts"]
-        if self.tasks is not None and found is not None:
-            losses |= self.tasks(found, example)
+        if self.tasks is not None and output is not None:
+            losses |= self.tasks(output, example)
             losses["loss"] = losses["loss"] + losses["tasks"]
         return losses
 

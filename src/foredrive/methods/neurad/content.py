@@ -72,12 +72,12 @@ class FieldContent(Record):
         if not isinstance(source, FieldContent):
             raise InputError("an actor that is not part of a field does not fit into a field")
         lender, fields = source.fields[int(source.owner[source_row])], self.fields
-        known = [place for place, parts in enumerate(fields) if parts.same_as(lender)]
-        if not known:
-            fields, known = (*fields, _on(lender, self.device)), [len(fields)]
+        places = [place for place, parts in enumerate(fields) if parts.same_as(lender)]
+        if not places:
+            fields, places = (*fields, _on(lender, self.device)), [len(fields)]
         return FieldContent(
             slot=torch.cat([self.slot, source.slot[source_row : source_row + 1].to(self.slot)]),
-            owner=torch.cat([self.owner, self.owner.new_tensor(known[:1])]),
+            owner=torch.cat([self.owner, self.owner.new_tensor(places[:1])]),
             shown=self.shown.with_copy(source.shown, source_row, row),
             fields=fields,
         )

@@ -94,7 +94,7 @@ def look_with_guests(
     ray = torch.cat([one.ray for one in crossings]).unique()
     behind = _curve(seen.intervals, ray)
     curves = [_widened(look, one.ray, ray) for look, one in zip(looks, crossings, strict=True)]
-    found = []
+    looks_of_beams = []
     for look, one, guest in zip(looks, crossings, guests, strict=True):
         place = torch.searchsorted(ray, one.ray.contiguous())
         others = [behind, *(curve for other, curve in zip(looks, curves, strict=True) if other is not look)]
@@ -106,8 +106,8 @@ def look_with_guests(
         share[one.ray] = (look.intervals.weight * free).sum(-1)
         feature = look.feature.new_zeros(len(rays.t_s), guest.parts.network.config.width)
         feature[one.ray] = look.feature
-        found.append(SeenOfGuest(share, feature))
-    return _together(seen, ray, [behind, *curves]), found
+        looks_of_beams.append(SeenOfGuest(share, feature))
+    return _together(seen, ray, [behind, *curves]), looks_of_beams
 
 
 def with_guests_in_image(

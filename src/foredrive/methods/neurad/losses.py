@@ -35,8 +35,8 @@ def interlevel_loss(
     with torch.no_grad():
         rest = 1 - weight.sum(-1, keepdim=True)
         full = torch.cat([weight[:, :-1], weight[:, -1:] + rest], dim=-1)
-        at, passed, slope = _blurred(border, full, pulse)
-        share = _quadratic(proposal_border, at, passed, slope).diff(dim=-1)
+        knots, passed, slope = _blurred(border, full, pulse)
+        share = _quadratic(proposal_border, knots, passed, slope).diff(dim=-1)
     missing = (share - proposal_weight).clamp_min(0)
     return (missing**2 / (proposal_weight + _LEAST_WEIGHT)).sum(-1).mean()
 
@@ -47,24 +47,24 @@ def _blurred(
     """Return knots, integral and density of a histogram that is blurred by a box (Zip-NeRF, supplement)."""
     density = weight / border.diff(dim=-1).clamp_min(1e-7)
     step = torch.nn.functional.pad(density, (0, 1)) - torch.nn.functional.pad(density, (1, 0))
-    at, order = torch.cat([border - pulse, border + pulse], dim=-1).sort(dim=-1)
+    knots, order = torch.cat([border - pulse, border + pulse], dim=-1).sort(dim=-1)
     bend = (torch.cat([step, -step], dim=-1) / (2 * pulse)).gather(1, order)
-    gap = at.diff(dim=-1)
+    gap = knots.diff(dim=-1)
     height = torch.nn.functional.pad((gap * bend.cumsum(-1)[:, :-1]).cumsum(-1), (1, 0)).clamp_min(0)
     passed = torch.nn.functional.pad((0.5 * (height[:, 1:] + height[:, :-1]) * gap).cumsum(-1), (1, 0))
-    return at, passed, height
+    return knots, passed, height
 
 
 def _quadratic(
     x: Float[Tensor, "R P"],
-    at: Float[Tensor, "R K"],
+    knots: Float[Tensor, "R K"],
     passed: Float[Tensor, "R K"],
     height: Float[Tensor, "R K"],
 ) -> Float[Tensor, "R P"]:
     """Return the integral at x of a density that is linear between knots, 0 before and 1 after them."""
-    right = torch.searchsorted(at, x.contiguous()).clamp(1, at.shape[1] - 1)
+    right = torch.searchsorted(knots, x.contiguous()).clamp(1, knots.shape[1] - 1)
     left = right - 1
-    x0, x1 = at.gather(1, left), at.gather(1, right)
+    x0, x1 = knots.gather(1, left), knots.gather(1, right)
     h0, h1 = height.gather(1, left), height.gather(1, right)
     way = torch.minimum(torch.maximum(x, x0), x1) - x0
     part = way / (x1 - x0).clamp_min(1e-7)

@@ -87,11 +87,11 @@ def _quantiles(
 
 
 def interpolated(
-    x: Float[Tensor, "R M"], at: Float[Tensor, "R N"], value: Float[Tensor, "R N"]
+    x: Float[Tensor, "R M"], query: Float[Tensor, "R N"], value: Float[Tensor, "R N"]
 ) -> Float[Tensor, "R M"]:
     """Return the piecewise linear functions through (at, value) at x, constant beyond their ends."""
-    right = torch.searchsorted(at, x, right=True).clamp(1, at.shape[1] - 1)
-    x0, x1 = at.gather(1, right - 1), at.gather(1, right)
+    right = torch.searchsorted(query, x, right=True).clamp(1, query.shape[1] - 1)
+    x0, x1 = query.gather(1, right - 1), query.gather(1, right)
     y0, y1 = value.gather(1, right - 1), value.gather(1, right)
     part = ((x - x0) / (x1 - x0).clamp_min(torch.finfo(x.dtype).tiny)).clamp(0, 1)
     return y0 + part * (y1 - y0)

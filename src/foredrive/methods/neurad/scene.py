@@ -197,7 +197,7 @@ class FieldScene(RebuiltScene):
         self, graph: SceneGraph, rays: FieldRays
     ) -> tuple[Mapping[str, Tensor], tuple[list[Guest], list[SeenOfGuest]] | None]:
         """Return the features, distances and opacities of any number of rays, and guests if there are any."""
-        found: dict[str, list[Tensor]] = {"feature": [], "depth_m": [], "alpha": [], "median_m": []}
+        rendered: dict[str, list[Tensor]] = {"feature": [], "depth_m": [], "alpha": [], "median_m": []}
         own, guests = split_guests(graph.tracks, field_of(graph))
         of_guests: list[list[SeenOfGuest]] = []
         for first in range(0, max(len(rays.t_s), 1), RAYS_AT_ONCE):
@@ -207,9 +207,9 @@ class FieldScene(RebuiltScene):
                 of_guests.append(parts)
             else:
                 seen = self.look(graph, part)
-            for name, values in found.items():
+            for name, values in rendered.items():
                 values.append(getattr(seen, name))
-        joined = {name: torch.cat(values) for name, values in found.items()}
+        joined = {name: torch.cat(values) for name, values in rendered.items()}
         if not guests:
             return joined, None
         seen_of = [

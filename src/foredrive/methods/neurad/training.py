@@ -146,13 +146,13 @@ class FieldTraining:
         tables = tables_of(scene.field)
         of_table = {id(table) for table in tables}
         layers = [p for p in scene.field.parameters() if id(p) not in of_table]
-        found = {
+        by_name = {
             "grids": tables,
             "layers": [*layers, *scene.lidar_decoder.parameters(), scene.camera_decoder.appearance],
             "decoder": [p for n, p in scene.camera_decoder.named_parameters() if n != "appearance"],
         }
         for rate in dataclasses.fields(self.schedule.rates):
-            parameters = found.get(rate.name) or [getattr(scene, rate.name)]
+            parameters = by_name.get(rate.name) or [getattr(scene, rate.name)]
             # Fused, the moments of a CNN in channels-last order would be read in another order.
             fused, its_rate = rate.name == "grids", getattr(self.schedule.rates, rate.name)
             groups.append(ParameterGroup(rate.name, parameters, its_rate, fused=fused))
@@ -196,7 +196,7 @@ class FieldTraining:
 
     def _patches(self, generator: torch.Generator) -> list["_Patch"]:
         """Draw patches of images. The corner may be any pixel from which a patch fits into the image."""
-        found = []
+        patches = []
         for _ in range(self.schedule.patches if self.views.cameras else 0):
             view = self.views.cameras[_draw(len(self.views.cameras), generator)]
             assert view.image is not None
@@ -207,18 +207,18 @@ class FieldTraining:
                 view.to(self.scene.device), torch.tensor([left, top]), torch.tensor([wide, high])
             )
             image = view.image[:, top : top + UPSAMPLING * high, left : left + UPSAMPLING * wide]
-            found.append(_Patch(rays, image.float() / 255, view.sensor, (high, wide)))
-        return found
+            patches.append(_Patch(rays, image.float() / 255, view.sensor, (high, wide)))
+        return patches
 
     def _some_beams(self, generator: torch.Generator) -> list["_Beams"]:
-        schedule, found = self.schedule, []
+        schedule, beam_batches = self.schedule, []
         for _ in range(schedule.sweeps if self._sweeps else 0):
             view, rays = self._sweeps[_draw(len(self._sweeps), generator)]
             count = max(schedule.beams // schedule.sweeps, 1)
             chosen = torch.randint(len(rays.t_s), (count,), generator=generator)
             beams = view.beams
             # Where misses are unknown, no beam is known to be lost.
-            found.append(
+            beam_batches.append(
                 _Beams(
                     FieldRays(*(tensor[chosen] for tensor in rays)),
                     beams.range_m[chosen],
@@ -227,7 +227,7 @@ class FieldTraining:
                     view.misses_known,
                 )
             )
-        return found
+        return beam_batches
 
     def _image_losses(self, patches: list["_Patch"], feature: Float[Tensor, "R D"]) -> dict[str, Tensor]:
         """Return the mean squared error over all pixels of the patches, and the perceptual loss."""
@@ -248,8 +248,8 @@ class FieldTraining:
                     wanted = self._vgg(real)
                 share = len(alike) / len(patches)
                 likeness = likeness + share * weighted_feature_loss(self._vgg(rgb), wanted)
-        found = {"rgb": squares / count}
-        return found if self._vgg is None else found | {"perceptual": likeness}
+        losses = {"rgb": squares / count}
+        return losses if self._vgg is None else losses | {"perceptual": likeness}
 
     def _decoded(
         self, feature: Float[Tensor, "n H W D"], camera: Int[Tensor, "n"]
@@ -276,8 +276,8 @@ class FieldTraining:
             losses["drop"] = drop_loss(drop_logit, returned)
         proposals = [("proposal_", proposal) for proposal in seen.proposals if proposal.weight.requires_grad]
         for prefix, intervals in (("", seen.intervals), *proposals):
-            found = self._distance_losses(intervals, first, range_m, returned, quantile=not prefix)
-            for name, loss in found.items():
+            terms = self._distance_losses(intervals, first, range_m, returned, quantile=not prefix)
+            for name, loss in terms.items():
                 losses[prefix + name] = losses.get(prefix + name, 0) + loss
         return losses
 

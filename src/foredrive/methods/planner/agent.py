@@ -24,7 +24,7 @@ class AgentOutput(NamedTuple):
     """The belief about now, then those of the imagined key frames."""
     decoded: list[Decoded]
     plan: Trajectory
-    found: HeadOutput | None = None
+    perceived: HeadOutput | None = None
     """Output of the agent's own task heads."""
 
 
@@ -47,8 +47,8 @@ class PlanningAgent(nn.Module, Generic[W]):
         """Observe the clip, imagine `steps` key frames (and those the planner needs), and plan."""
         beliefs = self.rollout(clip, max(steps, self.planner.imagined_frames))
         decoded = [self.world_model.decode(belief) for belief in beliefs[: steps + 1]]
-        found = self.perceive(beliefs[0])
-        return AgentOutput(beliefs[: steps + 1], decoded, self.plan(clip, beliefs, found), found)
+        output = self.perceive(beliefs[0])
+        return AgentOutput(beliefs[: steps + 1], decoded, self.plan(clip, beliefs, output), output)
 
     def rollout(self, clip: Clip, steps: int) -> list[Belief]:
         """Return the beliefs about now and about the next `steps` key frames."""
@@ -85,35 +85,35 @@ class PlanningAgent(nn.Module, Generic[W]):
         with full_precision(now.volume):
             cast = {id(volume): volume.map_tensors(Tensor.float) for volume in read.values()}
             volumes = {task: cast[id(volume)] for task, volume in read.items()}
-            found: HeadOutput = self.heads(volumes, steps, carried)
-        return found
+            output: HeadOutput = self.heads(volumes, steps, carried)
+        return output
 
-    def tokens(self, now: Belief, found: HeadOutput | None = None) -> Float[Tensor, "b N C"] | None:
+    def tokens(self, now: Belief, output: HeadOutput | None = None) -> Float[Tensor, "b N C"] | None:
         """Return what the planner attends to beside the volumes; None if it does not.
 
         Args:
             now: belief about now.
-            found: output of `perceive`, if it is known.
+            output: output of `perceive`, if it is known.
         """
         if self.planner.scene is None:
             return None
-        found = found or self.perceive(now)
-        assert found is not None
-        tokens: Tensor = self.planner.scene(found)
+        output = output or self.perceive(now)
+        assert output is not None
+        tokens: Tensor = self.planner.scene(output)
         return tokens
 
-    def plan(self, clip: Clip, beliefs: Sequence[Belief], found: HeadOutput | None = None) -> Trajectory:
+    def plan(self, clip: Clip, beliefs: Sequence[Belief], output: HeadOutput | None = None) -> Trajectory:
         """Plan from the belief about now and those next key frames that the planner uses.
 
         Args:
             clip: for the motion of the ego vehicle, the command and the route.
             beliefs: about now and about the next key frames.
-            found: output of `perceive`, if it is known.
+            output: output of `perceive`, if it is known.
         """
-        plan: Trajectory = self.planner(*self._told(clip, beliefs, found))
+        plan: Trajectory = self.planner(*self._told(clip, beliefs, output))
         return plan
 
-    def _told(self, clip: Clip, beliefs: Sequence[Belief], found: HeadOutput | None) -> tuple[Any, ...]:
+    def _told(self, clip: Clip, beliefs: Sequence[Belief], output: HeadOutput | None) -> tuple[Any, ...]:
         """Return the arguments of the planner."""
         poses, speeds = ego_motion(clip, self.planner.history)
         return (
@@ -125,7 +125,7 @@ class PlanningAgent(nn.Module, Generic[W]):
             clip.ego_speed_valid[:, clip.now],
             torch.cat([poses, speeds[:, :-1, None]], dim=-1),
             route_target(clip) if self.planner.target else None,
-            self.tokens(beliefs[0], found),
+            self.tokens(beliefs[0], output),
         )
 
     def planner_volume(self, belief: Belief) -> Float[Tensor, "b D Z Y X"]:

@@ -37,6 +37,6 @@ class PlannerObjective(nn.Module):
         observed, agent = example.clip.observed(), self.agent
         with torch.no_grad():
             beliefs = agent.rollout(observed, agent.planner.imagined_frames)
-            found = agent.perceive(beliefs[0], observed)
-        error = waypoint_loss(agent.plan(observed, beliefs, found), example.clip.future)
+            output = agent.perceive(beliefs[0], observed)
+        error = waypoint_loss(agent.plan(observed, beliefs, output), example.clip.future)
         return {"wpts": error, "loss": error}

@@ -42,7 +42,7 @@ def evaluate_cameras(
     """
     if not views:
         return {}
-    found: dict[str, list[float]] = defaultdict(list)
+    scores: dict[str, list[float]] = defaultdict(list)
     graph, took_s, pixels = graph or scene.graph, 0.0, 0
     for number, view in enumerate(views):
         started = time.perf_counter()
@@ -58,10 +58,10 @@ def evaluate_cameras(
         for prefix, image in shown.items():
             figures = {"psnr_db": psnr_db(image, real, known), "ssim": ssim(image, real, known)}
             for name, value in figures.items():
-                found[prefix + name].append(float(value))
+                scores[prefix + name].append(float(value))
                 if float(view.twist_cam[:3].norm()) > MOVING_MPS:
-                    found[f"moving.{prefix}{name}"].append(float(value))
-    return {name: fmean(values) for name, values in found.items()} | {
+                    scores[f"moving.{prefix}{name}"].append(float(value))
+    return {name: fmean(values) for name, values in scores.items()} | {
         "images": float(len(views)),
         "camera_mp_per_s": pixels / took_s * 1e-6,
     }

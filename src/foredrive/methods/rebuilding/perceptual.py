@@ -55,5 +55,5 @@ class PerceptualMetrics:
             if fid is not None:
                 fid.update(real, real=True)
                 fid.update(rendered.rgb_8bit[None], real=False)
-        found = {"lpips": fmean(distances)} if distances else {}
-        return found if fid is None else found | {"fid": float(fid.compute())}
+        figures = {"lpips": fmean(distances)} if distances else {}
+        return figures if fid is None else figures | {"fid": float(fid.compute())}

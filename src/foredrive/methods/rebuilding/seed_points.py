@@ -50,7 +50,7 @@ def lidar_points(
     """Return the lidar points of the static part (scene's frame) and of each actor (its own frame)."""
     exposed_s = torch.tensor([view.t_s for view in cameras])
     standing: list[SeedPoints] = []
-    found: list[list[SeedPoints]] = [[empty_points()] for _ in range(len(tracks))]
+    parts: list[list[SeedPoints]] = [[empty_points()] for _ in range(len(tracks))]
     for sweep in sweeps:
         returned = sweep.beams[sweep.beams.returned]
         xyz = transform_points(sweep.T_scene_ego, returned.points_ego)
@@ -72,8 +72,8 @@ def lidar_points(
         for row in owner[owner != STATIC].unique().tolist():
             T_actor_scene, mine = inverse_se3(states.T_scene_actor[row]), owner == row
             own_xyz = transform_points(T_actor_scene, at_sweep[mine])
-            found[row].append(dataclasses.replace(points[mine], xyz_m=own_xyz))
-    return all_points([empty_points(), *standing]), [all_points(points) for points in found]
+            parts[row].append(dataclasses.replace(points[mine], xyz_m=own_xyz))
+    return all_points([empty_points(), *standing]), [all_points(points) for points in parts]
 
 
 def points_along_pixels(
@@ -98,7 +98,7 @@ def points_along_pixels(
         far_m: range of points that look upwards with no beam near, uniform in 1/m.
         generator: random choice of pixels.
     """
-    found = [empty_points()]
+    parts = [empty_points()]
     moments_s = torch.tensor([sweep.t_s for sweep in sweeps])
     for view, share in zip(cameras, _shares(count, len(cameras)), strict=True):
         uv, direction = _random_pixels(view, share, generator)
@@ -120,8 +120,8 @@ def points_along_pixels(
             range_m, kept = torch.where(met, beam_m, away_m), standing[inside][nearest] | ~met
         drawn = count * sum(other.sensor == view.sensor for other in cameras) / len(cameras)
         scale_m = scale * range_m * _pixels_apart_rad(view, drawn)
-        found.append(_at(view, uv, direction, range_m, scale_m)[kept])
-    return all_points(found)
+        parts.append(_at(view, uv, direction, range_m, scale_m)[kept])
+    return all_points(parts)
 
 
 def points_at_random_ranges(
@@ -132,13 +132,13 @@ def points_at_random_ranges(
     generator: torch.Generator,
 ) -> SeedPoints:
     """Return points along random pixels, at ranges uniform in 1/m. See `points_along_pixels`."""
-    found = [empty_points()]
+    parts = [empty_points()]
     for view, share in zip(cameras, _shares(count, len(cameras)), strict=True):
         uv, direction = _random_pixels(view, share, generator)
         away_m = even_in_inverse(share, range_m, generator)
         scale_m = scale * away_m * _pixels_apart_rad(view, share)
-        found.append(_at(view, uv, direction, away_m, scale_m))
-    return all_points(found)
+        parts.append(_at(view, uv, direction, away_m, scale_m))
+    return all_points(parts)
 
 
 def subsample_static(

@@ -67,8 +67,8 @@ class ActorTracks(Record):
         """
         rows = (self.track_id == track_id).nonzero()
         if len(rows) == 0:
-            known = ", ".join(str(i) for i in self.track_id.tolist()) or "none"
-            raise InputError(f"no actor {track_id}; there are: {known}")
+            ids = ", ".join(str(i) for i in self.track_id.tolist()) or "none"
+            raise InputError(f"no actor {track_id}; there are: {ids}")
         return int(rows[0])
 
     def only(self, rows: Bool[Tensor, "A"] | Int[Tensor, "n"]) -> "ActorTracks":

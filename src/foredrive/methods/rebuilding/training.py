@@ -103,13 +103,13 @@ def rebuild(training: SceneTraining, folder: Path) -> None:
         InputError: a checkpoint cannot be read, or a loss is not finite.
     """
     scene, steps = training.scene, training.steps
-    found, done = latest_checkpoint(folder / CHECKPOINTS), 0
-    if found is not None:
-        scene.resize(found / "model.safetensors")
+    checkpoint, done = latest_checkpoint(folder / CHECKPOINTS), 0
+    if checkpoint is not None:
+        scene.resize(checkpoint / "model.safetensors")
     optimizer = make_optimizer(training)
-    if found is not None:
-        done = load_checkpoint(found, scene, optimizer)
-        remove_older(found)
+    if checkpoint is not None:
+        done = load_checkpoint(checkpoint, scene, optimizer)
+        remove_older(checkpoint)
     if done >= steps:
         return
     rates, shown_db = {group.name: group.rate for group in training.parameter_groups()}, math.nan

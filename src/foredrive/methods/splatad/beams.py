@@ -90,8 +90,8 @@ def tiled_lidar_beams(
 
 def scan_times(points: TiledPoints) -> Float[Tensor, "S"]:
     """Return the mean firing time of the beams in each of `SECTORS` sectors of azimuth, s; 0 without."""
-    there = points.index >= 0
-    sector, time_s = sector_of(points.position[..., 0][there]), points.time_s[there]
+    hits = points.index >= 0
+    sector, time_s = sector_of(points.position[..., 0][hits]), points.time_s[hits]
     total = time_s.new_zeros(SECTORS).index_add(0, sector, time_s)
     return total / sector.bincount(minlength=SECTORS).clamp(min=1)
 

@@ -242,9 +242,9 @@ def _gaussians(
 
 def _patches(points: SeedPoints, size: InitialGaussians, generator: torch.Generator) -> Gaussians:
     """Build Gaussians with the covariance axes of their neighbours: flat where the neighbours are flat."""
-    found = _gaussians(points, size, size.opacity, generator, by_neighbours=size.random_rotations)
+    gaussians = _gaussians(points, size, size.opacity, generator, by_neighbours=size.random_rotations)
     if len(points.xyz_m) <= _PATCH or size.random_rotations:
-        return found
+        return gaussians
     xyz = points.xyz_m.numpy().astype(np.float64)
     _, near = cKDTree(xyz).query(xyz, k=_PATCH + 1)
     spread = xyz[near] - xyz[near].mean(1, keepdims=True)
@@ -252,4 +252,4 @@ def _patches(points: SeedPoints, size: InitialGaussians, generator: torch.Genera
     axes *= np.sign(np.linalg.det(axes))[:, None, None]  # make it a rotation
     scale_m = np.sqrt(variance.clip(0)).clip(_FLATTEST_M, 0.5 * _GREATEST_SCALE_M)
     quaternion, log_scale = quaternion_from_matrix(torch.from_numpy(axes)), torch.from_numpy(scale_m).log()
-    return dataclasses.replace(found, quaternion=quaternion.float(), log_scale=log_scale.float())
+    return dataclasses.replace(gaussians, quaternion=quaternion.float(), log_scale=log_scale.float())

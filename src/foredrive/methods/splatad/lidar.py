@@ -105,13 +105,13 @@ def _scanned(
         time_s = scan_s[sector_of(torch.atan2(y, x))]
         turn_s = scan_s.max() - scan_s.min()
         other_s = torch.where(time_s > 0, time_s - turn_s, time_s + turn_s)
-    here, there = (
+    here, beyond = (
         _project(_moved(them.position_m, them.velocity_mps, twist_lidar, when_s))
         for when_s in (time_s, other_s)
     )
-    azimuth, elevation = (there[0] - here[0]).T
+    azimuth, elevation = (beyond[0] - here[0]).T
     azimuth = torch.remainder(azimuth + math.pi, 2 * math.pi) - math.pi
-    velocity = torch.stack([azimuth, elevation, there[1] - here[1]]) / (other_s - time_s)
+    velocity = torch.stack([azimuth, elevation, beyond[1] - here[1]]) / (other_s - time_s)
     centre = _Centre(here[0] - (time_s * velocity[:2]).T, here[1] - time_s * velocity[2], velocity)
     # Until then the axes turn by time · ω, and J (1 - time [ω]×) takes vectors in the axes at time 0.
     turned = torch.linalg.cross(here[2], twist_lidar[None, 3:, None].expand_as(here[2]), dim=1)

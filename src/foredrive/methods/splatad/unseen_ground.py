@@ -144,8 +144,8 @@ def _levels(xyz_m: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "C 3"]:
     order = np.lexsort((xyz_m[:, 2], member.reshape(-1)))
     first = np.cumsum(count) - count
     median = xyz_m[order[first + count // 2], 2] if len(cells) else np.zeros(0)
-    known = count >= _FEWEST
-    return np.column_stack([(cells[known] + 0.5) * _CELL_M, median[known]])
+    reliable = count >= _FEWEST
+    return np.column_stack([(cells[reliable] + 0.5) * _CELL_M, median[reliable]])
 
 
 def _grid(way_xy: Float[np.ndarray, "K 2"], step_m: float) -> Float[np.ndarray, "P 2"]:

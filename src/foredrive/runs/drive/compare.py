@@ -178,8 +178,8 @@ def figures_of(comparison: Comparison) -> dict[str, float | int | str | None]:
         for metric in METRICS:
             out[f"{agent.name}.{metric}"] = statistics.fmean(agent.values(metric, comparison.keys))
     for metric, of_agents in comparison.differences.items():
-        for name, found in of_agents.items():
-            for part, value in dataclasses.asdict(found).items():
+        for name, metrics in of_agents.items():
+            for part, value in dataclasses.asdict(metrics).items():
                 out[f"{name}.{metric}.difference.{part}"] = None if np.isnan(value) else value
     return out
 
@@ -195,13 +195,13 @@ def _rows(agents: Sequence[ComparedAgent], keys: Sequence[Key]) -> tuple[RouteRo
 
 def _happened(agent: ComparedAgent, keys: Sequence[Key]) -> str:
     """Return infractions and early ends of some drives of one route, with their counts."""
-    found: list[str] = []
+    kinds: list[str] = []
     for key in keys:
         score = agent.drives[key].score
-        found += [str(infraction.kind) for infraction in score.infractions]
+        kinds += [str(infraction.kind) for infraction in score.infractions]
         if score.ending is not Ending.COMPLETED:
-            found.append(str(score.ending))
-    counts = {name: found.count(name) for name in dict.fromkeys(found)}
+            kinds.append(str(score.ending))
+    counts = {name: kinds.count(name) for name in dict.fromkeys(kinds)}
     return ", ".join(
         name.replace("_", " ") + (f" ({count})" if count > 1 else "") for name, count in counts.items()
     )

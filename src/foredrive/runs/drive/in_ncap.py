@@ -61,11 +61,11 @@ class SafetyTests:
 
     def noted(self) -> Mapping[str, object]:
         """Return the fields, a hash of the scenarios, and their path as the routes."""
-        told = repr(load_scenarios(Path(self.scenarios)))
+        scenarios = repr(load_scenarios(Path(self.scenarios)))
         shown = {} if self.sees is None else {"sees": self.sees}
         return {
             **shown,
-            "scenarios_sha256": hashlib.sha256(told.encode()).hexdigest(),
+            "scenarios_sha256": hashlib.sha256(scenarios.encode()).hexdigest(),
             "runs": list(self.runs),
             "scenarios": self.scenarios,
             "rules": self.rules,
@@ -94,7 +94,7 @@ class SafetyTests:
     def set_up(self, job: DriveJob, suite: DriveSuite, out: Path) -> Iterator[DriveSetup]:
         """Set up a run in the reconstructed scene."""
         rules = _rules(self.rules)
-        scenario = next(each for each in load_scenarios(Path(self.scenarios)) if each.label == job.route)
+        scenario = next(entry for entry in load_scenarios(Path(self.scenarios)) if entry.label == job.route)
         folder = _folders(self.runs)[scenario.scene]
         sensors = renders_for(suite)
         place = place_in(folder)
@@ -133,14 +133,14 @@ def _judged(
     result = judge(scenario.kind, driven, reference_mps, rules.left_way_score)
     if place.lanes is None or result.score is None:
         return result
-    found = hd_score_of(
+    judged = hd_score_of(
         driven,
         run.simulator.tracks,
         place.vehicle.T_world_scene,
         run.scenario.start_s,
         place.lanes.area,
     )
-    return dataclasses.replace(result, hd_score=None if found is None else found.hd_score)
+    return dataclasses.replace(result, hd_score=None if judged is None else judged.hd_score)
 
 
 def propose_scenarios(runs: Sequence[str], file: Path, rules: str, count: int) -> SelfTest:
@@ -155,10 +155,10 @@ def propose_scenarios(runs: Sequence[str], file: Path, rules: str, count: int) -
     if file.exists():
         raise InputError(f"{file}: exists already; proposed scenarios are written to a new file")
     places = _by_name(runs)
-    found = [each for scene, run in places.items() for each in propose(place_in(run), scene)]
-    if not found:
+    proposals = [proposal for scene, run in places.items() for proposal in propose(place_in(run), scene)]
+    if not proposals:
         raise InputError("no scenario is feasible in these logs: they are too short, too slow or too full")
-    tested = self_test(found, lambda scenario: place_in(places[scenario.scene]), count, _rules(rules))
+    tested = self_test(proposals, lambda scenario: place_in(places[scenario.scene]), count, _rules(rules))
     if not tested.passed:
         raise InputError(f"no scenario passes the self-test: {tested.told}")
     save_scenarios(tested.passed, file)

@@ -80,7 +80,7 @@ class RebuiltRoutes:
         opened, edits = opened_rebuilt(self.run), _edits_of(self.edits)
         suite.faults.check_cameras(opened.vehicle.rig.names)
         past_frames = past_frames_of(suite.agent)
-        _, start_s, threat = next(each for each in self._plan(past_frames) if each[0] == job)
+        _, start_s, threat = next(planned for planned in self._plan(past_frames) if planned[0] == job)
         edited = edited_scene(opened.scene, edits)
         drive = LoggedDrive(opened.vehicle, edited.T_ego_shifted.cpu())
         graph = edited.graph
@@ -204,6 +204,6 @@ def _agent_in(name: str, simulator: RebuiltSimulator, sees: Sees | None) -> Agen
     if name == CORRIDOR:
         return CorridorAgent(simulator.drive)
     agent = make_agent(name, lambda: simulator.state.t_s, sees=sees)
-    there = [camera.lower() for camera in simulator.renderer.rig.names]
-    wanted = [camera.lower() for camera in inputs_of(name).camera_names or there]
-    return _SelectedCameras(agent, camera_indices(there, wanted)) if wanted != there else agent
+    cameras = [camera.lower() for camera in simulator.renderer.rig.names]
+    wanted = [camera.lower() for camera in inputs_of(name).camera_names or cameras]
+    return _SelectedCameras(agent, camera_indices(cameras, wanted)) if wanted != cameras else agent

@@ -89,7 +89,7 @@ def summarise(drives: Sequence[DriveRecord]) -> Figures:
         out |= {name: value.mean, f"{name}.spread": value.spread}
     out |= {f"endings.{ending}": count for ending, count in suite.endings.items()}
     out |= {f"infractions.{kind}": count for kind, count in suite.infractions.items()}
-    out |= {f"infractions_per_km.{kind}": each for kind, each in suite.infractions_per_km.items()}
+    out |= {f"infractions_per_km.{kind}": rate for kind, rate in suite.infractions_per_km.items()}
     begun = Counter(event.what for drive in drives for event in drive.scenario_events)
     out |= {f"scenarios.{kind}": begun[kind] for kind in ScenarioKind}
     comfortable = [drive.comfort.comfortable_share for drive in drives if drive.comfort]

@@ -70,11 +70,11 @@ class FollowingAgent:
         if dt_s is not None and not 0 < dt_s <= MAX_GAP_S:
             dt_s = None
         beliefs = agent.rollout(clip, agent.planner.imagined_frames)
-        found, _ = self._follower.step(
+        output, _ = self._follower.step(
             lambda carried: agent.perceived(beliefs[0], carried=carried), clip.T_world_ego[0, clip.now], dt_s
         )
         self._before_s = now_s
-        return agent.plan(clip, beliefs, found)
+        return agent.plan(clip, beliefs, output)
 
 
 def following(seeing: SeeingAgent, clock: Callable[[], float]) -> Agent:

@@ -261,13 +261,13 @@ def folder_of(suite: DriveSuite, out: Path) -> RunFolder:
             raise InputError(f"{error}, but there are drives beside it; choose another folder") from error
 
     def read() -> dict[str, object] | None:
-        there = noted_there()
-        return None if there is None else {what: fixed(there)}
+        note = noted_there()
+        return None if note is None else {what: fixed(note)}
 
     def write() -> None:
-        there, note = noted_there() or {}, dict(wanted)
+        old, note = noted_there() or {}, dict(wanted)
         for key in grows:
-            before, now = there.get(key), note[key]
+            before, now = old.get(key), note[key]
             if isinstance(before, int) and isinstance(now, int):
                 note[key] = max(before, now)
         with atomic_path(path) as temporary:

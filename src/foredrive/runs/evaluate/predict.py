@@ -106,7 +106,7 @@ class AgentPredictor:
         """Predict plan, occupancy and flow for now and the next key frames; views and futures if asked."""
         agent, world = self.agent, self.agent.world_model
         beliefs = agent.rollout(observed, max(self.steps, agent.planner.imagined_frames))
-        found, track_id = self._perceive(beliefs[0], observed)
+        output, track_id = self._perceive(beliefs[0], observed)
         decoded = [world.decode(belief) for belief in beliefs[: self.steps + 1]]
         flow = [frame.flow for frame in decoded if frame.flow is not None]
         views = None
@@ -119,9 +119,9 @@ class AgentPredictor:
             ]
             futures = torch.stack([_occupied(world, beliefs) for beliefs in drawn], dim=1)
         tasks = Prediction()
-        if self.heads is not None and found is not None:
-            tasks = _tasks(self.heads, found, track_id)
-        own = found if self.heads is agent.heads else None
+        if self.heads is not None and output is not None:
+            tasks = _tasks(self.heads, output, track_id)
+        own = output if self.heads is agent.heads else None
         return dataclasses.replace(
             tasks,
             occupancy_logit=torch.stack([frame.occupancy_logit for frame in decoded], dim=1),
@@ -140,12 +140,12 @@ class AgentPredictor:
         volumes = volumes_of(self.agent.world_model, now, heads.config.volumes, heads.config.later)
         if follower is None:
             return heads(volumes), None
-        found = []
+        outputs = []
         for item, key in enumerate(self._keys or [""] * len(now.volume)):
             of_item = functools.partial(heads, _of_item(volumes, item), None)
-            found.append(follower.step(of_item, key, observed.T_world_ego[item, observed.now]))
+            outputs.append(follower.step(of_item, key, observed.T_world_ego[item, observed.now]))
         self._keys = ()
-        return together([output for output, _ in found]), torch.cat([track_id for _, track_id in found])
+        return together([output for output, _ in outputs]), torch.cat([track_id for _, track_id in outputs])
 
     def _views(self, renderer: RayRenderer, observed: Clip, now: Decoded) -> Float[Tensor, "b C 3 h w"]:
         rays = thinned_rays(observed, observed.now, self.ray_stride)
@@ -160,22 +160,22 @@ def _of_item(volumes: Mapping[Task, TaskVolume], item: int) -> dict[Task, TaskVo
     return {task: distinct[id(volume)] for task, volume in volumes.items()}
 
 
-def _tasks(heads: TaskHeads, found: HeadOutput, track_id: Int[Tensor, "b Q"] | None) -> Prediction:
+def _tasks(heads: TaskHeads, output: HeadOutput, track_id: Int[Tensor, "b Q"] | None) -> Prediction:
     """Return the parts of a prediction that heads give; those without a head are None."""
     motion = None if heads.agents is None else heads.agents.motion
     agents = None
-    if found.agents is not None:
-        agents = found.agents[-1].agents(0.5 if motion is None else motion.config.dt_s)
+    if output.agents is not None:
+        agents = output.agents[-1].agents(0.5 if motion is None else motion.config.dt_s)
         agents = agents if track_id is None else dataclasses.replace(agents, track_id=track_id)
     instances = None
-    if found.instances is not None and found.agents is not None and heads.instance_grid is not None:
-        instances = instance_raster(found.instances, found.agents[-1], heads.instance_grid)
+    if output.instances is not None and output.agents is not None and heads.instance_grid is not None:
+        instances = instance_raster(output.instances, output.agents[-1], heads.instance_grid)
     return Prediction(
         instances=instances,
         agents=agents,
-        map_lines=None if found.elements is None else found.elements[-1].lines(),
-        map_layers=None if found.raster is None else found.raster.sigmoid(),
-        semantics=None if found.voxels is None else found.voxels.argmax(dim=1).to(torch.uint8),
+        map_lines=None if output.elements is None else output.elements[-1].lines(),
+        map_layers=None if output.raster is None else output.raster.sigmoid(),
+        semantics=None if output.voxels is None else output.voxels.argmax(dim=1).to(torch.uint8),
     )
 
 

@@ -120,9 +120,11 @@ def rendered_images(
 
 def _own_names(log: Log, names: Sequence[str]) -> list[str]:
     """Return the log's own camera names for names that may be those of 123D."""
-    there = pinhole_cameras(log)
-    found = [find_camera(there, name) for name in names]
-    return [name if camera is None else camera.camera_name for name, camera in zip(names, found, strict=True)]
+    by_name = pinhole_cameras(log)
+    cameras = [find_camera(by_name, name) for name in names]
+    return [
+        name if camera is None else camera.camera_name for name, camera in zip(names, cameras, strict=True)
+    ]
 
 
 class RealToSimComparison:
@@ -145,8 +147,8 @@ class RealToSimComparison:
                 Prediction(occupancy_logit=prediction.occupancy_logit, plan=prediction.plan)
             )
         shown, real = (clip.images[now].float() / 255 for clip in (rendered, example.clip))
-        known = example.clip.image_valid[now][:, None, None].expand(-1, *example.clip.rig.size_hw)
-        self._psnr_db.append(psnr_db(shown, real, known))
+        valid = example.clip.image_valid[now][:, None, None].expand(-1, *example.clip.rig.size_hw)
+        self._psnr_db.append(psnr_db(shown, real, valid))
         self._examples.append(dataclasses.replace(batch, clip=_without_images(batch.clip)))
 
     def figures(self, frame_dt_s: float) -> Figures:
@@ -158,9 +160,9 @@ class RealToSimComparison:
             (RENDERED, self._predictions[RENDERED], self._examples),
             (AGREEMENT, self._predictions[RENDERED], agreed),
         ):
-            found = evaluate(_StoredPredictions(iter(prediction)), truth, frame_dt_s=frame_dt_s).summary
+            summary = evaluate(_StoredPredictions(iter(prediction)), truth, frame_dt_s=frame_dt_s).summary
             kinds = (".iou_", ".l2_") if name == AGREEMENT else (".iou_", ".l2_", ".collision_")
-            kept = {key: value for key, value in found.items() if any(kind in key for kind in kinds)}
+            kept = {key: value for key, value in summary.items() if any(kind in key for kind in kinds)}
             out |= {f"{name}.{key}": value for key, value in kept.items() if not key.endswith(PERSISTENT)}
         return out
 
@@ -180,15 +182,15 @@ def _as_truth(example: Example, prediction: Prediction) -> Example:
     """Return an example whose labels are replaced by a prediction."""
     assert prediction.occupancy_logit is not None
     assert prediction.plan is not None
-    values, known = example.occupancy.values.clone(), example.occupancy.known.clone()
+    values, valid = example.occupancy.values.clone(), example.occupancy.known.clone()
     now = example.clip.now
     span = slice(now, now + prediction.occupancy_logit.shape[1])
     values[:, span, 0] = (prediction.occupancy_logit > 0).to(values)
-    known[:, span] = True
+    valid[:, span] = True
     return dataclasses.replace(
         example,
         clip=dataclasses.replace(example.clip, future=prediction.plan),
-        occupancy=VoxelGrid(example.occupancy.spec, values, known),
+        occupancy=VoxelGrid(example.occupancy.spec, values, valid),
     )
 
 

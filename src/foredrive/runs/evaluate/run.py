@@ -217,7 +217,7 @@ def predict_examples(run: Run, logs: Sequence[LogPath], count: int) -> list[Exam
     config = dataclasses.replace(clips.judged, lidar=True, map=True, tasks=tasks)
     dataset = open_clips(logs, config, run.cache_dir)
     predictor = agent_predictor(agent, trained, clips.future_frames, RENDER_STRIDE)
-    found = []
+    predictions = []
     for k in range(min(count, len(dataset))):
         try:
             item = dataset[int((k + 0.5) * len(dataset) / count)]
@@ -227,7 +227,7 @@ def predict_examples(run: Run, logs: Sequence[LogPath], count: int) -> list[Exam
         prediction = predictor.predict(observed, frozenset({"occupancy_logit", "plan", "images"}))
         assert prediction.occupancy_logit is not None
         assert prediction.plan is not None
-        found.append(
+        predictions.append(
             ExamplePrediction(
                 example=item,
                 occupied=prediction.occupancy_logit[0] > 0,
@@ -237,4 +237,4 @@ def predict_examples(run: Run, logs: Sequence[LogPath], count: int) -> list[Exam
                 tasks=None if trained is None else prediction,
             )
         )
-    return found
+    return predictions

@@ -69,14 +69,14 @@ def open_run_log(folder: Path) -> tuple[RebuildRecipe[Any], LogPath]:
     return load_rebuild_recipe(folder / CONFIG), path
 
 
-def camera_indices(there: Sequence[str], wanted: Sequence[str]) -> list[int]:
+def camera_indices(names: Sequence[str], wanted: Sequence[str]) -> list[int]:
     """Return the index of the reconstructed camera for each camera that an agent requires.
 
     Raises:
         InputError: some cameras were not reconstructed; the error names them.
     """
-    if missing := [name for name in wanted if name not in there]:
+    if missing := [name for name in wanted if name not in names]:
         raise InputError(
-            f"cameras not reconstructed: {', '.join(missing)}; available: {', '.join(there) or 'none'}"
+            f"cameras not reconstructed: {', '.join(missing)}; available: {', '.join(names) or 'none'}"
         )
-    return [there.index(name) for name in wanted]
+    return [names.index(name) for name in wanted]

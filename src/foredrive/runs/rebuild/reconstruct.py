@@ -159,8 +159,8 @@ def read_reconstruction_data(
     every, frames = recipe.hold_out_every, torch.arange(len(drive.t_s))
     held = (frames % every == every - 1) if every else torch.zeros_like(frames, dtype=torch.bool)
     T_world_scene = drive.T_world_ego[0]
-    known = drive.frames(frames[~held].tolist())
-    tracks = read_tracks(known, T_world_scene)
+    training = drive.frames(frames[~held].tolist())
+    tracks = read_tracks(training, T_world_scene)
     for lacking, what in (
         (not bool(drive.sweep_valid.any()), "no lidar: rebuilt from its images alone"),
         (len(tracks) == 0, "no tracks: everything in it is taken to stand still"),
@@ -172,7 +172,7 @@ def read_reconstruction_data(
     actors, obstacles = split_tracks(tracks, recipe.moves_m, recipe.nonrigid)
     if not recipe.actors:
         actors, obstacles = tracks.only(torch.zeros_like(tracks.present[:, 0])), tracks
-    train = _sensor_views(known, T_world_scene)
+    train = _sensor_views(training, T_world_scene)
     return ReconstructionData(
         train=train,
         held_out=_sensor_views(drive.frames(frames[held].tolist()), T_world_scene),
@@ -279,9 +279,9 @@ def _folder_of(recipe: RebuildRecipe[Any], path: LogPath, folder: Path) -> RunFo
     def read() -> dict[str, object] | None:
         if not (folder / CONFIG).is_file():
             return None
-        there = load_rebuild_recipe(folder / CONFIG)
+        recipe = load_rebuild_recipe(folder / CONFIG)
         try:
-            return {other_recipe: there, other_log: json.loads((folder / LOG).read_text())["folder"]}
+            return {other_recipe: recipe, other_log: json.loads((folder / LOG).read_text())["folder"]}
         except (OSError, ValueError, LookupError, TypeError) as error:
             raise InputError(f"{folder / LOG}: cannot be read as the path of a log: {error}") from error
 

@@ -134,7 +134,7 @@ def render_frame(
 
 def edits_from_arguments(
     tracks: ActorTracks,
-    known: Sequence[Edit],
+    saved: Sequence[Edit],
     shift_left_m: float,
     remove: Sequence[int],
     insert: Sequence[str],
@@ -152,7 +152,7 @@ def edits_from_arguments(
         InputError: an entry of `insert` has another format.
     """
     edits: list[Edit] = []
-    copies = [edit.copy for edit in known if isinstance(edit, Duplicate | Insert | DriveStraight)]
+    copies = [edit.copy for edit in saved if isinstance(edit, Duplicate | Insert | DriveStraight)]
     copy = max([*tracks.track_id.tolist(), *copies], default=0) + 1
     for number, text in enumerate(insert):
         source, _, rest = text.rpartition(":")

@@ -135,8 +135,8 @@ def _recipe_from(written: Any, source: str) -> RebuildRecipe[Any]:
     representation = written.get("representation") if isinstance(written, Mapping) else None
     kind = representation.get("kind") if isinstance(representation, Mapping) else None
     if kind not in REPRESENTATIONS:
-        known = ", ".join(REPRESENTATIONS)
-        raise InputError(f"{source}: not a recipe: representation.kind: {kind!r} is none of {known}")
+        names = ", ".join(REPRESENTATIONS)
+        raise InputError(f"{source}: not a recipe: representation.kind: {kind!r} is none of {names}")
     row = REPRESENTATIONS[kind]
     recipe: RebuildRecipe[Any] = validated(RebuildRecipe[row], written, source)  # type: ignore[valid-type]
     return recipe

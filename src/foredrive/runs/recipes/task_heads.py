@@ -136,9 +136,9 @@ def _heads_of(tasks: Sequence[str], sizes: TaskHeadsConfig, schedule: Schedule) 
         raise InputError("name at least one task")
     for task in tasks:
         if task not in (*HEADED, INSTANCES):
-            known = "has no head" if task in get_args(Task) else "is unknown"
+            fault = "has no head" if task in get_args(Task) else "is unknown"
             headed = ", ".join((*HEADED, INSTANCES))
-            raise InputError(f"the task {task!r} {known}; heads can be trained for {headed}")
+            raise InputError(f"the task {task!r} {fault}; heads can be trained for {headed}")
     agents = sizes.agents if {"detection", "motion", "tracking", INSTANCES} & set(tasks) else None
     if agents is not None and "motion" not in tasks:
         agents = replace(agents, motion=None)

@@ -64,17 +64,17 @@ def train_captions(
     views = gather_views(logs, stride_s, towers.image_side_px, towers.crop, folder / "cache")
     targets = unit(image_targets(views, towers, folder))
     rows = [row for log in views for row in log.rows]
-    told = [whole_caption(row.facts) for row in rows]
-    known = [n for n, caption in enumerate(told) if caption is not None]
-    if not known:
+    whole = [whole_caption(row.facts) for row in rows]
+    captioned = [n for n, caption in enumerate(whole) if caption is not None]
+    if not captioned:
         raise InputError("no view of these logs has annotated boxes or a recorded setting")
-    captions = {n: str(told[n]) for n in known}
+    captions = {n: str(whole[n]) for n in captioned}
     words = sorted({word for caption in captions.values() for word in caption.split()})
     longest = 1 + max(len(caption.split()) for caption in captions.values())
     torch.manual_seed(schedule.seed)
     decoder = CaptionDecoder(towers.dim, words, longest)
     items = []
-    for n in known:
+    for n in captioned:
         numbers = decoder.numbers(captions[n])
         padded = torch.tensor(numbers + [PAD] * (longest - len(numbers)))
         items.append(CaptionedEmbeddings(targets[n], padded, (rows[n].name,)))
@@ -82,7 +82,7 @@ def train_captions(
         CaptionObjective(decoder), _CaptionedViews(items), _collate, schedule, folder, make_fabric("32-true")
     )
     file = towers_folder / CAPTIONS
-    card = {"words": words, "longest": longest, "fingerprint": towers.fingerprint, "views": len(known)}
+    card = {"words": words, "longest": longest, "fingerprint": towers.fingerprint, "views": len(captioned)}
     with atomic_path(file) as temporary:
         state = {name: value.half().contiguous() for name, value in decoder.state_dict().items()}
         save_file(state, temporary, metadata={_TOLD: json.dumps(card)})
@@ -119,12 +119,12 @@ class Captioned(NamedTuple):
 
 def caption_views(views: dict[str, View], towers: Towers, decoder: CaptionDecoder) -> dict[str, Captioned]:
     """Caption each view, once from its image and once from its lidar returns."""
-    found = {}
+    captions = {}
     for name, view in views.items():
         pair = torch.from_numpy(embed_views(towers, [view])[0])
         said = [decoder.say(vector[None])[0] if vector.isfinite().all() else None for vector in pair]
-        found[name] = Captioned(*said)
-    return found
+        captions[name] = Captioned(*said)
+    return captions
 
 
 def _collate(items: Sequence[CaptionedEmbeddings]) -> CaptionedEmbeddings:

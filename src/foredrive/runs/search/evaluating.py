@@ -82,7 +82,9 @@ def evaluate_index(index: FrameIndex, towers: Towers, moments: int) -> dict[str,
     frames, views = rows.filter(pa.array(whole)), rows.filter(pa.array(~whole))
     shares = _retrieval("frames", _pairs_of(frames)) | _retrieval("views", _pairs_of(views))
     period, weather = views["time_of_day"].to_pylist(), views["weather"].to_pylist()
-    weather = [name if at != NIGHT else None for name, at in zip(weather, period, strict=True)]
+    weather = [
+        name if time_of_day != NIGHT else None for name, time_of_day in zip(weather, period, strict=True)
+    ]
     score = functools.partial(_classification, towers=towers)
     shares |= score("period", _pairs_of(views), [PERIODS.get(name) for name in period], PERIOD_TEMPLATES)
     shares |= score("weather", _pairs_of(views), [WEATHERS.get(name) for name in weather], WEATHER_TEMPLATES)
@@ -124,8 +126,8 @@ def _classification(
     image, lidar = pairs.image[kept], pairs.lidar[kept]
     vectors = {"image": image, "lidar": lidar, "joint": mean_direction(np.stack([image, lidar]))}
     shares = {}
-    for arm, found in vectors.items():
-        right = (classify(torch.from_numpy(found), texts).numpy() == true).astype(float)
+    for arm, arm_vectors in vectors.items():
+        right = (classify(torch.from_numpy(arm_vectors), texts).numpy() == true).astype(float)
         shares[f"{task}.accuracy.{arm}"] = _share(right, logs)
         shares[f"{task}.class_accuracy.{arm}"] = _share(right, logs, true)
         for number in sorted(set(true.tolist())):
@@ -153,13 +155,13 @@ def _objects(frames: pa.Table, towers: Towers, moments: int) -> tuple[_SensorPai
     for row in frames.select(["log", "folder", "maps_dir", "frame"]).take(pa.array(chosen)).to_pylist():
         log = opened_log(LogPath(Path(row["folder"]), Path(row["maps_dir"])))
         objects = [
-            found
-            for found in read_objects(log, row["frame"], towers.image_side_px)
-            if found.category in OBJECTS
+            object_view
+            for object_view in read_objects(log, row["frame"], towers.image_side_px)
+            if object_view.category in OBJECTS
         ]
         if objects:
-            vectors.append(embed_views(towers, [found.view for found in objects]))
+            vectors.append(embed_views(towers, [object_view.view for object_view in objects]))
             logs += [row["log"]] * len(objects)
-            nouns += [OBJECTS[found.category] for found in objects]
+            nouns += [OBJECTS[object_view.category] for object_view in objects]
     pairs = np.concatenate(vectors) if vectors else np.zeros((0, 2, towers.dim), np.float32)
     return _SensorPairs(pairs[:, 0], pairs[:, 1], logs), list(nouns)

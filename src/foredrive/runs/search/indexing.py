@@ -92,8 +92,8 @@ def index_logs(
         index = FrameIndex.make(uri, IndexSettings(tower.name, tower.fingerprint, tower.dim, stride_s))
         failed: dict[str, str] = {}
         jobs = _plan(logs, index, failed)
-        there = index.parts()
-        todo = [job for job in jobs if job.part not in there]
+        indexed = index.parts()
+        todo = [job for job in jobs if job.part not in indexed]
         total = sum(len(job.frames) for job in todo)
         writer, done = IndexWriter(index), 0
         tick(0, total)
@@ -205,8 +205,8 @@ def _plan(logs: Sequence[LogPath], index: FrameIndex, failed: dict[str, str]) ->
 
 def moments(log: Log, stride_s: float) -> list[int]:
     """Return the frames nearest to each multiple of `stride_s`, within the log's parts if it has any."""
-    frame, found = log.nearest_frames(np.arange(log.t_us[0], log.t_us[-1] + 1, stride_s * 1e6))
-    frames = np.unique(frame[found])
+    frame, valid = log.nearest_frames(np.arange(log.t_us[0], log.t_us[-1] + 1, stride_s * 1e6))
+    frames = np.unique(frame[valid])
     if log.path.parts_s:
         t_s = (log.t_us[frames] - log.t_us[0]) * 1e-6
         frames = frames[np.any([(t_s >= start) & (t_s < end) for start, end in log.path.parts_s], axis=0)]

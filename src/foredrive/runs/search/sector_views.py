@@ -47,23 +47,23 @@ class LogViews:
 
     def __init__(self, folder: Path) -> None:
         try:
-            told = json.loads((folder / ROWS).read_text())
+            facts = json.loads((folder / ROWS).read_text())
             with safe_open(folder / TENSORS, framework="pt"):
                 pass
         except (OSError, SafetensorError, ValueError) as error:
             raise InputError(f"{folder}: views cannot be read ({error}); delete it") from error
         self.name, self._file = folder.name, folder / TENSORS
-        self.rows = [_row_of(*entry["row"]) for entry in told]
-        self._place = [(entry["row"][2], entry["at"], entry["points"]) for entry in told]
+        self.rows = [_row_of(*entry["row"]) for entry in facts]
+        self._place = [(entry["row"][2], entry["at"], entry["points"]) for entry in facts]
 
     def __len__(self) -> int:
         return len(self.rows)
 
     def image(self, row: int) -> UInt8[Tensor, "3 H W"]:
         """Return the image of a view."""
-        view, at, _ = self._place[row]
+        view, corner, _ = self._place[row]
         with safe_open(self._file, framework="pt") as opened:
-            return opened.get_slice(f"image.{view}")[at]
+            return opened.get_slice(f"image.{view}")[corner]
 
     def points(self, row: int) -> Float[Tensor, "P 4"]:
         """Return x, y, z and intensity of a view's returns."""
@@ -88,14 +88,14 @@ def gather_views(
     Raises:
         InputError: a log cannot be read, or has no view with an image.
     """
-    found = []
+    views = []
     for path in logs:
         asked = f"{VIEWS_VERSION} {path} {log_digest(path)} {stride_s} {side_px} {crop}"
         folder = cache_dir / "views" / hashlib.sha256(asked.encode()).hexdigest()[:24]
         if not folder.is_dir():
             _write_views(Log(path), stride_s, side_px, crop, folder)
-        found.append(LogViews(folder))
-    return found
+        views.append(LogViews(folder))
+    return views
 
 
 def _write_views(log: Log, stride_s: float, side_px: int, crop: Crop, folder: Path) -> None:

@@ -65,30 +65,30 @@ class CaptionedViews(Dataset[CaptionedImages]):
         self, views: Sequence[LogViews], embed: Callable[[list[str]], Float[Tensor, "N D"]], texts: int
     ) -> None:
         self._rows = _ViewsOfLogs(views)
-        told = [phrases(row.facts, seed, texts) for seed, row in enumerate(self._rows.all())]
-        self._known = [index for index, those in enumerate(told) if those]
+        captions = [phrases(row.facts, seed, texts) for seed, row in enumerate(self._rows.all())]
+        self._known = [index for index, those in enumerate(captions) if those]
         if not self._known:
             raise InputError("no view of these logs has annotated boxes or a recorded setting")
         sizes = {tuple(images.shape[1:]) for log in views for _, images in log.images_by_view()}
         if len(sizes) > 1:
             raise InputError(f"all images must have one size; these logs have {sorted(sizes)}")
-        distinct = sorted({phrase.text for those in told for phrase in those})
+        distinct = sorted({phrase.text for those in captions for phrase in those})
         embedded = embed(distinct)
         number = {text: n for n, text in enumerate(distinct)}
-        self._text_of = {index: [number[phrase.text] for phrase in told[index]] for index in self._known}
+        self._text_of = {index: [number[phrase.text] for phrase in captions[index]] for index in self._known}
         used = torch.tensor([n for those in self._text_of.values() for n in those])
         self.text_mean = embedded[used].mean(0)
         self._texts = embedded - self.text_mean
-        self._set_facts(told)
+        self._set_facts(captions)
 
-    def _set_facts(self, told: Sequence[Sequence[Phrase]]) -> None:
+    def _set_facts(self, captions: Sequence[Sequence[Phrase]]) -> None:
         rows = self._rows.all()
         true = [rows[index].facts.facts for index in self._known]
         vocabulary = {fact: n for n, fact in enumerate(sorted(set[str]().union(*true)))}
         self._holds = torch.stack([_several_hot(facts, vocabulary) for facts in true])
         self._stated = torch.stack(
             [
-                torch.stack([_several_hot(phrase.facts, vocabulary) for phrase in told[index]])
+                torch.stack([_several_hot(phrase.facts, vocabulary) for phrase in captions[index]])
                 for index in self._known
             ]
         )
@@ -125,14 +125,14 @@ class ImagedViews(Dataset[ImagedSweeps]):
 
 def text_targets(texts: Sequence[str], model: str, folder: Path) -> Float[Tensor, "N E"]:
     """Embed texts with a text encoder; cache the result in a folder."""
-    told = hashlib.sha256("\n".join([model, *texts]).encode()).hexdigest()[:24]
-    file = folder / f"texts-{told}.safetensors"
+    key = hashlib.sha256("\n".join([model, *texts]).encode()).hexdigest()[:24]
+    file = folder / f"texts-{key}.safetensors"
     if not file.is_file():
-        encoder, found = TextEncoder(model), []
+        encoder, vectors = TextEncoder(model), []
         for start in track(range(0, len(texts), TEXTS_AT_ONCE), "embedding texts"):
-            found.append(encoder(texts[start : start + TEXTS_AT_ONCE]))
+            vectors.append(encoder(texts[start : start + TEXTS_AT_ONCE]))
         with atomic_path(file) as temporary:
-            save_file({"texts": torch.cat(found)}, temporary)
+            save_file({"texts": torch.cat(vectors)}, temporary)
     return load_file(file)["texts"]
 
 
@@ -145,13 +145,13 @@ def _targets_of(log: LogViews, towers: Towers, folder: Path) -> Float[Tensor, "n
     file = folder / "targets" / f"{log.name}-{towers.fingerprint}.safetensors"
     if file.is_file():
         return load_file(file)["targets"]
-    found = torch.zeros(len(log), 2, towers.dim)
+    targets = torch.zeros(len(log), 2, towers.dim)
     for rows, images in log.images_by_view():
-        found[rows, 0] = towers.embed_images(images)
-        found[rows, 1] = towers.embed_images(images.flip(-1))
+        targets[rows, 0] = towers.embed_images(images)
+        targets[rows, 1] = towers.embed_images(images.flip(-1))
     with atomic_path(file) as temporary:
-        save_file({"targets": found}, temporary)
-    return found
+        save_file({"targets": targets}, temporary)
+    return targets
 
 
 def collate_captioned(items: Sequence[CaptionedImages]) -> CaptionedImages:

@@ -200,8 +200,8 @@ def _folder_of(folder: Path, recipe: TowerRecipe, logs: Sequence[LogPath], besid
         if not file.is_file():
             return None
         try:
-            found = json.loads(file.read_text())
-            return named({**found, "recipe": TypeAdapter(TowerRecipe).validate_python(found["recipe"])})
+            stored = json.loads(file.read_text())
+            return named({**stored, "recipe": TypeAdapter(TowerRecipe).validate_python(stored["recipe"])})
         except (OSError, ValueError, LookupError, TypeError) as error:
             raise InputError(f"{file}: cannot be read: {error}") from error
 

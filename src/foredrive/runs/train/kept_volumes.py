@@ -97,10 +97,10 @@ class KeptVolumes(Dataset[TaskExample]):
             clip = stack_records([dataset.clip(row) for row in rows]).to(device)
             world = agent.world_model
             with torch.no_grad():
-                found = task_volumes(world, world.observe(clip.observed()), self.tasks, self._later)
+                volumes = task_volumes(world, world.observe(clip.observed()), self.tasks, self._later)
             for item, row in enumerate(rows):
                 with atomic_path(self._files[row]) as temporary:
-                    save_file(_tensors(found[item].to("cpu")), temporary)
+                    save_file(_tensors(volumes[item].to("cpu")), temporary)
 
 
 def _tensors(volumes: TaskVolumes) -> dict[str, Tensor]:

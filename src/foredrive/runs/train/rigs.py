@@ -116,8 +116,10 @@ def _read(log: Log, names: tuple[str, ...]) -> dict[str, Mount]:
     if not cameras:
         return {}
     mounts = rig_of_log(log).cameras
-    found = [camera.camera_id.name for name in names if (camera := find_camera(cameras, name)) is not None]
-    return {name: mounts[name] for name in found}
+    names_123d = [
+        camera.camera_id.name for name in names if (camera := find_camera(cameras, name)) is not None
+    ]
+    return {name: mounts[name] for name in names_123d}
 
 
 def _rounded(rig: RigPlan) -> tuple[tuple[float, ...], ...]:

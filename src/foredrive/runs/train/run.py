@@ -70,12 +70,12 @@ class Run:
     @property
     def conditions(self) -> dict[str, str | int]:
         """Return device, precision and processes of each stage, as flat dotted keys. Older runs have none."""
-        found: dict[str, str | int] = {}
+        conditions: dict[str, str | int] = {}
         for stage in STAGES:
             with contextlib.suppress(OSError, ValueError, AttributeError, RecursionError):
                 entries = json.loads((self.folder / stage / CONDITIONS).read_text()).items()
-                found |= {f"training.{stage}.{name}": value for name, value in entries}
-        return found
+                conditions |= {f"training.{stage}.{name}": value for name, value in entries}
+        return conditions
 
 
 def open_run(folder: Path) -> Run:
@@ -252,9 +252,9 @@ def _kept(recipe: Recipe, start: Path | None) -> Run:
     """Return the run whose world model and heads are kept."""
     if start is None:
         raise InputError(f"{recipe.name}: transfer is frozen; --start has to name a trained run")
-    found = open_run(start)
-    assert found.weights
-    return found
+    source = open_run(start)
+    assert source.weights
+    return source
 
 
 def _train_stage(

@@ -34,7 +34,9 @@ class FrameSequences(Dataset[list[T]]):
     def __init__(self, items: Dataset[T], keys: Sequence[str], frames: int, dt_s: float) -> None:
         self.items = items
         after = _successors(keys, dt_s)
-        self.sequences = [found for first in range(len(keys)) if (found := _sequence(first, after, frames))]
+        self.sequences = [
+            sequence for first in range(len(keys)) if (sequence := _sequence(first, after, frames))
+        ]
         if not self.sequences:
             raise InputError(f"no log has {frames} clips that are {dt_s:g} s apart")
 
@@ -86,7 +88,7 @@ def in_sequences(
 
 def _successors(keys: Sequence[str], dt_s: float) -> dict[int, int]:
     """Return the item that follows each item after about `dt_s`, where there is one."""
-    found: dict[int, int] = {}
+    successors: dict[int, int] = {}
     for _, group in itertools.groupby(range(len(keys)), lambda number: log_of(keys[number])):
         numbers = list(group)
         t_s = np.array([1e-6 * time_of(keys[number]) for number in numbers])
@@ -94,15 +96,15 @@ def _successors(keys: Sequence[str], dt_s: float) -> dict[int, int]:
         nearest = off_s.argmin(axis=1)
         for row, column in enumerate(nearest.tolist()):
             if off_s[row, column] <= TOLERANCE * dt_s:
-                found[numbers[row]] = numbers[column]
-    return found
+                successors[numbers[row]] = numbers[column]
+    return successors
 
 
 def _sequence(first: int, after: dict[int, int], frames: int) -> list[int]:
     """Return a sequence from its first item on; an empty one if the log ends before."""
-    found = [first]
-    while len(found) < frames:
-        if found[-1] not in after:
+    indices = [first]
+    while len(indices) < frames:
+        if indices[-1] not in after:
             return []
-        found.append(after[found[-1]])
-    return found
+        indices.append(after[indices[-1]])
+    return indices

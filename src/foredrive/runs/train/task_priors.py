@@ -28,9 +28,9 @@ PRIORS = "priors.safetensors"
 
 def save_priors(priors: TaskPriors, path: Path) -> None:
     """Write the baselines that exist."""
-    known = {name: value.contiguous() for name, value in vars(priors).items() if value is not None}
+    tensors = {name: value.contiguous() for name, value in vars(priors).items() if value is not None}
     with atomic_path(path) as temporary:
-        save_file(known, temporary)
+        save_file(tensors, temporary)
 
 
 def load_priors(path: Path) -> TaskPriors:
@@ -70,6 +70,6 @@ def semantic_weights(truths: Iterable[TaskTruth | None]) -> Float[Tensor, "C"] |
     for truth in truths:
         if truth is not None and (voxels := truth.semantics) is not None:
             classes = len(VOXEL_CLASSES[voxels.taxonomy])
-            found = torch.bincount(voxels.index[voxels.known].long(), minlength=classes)
-            counts = found if counts is None else counts + found
+            class_counts = torch.bincount(voxels.index[voxels.known].long(), minlength=classes)
+            counts = class_counts if counts is None else counts + class_counts
     return None if counts is None else class_weights(counts)

@@ -102,9 +102,9 @@ def train_heads(run: Run, heads: TaskHeadsRecipe) -> TrainedHeads:
         save_priors(fit_task_priors(example.truth for example in dataset.examples), folder / PRIORS)
         with atomic_path(folder / WEIGHTS) as temporary:
             save_weights(fresh, temporary)
-    found = load_heads(run)
-    assert found is not None
-    return found
+    trained = load_heads(run)
+    assert trained is not None
+    return trained
 
 
 def load_heads(run: Run) -> TrainedHeads | None:

@@ -132,11 +132,11 @@ def agent_losses(
         )
         held = held_objects(source, owner, targets.track_id, away_m)
         for number, layer in enumerate(layers):
-            found = layer[item]
-            query, match = matching_beside(found.boxes, targets.boxes, held, weights.boxes)
-            terms["queries"].append(matched_loss(found.boxes, targets.boxes, query, match, weights.boxes))
+            predicted = layer[item]
+            query, match = matching_beside(predicted.boxes, targets.boxes, held, weights.boxes)
+            terms["queries"].append(matched_loss(predicted.boxes, targets.boxes, query, match, weights.boxes))
             if number == len(layers) - 1:
-                for name, value in _matched_terms(found, targets, query, match).items():
+                for name, value in _matched_terms(predicted, targets, query, match).items():
                     terms[name].append(value)
                 owner = owners(query, match, targets.track_id, count)
     if last.future_xy is None:
@@ -163,13 +163,13 @@ def _cell_losses(centres: CentreMap, targets: AgentTargets, spec: VoxelSpec) -> 
     inside = ((cell >= 0) & (cell < cell.new_tensor([columns, rows]))).all(-1)
     box, _ = inside.nonzero(as_tuple=True)
     column, row = cell[inside].unbind(-1)
-    found = torch.cat(
+    logits = torch.cat(
         [centres.xy[row, column], centres.z[row, column, None], centres.log_lwh[row, column]], dim=-1
     )
     assert targets.boxes.yaw is not None
     yaw = targets.boxes.yaw.to(state)[box]
     arrow = torch.stack([yaw.sin(), yaw.cos()], dim=-1)
-    off = (found - state[box]).abs().sum(-1) + (centres.heading[row, column] - arrow).abs().sum(-1)
+    off = (logits - state[box]).abs().sum(-1) + (centres.heading[row, column] - arrow).abs().sum(-1)
     velocity = targets.velocity[box]
     known = velocity.isfinite().all(-1)
     slip = centres.velocity[row, column] - torch.where(known[:, None], velocity, 0.0)
@@ -178,22 +178,22 @@ def _cell_losses(centres: CentreMap, targets: AgentTargets, spec: VoxelSpec) -> 
 
 
 def _matched_terms(
-    found: AgentSet, targets: AgentTargets, query: Tensor, match: Tensor
+    predicted: AgentSet, targets: AgentTargets, query: Tensor, match: Tensor
 ) -> dict[str, Float[Tensor, ""]]:
     """Return the losses of velocity, attribute and motion of one item's matched queries."""
     true_velocity = targets.velocity[match]
     known = true_velocity.isfinite().all(-1)
-    off = (found.velocity[query] - torch.where(known[:, None], true_velocity, 0.0)).abs().sum(-1)
+    off = (predicted.velocity[query] - torch.where(known[:, None], true_velocity, 0.0)).abs().sum(-1)
     true_attribute = targets.attribute[match]
     entropy = F.cross_entropy(
-        found.attribute[query], true_attribute.long(), ignore_index=-1, reduction="none"
+        predicted.attribute[query], true_attribute.long(), ignore_index=-1, reduction="none"
     )
     terms = {"velocity": masked_mean(off, known), "attribute": masked_mean(entropy, true_attribute >= 0)}
-    if found.future_xy is None or found.log_prob is None:
+    if predicted.future_xy is None or predicted.log_prob is None:
         return terms
     motion = motion_losses(
-        found.future_xy[query],
-        found.log_prob[query],
+        predicted.future_xy[query],
+        predicted.log_prob[query],
         targets.future_xy[match],
         targets.future_valid[match],
     )

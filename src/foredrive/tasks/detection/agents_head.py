@@ -163,21 +163,21 @@ class AgentHead(nn.Module):
         queries, before = self.kind(first.label), _first_agents(first)
         if carried is not None:
             queries, before = self._with_carried(queries, before, carried)
-        found: list[AgentSet] = []
+        layers: list[AgentSet] = []
         for layer in self.layers:
             at_m = before.boxes.mean[..., :2]
             queries = queries + self.read(fine.at(at_m))
             queries = layer(queries, self.place(fine.share(at_m)), cells, cell_place)
-            found.append(_changed(before, self.change(queries)))
-            before = found[-1].map_tensors(torch.Tensor.detach)
-        found[-1] = replace(found[-1], query=queries)
+            layers.append(_changed(before, self.change(queries)))
+            before = layers[-1].map_tensors(torch.Tensor.detach)
+        layers[-1] = replace(layers[-1], query=queries)
         if self.motion is not None and motion_planes is not None:
-            boxes = found[-1].boxes
+            boxes = layers[-1].boxes
             future_xy, log_prob = self.motion(
-                queries, boxes.mean[..., :2], boxes.heading, found[-1].velocity, motion_planes, self.place
+                queries, boxes.mean[..., :2], boxes.heading, layers[-1].velocity, motion_planes, self.place
             )
-            found[-1] = replace(found[-1], future_xy=future_xy, log_prob=log_prob)
-        return centres, found
+            layers[-1] = replace(layers[-1], future_xy=future_xy, log_prob=log_prob)
+        return centres, layers
 
     def _with_carried(
         self, queries: Float[Tensor, "b Q W"], first: AgentSet, carried: AgentSet
@@ -192,14 +192,14 @@ class AgentHead(nn.Module):
         expected_m, proposed_m = carried.boxes.mean[..., :2], first.boxes.mean[..., :2]
         taken, rest = take_proposals(expected_m, proposed_m, self.carried.reach_m)
         sees = taken >= 0
-        at = taken.clamp_min(0)
+        place = taken.clamp_min(0)
 
         def go_on(seen: Tensor, expected: Tensor) -> Tensor:
             return torch.where(sees.view(*sees.shape, *[1] * (seen.dim() - 2)), seen, expected)
 
-        item = torch.arange(len(at), device=at.device)[:, None]
-        renewed = self.renew(carried.query) + sees[..., None] * queries[item, at]
-        old = _merged(go_on, _chosen(first, at), carried)
+        item = torch.arange(len(place), device=place.device)[:, None]
+        renewed = self.renew(carried.query) + sees[..., None] * queries[item, place]
+        old = _merged(go_on, _chosen(first, place), carried)
         return torch.cat([renewed, queries[item, rest]], dim=1), _merged(_join, old, _chosen(first, rest))
 
 

@@ -58,7 +58,7 @@ def read_coco(
     classes = [str(category.get("name", category["id"])) for category in categories]
     if len(set(classes)) < len(classes):
         raise InputError(f"{truth_path}: two categories have the same name")
-    found: dict[Any, list[tuple[int, Record]]] = defaultdict(list)
+    predicted: dict[Any, list[tuple[int, Record]]] = defaultdict(list)
     true: dict[Any, list[tuple[int, Record]]] = defaultdict(list)
     crowds = 0
     for n, record in enumerate(_listed(truth, "annotations", truth_path)):
@@ -71,11 +71,11 @@ def read_coco(
         category = _key(record, "category_id")
         others += category is not None and category not in label_of
         if category is None or category in label_of:
-            found[_key(record, "image_id")].append((n, record))
-    known = {image["id"] for image in images}
-    for records, where in ((found, path), (true, truth_path)):
+            predicted[_key(record, "image_id")].append((n, record))
+    image_ids = {image["id"] for image in images}
+    for records, where in ((predicted, path), (true, truth_path)):
         for image_id, members in records.items():
-            if image_id not in known:
+            if image_id not in image_ids:
                 raise InputError(f"{where}: record {members[0][0]} is of the unknown image {image_id}")
             for n, record in members:
                 if _key(record, "category_id") not in label_of:
@@ -83,13 +83,13 @@ def read_coco(
                         f"{where}: record {n} has the unknown category {record.get('category_id')}"
                     )
     sizeless, true_sizeless = (
-        _drop_sizeless(each, where) for each, where in ((found, path), (true, truth_path))
+        _drop_sizeless(side, where) for side, where in ((predicted, path), (true, truth_path))
     )
     tell_left_out(path, {"boxes of other categories": others, "boxes without size": sizeless}, len(results))
     true_boxes = sum(len(members) for members in true.values())
     tell_left_out(truth_path, {"boxes without size": true_sizeless}, true_boxes + true_sizeless)
     counts = {
-        "frames_without_detections": len(known - set(found)),
+        "frames_without_detections": len(image_ids - set(predicted)),
         "boxes_without_covariance": sum(record.get("covariance") is None for record in results),
         "crowds_left_out": crowds,
         "boxes_of_other_classes_left_out": others,
@@ -97,7 +97,7 @@ def read_coco(
         "true_boxes_without_size_left_out": true_sizeless,
     }
     frames = [
-        _frame(image, found[image["id"]], true[image["id"]], label_of, classes, path, truth_path, family)
+        _frame(image, predicted[image["id"]], true[image["id"]], label_of, classes, path, truth_path, family)
         for image in images
     ]
     return DetectionSet(frames, classes, False, counts, len(classes))
@@ -183,19 +183,19 @@ def _defaults(corners: Float[ndarray, "n 4"]) -> Float[ndarray, "n 4 4"]:
 
 def _listed(content: Mapping[str, Any], key: str, path: Path) -> list[Any]:
     records = content.get(key)
-    if not isinstance(records, list) or not all(isinstance(each, dict) for each in records):
+    if not isinstance(records, list) or not all(isinstance(record, dict) for record in records):
         raise InputError(f"{path}: has no list of {key}")
     return records
 
 
 def _named(content: Mapping[str, Any], key: str, path: Path) -> list[Any]:
     """Return records after checking that their ids are unique."""
-    records, known = _listed(content, key, path), set()
+    records, names = _listed(content, key, path), set()
     for n, record in enumerate(records):
         name = _key(record, "id")
-        if name is None or name in known:
+        if name is None or name in names:
             raise InputError(f"{path}: {key} {n} has {'no id' if name is None else f'the id {name} again'}")
-        known.add(name)
+        names.add(name)
     return records
 
 

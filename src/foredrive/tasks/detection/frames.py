@@ -190,8 +190,8 @@ def _covariance_matrices(
         raise InputError(
             f"{names[0]}: its covariance is neither {dims} variances nor a symmetric matrix of them"
         )
-    each = [_covariance_matrices([value], dims, names[n : n + 1]) for n, value in enumerate(values)]
-    return np.concatenate(each)
+    single = [_covariance_matrices([value], dims, names[n : n + 1]) for n, value in enumerate(values)]
+    return np.concatenate(single)
 
 
 def read_class_probabilities(
@@ -238,12 +238,12 @@ def tell_left_out(path: Path, counts: Mapping[str, int], given: int) -> None:
     _log.warning("%s", text)
 
 
-def order_classes(true: set[str], found: set[str]) -> tuple[list[str], int]:
+def order_classes(true: set[str], predicted: set[str]) -> tuple[list[str], int]:
     """Return the classes of the truth, then those of detections alone, and the number of the former.
 
     If the truth has no classes, those of the detections count as its own.
     """
-    return sorted(true) + sorted(found - true), len(true) or len(found)
+    return sorted(true) + sorted(predicted - true), len(true) or len(predicted)
 
 
 def enclosing_region(
@@ -281,8 +281,8 @@ def read_number_rows(
             return values.reshape(-1, count)
     except (KeyError, TypeError, ValueError, OverflowError):
         pass
-    found = [read_numbers(record, key, count, names[n]) for n, record in enumerate(records)]
-    return np.array(found).reshape(-1, count)
+    rows = [read_numbers(record, key, count, names[n]) for n, record in enumerate(records)]
+    return np.array(rows).reshape(-1, count)
 
 
 def read_relevance(objects: Sequence[Mapping[str, Any]], names: Sequence[str]) -> Float[ndarray, "N"] | None:

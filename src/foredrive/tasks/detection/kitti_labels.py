@@ -91,10 +91,10 @@ def read_kitti(folder: Path, truth: Path, family: Family) -> DetectionSet:
     Raises:
         InputError: a file or a line is wrong. The message names the first.
     """
-    true, found, classes, true_classes = read_frames(folder, truth)
+    true, predicted, classes, true_classes = read_frames(folder, truth)
     counts = {
         "frames_without_detections": len(set(true) - result_files(folder, truth, "frame")[1]),
-        "boxes_without_covariance": sum(len(lines) for lines in found.values()),
+        "boxes_without_covariance": sum(len(lines) for lines in predicted.values()),
     }
     frames = []
     for name, lines in true.items():
@@ -104,7 +104,7 @@ def read_kitti(folder: Path, truth: Path, family: Family) -> DetectionSet:
             DetectionFrame(
                 name.removesuffix(".txt"),
                 name.removesuffix(".txt"),
-                _detections(found[name], classes, family),
+                _detections(predicted[name], classes, family),
                 make_objects([line.name for line in lines], labels, true_state, true_yaw),
                 *enclosing_region(LOWER, UPPER, true_state),
                 range_m=np.linalg.norm(true_state[:, :2], axis=1),
@@ -124,17 +124,17 @@ def read_frames(
     """
     folder, files = result_files(folder, truth, "frame")
     true = {path.name: _lines(path, 15) for path in sorted(truth.glob("*.txt"))}
-    found = {name: _lines(folder / name, 16) if name in files else [] for name in true}
-    for lines_of, where in ((true, truth), (found, folder)):
+    predicted = {name: _lines(folder / name, 16) if name in files else [] for name in true}
+    for lines_of, where in ((true, truth), (predicted, folder)):
         given = sum(len(lines) for lines in lines_of.values())
         for name, lines in lines_of.items():
             lines_of[name] = [line for line in lines if (line.values[7:10] > 0).all()]
         sized = sum(len(lines) for lines in lines_of.values())
         tell_left_out(where, {"boxes without size": given - sized}, given)
     classes, true_classes = order_classes(
-        *({line.kind for lines in each.values() for line in lines} for each in (true, found))
+        *({line.kind for lines in side.values() for line in lines} for side in (true, predicted))
     )
-    return true, found, classes, true_classes
+    return true, predicted, classes, true_classes
 
 
 def _detections(lines: Sequence[KittiLine], classes: Sequence[str], family: Family) -> MultiBernoulli:

@@ -35,29 +35,29 @@ class MatchingLossConfig:
     energy_samples: int = 1000
 
 
-def set_loss(found: BoxSet, truth: LabelledBoxes) -> Float[Tensor, ""]:
+def set_loss(predicted: BoxSet, truth: LabelledBoxes) -> Float[Tensor, ""]:
     """Return the MB-NLL of one frame per object (Paper A). All associations count by their likelihood.
 
     It is +inf if there are more objects than queries, because there is no background.
     """
-    pmb = PoissonMultiBernoulli(found.as_multi_bernoulli())
+    pmb = PoissonMultiBernoulli(predicted.as_multi_bernoulli())
     return set_nll(pmb, truth).nll / max(len(truth.label), 1)
 
 
 def matching_loss(
-    found: BoxSet, truth: LabelledBoxes, config: MatchingLossConfig = MatchingLossConfig()
+    predicted: BoxSet, truth: LabelledBoxes, config: MatchingLossConfig = MatchingLossConfig()
 ) -> Float[Tensor, ""]:
     """Return the DETR loss of one frame per object: cross-entropy and box error of the best matching.
 
     With `box_score` "likelihood", L1 trains the means. The likelihood of matched boxes with fixed means
     trains the standard deviations. With "energy", the energy score trains both, but not the heading.
     """
-    query, match = best_matching(found, truth, config)
-    return matched_loss(found, truth, query, match, config)
+    query, match = best_matching(predicted, truth, config)
+    return matched_loss(predicted, truth, query, match, config)
 
 
 def matched_loss(
-    found: BoxSet,
+    predicted: BoxSet,
     truth: LabelledBoxes,
     query: Int[Tensor, "n"],
     match: Int[Tensor, "n"],
@@ -66,26 +66,26 @@ def matched_loss(
     """Return `matching_loss` for a given matching of queries and objects."""
     assert truth.yaw is not None
     objects = max(len(truth.label), 1)
-    classes = found.logits.shape[-1] - 1
-    target = torch.full(found.logits.shape[:1], classes, device=found.logits.device)
+    classes = predicted.logits.shape[-1] - 1
+    target = torch.full(predicted.logits.shape[:1], classes, device=predicted.logits.device)
     target[query] = truth.label[match].long()
     weight = torch.where(target == classes, config.no_object_weight, 1.0)
-    entropy = (F.cross_entropy(found.logits, target, reduction="none") * weight).sum()
-    state, scale = truth.state[match].to(found.mean), found.mean.new_tensor(STATE_SCALE)
-    mean, log_std, log_std_yaw = found.mean[query], found.log_std[query], found.log_std_yaw[query]
-    yaw = truth.yaw[match].to(found.mean)
+    entropy = (F.cross_entropy(predicted.logits, target, reduction="none") * weight).sum()
+    state, scale = truth.state[match].to(predicted.mean), predicted.mean.new_tensor(STATE_SCALE)
+    mean, log_std, log_std_yaw = predicted.mean[query], predicted.log_std[query], predicted.log_std_yaw[query]
+    yaw = truth.yaw[match].to(predicted.mean)
     arrow = torch.stack([yaw.sin(), yaw.cos()], dim=-1)
-    turn = (found.heading[query] - arrow).abs().sum()
-    cos = (found.heading[query].detach() * arrow).sum(-1)
+    turn = (predicted.heading[query] - arrow).abs().sum()
+    cos = (predicted.heading[query].detach() * arrow).sum(-1)
     spread = (log_std_yaw + (1 - cos) * (-2 * log_std_yaw).exp()).sum()
     if config.box_score == "energy":
         score = energy_score(
-            mean / scale, log_std.exp() / scale, state / scale, found.family, config.energy_samples
+            mean / scale, log_std.exp() / scale, state / scale, predicted.family, config.energy_samples
         )
         box = score.sum()
     else:
         box = ((mean - state).abs() / scale).sum()
-        spread = _negative_log_likelihood(mean.detach(), log_std, state, found.family).sum() + spread
+        spread = _negative_log_likelihood(mean.detach(), log_std, state, predicted.family).sum() + spread
     return (
         entropy + config.box_weight * box + config.heading_weight * turn + config.likelihood_weight * spread
     ) / objects
@@ -124,15 +124,15 @@ def energy_score(
 
 
 def best_matching(
-    found: BoxSet, truth: LabelledBoxes, config: MatchingLossConfig = MatchingLossConfig()
+    predicted: BoxSet, truth: LabelledBoxes, config: MatchingLossConfig = MatchingLossConfig()
 ) -> tuple[Int[Tensor, "n"], Int[Tensor, "n"]]:
     """Return matched queries and objects. Each object has one query, if there are enough."""
     with torch.no_grad():
-        class_cost = -found.logits.softmax(-1)[:, truth.label.long()]
-        scale = found.mean.new_tensor(STATE_SCALE)
-        error = (found.mean[:, None] - truth.state.to(found.mean)) / scale
+        class_cost = -predicted.logits.softmax(-1)[:, truth.label.long()]
+        scale = predicted.mean.new_tensor(STATE_SCALE)
+        error = (predicted.mean[:, None] - truth.state.to(predicted.mean)) / scale
         cost = (class_cost + config.box_weight * error.abs().sum(-1)).T.double().cpu().numpy()
     unmatched = np.full(len(cost), 1.0 + 2.0 * np.abs(cost).sum())  # dearer than all pairs
     column = torch.as_tensor(best_assignment(cost, unmatched).column)
     match = (column >= 0).nonzero()[:, 0]
-    return column[match].to(found.mean.device), match.to(found.mean.device)
+    return column[match].to(predicted.mean.device), match.to(predicted.mean.device)

@@ -48,7 +48,7 @@ def match_greedily(
 @numba.njit(cache=True, nogil=True)
 @no_type_check
 def _match_greedily(order, closeness, min_closeness):
-    found = np.full(len(order), -1)
+    partner = np.full(len(order), -1)
     taken = np.zeros(closeness.shape[1], np.bool_)
     for i in order:
         closest, best = -1, min_closeness
@@ -57,8 +57,8 @@ def _match_greedily(order, closeness, min_closeness):
             if not taken[j] and (close > best or (closest < 0 and close == best)):
                 closest, best = j, close
         if closest >= 0:
-            found[i], taken[closest] = closest, True
-    return found
+            partner[i], taken[closest] = closest, True
+    return partner
 
 
 def match_centres(
@@ -81,9 +81,9 @@ def match_centres(
     bounds = (np.searchsorted(true_frame[place], frames, side=side) for side in ("left", "right"))
     nearness = np.nextafter(-np.array(distances_m), 0.0)
     matched = _match_centres(np.append(first, len(turn)), *bounds, found_xy[turn], true_xy[place], nearness)
-    found = np.empty_like(matched)
-    found[:, turn] = np.append(place, -1)[matched]
-    return found
+    partner = np.empty_like(matched)
+    partner[:, turn] = np.append(place, -1)[matched]
+    return partner
 
 
 @numba.njit(cache=True, nogil=True)
@@ -91,11 +91,14 @@ def match_centres(
 def _match_centres(start, true_start, true_stop, found_xy, true_xy, nearness):
     matched = np.full((len(nearness), len(found_xy)), -1)
     for f in range(len(start) - 1):
-        rows, there = np.arange(start[f + 1] - start[f]), true_xy[true_start[f] : true_stop[f]]
-        closeness = np.empty((len(rows), len(there)))
+        rows, true_here = np.arange(start[f + 1] - start[f]), true_xy[true_start[f] : true_stop[f]]
+        closeness = np.empty((len(rows), len(true_here)))
         for i in rows:
-            for j in range(len(there)):
-                dx, dy = found_xy[start[f] + i, 0] - there[j, 0], found_xy[start[f] + i, 1] - there[j, 1]
+            for j in range(len(true_here)):
+                dx, dy = (
+                    found_xy[start[f] + i, 0] - true_here[j, 0],
+                    found_xy[start[f] + i, 1] - true_here[j, 1],
+                )
                 closeness[i, j] = -np.sqrt(dx * dx + dy * dy)
         for t in range(len(nearness)):
             taken = _match_greedily(rows, closeness, nearness[t])
@@ -121,8 +124,8 @@ def average_precision_coco(score: Float[ndarray, "n"], hit: Bool[ndarray, "n"], 
     if objects == 0:
         return float("nan")
     precision, recall = precision_recall(hit[descending(score)], objects)
-    at = np.searchsorted(recall, np.linspace(0, 1, 101), side="left")
-    return float(np.append(np.maximum.accumulate(precision[::-1])[::-1], 0.0)[at].mean())
+    index = np.searchsorted(recall, np.linspace(0, 1, 101), side="left")
+    return float(np.append(np.maximum.accumulate(precision[::-1])[::-1], 0.0)[index].mean())
 
 
 def average_precision_nuscenes(score: Float[ndarray, "n"], hit: Bool[ndarray, "n"], objects: int) -> float:
@@ -140,8 +143,8 @@ def ranked_precision_nuscenes(hit: Bool[ndarray, "n"], objects: int) -> float:
     if not hit.any():
         return 0.0
     precision, recall = precision_recall(hit, objects)
-    at = np.interp(np.linspace(0, 1, 101), recall, precision, right=0.0)
-    return float(np.clip(at[11:] - 0.1, 0.0, None).mean() / 0.9)
+    resampled = np.interp(np.linspace(0, 1, 101), recall, precision, right=0.0)
+    return float(np.clip(resampled[11:] - 0.1, 0.0, None).mean() / 0.9)
 
 
 def mean_of_valid(values: Sequence[float]) -> float:

@@ -49,14 +49,14 @@ class DetectionMetric:
         """Return the figures over all annotated frames."""
         if not self._true:
             return {"frames_counted": 0}
-        found, true = stacked(self._found), stacked(self._true)
+        predicted, true = stacked(self._found), stacked(self._true)
         none = np.zeros(0, dtype=np.int64)
-        nothing, racks, lacks = found[none], true[none], lacking(true)
-        out = detection_figures(found, true, racks, lacks)
+        nothing, racks, lacks = predicted[none], true[none], lacking(true)
+        out = detection_figures(predicted, true, racks, lacks)
         empty = detection_figures(nothing, true, racks, lacks)
         for key in ("map", "nds"):
             out |= {f"{name}.{key}.nothing_detected": empty[f"{name}.{key}"] for name in DETECTION_PROTOCOLS}
-        cars = [rows[rows.label == 0] for rows in (found, true)]
+        cars = [rows[rows.label == 0] for rows in (predicted, true)]
         figures = evaluate_detections(cars[0], cars[1], racks, CAR_30M).by_class["car"]
         out |= {"car_ap_2m_30m": figures.ap[2.0] if figures.true else float("nan")}
         out["car_ap_2m_30m.nothing_detected"] = 0.0

@@ -60,28 +60,28 @@ def read_nuscenes(
     Raises:
         InputError: a record is wrong. The message names the first.
     """
-    found, true = _by_frame(results, path), _by_frame(truth, truth_path)
-    unknown = sorted(set(found) - set(true))
+    found_boxes, true = _by_frame(results, path), _by_frame(truth, truth_path)
+    unknown = sorted(set(found_boxes) - set(true))
     if unknown:
         raise InputError(f"{path}: frame {unknown[0]} ({len(unknown)} in all) is not in {truth_path}")
     true_names, names = (
-        {box["detection_name"] for boxes in each.values() for box in boxes} for each in (true, found)
+        {box["detection_name"] for boxes in side.values() for box in boxes} for side in (true, found_boxes)
     )
     classes, true_classes = order_classes(true_names - {BICYCLE_RACK}, names)
     frames = []
     sizeless, true_sizeless = 0, 0
     for token, boxes in true.items():
-        predicted = _Boxes.of(found.get(token, ()), f"{path}: frame {token}")
+        predicted = _Boxes.of(found_boxes.get(token, ()), f"{path}: frame {token}")
         objects = _Boxes.of(boxes, f"{truth_path}: frame {token}")
-        sizeless += len(found.get(token, ())) - len(predicted.records)
+        sizeless += len(found_boxes.get(token, ())) - len(predicted.records)
         true_sizeless += len(boxes) - len(objects.records)
         frames.append(_frame(token, predicted, objects, classes, family))
-    for where, given, left_out in ((path, found, sizeless), (truth_path, true, true_sizeless)):
+    for where, given, left_out in ((path, found_boxes, sizeless), (truth_path, true, true_sizeless)):
         tell_left_out(where, {"boxes without size": left_out}, sum(map(len, given.values())))
     counts = {
-        "frames_without_detections": len(set(true) - set(found)),
+        "frames_without_detections": len(set(true) - set(found_boxes)),
         "boxes_without_covariance": sum(
-            box.get("covariance") is None for boxes in found.values() for box in boxes
+            box.get("covariance") is None for boxes in found_boxes.values() for box in boxes
         ),
         "frames_without_ego": sum(frame.range_m is None for frame in frames),
         "boxes_without_size_left_out": sizeless,
@@ -197,10 +197,12 @@ def _detections(
 
 def _by_frame(content: Mapping[str, Any], path: Path) -> dict[str, Sequence[Box]]:
     boxes = content.get("results", content)
-    if not isinstance(boxes, dict) or not all(isinstance(each, list) for each in boxes.values()):
+    if not isinstance(boxes, dict) or not all(
+        isinstance(frame_boxes, list) for frame_boxes in boxes.values()
+    ):
         raise InputError(f"{path}: there must be a list of boxes by sample token, under `results` or alone")
-    for token, each in boxes.items():
-        for n, box in enumerate(each):
+    for token, frame_boxes in boxes.items():
+        for n, box in enumerate(frame_boxes):
             if not isinstance(box, dict) or not isinstance(box.get("detection_name"), str):
                 raise InputError(f"{path}: frame {token}, box {n} has no detection_name")
     return boxes

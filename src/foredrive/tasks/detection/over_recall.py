@@ -32,8 +32,8 @@ def error_over_recall(
 
 def running_mean(values: Float[ndarray, "n"]) -> Float[ndarray, "n"]:
     """Return the mean of the known values so far: 0 before the first, 1 everywhere if none is known."""
-    known: Bool[ndarray, n] = ~np.isnan(values)
-    if not known.any():
+    valid: Bool[ndarray, n] = ~np.isnan(values)
+    if not valid.any():
         return np.ones(len(values))
-    count = np.cumsum(known)
+    count = np.cumsum(valid)
     return np.divide(np.nancumsum(values), count, out=np.zeros(len(values)), where=count > 0)

@@ -81,12 +81,12 @@ class CentreHead(nn.Module):
 
 
 @torch.no_grad()
-def best_proposals(found: CentreMap, count: int) -> Proposals:
+def best_proposals(centres: CentreMap, count: int) -> Proposals:
     """Return the most probable pairs of a class and a cell, where no neighbouring cell is more probable.
 
     As in TransFusion (Bai et al. 2022, §3.3). Nothing passes a gradient.
     """
-    logits = found.logits
+    logits = centres.logits
     peak = F.max_pool2d(logits, 3, stride=1, padding=1) == logits
     cells = logits[0, 0].numel()
     ranked = torch.where(peak, logits, -torch.inf).flatten(1)
@@ -102,9 +102,9 @@ def best_proposals(found: CentreMap, count: int) -> Proposals:
         cell=cell,
         label=label,
         logits=chosen(logits.permute(0, 2, 3, 1)),
-        xy=chosen(found.xy),
-        z=chosen(found.z),
-        log_lwh=chosen(found.log_lwh),
-        heading=chosen(found.heading),
-        velocity=chosen(found.velocity),
+        xy=chosen(centres.xy),
+        z=chosen(centres.z),
+        log_lwh=chosen(centres.log_lwh),
+        heading=chosen(centres.heading),
+        velocity=chosen(centres.velocity),
     )

@@ -114,21 +114,21 @@ class DetectionFigures:
 
 
 def evaluate_detections(
-    found: ObjectRows, true: ObjectRows, racks: ObjectRows, protocol: DetectionProtocol
+    predicted: ObjectRows, true: ObjectRows, racks: ObjectRows, protocol: DetectionProtocol
 ) -> DetectionFigures:
     """Return the figures of detections under one protocol.
 
     Args:
-        found: in the order of the file: among equal scores the later detection comes first.
-        true, found: labels are indices into the protocol's classes; -1 is left out.
+        predicted: in the order of the file: among equal scores the later detection comes first.
+        true, predicted: labels are indices into the protocol's classes; -1 is left out.
         racks: bicycle racks; labels do not matter.
     """
-    found, true = (
+    predicted, true = (
         boxes[(boxes.label >= 0) & counted(boxes, racks, protocol.region, protocol.classes)]
-        for boxes in (found, true)
+        for boxes in (predicted, true)
     )
     by_class = {
-        name: _class_figures(found[found.label == n], true[true.label == n], name, protocol)
+        name: _class_figures(predicted[predicted.label == n], true[true.label == n], name, protocol)
         for n, name in enumerate(protocol.classes)
     }
     mean_ap = float(np.mean([np.mean([*figures.ap.values()]) for figures in by_class.values()]))
@@ -138,12 +138,12 @@ def evaluate_detections(
 
 
 def _class_figures(
-    found: ObjectRows, true: ObjectRows, name: str, protocol: DetectionProtocol
+    predicted: ObjectRows, true: ObjectRows, name: str, protocol: DetectionProtocol
 ) -> ClassFigures:
-    found = found[descending(found.score, ties_reversed=True)]
+    predicted = predicted[descending(predicted.score, ties_reversed=True)]
     partners = match_centres(
-        found.frame,
-        found.centre[:, :2],
+        predicted.frame,
+        predicted.centre[:, :2],
         true.frame,
         true.centre[:, :2],
         protocol.distances_m,
@@ -154,35 +154,39 @@ def _class_figures(
         for distance, partner in zip(protocol.distances_m, partners, strict=True)
     }
     partner = partners[protocol.distances_m.index(protocol.error_distance_m)]
-    errors = _mean_errors(found, true, partner, name, protocol)
+    errors = _mean_errors(predicted, true, partner, name, protocol)
     undefined = dict.fromkeys(protocol.without.get(name, ()), math.nan)
     return ClassFigures(ap, errors | undefined, len(true))
 
 
 def _mean_errors(
-    found: ObjectRows, true: ObjectRows, partner: Int[ndarray, "m"], name: str, protocol: DetectionProtocol
+    predicted: ObjectRows,
+    true: ObjectRows,
+    partner: Int[ndarray, "m"],
+    name: str,
+    protocol: DetectionProtocol,
 ) -> dict[str, float]:
     """Return each error of the hits, averaged over recall. Detections are in order of falling score."""
     hit = partner >= 0
-    errors = hit_errors(found[hit], true[partner[hit]], half_turn=name in protocol.half_turn)
-    return {key: error_over_recall(found.score, hit, len(true), each) for key, each in errors.items()}
+    errors = hit_errors(predicted[hit], true[partner[hit]], half_turn=name in protocol.half_turn)
+    return {key: error_over_recall(predicted.score, hit, len(true), error) for key, error in errors.items()}
 
 
 def hit_errors(
-    found: ObjectRows, true: ObjectRows, *, half_turn: bool = False
+    predicted: ObjectRows, true: ObjectRows, *, half_turn: bool = False
 ) -> dict[str, Float[ndarray, "n"]]:
     """Return `ERRORS` of pairs. NaN: the velocity is unknown, or the true box has no attribute."""
     smaller, a, b = (
         size.prod(axis=1)
-        for size in (np.minimum(found.size_lwh, true.size_lwh), found.size_lwh, true.size_lwh)
+        for size in (np.minimum(predicted.size_lwh, true.size_lwh), predicted.size_lwh, true.size_lwh)
     )
     period = math.pi if half_turn else 2 * math.pi
-    turn = np.abs((true.yaw - found.yaw + period / 2) % period - period / 2)
-    wrong = np.where(found.attribute == true.attribute, 0.0, 1.0)
+    turn = np.abs((true.yaw - predicted.yaw + period / 2) % period - period / 2)
+    wrong = np.where(predicted.attribute == true.attribute, 0.0, 1.0)
     return {
-        "ate_m": np.linalg.norm(found.centre[:, :2] - true.centre[:, :2], axis=1),
+        "ate_m": np.linalg.norm(predicted.centre[:, :2] - true.centre[:, :2], axis=1),
         "ase": 1.0 - smaller / (a + b - smaller),
         "aoe_rad": turn,
-        "ave_mps": np.linalg.norm(found.velocity - true.velocity, axis=1),
+        "ave_mps": np.linalg.norm(predicted.velocity - true.velocity, axis=1),
         "aae": np.where(true.attribute == UNKNOWN, np.nan, wrong),
     }

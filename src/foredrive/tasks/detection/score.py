@@ -179,19 +179,19 @@ def _objects(
     bernoulli: Int[ndarray, "_"],
     brier: Float[ndarray, "N"],
 ) -> ObjectScores:
-    found, count = result.associations, len(result.associations.background)
-    box = -found.probability * result.pair_log_box.numpy()
-    label = -found.probability * result.pair_log_label.numpy()
+    associations, count = result.associations, len(result.associations.background)
+    box = -associations.probability * result.pair_log_box.numpy()
+    label = -associations.probability * result.pair_log_label.numpy()
     log_background = result.log_background.numpy()
     with np.errstate(invalid="ignore"):
-        missed = np.where(found.background > 0, -found.background * log_background, 0.0)
+        missed = np.where(associations.background > 0, -associations.background * log_background, 0.0)
     return ObjectScores(
         frame.objects.label.numpy(),
-        np.bincount(found.object, box, count).astype(float),  # bincount of no pairs returns integers
-        np.bincount(found.object, label, count).astype(float),
+        np.bincount(associations.object, box, count).astype(float),  # bincount of no pairs returns integers
+        np.bincount(associations.object, label, count).astype(float),
         missed,
-        found.background,
-        np.where(found.best < 0, -1, np.append(bernoulli, -1)[found.best]),
+        associations.background,
+        np.where(associations.best < 0, -1, np.append(bernoulli, -1)[associations.best]),
         brier,
     )
 
@@ -202,8 +202,8 @@ def _object_brier(
     detected, label = frame.detected, frame.objects.label.numpy()
     probability = (detected.log_existence[:, None] + detected.log_class).exp().numpy()[bernoulli]
     thresholds = [-distance for distance in NEAR_M] if is_3d else NEAR_OVERLAP
-    each = [object_brier(probability, closeness[bernoulli] >= nearness, label) for nearness in thresholds]
-    return np.mean(each, axis=0)
+    briers = [object_brier(probability, closeness[bernoulli] >= nearness, label) for nearness in thresholds]
+    return np.mean(briers, axis=0)
 
 
 def _detections(

@@ -65,7 +65,7 @@ def compare_scores(
     """
     if [score.name for score in scores] != [other.name for other in others]:
         raise InputError("two files of detections can be compared on the same frames only")
-    ours, theirs = (np.array([score.nll for score in each]) for each in (scores, others))
+    ours, theirs = (np.array([score.nll for score in scored]) for scored in (scores, others))
     both = np.isfinite(ours) & np.isfinite(theirs)
     if not both.any():
         raise InputError("there is no frame in which both likelihoods are finite")
@@ -163,8 +163,8 @@ def _reliability(
 def _diagrams(detection_set: DetectionSet, scores: Sequence[FrameScore]) -> dict[str, Reliability]:
     """Return diagrams of hits (at 2 m or overlap 0.5) and of existence against associations."""
     score, hit = _joined(scores, "detections", "score"), _joined(scores, "detections", "hit")
-    at = NUSCENES_DISTANCES_M.index(2.0) if detection_set.is_3d else 0
-    diagrams = {"d_ece": reliability(score, hit[at])}
+    radius = NUSCENES_DISTANCES_M.index(2.0) if detection_set.is_3d else 0
+    diagrams = {"d_ece": reliability(score, hit[radius])}
     existence = _joined(scores, "detections", "existence")
     has_object = _joined(scores, "detections", "has_object")
     bernoulli = ~np.isnan(has_object)
@@ -178,20 +178,22 @@ def _calibration(
     """Return D-ECE by class and range, object-level error, and LaECE (hits at 0.5), LaECE₀ of image boxes."""
     label, score = _joined(scores, "detections", "label"), _joined(scores, "detections", "score")
     hit, overlap = _joined(scores, "detections", "hit"), _joined(scores, "detections", "overlap")
-    at = NUSCENES_DISTANCES_M.index(2.0) if detection_set.is_3d else 0
+    radius = NUSCENES_DISTANCES_M.index(2.0) if detection_set.is_3d else 0
     of_objects = _joined(scores, "objects", "brier")
     figures: Figures = {
-        "brier.hit": float(brier(score, hit[at]).mean()) if len(score) else None,
+        "brier.hit": float(brier(score, hit[radius]).mean()) if len(score) else None,
         "calibration.object_level": float(of_objects.mean()) if len(of_objects) else None,
     }
-    outcomes = {} if detection_set.is_3d else {"la_ece": np.where(hit[at], overlap, 0.0), "la_ece_0": overlap}
+    outcomes = (
+        {} if detection_set.is_3d else {"la_ece": np.where(hit[radius], overlap, 0.0), "la_ece_0": overlap}
+    )
     for c, name in enumerate(detection_set.classes):
-        figures[f"calibration.d_ece.{name}"] = reliability(score[label == c], hit[at][label == c]).error
+        figures[f"calibration.d_ece.{name}"] = reliability(score[label == c], hit[radius][label == c]).error
     if any(frame.range_m is not None for frame in detection_set.frames):
         where = np.concatenate([_detection_range_m(frame) for frame in detection_set.frames])
         for low, high in pairwise(RANGES_M):
             inside = (where >= low) & (where < high)
-            error = reliability(score[inside], hit[at][inside]).error
+            error = reliability(score[inside], hit[radius][inside]).error
             figures[f"calibration.d_ece.from_{low:g}_m"] = error
     for key, outcome in outcomes.items():
         errors = [

@@ -44,8 +44,8 @@ def fit_head(
         for _ in range(steps):
             chosen = rng.choice(len(samples), batch, replace=False).tolist()
             optimizer.zero_grad()
-            found = head(torch.stack([samples[n][0] for n in chosen]))
-            losses = [loss(found[place], samples[n][1]) for place, n in enumerate(chosen)]
+            predicted = head(torch.stack([samples[n][0] for n in chosen]))
+            losses = [loss(predicted[place], samples[n][1]) for place, n in enumerate(chosen)]
             _check_finite(losses, chosen, samples, queries=len(head.middle_m))
             torch.stack(losses).mean().backward()
             torch.nn.utils.clip_grad_norm_(head.parameters(), 10.0)

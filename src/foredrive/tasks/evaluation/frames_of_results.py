@@ -33,7 +33,7 @@ def log_frames(folder: Path, wanted: Collection[str], path: Path) -> Iterator[Lo
     Raises:
         InputError: a frame is not in the logs. The message names the first.
     """
-    found = []
+    frames = []
     for drive, log_path in enumerate(find_logs(folder)):
         if not any(name.startswith(f"{log_path.name}@") for name in wanted):
             continue
@@ -41,19 +41,21 @@ def log_frames(folder: Path, wanted: Collection[str], path: Path) -> Iterator[Lo
         for frame, t_us in enumerate(log.t_us.tolist()):
             name = f"{log_path.name}@{t_us}"
             if name in wanted:
-                found.append(name)
+                frames.append(name)
                 yield LogFrame(name, log, frame, drive)
-    check_known_frames(path, wanted, folder, found)
+    check_known_frames(path, wanted, folder, frames)
 
 
-def check_known_frames(path: object, listed: Iterable[str], truth: object, known: Sequence[str]) -> None:
+def check_known_frames(
+    path: object, listed: Iterable[str], truth: object, known_frames: Sequence[str]
+) -> None:
     """Refuse results of frames that the truth does not have.
 
     Raises:
         InputError: the message names the first and the number of them.
     """
-    frames, there = list(listed), set(known)
-    unknown = [name for name in frames if name not in there]
+    frames, true_frames = list(listed), set(known_frames)
+    unknown = [name for name in frames if name not in true_frames]
     if len(unknown) == len(frames) > 0:
         raise InputError(
             f"{path}: none of its {len(frames)} frames is in {truth} (first: {unknown[0]}): "

@@ -145,12 +145,13 @@ class ResultsFiles:
             if task == "map":
                 area_m = [2 * half_m for half_m in HALF_XY_M[AREA]]
                 vectors = [
-                    {"sample_token": token, "vectors": each} for token, each in _judged(frames).items()
+                    {"sample_token": token, "vectors": frame_vectors}
+                    for token, frame_vectors in _judged(frames).items()
                 ]
                 content = {"meta": meta | {"area_m": area_m}, "results": vectors}
             write_json(self.folder / f"{task}.json", content, indent=None)
         if any(self._voxels.values()):
-            for path in (path for path, known in self._voxels.items() if not known):
+            for path in (path for path, written in self._voxels.items() if not written):
                 path.unlink()
 
 
@@ -163,7 +164,7 @@ def _agent_records(token: str, agents: Agents, T_world_ego: Pose) -> dict[str, l
     """Return the boxes of one frame by task."""
     boxes, names = _box_records(token, agents, T_world_ego), _names(agents)
     scores = agents.score.double().tolist()
-    found: dict[str, list[Record]] = {
+    records: dict[str, list[Record]] = {
         "detection": [
             box | {"detection_name": name, "detection_score": score, "attribute_name": attribute}
             for box, name, score, attribute in zip(
@@ -171,7 +172,7 @@ def _agent_records(token: str, agents: Agents, T_world_ego: Pose) -> dict[str, l
             )
         ]
     }
-    found["tracking"] = [
+    records["tracking"] = [
         box | {"tracking_id": str(track), "tracking_name": name, "tracking_score": score}
         for box, name, score, track in zip(boxes, names, scores, agents.track_id.tolist(), strict=True)
         if track >= 0 and name in TRACKED
@@ -180,7 +181,7 @@ def _agent_records(token: str, agents: Agents, T_world_ego: Pose) -> dict[str, l
         centre = agents.centre.double().numpy()
         futures = futures_in_world(agents.future_xy.double().numpy(), centre, T_world_ego)
         probabilities = agents.log_prob.double().exp().numpy()
-        found["motion"] = [
+        records["motion"] = [
             {
                 **_chosen(box, ("sample_token", "translation")),
                 **_chosen(record, ("detection_name", "detection_score")),
@@ -188,10 +189,10 @@ def _agent_records(token: str, agents: Agents, T_world_ego: Pose) -> dict[str, l
                 "predict_traj_score": probability.tolist(),
             }
             for box, record, future, probability in zip(
-                boxes, found["detection"], futures, probabilities, strict=True
+                boxes, records["detection"], futures, probabilities, strict=True
             )
         ]
-    return found
+    return records
 
 
 def _box_records(token: str, agents: Agents, T_world_ego: Pose) -> list[Record]:

@@ -61,7 +61,7 @@ class PredictedBatch:
     def to(self, device: torch.device | str) -> "PredictedBatch":
         """Return the batch on a device."""
         truth = None if self.truth is None else self.truth.to(device)
-        parts = tuple((chosen.to(device), found.to(device)) for chosen, found in self.parts)
+        parts = tuple((chosen.to(device), part.to(device)) for chosen, part in self.parts)
         return PredictedBatch(truth, parts, self.failures)
 
 

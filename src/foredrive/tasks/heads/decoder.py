@@ -73,5 +73,5 @@ class PlaceEmbedding(nn.Module):
     def forward(self, share: Float[Tensor, "*n 2"]) -> Float[Tensor, "*n W"]:
         """Embed positions that are given as shares of the plane's extent."""
         angle = (share[..., None] * self.frequency).flatten(-2)
-        found: Tensor = self.linear(torch.cat([angle.sin(), angle.cos()], dim=-1))
-        return found
+        embedding: Tensor = self.linear(torch.cat([angle.sin(), angle.cos()], dim=-1))
+        return embedding

@@ -55,14 +55,14 @@ class TaskHeadsConfig:
     @property
     def tasks(self) -> tuple[Task, ...]:
         """Return the tasks of the heads."""
-        found: list[Task] = []
+        tasks: list[Task] = []
         if self.agents is not None:
-            found += [self.of_agents] if self.agents.motion is None else [self.of_agents, "motion"]
+            tasks += [self.of_agents] if self.agents.motion is None else [self.of_agents, "motion"]
         if self.elements is not None or self.raster is not None:
-            found.append("map")
+            tasks.append("map")
         if self.voxels is not None:
-            found.append("occupancy")
-        return tuple(found)
+            tasks.append("occupancy")
+        return tuple(tasks)
 
     def read_for(self, task: Task) -> Task:
         """Return the task whose volume the head of a task reads."""
@@ -123,14 +123,14 @@ def volumes_of(
     imagined, T_now_later = imagined_volumes(world, belief, later) if later else (None, None)
     past = None if belief.T_past_now is None or belief.history is None else belief.history[:, -2]
     made: dict[int, TaskVolume] = {}
-    found: dict[Task, TaskVolume] = {}
+    by_task: dict[Task, TaskVolume] = {}
     for task in tasks:
         volume = world.volume_for(belief, task)
-        found[task] = made.setdefault(
+        by_task[task] = made.setdefault(
             id(volume),
             TaskVolume(volume, past, belief.T_past_now, imagined, T_now_later),
         )
-    return found
+    return by_task
 
 
 def imagined_volumes(
@@ -140,10 +140,10 @@ def imagined_volumes(
 
     There are fewer if the world model imagines fewer.
     """
-    found = world.imagine(belief, steps if world.max_steps is None else min(steps, world.max_steps))
+    beliefs = world.imagine(belief, steps if world.max_steps is None else min(steps, world.max_steps))
     eye = torch.eye(4, device=belief.volume.device).expand(len(belief.volume), 4, 4)
-    poses = [eye if each.T_now_ego is None else each.T_now_ego for each in found]
-    volumes = [world.volume_for(each, "occupancy") for each in found]
+    poses = [eye if later.T_now_ego is None else later.T_now_ego for later in beliefs]
+    volumes = [world.volume_for(later, "occupancy") for later in beliefs]
     return torch.stack(volumes, dim=1), torch.stack(poses, dim=1)
 
 

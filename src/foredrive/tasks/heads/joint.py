@@ -38,7 +38,7 @@ class TaskTerms(nn.Module):
         self.class_weight: Tensor | None
         self.register_buffer("class_weight", class_weight, persistent=False)
 
-    def forward(self, found: HeadOutput, example: Example) -> dict[str, Float[Tensor, ""]]:
+    def forward(self, output: HeadOutput, example: Example) -> dict[str, Float[Tensor, ""]]:
         """Return the losses by name, as "task_NAME", and their weighted sum as "tasks".
 
         Raises:
@@ -48,7 +48,7 @@ class TaskTerms(nn.Module):
             raise InputError(f"{example.key[0]}: heads are trained, but the clip has no truth of their tasks")
         clip = example.clip
         losses = task_losses(
-            found,
+            output,
             boxes_now(clip),
             clip.boxes_valid[:, clip.now],
             example.truth,

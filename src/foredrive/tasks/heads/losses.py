@@ -96,13 +96,13 @@ def _map_loss(layers: list[MapSet], elements: MapElements, weights: MapLossWeigh
         kinds, points = layers[0].logits.shape[-1], layers[0].points.shape[-2]
         targets = map_targets(elements[item], kinds, points)
         for layer in layers:
-            found = map_element_losses(
+            losses = map_element_losses(
                 layer.logits[item], layer.points[item], targets.kind, targets.orders, weights
             )
             values.append(
-                weights.kind * found.kind
-                + weights.points * found.points
-                + weights.direction * found.direction
+                weights.kind * losses.kind
+                + weights.points * losses.points
+                + weights.direction * losses.direction
             )
     return torch.stack(values).mean() if values else layers[0].logits.sum() * 0
 

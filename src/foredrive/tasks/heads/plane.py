@@ -41,8 +41,8 @@ class Plane(Record):
     def at(self, points_m: Float[Tensor, "b *n 2"]) -> Float[Tensor, "b *n W"]:
         """Return the features at points of the ego frame, bilinear; they fall to 0 outside of the plane."""
         where = (2 * self.share(points_m) - 1).flatten(1, -2)[:, None]
-        found = F.grid_sample(self.features, where.to(self.features), align_corners=False)
-        return found[:, :, 0].mT.unflatten(1, points_m.shape[1:-1])
+        sampled = F.grid_sample(self.features, where.to(self.features), align_corners=False)
+        return sampled[:, :, 0].mT.unflatten(1, points_m.shape[1:-1])
 
 
 @dataclass(frozen=True)
@@ -133,32 +133,32 @@ class PlanePyramid(nn.Module):
             past: an earlier one in its own ego frame; None counts as one of zeros.
             T_past_now: the ego frame at now -> the ego frame of the past volume.
         """
-        at = self.columns(volume.flatten(1, 2))
+        plane = self.columns(volume.flatten(1, 2))
         if self.past:
-            before = torch.zeros_like(at)
+            before = torch.zeros_like(plane)
             if past is not None and T_past_now is not None:
                 before = self._moved(self.columns(past.flatten(1, 2)), T_past_now)
-            at = torch.cat([at, before], dim=1)
-        levels = [self.join(at.contiguous(memory_format=torch.channels_last))]
+            plane = torch.cat([plane, before], dim=1)
+        levels = [self.join(plane.contiguous(memory_format=torch.channels_last))]
         for down in self.down:
             levels.append(down(levels[-1]))
-        found = levels.pop()
+        refined = levels.pop()
         for n in reversed(range(len(levels))):
-            narrowed = self.narrow[n](found)
-            found = self.up[n](
+            narrowed = self.narrow[n](refined)
+            refined = self.up[n](
                 levels[n] + F.interpolate(narrowed, size=levels[n].shape[-2:], mode="bilinear")
             )
             if n == self.halvings:
-                coarse = found
+                coarse = refined
         return Planes(
-            fine=Plane(found, self.lower_m, self.cell_m), coarse=Plane(coarse, self.lower_m, self.coarse_m)
+            fine=Plane(refined, self.lower_m, self.cell_m), coarse=Plane(coarse, self.lower_m, self.coarse_m)
         )
 
     def _moved(self, past: Float[Tensor, "b W y x"], T_past_now: Float[Tensor, "b 4 4"]) -> Tensor:
         """Read the plane of the past at the places of now's cells, 0 outside."""
         middle = cell_middles(self.lower_m, self.cell_m, self.shape_yx).to(past)
-        there = middle @ T_past_now[:, :2, :2].mT.to(past) + T_past_now[:, None, :2, 3].to(past)
-        return Plane(past, self.lower_m, self.cell_m).at(there).mT.unflatten(-1, self.shape_yx)
+        moved = middle @ T_past_now[:, :2, :2].mT.to(past) + T_past_now[:, None, :2, 3].to(past)
+        return Plane(past, self.lower_m, self.cell_m).at(moved).mT.unflatten(-1, self.shape_yx)
 
 
 def _convolution(width_in: int, width: int, stride: int = 1, size: int = 3) -> nn.Sequential:

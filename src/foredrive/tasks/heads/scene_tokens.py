@@ -65,21 +65,21 @@ class SceneTokens(nn.Module):
         if heads is not None and heads.elements is not None and "map" in attends:
             self.elements = _mlp(heads.width + heads.elements.kinds + 2 * heads.elements.points, width)
 
-    def forward(self, found: HeadOutput) -> Float[Tensor, "b N C"]:
+    def forward(self, output: HeadOutput) -> Float[Tensor, "b N C"]:
         """Return a token for each query, agents first."""
         tokens = []
         if self.agents is not None:
-            assert found.agents is not None
-            tokens.append(self._of_agents(self.agents, found.agents[-1]))
+            assert output.agents is not None
+            tokens.append(self._of_agents(self.agents, output.agents[-1]))
         if self.elements is not None:
-            assert found.elements is not None
-            tokens.append(self._of_elements(self.elements, found.elements[-1]))
+            assert output.elements is not None
+            tokens.append(self._of_elements(self.elements, output.elements[-1]))
         return torch.cat(tokens, dim=1)
 
     def _of_agents(self, mlp: nn.Module, agents: AgentSet) -> Float[Tensor, "b Q C"]:
         assert agents.query is not None
         centre = agents.boxes.mean[..., :2]
-        known = [
+        attributes = [
             agents.boxes.logits.softmax(dim=-1)[..., :-1],
             agents.boxes.heading,
             agents.boxes.mean[..., 3:5],
@@ -88,17 +88,17 @@ class SceneTokens(nn.Module):
         if agents.future_xy is not None and agents.log_prob is not None:
             best = agents.log_prob.argmax(dim=-1)[..., None, None, None]
             path = agents.future_xy.take_along_dim(best, dim=2)[:, :, 0]
-            known.append(((path - centre[:, :, None]) / FUTURE_SCALE_M).flatten(2))
-        features = torch.cat([agents.query, torch.cat(known, dim=-1).detach()], dim=-1)
+            attributes.append(((path - centre[:, :, None]) / FUTURE_SCALE_M).flatten(2))
+        features = torch.cat([agents.query, torch.cat(attributes, dim=-1).detach()], dim=-1)
         tokens: Tensor = mlp(features) + self.place(self._share(centre.detach()))
         return tokens
 
     def _of_elements(self, mlp: nn.Module, elements: MapSet) -> Float[Tensor, "b E C"]:
         assert elements.query is not None
         share = self._share(elements.points)
-        known = torch.cat([elements.logits.sigmoid(), share.flatten(2)], dim=-1).detach()
+        attributes = torch.cat([elements.logits.sigmoid(), share.flatten(2)], dim=-1).detach()
         middle = self.place(share.mean(dim=2).detach())
-        tokens: Tensor = mlp(torch.cat([elements.query, known], dim=-1)) + middle
+        tokens: Tensor = mlp(torch.cat([elements.query, attributes], dim=-1)) + middle
         return tokens
 
     def _share(self, points_m: Float[Tensor, "*n 2"]) -> Float[Tensor, "*n 2"]:

@@ -59,9 +59,9 @@ def agent_targets(boxes: Boxes, futures: AgentFutures | None, spec: VoxelSpec, s
     xy, valid = boxes.centre.new_zeros(count, steps, 2), kept.new_zeros(count, steps)
     if futures is not None:
         rows = kept[: len(futures.valid)]  # a batch may pad boxes and futures to different lengths
-        found = int(rows.sum())
-        xy[:found] = futures.xy[: len(rows), :steps][rows]  # no steps for a head without forecasts
-        valid[:found] = futures.valid[: len(rows), :steps][rows]
+        total = int(rows.sum())
+        xy[:total] = futures.xy[: len(rows), :steps][rows]  # no steps for a head without forecasts
+        valid[:total] = futures.valid[: len(rows), :steps][rows]
     return AgentTargets(
         boxes=LabelledBoxes(label[kept], state[kept], boxes.yaw[kept]),
         track_id=boxes.track_id[kept],
@@ -86,7 +86,7 @@ def map_targets(elements: MapElements, kinds: int, points: int) -> MapTargets:
 def even_points(line: Float[np.ndarray, "V 2"], points: int) -> Float[np.ndarray, "P 2"]:
     """Return points at equal distances along a polyline, its ends included. A closed one stays closed."""
     arc_m = arc_lengths(line)
-    found = points_at(line, arc_m, np.linspace(0.0, arc_m[-1], points))
+    resampled = points_at(line, arc_m, np.linspace(0.0, arc_m[-1], points))
     if math.isclose(0.0, float(np.abs(line[0] - line[-1]).max()), abs_tol=1e-9):
-        found[-1] = found[0]
-    return found
+        resampled[-1] = resampled[0]
+    return resampled

@@ -114,22 +114,24 @@ def area_of(lines: LineSet) -> Area:
 def _against_logs(predicted: dict[str, _Frame], results: Path, truth: Path, stated: Area | None) -> MapFiles:
     """Return predictions and the maps of logs at their frames, in the area that the results state, if any."""
     frames = list(log_frames(truth, predicted, results))
-    lines, short = _line_set([predicted[each.name] for each in frames])
+    lines, short = _line_set([predicted[frame.name] for frame in frames])
     area = stated or area_of(lines)
     half_xy_m = HALF_XY_M[area]
-    kinds, found, number = [], [], []
-    for n, each in enumerate(frames):
-        elements = read_map_elements(each.log, each.frame, (2 * half_xy_m[0], 2 * half_xy_m[1]))
+    kinds, predicted_lines, number = [], [], []
+    for n, frame in enumerate(frames):
+        elements = read_map_elements(frame.log, frame.frame, (2 * half_xy_m[0], 2 * half_xy_m[1]))
         if not elements.known:
-            raise InputError(f"{each.log.path.folder} has no map to judge frame {each.name} by")
+            raise InputError(f"{frame.log.path.folder} has no map to judge frame {frame.name} by")
         for vertices, valid, kind in zip(elements.vertices, elements.valid, elements.kind, strict=True):
-            found.append(vertices[valid].double().numpy())
+            predicted_lines.append(vertices[valid].double().numpy())
             kinds.append(int(kind))
             number.append(n)
-    count = len(found)
-    true = LineSet(np.array(number, dtype=np.int64), np.array(kinds, dtype=np.int64), found, np.ones(count))
-    names = [each.name for each in frames]
-    return MapFiles(lines, true, names, np.array([each.drive for each in frames]), area, 0, short)
+    count = len(predicted_lines)
+    true = LineSet(
+        np.array(number, dtype=np.int64), np.array(kinds, dtype=np.int64), predicted_lines, np.ones(count)
+    )
+    names = [frame.name for frame in frames]
+    return MapFiles(lines, true, names, np.array([frame.drive for frame in frames]), area, 0, short)
 
 
 def _in_order(frames: Mapping[str, _Frame]) -> list[str]:
@@ -167,12 +169,12 @@ def _read(path: Path, *, predicted: bool) -> tuple[dict[str, _Frame], Area | Non
             area = _stated_area(content.get("meta"))
             content = content.get("results", content.get("GTs", content))
         if isinstance(content, list):
-            found: Iterator[tuple[str, _Frame]] = _of_maptr(content, predicted)
+            frame_lines: Iterator[tuple[str, _Frame]] = _of_maptr(content, predicted)
         elif isinstance(content, dict):
-            found = _of_streammapnet(content, predicted)
+            frame_lines = _of_streammapnet(content, predicted)
         else:
             raise InputError("neither frames in a list (MapTR) nor by token (StreamMapNet)")
-        for token, frame in found:
+        for token, frame in frame_lines:
             if token in frames:
                 raise InputError(f"frame {token} is there twice")
             _check_identities(token, frame)

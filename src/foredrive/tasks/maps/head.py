@@ -83,16 +83,16 @@ class MapHead(nn.Module):
         cell_place = self.place(planes.coarse.share(planes.coarse.middle_m))[None]
         queries = (self.element + self.point).expand(batch, -1, -1, -1)
         at_m = self.start_m.expand(batch, -1, -1, -1)
-        found = []
+        layers = []
         for layer in self.layers:
             queries = queries + self.read(fine.at(at_m))
             place = self.place(fine.share(at_m)).flatten(1, 2)
             queries = layer(queries.flatten(1, 2), place, cells, cell_place).view_as(queries)
             points = at_m + self.step_m * self.shift(queries)
             features = queries.mean(dim=2)
-            found.append(MapSet(self.kind(features), points, features))
+            layers.append(MapSet(self.kind(features), points, features))
             at_m = points.detach()
-        return found
+        return layers
 
 
 @dataclass(frozen=True)
@@ -156,9 +156,9 @@ class RasterHead(nn.Module):
         far = F.interpolate(far, size=self.fine_shape, mode="bilinear")
         near = self.narrow(_on_canvas(planes.fine, self.fine_m, self.fine_shape))
         logits = F.pixel_shuffle(self.out(self.refine(F.relu(far + near))), 2)
-        found = Plane(logits, self.spec.lower_m, self.cell_m / 2)
-        at = found.at(self.middle_m.expand(len(logits), -1, -1))
-        return at.mT.unflatten(-1, self.spec.shape_yx)
+        plane = Plane(logits, self.spec.lower_m, self.cell_m / 2)
+        at_middles = plane.at(self.middle_m.expand(len(logits), -1, -1))
+        return at_middles.mT.unflatten(-1, self.spec.shape_yx)
 
 
 def _dilated(width: int, stride: int) -> tuple[nn.Module, ...]:
@@ -174,6 +174,6 @@ def _on_canvas(
 ) -> Float[Tensor, "b W_1 y x"]:
     """Return features at cells of a larger grid, 0 outside of the plane; the last channel is 1 inside."""
     inside = Plane(torch.ones_like(plane.features[:, :1]), plane.lower_m, plane.cell_m)
-    at = middle_m.expand(len(plane.features), -1, -1)
-    found = torch.cat([plane.at(at), inside.at(at)], dim=-1)
-    return found.mT.unflatten(-1, shape_yx)
+    points_m = middle_m.expand(len(plane.features), -1, -1)
+    drawn = torch.cat([plane.at(points_m), inside.at(points_m)], dim=-1)
+    return drawn.mT.unflatten(-1, shape_yx)

@@ -45,10 +45,10 @@ class LineSet:
 
     def resampled(self, points: int) -> Float64[ndarray, "M points 2"]:
         """Return the polylines with `points` vertices each, at equal distances along the line."""
-        found = np.empty((len(self.lines), points, 2))
+        points_of = np.empty((len(self.lines), points, 2))
         for row, line in enumerate(self.lines):
-            found[row] = resample(line, points)
-        return found
+            points_of[row] = resample(line, points)
+        return points_of
 
 
 def resample(line: Float[ndarray, "V 2"], points: int) -> Float64[ndarray, "points 2"]:
@@ -71,12 +71,12 @@ def chamfer_distances(
 @numba.njit(cache=True, nogil=True)
 @no_type_check
 def _chamfer(lines, others, at_most_m):
-    found = np.full((len(lines), len(others)), np.inf)
+    distance_m = np.full((len(lines), len(others)), np.inf)
     for i in range(len(lines)):
         for j in range(len(others)):
             if _to_box(lines[i], others[j]) + _to_box(others[j], lines[i]) <= 2 * at_most_m + 1e-9:
-                found[i, j] = 0.5 * (_one_way(lines[i], others[j]) + _one_way(others[j], lines[i]))
-    return found
+                distance_m[i, j] = 0.5 * (_one_way(lines[i], others[j]) + _one_way(others[j], lines[i]))
+    return distance_m
 
 
 @numba.njit(cache=True, nogil=True)

@@ -50,12 +50,12 @@ def map_element_losses(
     target = torch.zeros_like(logits)
     target[element, kind[match]] = 1.0
     objects = max(len(kind), 1)
-    true, found = orders[match, order], points[element]
-    edges, true_edges = (line[:, 1:] - line[:, :-1] for line in (found, true))
+    true, predicted = orders[match, order], points[element]
+    edges, true_edges = (line[:, 1:] - line[:, :-1] for line in (predicted, true))
     turn = 1 - F.cosine_similarity(edges, true_edges, dim=-1, eps=1e-6)
     return MapLosses(
         kind=sigmoid_focal_loss(logits, target).sum() / objects,
-        points=(found - true).abs().sum(-1).mean(-1).sum() / objects,
+        points=(predicted - true).abs().sum(-1).mean(-1).sum() / objects,
         direction=turn.mean(-1).sum() / objects,
     )
 
@@ -100,5 +100,7 @@ def _best_matching(
     yes, no = (sigmoid_focal_loss(logits, torch.full_like(logits, value)) for value in (1.0, 0.0))
     distance, order = (points[:, None, None] - orders).abs().sum(-1).mean(-1).min(dim=-1)  # [E N]
     cost = weights.kind * (yes - no)[:, kind] + weights.points * distance
-    element, match = (torch.as_tensor(found) for found in linear_sum_assignment(cost.double().cpu().numpy()))
+    element, match = (
+        torch.as_tensor(indices) for indices in linear_sum_assignment(cost.double().cpu().numpy())
+    )
     return element.to(points.device), match.to(points.device), order[element, match]

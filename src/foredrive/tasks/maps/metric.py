@@ -81,12 +81,12 @@ class MapLinesMetric:
 
     def update(self, prediction: Prediction, truth: Example) -> None:
         """Add b clips."""
-        found, elements = prediction.map_lines, None if truth.truth is None else truth.truth.elements
-        if found is None or elements is None:
+        predicted, elements = prediction.map_lines, None if truth.truth is None else truth.truth.elements
+        if predicted is None or elements is None:
             return
         for item in elements.known.nonzero()[:, 0].tolist():
-            points, kinds = found.points[item].double().cpu().numpy(), found.kind[item].tolist()
-            scores = found.score[item].tolist()
+            points, kinds = predicted.points[item].double().cpu().numpy(), predicted.kind[item].tolist()
+            scores = predicted.score[item].tolist()
             rows = zip(kinds, points, scores, strict=True)
             self._found += [(self._frames, kind, line, score) for kind, line, score in rows]
             for number, kind in enumerate(elements.kind[item].tolist()):
@@ -99,15 +99,18 @@ class MapLinesMetric:
         """Return the average precisions over all frames with a map."""
         if not self._frames:
             return {}
-        found, true = _line_set(self._found), _line_set(self._true)
+        predicted, true = _line_set(self._found), _line_set(self._true)
         out: Figures = {}
         for name, protocol in PROTOCOLS.items():
             if protocol.identity:
                 continue
-            scores = score_maps(found, true, protocol, AREA)
+            scores = score_maps(predicted, true, protocol, AREA)
             out[f"{name}.map"] = mean_precision(scores, protocol)
             out[f"{name}.map.nothing_detected"] = 0.0
-            out |= {f"{name}.ap_{ElementKind(kind).name.lower()}": found.ap for kind, found in scores.items()}
+            out |= {
+                f"{name}.ap_{ElementKind(kind).name.lower()}": predicted.ap
+                for kind, predicted in scores.items()
+            }
         return out | {"lines.frames_counted": self._frames}
 
 

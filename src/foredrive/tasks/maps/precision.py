@@ -96,10 +96,10 @@ def _score_class(
     if protocol.frames_without_truth == "dropped":
         predicted = predicted[np.flatnonzero(np.isin(predicted.frame, true.frame))]
     distances_m = protocol.distances_m[area]
-    found = _match(predicted, true, protocol, distances_m)
+    matched = _match(predicted, true, protocol, distances_m)
     if protocol.identity:
-        found = np.stack([_claimed(row, predicted, true, drive) for row in found])
-    aps = tuple(average_precision_area(predicted.score, row >= 0, objects) for row in found)
+        matched = np.stack([_claimed(row, predicted, true, drive) for row in matched])
+    aps = tuple(average_precision_area(predicted.score, row >= 0, objects) for row in matched)
     return MapPrecision(float(np.mean(aps)), aps, objects, len(predicted.lines))
 
 
@@ -107,7 +107,7 @@ def _match(
     predicted: LineSet, true: LineSet, protocol: VectorProtocol, distances_m: Sequence[float]
 ) -> Int[ndarray, "D M"]:
     """Return the true element that each prediction finds at each distance; -1: none."""
-    found = np.full((len(distances_m), len(predicted.lines)), -1)
+    matched = np.full((len(distances_m), len(predicted.lines)), -1)
     lines = predicted.resampled(protocol.points)
     others = _resampled_truth(true, protocol)
     rows, columns = rows_by_frame(predicted.frame), rows_by_frame(true.frame)
@@ -120,8 +120,8 @@ def _match(
         for row, limit_m in enumerate(distances_m):
             near = order[nearest_m[order] <= limit_m]
             element, first = np.unique(nearest[near], return_index=True)
-            found[row, ours[near[first]]] = theirs[element]
-    return found
+            matched[row, ours[near[first]]] = theirs[element]
+    return matched
 
 
 def _resampled_truth(true: LineSet, protocol: VectorProtocol) -> Float[ndarray, "N P 2"]:
@@ -151,7 +151,7 @@ def _distances(
 
 
 def _claimed(
-    found: Int[ndarray, "M"],
+    row: Int[ndarray, "M"],
     predicted: LineSet,
     true: LineSet,
     drive: Int[ndarray, "F"] | None,
@@ -159,12 +159,12 @@ def _claimed(
     """Leave each true element to the predicted identity that finds it first in its drive."""
     assert predicted.identity is not None
     assert true.identity is not None
-    hits = np.flatnonzero(found >= 0)
+    hits = np.flatnonzero(row >= 0)
     hits = hits[np.argsort(predicted.frame[hits], kind="stable")]
     frame = predicted.frame[hits]
-    key = np.stack([np.zeros_like(frame) if drive is None else drive[frame], true.identity[found[hits]]])
+    key = np.stack([np.zeros_like(frame) if drive is None else drive[frame], true.identity[row[hits]]])
     _, first, element = np.unique(key, axis=1, return_index=True, return_inverse=True)
     identity = predicted.identity[hits]
-    kept = found.copy()
+    kept = row.copy()
     kept[hits[identity != identity[first[element.ravel()]]]] = -1
     return kept

@@ -167,9 +167,11 @@ def _precision_of_motion(
     predicted: PredictedAgents, guessed: Bool[ndarray, "M"], true: TrueAgents, speed_mps: float
 ) -> ForecastPrecision:
     """Return the mean AP over the distances, and the errors at 2 m."""
-    each = [precision_at(predicted, guessed, true, speed_mps, distance_m) for distance_m in DISTANCES_M]
-    at = each[DISTANCES_M.index(ERROR_DISTANCE_M)]
-    return ForecastPrecision(float(np.mean([score.ap for score in each])), at.ade_m, at.fde_m)
+    precisions = [precision_at(predicted, guessed, true, speed_mps, distance_m) for distance_m in DISTANCES_M]
+    at_distance = precisions[DISTANCES_M.index(ERROR_DISTANCE_M)]
+    return ForecastPrecision(
+        float(np.mean([score.ap for score in precisions])), at_distance.ade_m, at_distance.fde_m
+    )
 
 
 def precision_at(
@@ -187,9 +189,9 @@ def precision_at(
     """
     if len(true.frame) == 0:
         return ForecastPrecision(float("nan"), float("nan"), float("nan"))
-    order, found = match_by_score(predicted, true, within_m=distance_m)
-    pairs = order[found[order] >= 0]
-    agent = found[pairs]
+    order, partner = match_by_score(predicted, true, within_m=distance_m)
+    pairs = order[partner[order] >= 0]
+    agent = partner[pairs]
     steps = true.steps_known(STEPS)[agent]
     errors = displacement_errors(predicted.future_xy[pairs, :FUTURES], true.future_xy[agent], steps)
     best = errors.mean.argmin(1)
@@ -199,7 +201,7 @@ def precision_at(
     right[pairs] = fde_m < distance_m + steps / STEPS * speed_mps
     if not right.any():
         return ForecastPrecision(0.0, MAX_ERROR_M, MAX_ERROR_M)
-    hit = right[order][(found[order] >= 0) | guessed[order]]
+    hit = right[order][(partner[order] >= 0) | guessed[order]]
     hits = np.cumsum(hit)
     precision, recall = hits / np.arange(1, len(hit) + 1), hits / len(true.frame)
     ap = np.interp(np.linspace(0, 1, 101), recall, precision, right=0.0).mean()

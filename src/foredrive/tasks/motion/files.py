@@ -138,17 +138,17 @@ def _against_logs(boxes: Mapping[str, Sequence[Box]], results: Path, truth: Path
     """Return predictions and the agents of logs at their frames."""
     frames = list(log_frames(truth, boxes, results))
     agents, names, ego_xy, headings = [], [], [], []
-    for number, each in enumerate(frames):
-        found = read_boxes(each.log, each.frame)
-        if found is None:
-            raise InputError(f"{results}: frame {each.name} is not annotated in {each.log.path.folder}")
-        future = read_futures(each.log, each.frame, STEPS, STEP_S)
-        T_world_ego = each.log.T_world_ego[each.frame]
-        agents.append(_agents_of_log(found, future, T_world_ego, number))
-        names += [f"{truth}: frame {each.name}, box {n}" for n in range(len(agents[-1].frame))]
+    for number, frame in enumerate(frames):
+        logged = read_boxes(frame.log, frame.frame)
+        if logged is None:
+            raise InputError(f"{results}: frame {frame.name} is not annotated in {frame.log.path.folder}")
+        future = read_futures(frame.log, frame.frame, STEPS, STEP_S)
+        T_world_ego = frame.log.T_world_ego[frame.frame]
+        agents.append(_agents_of_log(logged, future, T_world_ego, number))
+        names += [f"{truth}: frame {frame.name}, box {n}" for n in range(len(agents[-1].frame))]
         ego_xy.append(T_world_ego[:2, 3])
         headings.append(ego_yaw(T_world_ego))
-    rows = _rows(boxes, [each.name for each in frames], results)
+    rows = _rows(boxes, [frame.name for frame in frames], results)
     if not agents:
         raise InputError(f"{results}: holds no frames")
     fields = [field.name for field in dataclasses.fields(TrueAgents)]
@@ -190,10 +190,12 @@ class _Ego:
 
 def _by_token(content: Mapping[str, Any], path: Path) -> Mapping[str, Sequence[Box]]:
     boxes = content.get("results", content)
-    if not isinstance(boxes, dict) or not all(isinstance(each, list) for each in boxes.values()):
+    if not isinstance(boxes, dict) or not all(
+        isinstance(frame_boxes, list) for frame_boxes in boxes.values()
+    ):
         raise InputError(f"{path}: there must be a list of boxes by sample token, under `results` or alone")
-    for token, each in boxes.items():
-        for n, box in enumerate(each):
+    for token, frame_boxes in boxes.items():
+        for n, box in enumerate(frame_boxes):
             if not isinstance(box, dict):
                 raise InputError(f"{path}: frame {token}, box {n} is no object")
     return boxes
@@ -226,8 +228,8 @@ def _planar(value: Any) -> Any:
 
 
 def _scores(rows: _Rows) -> Float[ndarray, "n"]:
-    found = [_first(box, SCORES) for box in rows.records]
-    stated = [{} if value is None else {"score": value} for value in found]
+    scores = [_first(box, SCORES) for box in rows.records]
+    stated = [{} if value is None else {"score": value} for value in scores]
     score = read_number_rows(stated, "score", 1, rows.names)[:, 0]
     wrong = np.flatnonzero((score < 0) | (score > 1))
     if len(wrong):
@@ -242,26 +244,33 @@ def _predicted_futures(rows: _Rows) -> Float[ndarray, "n K T 2"]:
     shape: tuple[int, ...] = ()
     futures: list[ndarray] = []
     for where, value in zip(rows.names, stated, strict=True):
-        each = _numbers(value, where, "futures")
-        if each.ndim != 3 or each.shape[2] != 2 or not each.shape[0] or each.shape[1] < STEPS:
+        box_futures = _numbers(value, where, "futures")
+        if (
+            box_futures.ndim != 3
+            or box_futures.shape[2] != 2
+            or not box_futures.shape[0]
+            or box_futures.shape[1] < STEPS
+        ):
             raise InputError(f"{where}: its futures are not [K, {STEPS}, 2] (x, y at steps of 0.5 s)")
-        shape = each.shape if not futures else shape
-        if each.shape != shape:
-            raise InputError(f"{where}: its futures are {list(each.shape)}, those before {list(shape)}")
-        futures.append(each[:, :STEPS])
+        shape = box_futures.shape if not futures else shape
+        if box_futures.shape != shape:
+            raise InputError(
+                f"{where}: its futures are {list(box_futures.shape)}, those before {list(shape)}"
+            )
+        futures.append(box_futures[:, :STEPS])
     return np.stack(futures)
 
 
 def _probabilities(rows: _Rows, futures: int) -> Float[ndarray, "n K"]:
-    found = np.full((len(rows.records), futures), 1.0 / futures)
+    probabilities = np.full((len(rows.records), futures), 1.0 / futures)
     for n, (where, box) in enumerate(zip(rows.names, rows.records, strict=True)):
         stated = _first(box, PROBABILITIES)
         if stated is not None:
-            each = _numbers(stated, where, "probabilities of its futures").reshape(-1)
-            if len(each) != futures:
-                raise InputError(f"{where} has {len(each)} probabilities for {futures} futures")
-            found[n] = each
-    return found
+            stated_values = _numbers(stated, where, "probabilities of its futures").reshape(-1)
+            if len(stated_values) != futures:
+                raise InputError(f"{where} has {len(stated_values)} probabilities for {futures} futures")
+            probabilities[n] = stated_values
+    return probabilities
 
 
 def _true_futures(rows: _Rows) -> tuple[Float[ndarray, "n T 2"], Bool[ndarray, "n T"]]:
@@ -270,11 +279,11 @@ def _true_futures(rows: _Rows) -> tuple[Float[ndarray, "n T 2"], Bool[ndarray, "
     for n, (where, box) in enumerate(zip(rows.names, rows.records, strict=True)):
         if "traj" not in box:
             raise InputError(f"{where} has no traj: the truth states each agent's future, which may be empty")
-        each = _numbers(box["traj"], where, "traj")
-        if each.size and (each.ndim != 2 or each.shape[1] != 2):
+        values = _numbers(box["traj"], where, "traj")
+        if values.size and (values.ndim != 2 or values.shape[1] != 2):
             raise InputError(f"{where}: its traj is not [T, 2]")
-        steps = min(len(each), STEPS)
-        futures[n, :steps] = each[:steps].reshape(-1, 2)
+        steps = min(len(values), STEPS)
+        futures[n, :steps] = values[:steps].reshape(-1, 2)
         valid[n, :steps] = True
     return futures, valid
 
@@ -293,12 +302,14 @@ def _placed(
     rows: _Rows, first_steps: Float[ndarray, "n K 2"], true: TrueAgents, true_names: Sequence[str]
 ) -> bool:
     """Return whether futures are in the frame of the boxes. Both files must agree on it."""
-    known = np.flatnonzero(true.future_valid[:, 0])
+    rows_with_future = np.flatnonzero(true.future_valid[:, 0])
     near = np.linalg.norm(first_steps - rows.xy[:, None], axis=-1).min(axis=1) < FAR_M
-    true_near = np.linalg.norm(true.future_xy[known, 0] - true.xy[known], axis=-1) < FAR_M
+    true_near = (
+        np.linalg.norm(true.future_xy[rows_with_future, 0] - true.xy[rows_with_future], axis=-1) < FAR_M
+    )
     placed = bool(true_near.all())
     if not placed and true_near.any():
-        name = true_names[known[np.flatnonzero(~true_near)[0]]]
+        name = true_names[rows_with_future[np.flatnonzero(~true_near)[0]]]
         raise InputError(f"{name}: its traj begins more than {FAR_M:g} m from its translation")
     wrong = np.flatnonzero(near != placed)
     if len(wrong):

@@ -80,10 +80,10 @@ class MotionModes(nn.Module):
         speed = velocity.norm(dim=-1, keepdim=True)
         queries = queries + self.speed(torch.cat([velocity, speed], dim=-1) / 10.0)
         modes = (queries[:, :, None] + self.mode).flatten(1, 2)
-        at = place(plane.share(xy)).repeat_interleave(config.modes, dim=1)
+        anchors = place(plane.share(xy)).repeat_interleave(config.modes, dim=1)
         cell_place = place(plane.share(plane.middle_m))[None]
         for layer in self.layers:
-            modes = layer(modes, at, plane.cells, cell_place)
+            modes = layer(modes, anchors, plane.cells, cell_place)
         out = self.out(modes).unflatten(1, (queries.shape[1], config.modes))
         change = config.dt_s * out[..., :-1].unflatten(-1, (config.steps, 2)).cumsum(dim=-2)
         sin, cos = heading[:, :, None, None, 0], heading[:, :, None, None, 1]

@@ -39,7 +39,7 @@ def match_by_score(
     frames = int(max(predicted.frame.max(initial=-1), true.frame.max(initial=-1))) + 1
     start = np.searchsorted(true.frame[by_frame], np.arange(frames + 1))
     steps = true.steps_known(horizon)[by_frame]
-    found = _match_by_score(
+    partner = _match_by_score(
         order,
         predicted.frame,
         predicted.xy,
@@ -51,7 +51,7 @@ def match_by_score(
         steps,
         end_within_m,
     )
-    return order, np.where(found >= 0, by_frame[found], -1) if len(by_frame) else found
+    return order, np.where(partner >= 0, by_frame[partner], -1) if len(by_frame) else partner
 
 
 def match_by_distance(predicted: PredictedAgents, true: TrueAgents, *, within_m: float) -> Int[ndarray, "M"]:
@@ -59,7 +59,7 @@ def match_by_distance(predicted: PredictedAgents, true: TrueAgents, *, within_m:
 
     -1: none. Scores and classes do not matter.
     """
-    found = np.full(len(predicted.frame), -1)
+    partner = np.full(len(predicted.frame), -1)
     rows, columns = rows_by_frame(predicted.frame), rows_by_frame(true.frame)
     for frame, row in rows.items():
         column = columns.get(frame)
@@ -71,8 +71,8 @@ def match_by_distance(predicted: PredictedAgents, true: TrueAgents, *, within_m:
         cost = np.where(near, distance_m, _APART)[np.ix_(near.any(1), near.any(0))]
         i, j = linear_sum_assignment(cost)
         hit = cost[i, j] < _APART
-        found[row[i[hit]]] = column[j[hit]]
-    return found
+        partner[row[i[hit]]] = column[j[hit]]
+    return partner
 
 
 @numba.njit(cache=True, nogil=True)
@@ -80,7 +80,7 @@ def match_by_distance(predicted: PredictedAgents, true: TrueAgents, *, within_m:
 def _match_by_score(
     order, frame, xy, start, true_xy, within_m, future_xy, true_future_xy, steps, end_within_m
 ):
-    found = np.full(len(order), -1)
+    partner = np.full(len(order), -1)
     taken = np.zeros(len(true_xy), np.bool_)
     for i in order:
         nearest, nearest_m = -1, np.inf
@@ -100,5 +100,5 @@ def _match_by_score(
                     end_m = min(end_m, np.sqrt(x * x + y * y))
             if end_m >= end_within_m:
                 continue
-        found[i], taken[nearest] = nearest, True
-    return found
+        partner[i], taken[nearest] = nearest, True
+    return partner

@@ -45,21 +45,21 @@ class MotionMetric:
         if agents.dt_s != STEP_S or truth.truth.futures.dt_s != STEP_S:
             return
         for item in clip.boxes_valid[:, clip.now].nonzero()[:, 0].tolist():
-            found, frame = agents[item].to("cpu"), len(self._true)
-            assert found.future_xy is not None
-            assert found.log_prob is not None
-            t_s = STEP_S * torch.arange(1, found.future_xy.shape[-2] + 1)
-            steady = found.centre[:, None, :2] + found.velocity[:, None] * t_s[:, None]
+            predicted, frame = agents[item].to("cpu"), len(self._true)
+            assert predicted.future_xy is not None
+            assert predicted.log_prob is not None
+            t_s = STEP_S * torch.arange(1, predicted.future_xy.shape[-2] + 1)
+            steady = predicted.centre[:, None, :2] + predicted.velocity[:, None] * t_s[:, None]
             pose = clip.T_world_ego[item, clip.now].cpu().numpy()
-            self._steady.append(_placed(steady[:, None], found.centre, pose))
+            self._steady.append(_placed(steady[:, None], predicted.centre, pose))
             self._predicted.append(
                 {
-                    "frame": np.full(len(found.score), frame),
-                    "category": found.category.numpy(),
-                    "score": found.score.double().numpy(),
-                    "xy": _placed(found.centre[:, :2], found.centre, pose),
-                    "future_xy": _placed(found.future_xy, found.centre, pose),
-                    "probability": found.log_prob.double().exp().numpy(),
+                    "frame": np.full(len(predicted.score), frame),
+                    "category": predicted.category.numpy(),
+                    "score": predicted.score.double().numpy(),
+                    "xy": _placed(predicted.centre[:, :2], predicted.centre, pose),
+                    "future_xy": _placed(predicted.future_xy, predicted.centre, pose),
+                    "probability": predicted.log_prob.double().exp().numpy(),
                 }
             )
             boxes, futures = clip.boxes[item, clip.now].to("cpu"), truth.truth.futures[item].to("cpu")

@@ -81,19 +81,19 @@ def _precision(predicted: PredictedAgents, true: TrueAgents) -> tuple[float, flo
     objects = len(true.frame)
     if objects == 0 or len(predicted.frame) == 0:
         return 0.0, 0.0
-    order, found = match_by_score(predicted, true, within_m=MATCH_M, end_within_m=MISS_M, horizon=STEPS)
-    precision, recall = precision_recall(found[order] >= 0, objects)
+    order, partner = match_by_score(predicted, true, within_m=MATCH_M, end_within_m=MISS_M, horizon=STEPS)
+    precision, recall = precision_recall(partner[order] >= 0, objects)
     f1 = 2 * precision * recall / (precision + recall + 1e-5)
-    ap = average_precision_nuscenes(predicted.score, found >= 0, objects)
+    ap = average_precision_nuscenes(predicted.score, partner >= 0, objects)
     return ap, float(predicted.score[order][f1.argmax()])
 
 
 def _pair_errors(predicted: PredictedAgents, true: TrueAgents) -> Float[ndarray, "2 P"]:
     """Return minADE and minFDE of the pairs."""
-    found = match_by_distance(predicted, true, within_m=MATCH_M)
-    pairs = np.flatnonzero(found >= 0)
+    partner = match_by_distance(predicted, true, within_m=MATCH_M)
+    pairs = np.flatnonzero(partner >= 0)
     steps: Int[ndarray, P] = np.full(len(pairs), STEPS)
-    errors = displacement_errors(predicted.future_xy[pairs], true.future_xy[found[pairs]], steps)
+    errors = displacement_errors(predicted.future_xy[pairs], true.future_xy[partner[pairs]], steps)
     return np.stack([errors.mean.min(1), errors.last.min(1)])
 
 

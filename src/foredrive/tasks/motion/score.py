@@ -56,8 +56,8 @@ def read_challenge(results: Path, truth: Path) -> ChallengeForecasts:
         rows.setdefault(key, []).append(n)
     truths: dict[str, dict[str, Float[ndarray, "T 2"]]] = {}
     futures, shares, true = [], [], []
-    count = max((len(each) for each in rows.values()), default=1)
-    for (name, track_id), each in rows.items():
+    count = max((len(row) for row in rows.values()), default=1)
+    for (name, track_id), row in rows.items():
         where = f"{results}: scenario {name}, track {track_id}"
         if name not in files:
             raise InputError(f"{where} is not in {truth}: of another split?")
@@ -65,10 +65,10 @@ def read_challenge(results: Path, truth: Path) -> ChallengeForecasts:
             truths[name] = _scenario(files[name])
         if track_id not in truths[name]:
             raise InputError(f"{where} has no whole future in {files[name]}")
-        if len(each) != count:
-            raise InputError(f"{where} has {len(each)} futures, others {count}")
-        futures.append([_trajectory(x[n], y[n], where) for n in each])
-        shares.append([probability[n] for n in each])
+        if len(row) != count:
+            raise InputError(f"{where} has {len(row)} futures, others {count}")
+        futures.append([_trajectory(x[n], y[n], where) for n in row])
+        shares.append([probability[n] for n in row])
         true.append(truths[name][track_id])
         if not (np.min(shares[-1]) >= 0 and abs(np.sum(shares[-1]) - 1) < 1e-3):
             raise InputError(f"{where}: its probabilities do not add up to 1")
@@ -95,13 +95,13 @@ def _scenario(path: Path) -> dict[str, Float[ndarray, "T 2"]]:
     table = read_table(path, _SCENARIO)
     track, step, x, y = (table[name].to_numpy() for name in _SCENARIO)
     later = step >= OBSERVED
-    found = {}
+    scenario = {}
     for name in np.unique(track[later]):
         rows = np.flatnonzero(later & (track == name))
         rows = rows[np.argsort(step[rows], kind="stable")]
         if len(rows) == PREDICTED:
-            found[str(name)] = np.stack([x[rows], y[rows]], axis=-1).astype(np.float64)
-    return found
+            scenario[str(name)] = np.stack([x[rows], y[rows]], axis=-1).astype(np.float64)
+    return scenario
 
 
 LIKELIEST = (6, 1)

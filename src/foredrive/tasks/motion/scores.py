@@ -83,13 +83,13 @@ def _score_class(predicted: PredictedAgents, true: TrueAgents, protocol: MotionP
     if objects == 0:
         nan = float("nan")
         return MotionScores(nan, nan, nan, nan, 0, predictions, 0)
-    order, found = match_by_score(predicted, true, within_m=MATCH_M)
+    order, partner = match_by_score(predicted, true, within_m=MATCH_M)
     _, hit_again = match_by_score(
         predicted, true, within_m=MATCH_M, end_within_m=MISS_M, horizon=protocol.steps
     )
-    pairs = order[found[order] >= 0]
-    errors = _pair_errors(predicted, true, pairs, found[pairs], protocol.steps)
-    score, hit = predicted.score[order], found[order] >= 0
+    pairs = order[partner[order] >= 0]
+    errors = _pair_errors(predicted, true, pairs, partner[pairs], protocol.steps)
+    score, hit = predicted.score[order], partner[order] >= 0
     min_ade_m, min_fde_m, miss_rate = (
         error_over_recall(score, hit, objects, values)
         for values in (errors.mean.min(1), errors.last.min(1), 1.0 * _missed(errors, protocol))
@@ -106,20 +106,20 @@ def _score_nearest(
     in_play = frozenset[Category]().union(protocol.ignored, *protocol.classes.values())
     predicted = predicted[_is_any(predicted.category, in_play) & _within(predicted, protocol.region)]
     true = true[_is_any(true.category, in_play) & _within(true, protocol.region)]
-    found = match_by_distance(predicted, true, within_m=MATCH_M)
+    partner = match_by_distance(predicted, true, within_m=MATCH_M)
     steps = true.steps_known(protocol.steps)
-    pairs = np.flatnonzero(found >= 0)
-    pairs = pairs[steps[found[pairs]] > 0]
-    errors = _pair_errors(predicted, true, pairs, found[pairs], protocol.steps)
-    whole = steps[found[pairs]] == protocol.steps
+    pairs = np.flatnonzero(partner >= 0)
+    pairs = pairs[steps[partner[pairs]] > 0]
+    errors = _pair_errors(predicted, true, pairs, partner[pairs], protocol.steps)
+    whole = steps[partner[pairs]] == protocol.steps
     missed = _missed(errors, protocol)
     scores = {}
     for name, categories in protocol.classes.items():
-        of_class = _is_any(true.category[found[pairs]], categories)
+        of_class = _is_any(true.category[partner[pairs]], categories)
         judged = of_class & whole
         predictions = _is_any(predicted.category, categories)
         objects = int((_is_any(true.category, categories) & (steps == protocol.steps)).sum())
-        hits = (judged & ~missed).sum() - FALSE_POSITIVE_COST * (predictions & (found < 0)).sum()
+        hits = (judged & ~missed).sum() - FALSE_POSITIVE_COST * (predictions & (partner < 0)).sum()
         scores[name] = MotionScores(
             _mean(errors.mean.min(1)[of_class]),
             _mean(errors.last.min(1)[judged]),
@@ -164,4 +164,8 @@ def _mean(values: Float[ndarray, "n"]) -> float:
 
 def motion_figures(scores: Mapping[str, MotionScores]) -> dict[str, float]:
     """Return scores under flat keys: `car.min_ade_m`, `car.epa`, …"""
-    return {f"{name}.{key}": value for name, each in scores.items() for key, value in vars(each).items()}
+    return {
+        f"{name}.{key}": value
+        for name, class_scores in scores.items()
+        for key, value in vars(class_scores).items()
+    }

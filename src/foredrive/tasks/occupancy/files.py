@@ -235,21 +235,21 @@ def read_frame(files: VoxelFiles, token: str) -> VoxelFrame:
 
 def _labels_by_token(folder: Path) -> dict[str, Path]:
     """Return the files SCENE/TOKEN/labels.npz by token."""
-    found: dict[str, Path] = {}
+    by_token: dict[str, Path] = {}
     for path in sorted(folder.glob("*/*/labels.npz")):
         token = path.parent.name
-        if token in found:
-            raise InputError(f"{path}: frame {token} is also in {found[token].parent.parent}")
-        found[token] = path
-    return found
+        if token in by_token:
+            raise InputError(f"{path}: frame {token} is also in {by_token[token].parent.parent}")
+        by_token[token] = path
+    return by_token
 
 
 def _results_by_token(folder: Path) -> dict[str, Path]:
     flat = {path.stem: path for path in sorted(folder.glob("*.npz"))}
-    found = flat or _labels_by_token(folder)
-    if not found:
+    by_token = flat or _labels_by_token(folder)
+    if not by_token:
         raise InputError(f"{folder}: holds neither TOKEN.npz nor SCENE/TOKEN/labels.npz")
-    return found
+    return by_token
 
 
 def _data_set(file: Path) -> str:

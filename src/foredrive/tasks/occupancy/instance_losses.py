@@ -60,8 +60,8 @@ def instance_loss(
 
 def _inside(raster: PlaneSpec, spec: VoxelSpec) -> tuple[Bool[Tensor, "Y"], Bool[Tensor, "X"]]:
     """Return which rows and columns of a raster have their middle above a volume."""
-    found = []
+    inside = []
     for axis, size in ((1, raster.shape_yx[0]), (0, raster.shape_yx[1])):
         middle = raster.lower_m[axis] + (torch.arange(size) + 0.5) * raster.cell_m
-        found.append((middle > spec.lower_m[axis]) & (middle < spec.upper_m[axis]))
-    return found[0], found[1]
+        inside.append((middle > spec.lower_m[axis]) & (middle < spec.upper_m[axis]))
+    return inside[0], inside[1]

@@ -102,8 +102,8 @@ class InstanceHead(nn.Module):
         T_later_now = torch.linalg.inv(T_now_later.to(now.features))
         for step, plane in enumerate(later):
             T = T_later_now[:, step]
-            there = middle @ T[:, :2, :2].mT + T[:, None, :2, 3]
-            moved = Plane(self.pixels(plane.features), plane.lower_m, plane.cell_m).at(there)
+            carried_xy = middle @ T[:, :2, :2].mT + T[:, None, :2, 3]
+            moved = Plane(self.pixels(plane.features), plane.lower_m, plane.cell_m).at(carried_xy)
             seen.append(moved.mT.unflatten(-1, self.shape_yx))
         seen += [torch.zeros_like(seen[0])] * (self.config.steps - len(later))
         return InstanceSet(
@@ -156,14 +156,14 @@ def instance_raster(instances: InstanceSet, agents: AgentSet, spec: PlaneSpec) -
     """
     count = instances.embedding.shape[-2]
     points = cell_middles(spec.lower_m, spec.cell_m, spec.shape_yx).to(instances.embedding)
-    found = torch.zeros(len(instances.embedding), count, len(points), dtype=torch.long, device=points.device)
+    raster = torch.zeros(len(instances.embedding), count, len(points), dtype=torch.long, device=points.device)
     is_vehicle = _IS_VEHICLE.to(points.device)
-    for item in range(len(found)):
+    for item in range(len(raster)):
         score, label = agents.boxes.logits[item].softmax(dim=-1)[..., :-1].max(dim=-1)
         rows = ((score >= MIN_SCORE) & is_vehicle[label]).nonzero()[:, 0]
         if len(rows):
             probability = instance_logits(instances[item], agents[item], rows, points).sigmoid()
             inside = probability >= MIN_PROBABILITY
             which = (probability * inside * score[rows, None, None]).argmax(dim=0)
-            found[item] = torch.where(inside.any(dim=0), rows[which] + 1, 0)
-    return found.unflatten(-1, spec.shape_yx)
+            raster[item] = torch.where(inside.any(dim=0), rows[which] + 1, 0)
+    return raster.unflatten(-1, spec.shape_yx)

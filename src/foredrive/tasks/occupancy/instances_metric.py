@@ -104,8 +104,8 @@ def count_rasters(
     if past_frames < protocol.past_frames:
         return total
     for item in truth.valid.all(dim=1).nonzero().flatten().tolist():
-        found, true = (part[item].cpu().numpy() for part in (predicted, truth.track_id))
-        for name, counts in count_instances(found, true, protocol).items():
+        predicted_id, true = (part[item].cpu().numpy() for part in (predicted, truth.track_id))
+        for name, counts in count_instances(predicted_id, true, protocol).items():
             total[name] = total[name] + counts if name in total else counts
     return total
 
@@ -126,13 +126,13 @@ def _count_range(
         false += len(predicted_id) - len(columns)
         missed += len(true_id) - len(rows)
         for row, column in zip(rows, columns, strict=True):
-            instance, found = int(true_id[row]), int(predicted_id[column])
-            if partner.setdefault(instance, found) == found:
+            instance, candidate = int(true_id[row]), int(predicted_id[column])
+            if partner.setdefault(instance, candidate) == candidate:
                 pairs += 1
                 iou_sum += float(iou[row, column])
             else:
                 false, missed = false + 1, missed + 1
-                partner[instance] = found
+                partner[instance] = candidate
     return InstanceCounts(
         cells_hit=int(((predicted > 0) & (true > 0)).sum()),
         cells_false=int(((predicted > 0) & (true == 0)).sum()),

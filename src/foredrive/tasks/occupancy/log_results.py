@@ -83,17 +83,17 @@ def score_against_logs(results: Path, truth: Path, on_frame: Callable[[], None] 
     grid = read_grid(results)
     counts = LogVoxelCounts(grid.taxonomy, grid.spec)
     without_velocity = 0
-    for each in log_frames(truth, files, results):
-        labels, flow_mps = _read(files[each.name], grid)
-        cameras = pinhole_cameras(each.log)
+    for frame in log_frames(truth, files, results):
+        labels, flow_mps = _read(files[frame.name], grid)
+        cameras = pinhole_cameras(frame.log)
         named = (
             cameras if grid.cameras is None else {name: find_camera(cameras, name) for name in grid.cameras}
         )
-        there = [camera for camera in named.values() if camera is not None]
-        true = read_semantics(each.log, each.frame, grid.spec, grid.taxonomy, there)
+        pinholes = [camera for camera in named.values() if camera is not None]
+        true = read_semantics(frame.log, frame.frame, grid.spec, grid.taxonomy, pinholes)
         if not bool(true.known.any()):
-            raise InputError(f"{each.log.path.folder} has no recorded voxels to judge frame {each.name} by")
-        counts.add(labels, flow_mps, true, read_rays(each.log, each.frame, grid.spec))
+            raise InputError(f"{frame.log.path.folder} has no recorded voxels to judge frame {frame.name} by")
+        counts.add(labels, flow_mps, true, read_rays(frame.log, frame.frame, grid.spec))
         without_velocity += flow_mps is None
         on_frame()
     figures: Figures = {"data_set": grid.taxonomy, "frames": len(files)}
@@ -114,8 +114,8 @@ def read_grid(folder: Path) -> VoxelGridOfResults:
     if not isinstance(stated, dict):
         raise InputError(f"{path}: not an object")
     if stated.get("classes") not in VOXEL_CLASSES:
-        known = ", ".join(VOXEL_CLASSES)
-        raise InputError(f"{path}: the classes {stated.get('classes')!r} are none of {known}")
+        names = ", ".join(VOXEL_CLASSES)
+        raise InputError(f"{path}: the classes {stated.get('classes')!r} are none of {names}")
     lower_m, shape = (_three(stated, name, path) for name in ("lower_m", "shape_zyx"))
     (voxel_m,) = _numbers(stated, "voxel_m", 1, path)
     if not voxel_m > 0 or not all(size > 0 and size == int(size) for size in shape):
@@ -136,9 +136,9 @@ def _three(stated: dict[str, Any], name: str, path: Path) -> tuple[float, float,
 def _numbers(stated: dict[str, Any], name: str, count: int, path: Path) -> list[float]:
     value = stated.get(name)
     values: list[Any] = value if isinstance(value, list) else [value]
-    if len(values) != count or not all(_is_number(each) for each in values):
+    if len(values) != count or not all(_is_number(entry) for entry in values):
         raise InputError(f"{path}: {name} is not {count} finite number{'s' if count > 1 else ''}")
-    return [float(each) for each in values]
+    return [float(entry) for entry in values]
 
 
 def _is_number(value: object) -> bool:

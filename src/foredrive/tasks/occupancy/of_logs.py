@@ -50,9 +50,11 @@ class LogVoxelCounts:
 
     def figures(self) -> Figures:
         """Return the figures by `PROTOCOL.KEY`; single classes under the data sets' own protocols alone."""
-        found = self._own.figures() | ({} if self._openocc is None else self._openocc.figures())
+        figures = self._own.figures() | ({} if self._openocc is None else self._openocc.figures())
         own = (self._own.data_set, "openocc")
-        return {key: value for key, value in found.items() if key.count(".") < 2 or key.split(".")[0] in own}
+        return {
+            key: value for key, value in figures.items() if key.count(".") < 2 or key.split(".")[0] in own
+        }
 
 
 def _frame(

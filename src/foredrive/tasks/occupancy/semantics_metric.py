@@ -28,14 +28,14 @@ class SemanticVoxelMetric:
 
     def update(self, prediction: Prediction, truth: Example) -> None:
         """Add b clips."""
-        found, semantics = prediction.semantics, None if truth.truth is None else truth.truth.semantics
-        if found is None or semantics is None or truth.truth is None:
+        predicted, semantics = prediction.semantics, None if truth.truth is None else truth.truth.semantics
+        if predicted is None or semantics is None or truth.truth is None:
             return
         for item in semantics.known.flatten(1).any(dim=1).nonzero()[:, 0].tolist():
             true = semantics[item].to("cpu")
             rays = None if truth.truth.rays is None else truth.truth.rays[item].to("cpu")
             flow = None if prediction.flow_mps is None else prediction.flow_mps[item, 0, :2].cpu().numpy()
-            shown = {"": (found[item].cpu().numpy(), flow)}
+            shown = {"": (predicted[item].cpu().numpy(), flow)}
             if self._prior is not None:
                 shown[PRIOR] = (self._prior, None)
             for suffix, (voxels, velocity_mps) in shown.items():

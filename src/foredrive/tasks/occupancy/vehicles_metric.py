@@ -55,9 +55,9 @@ def count_car_columns(
         boxes, labels: ground truth of that frame, see `car_columns`.
         range_m: maximum distances.
     """
-    found = found_columns(predicted, labels.spec)
+    predicted_columns = found_columns(predicted, labels.spec)
     truth = [car_columns(boxes, labels, float(limit)) for limit in range_m]
-    hits = torch.stack([(found & columns).sum() for columns in truth])
+    hits = torch.stack([(predicted_columns & columns).sum() for columns in truth])
     return hits.cpu(), torch.stack([columns.sum() for columns in truth]).cpu()
 
 
@@ -75,12 +75,12 @@ def count_found_columns(
         range_m: maximum distances of the columns' centres.
     """
     spec = labels.spec
-    found = found_columns(predicted & labels.known, spec)
+    predicted_columns = found_columns(predicted & labels.known, spec)
     true = found_columns((labels.values[:, 0] > 0.5) & labels.known, spec)
     near = spec.centres_m()[0, ..., :2].norm(dim=-1)[None] <= range_m[:, None, None]  # [R, Y, X]
-    near = near.to(found.device)
-    hits = torch.stack([(found & true & within).sum() for within in near])
-    return hits.cpu(), torch.stack([(found & within).sum() for within in near]).cpu()
+    near = near.to(predicted_columns.device)
+    hits = torch.stack([(predicted_columns & true & within).sum() for within in near])
+    return hits.cpu(), torch.stack([(predicted_columns & within).sum() for within in near]).cpu()
 
 
 RANGES_M = (10.0, 20.0, 30.0)
@@ -115,11 +115,11 @@ class VehicleMetric:
         )
         self._hits += hits
         self._columns += columns
-        true, found = count_found_columns(
+        true, predicted_counts = count_found_columns(
             prediction.occupancy_logit[annotated, 0] > 0, labels[annotated], torch.tensor(RANGES_M)
         )
         self._true += true
-        self._found += found
+        self._found += predicted_counts
 
     def result(self) -> Figures:
         """Return the figures by range; NaN where no column holds a car or is predicted."""

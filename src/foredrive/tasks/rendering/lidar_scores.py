@@ -65,5 +65,5 @@ def chamfer_m2(cloud_m: Float[Tensor, "N 3"], real_m: Float[Tensor, "M 3"]) -> f
     if not len(cloud_m):
         return NO_POINTS_M**2
     a, b = cloud_m.numpy(), real_m.numpy()
-    there, back = cKDTree(b).query(a)[0], cKDTree(a).query(b)[0]
-    return float((np.square(there).sum() + np.square(back).sum()) / len(b))
+    forth, back = cKDTree(b).query(a)[0], cKDTree(a).query(b)[0]
+    return float((np.square(forth).sum() + np.square(back).sum()) / len(b))

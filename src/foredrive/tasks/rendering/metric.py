@@ -30,8 +30,8 @@ class ImageMetric:
         sums = torch.zeros(rendered.shape[1], 2, dtype=torch.float64)
         images = torch.zeros(rendered.shape[1], 1, dtype=torch.int64)
         for k in range(rendered.shape[1]):
-            there = known[:, k].flatten(2).any(dim=-1)  # [b, C]
-            views = (rendered[:, k][there], real[:, k][there], known[:, k][there])
+            seen = known[:, k].flatten(2).any(dim=-1)  # [b, C]
+            views = (rendered[:, k][seen], real[:, k][seen], known[:, k][seen])
             scores = torch.stack([psnr_db(*views), ssim(*views)], dim=-1)
             sums[k] = scores.double().sum(dim=0).cpu()
             images[k] = len(scores)

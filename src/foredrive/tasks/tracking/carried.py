@@ -62,13 +62,13 @@ def frame_steps(T_world_ego: Float64[Tensor, "b 4 4"], frames: int, dt_s: float)
     return FrameSteps(compose_se3(inverse_se3(poses), before).float(), dt_s)
 
 
-def lineage_of(found: AgentSet, carried: CarriedAgents | None, decay: float) -> Lineage:
+def lineage_of(predicted: AgentSet, carried: CarriedAgents | None, decay: float) -> Lineage:
     """Return the lineage of queries of which the first are those of `carried`.
 
     The rank is the score. Carried queries keep at least `decay` times their rank, so that an agent that is
     hidden for a moment is not lost (SparseDrive, Sun et al. 2024: its instance bank).
     """
-    score = found.boxes.logits.detach().softmax(dim=-1)[..., :-1].amax(dim=-1)
+    score = predicted.boxes.logits.detach().softmax(dim=-1)[..., :-1].amax(dim=-1)
     source = torch.full_like(score, NEW, dtype=torch.long)
     if carried is None:
         return Lineage(source, score)
@@ -78,14 +78,14 @@ def lineage_of(found: AgentSet, carried: CarriedAgents | None, decay: float) -> 
 
 
 def carry(
-    found: AgentSet, lineage: Lineage, count: int, T_now_before: Float[Tensor, "b 4 4"], dt_s: float
+    predicted: AgentSet, lineage: Lineage, count: int, T_now_before: Float[Tensor, "b 4 4"], dt_s: float
 ) -> CarriedAgents:
     """Return the agents of the highest ranks, moved by the ego motion and their own velocity.
 
     Queries keep their gradients. Boxes pass none, as in the layers of the head.
 
     Args:
-        found: agents of the frame before, with their queries.
+        predicted: agents of the frame before, with their queries.
         lineage: of these agents.
         count: number of agents to carry on.
         T_now_before: the ego frame of the frame before -> the ego frame at now.
@@ -93,7 +93,7 @@ def carry(
     """
     rank, best = lineage.rank.topk(count, dim=-1)
     item = torch.arange(len(best), device=best.device)[:, None]
-    bare = dataclasses.replace(found, future_xy=None, log_prob=None)
+    bare = dataclasses.replace(predicted, future_xy=None, log_prob=None)
     chosen = bare.map_tensors(lambda tensor: tensor[item, best])
     query = chosen.query
     here = moved(chosen.map_tensors(Tensor.detach), T_now_before, dt_s)
@@ -110,8 +110,10 @@ def moved(agents: AgentSet, T_now_before: Float[Tensor, "b 4 4"], dt_s: float) -
         sin, cos = boxes.heading.to(mean).unbind(-1)
         heading = rotate_vectors(T, torch.stack([cos, sin, level[..., 0]], dim=-1))
         turned = torch.nn.functional.normalize(heading[..., [1, 0]], dim=-1, eps=1e-3)
-        there = dataclasses.replace(boxes, mean=torch.cat([centre, mean[..., 3:]], dim=-1), heading=turned)
-        return dataclasses.replace(agents, boxes=there, velocity=rotate_vectors(T, velocity)[..., :2])
+        moved_boxes = dataclasses.replace(
+            boxes, mean=torch.cat([centre, mean[..., 3:]], dim=-1), heading=turned
+        )
+        return dataclasses.replace(agents, boxes=moved_boxes, velocity=rotate_vectors(T, velocity)[..., :2])
 
 
 def follow(
@@ -139,8 +141,8 @@ def follow(
         every.append((centres, layers, lineage))
         if k + 1 < frames:
             carried = carry(layers[-1], lineage, config.agents, steps.T_now_before[:, k + 1], steps.dt_s)
-    layers = [interleaved([found[1][n] for found in every]) for n in range(len(every[0][1]))]
-    return interleaved([found[0] for found in every]), layers, interleaved([found[2] for found in every])
+    layers = [interleaved([step[1][n] for step in every]) for n in range(len(every[0][1]))]
+    return interleaved([step[0] for step in every]), layers, interleaved([step[2] for step in every])
 
 
 def interleaved(records: Sequence[R]) -> R:

@@ -113,7 +113,7 @@ def _ratio(part: int | float, whole: int) -> float:
 
 def clear_mot(
     true: TrackRows,
-    found: TrackRows,
+    predicted: TrackRows,
     candidates: Candidates,
     active: Bool[ndarray, "m"] | None = None,
 ) -> tuple[ClearEvents, ClearCounts]:
@@ -130,10 +130,10 @@ def clear_mot(
     Raises:
         InputError: rows are not in the order of frames, or a track has two boxes in one frame.
     """
-    for rows, name in ((true, "true"), (found, "found")):
+    for rows, name in ((true, "true"), (predicted, "found")):
         _check_rows(rows, name)
-    some = np.ones(len(found), bool) if active is None else active
-    layout = lay_out(true, found, candidates)
+    some = np.ones(len(predicted), bool) if active is None else active
+    layout = lay_out(true, predicted, candidates)
     events = ClearEvents(*follow(layout, some))
     return events, count_events(layout, events, some)
 
@@ -163,14 +163,14 @@ class Layout:
     distance: Float[ndarray, "P"]
 
 
-def lay_out(true: TrackRows, found: TrackRows, candidates: Candidates) -> Layout:
+def lay_out(true: TrackRows, predicted: TrackRows, candidates: Candidates) -> Layout:
     """Return the rows of each frame and the candidates of each true row."""
-    frames = np.union1d(true.frame, found.frame)
+    frames = np.union1d(true.frame, predicted.frame)
     return Layout(
         _starts(true.frame, frames),
-        _starts(found.frame, frames),
+        _starts(predicted.frame, frames),
         np.unique(true.track, return_inverse=True)[1],
-        np.unique(found.track, return_inverse=True)[1],
+        np.unique(predicted.track, return_inverse=True)[1],
         np.searchsorted(candidates.true_row, np.arange(len(true) + 1)),
         np.ascontiguousarray(candidates.found_row, dtype=np.int64),
         np.ascontiguousarray(candidates.value, dtype=np.float64),
@@ -209,10 +209,10 @@ def _follow(true_start, found_start, true_track, found_track, start, found_row, 
         for row in rows:  # keep the track of before
             if last[true_track[row]] >= 0:
                 for p in range(start[row], start[row + 1]):
-                    there = found_row[p]
-                    if not taken[there] and found_track[there] == last[true_track[row]]:
-                        kind[row], partner[row], apart[row] = MATCH, there, distance[p]
-                        taken[there] = True
+                    present = found_row[p]
+                    if not taken[present] and found_track[present] == last[true_track[row]]:
+                        kind[row], partner[row], apart[row] = MATCH, present, distance[p]
+                        taken[present] = True
                         break
         _match_rest(rows, start, found_row, distance, taken, partner, apart)
         for row in rows:
@@ -322,7 +322,7 @@ def near_pairs(
 ) -> Candidates:
     """Return the pairs of one frame whose centres are nearer than a distance. Rows are in order of frames."""
     first, last = (np.searchsorted(found_frame, true_frame, side=side) for side in ("left", "right"))
-    arrays = (np.ascontiguousarray(each, np.float64) for each in (true_xy, found_xy))
+    arrays = (np.ascontiguousarray(xy, np.float64) for xy in (true_xy, found_xy))
     return Candidates(*_near_pairs(first, last, *arrays, max_distance))
 
 

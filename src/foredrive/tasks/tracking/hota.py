@@ -59,7 +59,7 @@ class Hota:
         return {name: float(getattr(self, name).mean()) for name in names}
 
 
-def hota(true: TrackRows, found: TrackRows, similar: Candidates) -> Hota:
+def hota(true: TrackRows, predicted: TrackRows, similar: Candidates) -> Hota:
     """Return HOTA of tracks. Frames and tracks of several sequences have numbers of their own.
 
     In each frame boxes are matched so that the sum over pairs of similarity times alignment is largest. The
@@ -69,11 +69,11 @@ def hota(true: TrackRows, found: TrackRows, similar: Candidates) -> Hota:
         similar: all pairs of a frame with a similarity (in [0, 1]) above 0.
     """
     true_boxes, true_track = _counts(true.track)
-    found_boxes, found_track = _counts(found.track)
+    found_boxes, found_track = _counts(predicted.track)
     both = np.stack([true_track[similar.true_row], found_track[similar.found_row]], axis=1)
     pairs, pair = np.unique(both, axis=0, return_inverse=True)
     pair, lengths = pair.reshape(-1), true_boxes[pairs[:, 0]] + found_boxes[pairs[:, 1]]
-    shared = np.bincount(pair, _share(similar, len(true), len(found)), len(pairs))
+    shared = np.bincount(pair, _share(similar, len(true), len(predicted)), len(pairs))
     matched = _match(true, similar, (shared / (lengths - shared))[pair] * similar.value)
     hit = (matched >= 0) & (similar.value >= ALPHAS[:, None] - _EPS)
     joint = np.stack([np.bincount(pair[row], minlength=len(pairs)) for row in hit])
@@ -85,7 +85,7 @@ def hota(true: TrackRows, found: TrackRows, similar: Candidates) -> Hota:
     return Hota(
         true_positives=hits,
         misses=len(true) - hits,
-        false=len(found) - hits,
+        false=len(predicted) - hits,
         ass_a=ass_a,
         ass_re=ass_re,
         ass_pr=ass_pr,
@@ -99,11 +99,11 @@ def _counts(track: Int[ndarray, "n"]) -> tuple[Int[ndarray, "T"], Int[ndarray, "
     return count, number
 
 
-def _share(similar: Candidates, true: int, found: int) -> Float[ndarray, "P"]:
+def _share(similar: Candidates, true: int, predicted: int) -> Float[ndarray, "P"]:
     """Return the similarity of each pair as a share of that of all pairs that its two boxes have."""
     value = similar.value
     whole = np.bincount(similar.true_row, value, true)[similar.true_row] - value
-    whole += np.bincount(similar.found_row, value, found)[similar.found_row]
+    whole += np.bincount(similar.found_row, value, predicted)[similar.found_row]
     return np.divide(value, whole, out=np.zeros_like(value), where=whole > _EPS)
 
 

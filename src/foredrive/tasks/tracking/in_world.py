@@ -93,7 +93,7 @@ def stacked(rows: Sequence[ObjectRows]) -> ObjectRows:
     if not rows:
         zero = np.zeros(0, np.int64)
         return make_rows(zero, zero, np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
-    return ObjectRows(**{name: np.concatenate([vars(each)[name] for each in rows]) for name in vars(rows[0])})
+    return ObjectRows(**{name: np.concatenate([vars(part)[name] for part in rows]) for name in vars(rows[0])})
 
 
 def _columns(

@@ -25,12 +25,12 @@ def score_kitti_boxes(folder: Path, truth: Path) -> Figures:
     Raises:
         InputError: a file or a line is wrong. The message names the first.
     """
-    true, found, classes, true_classes = read_frames(folder, truth)
+    true, predicted, classes, true_classes = read_frames(folder, truth)
     for lines in true.values():
         for line in lines:
             check_type(line.kind, line.name)
-    others = _drop_other_classes(found, classes[:true_classes])
-    tell_left_out(folder, {"boxes of other classes": others}, others + sum(map(len, found.values())))
+    others = _drop_other_classes(predicted, classes[:true_classes])
+    tell_left_out(folder, {"boxes of other classes": others}, others + sum(map(len, predicted.values())))
     protocol = dataclasses.replace(
         DETECTION_PROTOCOLS["nuscenes"],
         title="KITTI, by distance",
@@ -38,7 +38,7 @@ def score_kitti_boxes(folder: Path, truth: Path) -> Figures:
         region=Region("circle", {}),
         without=dict.fromkeys(classes, _UNKNOWN),
     )
-    found_rows = _rows(list(found.values()), protocol.classes, scored=True)
+    found_rows = _rows(list(predicted.values()), protocol.classes, scored=True)
     true_rows = _rows(list(true.values()), protocol.classes, scored=False)
     scored = evaluate_detections(found_rows, true_rows, true_rows[:0], protocol)
     figures: Figures = {
@@ -53,24 +53,24 @@ def score_kitti_boxes(folder: Path, truth: Path) -> Figures:
     for name, of_class in scored.by_class.items():
         label = name.lower()
         figures[f"detection.kitti.{label}.ap"] = float(np.mean([*of_class.ap.values()]))
-        figures |= {f"detection.kitti.{label}.ap_{at:g}m": ap for at, ap in of_class.ap.items()}
-        known = {key: error for key, error in of_class.errors.items() if key not in _UNKNOWN}
-        figures |= {f"detection.kitti.{label}.{key}": error for key, error in known.items()}
+        figures |= {f"detection.kitti.{label}.ap_{radius_m:g}m": ap for radius_m, ap in of_class.ap.items()}
+        errors = {key: error for key, error in of_class.errors.items() if key not in _UNKNOWN}
+        figures |= {f"detection.kitti.{label}.{key}": error for key, error in errors.items()}
     return figures
 
 
-def _drop_other_classes(found: dict[str, list[KittiLine]], classes: Sequence[str]) -> int:
+def _drop_other_classes(predicted: dict[str, list[KittiLine]], classes: Sequence[str]) -> int:
     """Remove the lines of other classes, and return their number."""
-    given = sum(map(len, found.values()))
-    for name, lines in found.items():
-        found[name] = [line for line in lines if line.kind in classes]
-    return given - sum(map(len, found.values()))
+    given = sum(map(len, predicted.values()))
+    for name, lines in predicted.items():
+        predicted[name] = [line for line in lines if line.kind in classes]
+    return given - sum(map(len, predicted.values()))
 
 
 def _rows(frames: list[list[KittiLine]], classes: tuple[str, ...], *, scored: bool) -> ObjectRows:
-    lines = [line for each in frames for line in each]
+    lines = [line for frame_lines in frames for line in frame_lines]
     state, yaw = box_states(lines)
-    frame = np.repeat(np.arange(len(frames)), [len(each) for each in frames])
+    frame = np.repeat(np.arange(len(frames)), [len(frame_lines) for frame_lines in frames])
     label_of = {name: n for n, name in enumerate(classes)}
     score = np.array([line.values[14] if scored else np.nan for line in lines]).reshape(-1)
     return make_rows(

@@ -68,12 +68,12 @@ def score_kitti_tracks(folder: Path, truth: Path) -> Figures:
         pairs.append(
             (true, read_sequence(folder / path.name, _RESULT_FIELDS) if path.name in files else true[:0])
         )
-    given = sum(len(found) for _, found in pairs)
+    given = sum(len(predicted) for _, predicted in pairs)
     judged = [name for name in CLASSES if any((true.kind == name).any() for true, _ in pairs)]
     unjudged = [name for name in CLASSES if name not in judged]
-    pairs = [(true, found[np.isin(found.kind, KITTI_TYPES)]) for true, found in pairs]
-    others = given - sum(len(found) for _, found in pairs)
-    absent = sum(int(np.isin(found.kind, unjudged).sum()) for _, found in pairs)
+    pairs = [(true, predicted[np.isin(predicted.kind, KITTI_TYPES)]) for true, predicted in pairs]
+    others = given - sum(len(predicted) for _, predicted in pairs)
+    absent = sum(int(np.isin(predicted.kind, unjudged).sum()) for _, predicted in pairs)
     tell_left_out(
         folder, {"boxes of other classes": others, "boxes of classes that the truth lacks": absent}, given
     )
@@ -98,7 +98,7 @@ def read_sequence(path: Path, fields: int) -> KittiBoxes:
         lines = path.read_text("utf-8-sig").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: not text that can be read") from error
-    rows, kinds, known = [], [], set()
+    rows, kinds, seen = [], [], set()
     for n, line in enumerate(lines, 1):
         words = line.split()
         if not words:
@@ -112,9 +112,9 @@ def read_sequence(path: Path, fields: int) -> KittiBoxes:
         if not all(abs(value) <= MAX_NUMBER for value in values):
             raise InputError(f"{path}: line {n} has a number that is not finite, or beyond {MAX_NUMBER:g}")
         kind = words[2].lower()
-        if kind != "dontcare" and (kind, *values[:2]) in known:
+        if kind != "dontcare" and (kind, *values[:2]) in seen:
             raise InputError(f"{path}: line {n} has the track {words[1]} a second time in frame {words[0]}")
-        known.add((kind, *values[:2]))
+        seen.add((kind, *values[:2]))
         rows.append(values)
         kinds.append(kind)
     table = np.array(rows, dtype=np.float64).reshape(-1, fields - 1)
@@ -123,29 +123,29 @@ def read_sequence(path: Path, fields: int) -> KittiBoxes:
     return boxes[np.argsort(frame, kind="stable")]
 
 
-def counted_boxes(true: KittiBoxes, found: KittiBoxes, name: str) -> tuple[KittiBoxes, KittiBoxes]:
+def counted_boxes(true: KittiBoxes, predicted: KittiBoxes, name: str) -> tuple[KittiBoxes, KittiBoxes]:
     """Return the true boxes of a class that must be found, and the found boxes that count for or against.
 
     Truth that is truncated, hardly visible or of the neighbouring class need not be found. What is matched
     with it does not count; nor what is matched with nothing and low, or mostly in a `DontCare` region.
     """
     ignored = true[true.kind == "dontcare"]
-    true, found = true[np.isin(true.kind, (name, CLASSES[name]))], found[found.kind == name]
+    true, predicted = true[np.isin(true.kind, (name, CLASSES[name]))], predicted[predicted.kind == name]
     must = (true.kind == name) & (true.occlusion <= MAX_OCCLUSION) & (true.truncation <= MAX_TRUNCATION)
-    kept = np.ones(len(found), bool)
-    for frame in np.unique(found.frame):
-        columns, rows = np.flatnonzero(found.frame == frame), np.flatnonzero(true.frame == frame)
-        overlap = overlaps(true.corners[rows], found.corners[columns])
+    kept = np.ones(len(predicted), bool)
+    for frame in np.unique(predicted.frame):
+        columns, rows = np.flatnonzero(predicted.frame == frame), np.flatnonzero(true.frame == frame)
+        overlap = overlaps(true.corners[rows], predicted.corners[columns])
         overlap[overlap < MIN_OVERLAP - _EPS] = 0.0
         row, column = linear_sum_assignment(overlap, maximize=True)
         hit = overlap[row, column] > 0
         row, column = row[hit], column[hit]
         kept[columns[column]] = must[rows[row]]
         alone = np.delete(columns, column)
-        corners, regions = found.corners[alone], ignored.corners[ignored.frame == frame]
+        corners, regions = predicted.corners[alone], ignored.corners[ignored.frame == frame]
         low = corners[:, 3] - corners[:, 1] <= MIN_HEIGHT_PX + _EPS
         kept[alone] = ~(low | _mostly_inside(corners, regions))
-    return true[must], found[kept]
+    return true[must], predicted[kept]
 
 
 def _mostly_inside(corners: Float[ndarray, "n 4"], regions: Float[ndarray, "m 4"]) -> Bool[ndarray, "n"]:
@@ -158,28 +158,28 @@ def _mostly_inside(corners: Float[ndarray, "n 4"], regions: Float[ndarray, "m 4"
 
 def _score_class(pairs: Sequence[tuple[KittiBoxes, KittiBoxes]], name: str) -> dict[str, float | int | None]:
     sides: tuple[list[KittiBoxes], list[KittiBoxes]] = ([], [])
-    for each in pairs:
-        for side, boxes in zip(sides, counted_boxes(*each, name), strict=True):
+    for pair in pairs:
+        for side, boxes in zip(sides, counted_boxes(*pair, name), strict=True):
             side.append(boxes)
     frames = 1 + max(int(boxes.frame.max(initial=0)) for side in sides for boxes in side)
-    (true, a), (found, b) = (_joined(side, frames) for side in sides)
+    (true, a), (predicted, b) = (_joined(side, frames) for side in sides)
     rows, columns, values = [], [], []
     for frame in np.unique(true.frame):
-        row, column = (np.flatnonzero(side.frame == frame) for side in (true, found))
+        row, column = (np.flatnonzero(side.frame == frame) for side in (true, predicted))
         overlap = overlaps(a[row], b[column])
         i, j = np.nonzero(overlap)
         rows.append(row[i])
         columns.append(column[j])
         values.append(overlap[i, j])
     zero = np.zeros(0, np.int64)
-    row, column = (np.concatenate([zero, *each]) for each in (rows, columns))
+    row, column = (np.concatenate([zero, *pair]) for pair in (rows, columns))
     similar = Candidates(row, column, np.concatenate([np.zeros(0), *values]))
     near = similar.value >= MIN_OVERLAP - _EPS
     close = Candidates(similar.true_row[near], similar.found_row[near], 1 - similar.value[near])
-    counts = clear_mot(true, found, close)[1]
+    counts = clear_mot(true, predicted, close)[1]
     clear = {"mota": counts.mota, "motp_overlap": 1 - counts.motp, "recall": counts.recall}
     return {
-        **hota(true, found, similar).figures(),
+        **hota(true, predicted, similar).figures(),
         **{key: None if np.isnan(value) else value for key, value in clear.items()},
         "gt": counts.true,
         "tp": counts.matches,

@@ -52,14 +52,14 @@ def held_objects(
 
 
 def matching_beside(
-    found: BoxSet, truth: LabelledBoxes, held: Held, config: MatchingLossConfig
+    predicted: BoxSet, truth: LabelledBoxes, held: Held, config: MatchingLossConfig
 ) -> tuple[Int[Tensor, "n"], Int[Tensor, "n"]]:
     """Return queries and their objects: the held ones, and the best matching of all others."""
     free_query = (~held.bound).nonzero()[:, 0]
     free = torch.ones(len(truth.label), dtype=torch.bool, device=held.match.device)
     free[held.match] = False
     free_object = free.nonzero()[:, 0]
-    query, match = best_matching(found[free_query], truth[free_object], config)
+    query, match = best_matching(predicted[free_query], truth[free_object], config)
     return torch.cat([held.query, free_query[query]]), torch.cat([held.match, free_object[match]])
 
 

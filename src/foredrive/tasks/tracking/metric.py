@@ -44,7 +44,7 @@ class _Tracks:
     """Frames since the last detection."""
 
 
-def greedy_tracks(found: ObjectRows, frames: Frames, classes: Sequence[str]) -> ObjectRows:
+def greedy_tracks(predicted: ObjectRows, frames: Frames, classes: Sequence[str]) -> ObjectRows:
     """Return the detections of the classes with identities by greedy association at constant velocity.
 
     As in CenterPoint (Yin et al. 2021; tianweiy/CenterPoint, tools/nusc_tracking/pub_tracker.py): a detection
@@ -53,19 +53,19 @@ def greedy_tracks(found: ObjectRows, frames: Frames, classes: Sequence[str]) -> 
     anew.
 
     Args:
-        found: the frames of each row are indices into `frames`.
+        predicted: the frames of each row are indices into `frames`.
         frames: in the order of time within each scene.
         classes: names of the labels. Detections of other classes are left out.
     """
     limit_m = np.array([MAX_DISTANCE_M.get(name, np.nan) for name in classes])
-    found = found[(found.label >= 0) & np.isfinite(limit_m)[found.label]]
-    number = np.full(len(found), -1, dtype=np.int64)
+    predicted = predicted[(predicted.label >= 0) & np.isfinite(limit_m)[predicted.label]]
+    number = np.full(len(predicted), -1, dtype=np.int64)
     tracks, begun = _nothing(), 0
     for frame, dt_s in _steps(frames):
         tracks = _nothing() if dt_s is None else tracks
-        rows = np.flatnonzero(found.frame == frame)
-        rows = rows[np.argsort(-found.score[rows], kind="stable")]
-        here = found[rows]
+        rows = np.flatnonzero(predicted.frame == frame)
+        rows = rows[np.argsort(-predicted.score[rows], kind="stable")]
+        here = predicted[rows]
         dt_s = dt_s or FRAME_S
         partner = _partners(here, tracks, limit_m * dt_s / FRAME_S, dt_s)
         new = partner < 0
@@ -73,7 +73,7 @@ def greedy_tracks(found: ObjectRows, frames: Frames, classes: Sequence[str]) -> 
         number[rows[new]] = begun + np.arange(new.sum())
         begun += int(new.sum())
         tracks = _next_tracks(here, number[rows], tracks, partner, dt_s)
-    return replace(found, track=number)
+    return replace(predicted, track=number)
 
 
 def _steps(frames: Frames) -> Iterator[tuple[int, float | None]]:
@@ -163,11 +163,11 @@ class TrackingMetric:
         """Return the figures over all annotated frames."""
         if not self._keys:
             return {"frames_counted": 0}
-        found, true = stacked(self._found), stacked(self._true)
+        predicted, true = stacked(self._found), stacked(self._true)
         times = np.array([time_of(key) for key in self._keys], dtype=np.int64)
         frames = Frames(np.array(self._scene, dtype=np.int64), times)
         out: Figures = {"frames_counted": len(frames), "scenes": self._scene[-1] + 1}
-        if (found.track >= 0).any():
-            out |= tracking_figures(found[found.track >= 0], true, true[:0], frames)
-        simple = tracking_figures(greedy_tracks(found, frames, CLASSES), true, true[:0], frames)
+        if (predicted.track >= 0).any():
+            out |= tracking_figures(predicted[predicted.track >= 0], true, true[:0], frames)
+        simple = tracking_figures(greedy_tracks(predicted, frames, CLASSES), true, true[:0], frames)
         return out | {f"{key}{BASELINE}": value for key, value in simple.items()}

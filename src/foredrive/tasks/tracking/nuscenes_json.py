@@ -154,14 +154,18 @@ def read_results(
     Raises:
         InputError: a box is wrong, or a frame has no ground truth. The message names the first.
     """
-    found = boxes_by_frame(path, read_object(path))
-    check_known_frames(path, found, truth_path, truth.names)
-    for name, each in found.items():
-        if len(each) > max_boxes:
-            raise InputError(f"{path}: frame {name} has {len(each)} boxes, and {max_boxes} are allowed")
-    names, boxes = BoxNames(path, found), [box for each in found.values() for box in each]
+    by_frame = boxes_by_frame(path, read_object(path))
+    check_known_frames(path, by_frame, truth_path, truth.names)
+    for name, frame_boxes in by_frame.items():
+        if len(frame_boxes) > max_boxes:
+            raise InputError(
+                f"{path}: frame {name} has {len(frame_boxes)} boxes, and {max_boxes} are allowed"
+            )
+    names, boxes = BoxNames(path, by_frame), [box for frame_boxes in by_frame.values() for box in frame_boxes]
     number = {name: n for n, name in enumerate(truth.names)}
-    frame = np.array([number[name] for name, each in found.items() for _ in each], dtype=np.int64)
+    frame = np.array(
+        [number[name] for name, frame_boxes in by_frame.items() for _ in frame_boxes], dtype=np.int64
+    )
     label = read_labels(boxes, (f"{task}_name",), classes, (), names)
     centre, size_lwh, yaw = read_geometry(boxes, names)
     columns: dict[str, ndarray] = {
@@ -169,7 +173,7 @@ def read_results(
         "velocity": read_velocities(boxes, names),
         "from_ego": centre[:, :2] - truth.ego[frame],
     }
-    missing = len(number) - len(found)
+    missing = len(number) - len(by_frame)
     if task == "detection":
         columns["attribute"] = read_attributes(boxes, names)
         rows = make_rows(frame, label, centre, size_lwh, yaw, **columns)
@@ -189,7 +193,7 @@ def read_json_truth(path: Path, task: ObjectTask, classes: Sequence[str]) -> Obj
     """
     whole = read_object(path)
     content, stated = boxes_by_frame(path, whole), whole.get("samples", {})
-    if not isinstance(stated, dict) or not all(isinstance(each, dict) for each in stated.values()):
+    if not isinstance(stated, dict) or not all(isinstance(sample, dict) for sample in stated.values()):
         raise InputError(f"{path}: its `samples` must be objects by sample token")
     samples = {
         name: _sample(stated.get(name, {}), boxes, f"{path}: frame {name}") for name, boxes in content.items()
@@ -217,7 +221,9 @@ def make_truth(
         {name: [box for box in boxes if (_name(box) == RACK) is rack] for name, boxes in content.items()}
         for rack in (True, False)
     )
-    ego = np.array([(np.nan, np.nan) if (at := samples[name].ego) is None else at for name in content])
+    ego = np.array(
+        [(np.nan, np.nan) if (position := samples[name].ego) is None else position for name in content]
+    )
     ego = ego.reshape(-1, 2).astype(np.float64)
     boxes, rack_boxes = _with_size(
         [_true_rows(objects, ego, path, task, classes), _true_rows(racks, ego, path, "detection", ())], path
@@ -234,10 +240,12 @@ def boxes_by_frame(path: Path, content: Mapping[str, Any]) -> dict[str, Sequence
         InputError: it has none.
     """
     boxes = content.get("results", content)
-    if not isinstance(boxes, dict) or not all(isinstance(each, list) for each in boxes.values()):
+    if not isinstance(boxes, dict) or not all(
+        isinstance(frame_boxes, list) for frame_boxes in boxes.values()
+    ):
         raise InputError(f"{path}: there must be a list of boxes by sample token, under `results` or alone")
-    for name, each in boxes.items():
-        for n, box in enumerate(each):
+    for name, frame_boxes in boxes.items():
+        for n, box in enumerate(frame_boxes):
             if not isinstance(box, dict):
                 raise InputError(f"{path}: frame {name}, box {n} is no object")
     return boxes
@@ -262,8 +270,8 @@ def _true_rows(
     task: ObjectTask,
     classes: Sequence[str],
 ) -> ObjectRows:
-    names, boxes = BoxNames(path, content), [box for each in content.values() for box in each]
-    frame = np.repeat(np.arange(len(content)), [len(each) for each in content.values()])
+    names, boxes = BoxNames(path, content), [box for frame_boxes in content.values() for box in frame_boxes]
+    frame = np.repeat(np.arange(len(content)), [len(frame_boxes) for frame_boxes in content.values()])
     centre, size_lwh, yaw = read_geometry(boxes, names)
     columns: dict[str, ndarray] = {
         "velocity": read_velocities(boxes, names),

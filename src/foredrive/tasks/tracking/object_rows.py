@@ -58,7 +58,7 @@ def make_rows(
     centre: Float[ndarray, "n 3"],
     size_lwh: Float[ndarray, "n 3"],
     yaw: Float[ndarray, "n"],
-    **known: Shaped[ndarray, "n ..."],
+    **given: Shaped[ndarray, "n ..."],
 ) -> ObjectRows:
     """Return rows whose other columns are unknown, unless they are given by name."""
     n = len(frame)
@@ -69,7 +69,7 @@ def make_rows(
         "num_points": np.full(n, UNKNOWN),
         "from_ego": np.full((n, 2), np.nan),
         "track": np.full(n, -1),
-        **known,
+        **given,
     }
     return ObjectRows(frame, label, centre, size_lwh, yaw, **columns)
 
@@ -116,10 +116,10 @@ def inside_racks(boxes: ObjectRows, racks: ObjectRows, classes: Sequence[str]) -
     cycles = np.isin(boxes.label, [n for n, name in enumerate(classes) if name in IN_RACKS])
     cycles &= np.isin(boxes.frame, racks.frame)
     for frame in np.unique(boxes.frame[cycles]):
-        rows, there = np.flatnonzero(cycles & (boxes.frame == frame)), racks[racks.frame == frame]
+        rows, racks_here = np.flatnonzero(cycles & (boxes.frame == frame)), racks[racks.frame == frame]
         points, centre, size, yaw = (
             torch.as_tensor(values, dtype=torch.float64)
-            for values in (boxes.centre[rows], there.centre, there.size_lwh, there.yaw)
+            for values in (boxes.centre[rows], racks_here.centre, racks_here.size_lwh, racks_here.yaw)
         )
         inside[rows] = points_in_boxes(points, centre, size, yaw).any(1).numpy()
     return inside

@@ -187,21 +187,21 @@ class TrackingFigures:
 
 
 def evaluate_tracking(
-    found: ObjectRows, true: ObjectRows, racks: ObjectRows, frames: Frames, protocol: TrackingProtocol
+    predicted: ObjectRows, true: ObjectRows, racks: ObjectRows, frames: Frames, protocol: TrackingProtocol
 ) -> TrackingFigures:
     """Return the figures of tracks under one protocol.
 
     Args:
-        found: labels are indices into the protocol's classes, as those of `true`; -1 is left out.
+        predicted: labels are indices into the protocol's classes, as those of `true`; -1 is left out.
         racks: bicycle racks; labels do not matter.
         frames: all frames of the scenes, also those without boxes.
     """
-    found = found[found.score >= protocol.min_score]
+    predicted = predicted[predicted.score >= protocol.min_score]
     whole_true, whole_found = (
         whole_tracks(
             boxes[(boxes.label >= 0) & counted(boxes, racks, protocol.region, protocol.classes)], frames
         )
-        for boxes in (true, found)
+        for boxes in (true, predicted)
     )
     by_class = {}
     for n, name in enumerate(protocol.classes):
@@ -228,23 +228,23 @@ def recall_thresholds(
 
 
 def _class_figures(
-    true: ObjectRows, found: ObjectRows, frames: Frames, protocol: TrackingProtocol
+    true: ObjectRows, predicted: ObjectRows, frames: Frames, protocol: TrackingProtocol
 ) -> dict[str, float]:
     """Return AMOTA and AMOTP, and the other figures at the threshold of the best MOTA."""
     if len(true) == 0:
         return dict.fromkeys(_FIGURES, math.nan)
-    layout = _lay_out(true, found, frames, protocol)
-    everything = ClearEvents(*follow(layout, np.ones(len(found), bool)))
+    layout = _lay_out(true, predicted, frames, protocol)
+    everything = ClearEvents(*follow(layout, np.ones(len(predicted), bool)))
     matches = everything.found_row[everything.kind == MATCH]
-    threshold = recall_thresholds(found.score[matches], len(true), protocol)
+    threshold = recall_thresholds(predicted.score[matches], len(true), protocol)
     reached = ~np.isnan(threshold)
     if not reached.any():
         return _nothing_found(layout, protocol)
-    counts = _counts_at(layout, found.score, np.unique(threshold[reached]))
-    each = [at_threshold(counts[score]) if score in counts else None for score in threshold.tolist()]
-    motar, motp = (np.array([math.nan if f is None else f[key] for f in each]) for key in ("motar", "motp"))
-    mota = [-math.inf if f is None else f["mota"] for f in each]
-    best = each[int(np.argmax(mota))]  # of equal ones, that of the highest recall
+    counts = _counts_at(layout, predicted.score, np.unique(threshold[reached]))
+    points = [at_threshold(counts[score]) if score in counts else None for score in threshold.tolist()]
+    motar, motp = (np.array([math.nan if f is None else f[key] for f in points]) for key in ("motar", "motp"))
+    mota = [-math.inf if f is None else f["mota"] for f in points]
+    best = points[int(np.argmax(mota))]  # of equal ones, that of the highest recall
     assert best is not None
     return {
         "amota": _average(motar, 0.0),
@@ -253,14 +253,14 @@ def _class_figures(
     }
 
 
-def _lay_out(true: ObjectRows, found: ObjectRows, frames: Frames, protocol: TrackingProtocol) -> Layout:
+def _lay_out(true: ObjectRows, predicted: ObjectRows, frames: Frames, protocol: TrackingProtocol) -> Layout:
     rows = []
-    for boxes in (true, found):
+    for boxes in (true, predicted):
         scene_and_track = np.stack([frames.scene[boxes.frame], boxes.track], axis=1)
         track = np.unique(scene_and_track, axis=0, return_inverse=True)[1].reshape(-1)
         rows.append(TrackRows(boxes.frame, track))
     near = near_pairs(
-        true.frame, true.centre[:, :2], found.frame, found.centre[:, :2], protocol.max_distance_m
+        true.frame, true.centre[:, :2], predicted.frame, predicted.centre[:, :2], protocol.max_distance_m
     )
     return lay_out(rows[0], rows[1], near)
 
@@ -328,9 +328,9 @@ def _over_classes(by_class: Mapping[str, Mapping[str, float]]) -> dict[str, floa
     every: dict[str, float] = {}
     for key in _FIGURES:
         values = np.array([figures[key] for figures in by_class.values()])
-        known: Float[ndarray, k] = values[~np.isnan(values)]
+        valid: Float[ndarray, k] = values[~np.isnan(values)]
         if key in SUMMED:
-            every[key] = float(known.sum())
+            every[key] = float(valid.sum())
         else:
-            every[key] = float(known.mean()) if len(known) else math.nan
+            every[key] = float(valid.mean()) if len(valid) else math.nan
     return every

@@ -95,54 +95,54 @@ def read_objects(results: Path, truth: Path, task: ObjectTask) -> tuple[FoundObj
             true = read_log_truth(truth, listed, results, protocol.classes)
         else:
             true = read_tables_truth(tables, listed, results, task, protocol.classes)
-    found = read_results(results, true, truth, task, protocol.classes, protocol.max_boxes)
-    return found, true
+    predicted = read_results(results, true, truth, task, protocol.classes, protocol.max_boxes)
+    return predicted, true
 
 
-def score_detections(found: FoundObjects, truth: ObjectTruth) -> Figures:
+def score_detections(predicted: FoundObjects, truth: ObjectTruth) -> Figures:
     """Return the figures of detections under every protocol.
 
     What the ground truth lacks is None: an error that it cannot judge, and with it NDS.
     """
-    figures = detection_figures(found.boxes, truth.boxes, truth.racks, truth.lacks)
-    return _counts(found, truth) | {f"detection.{key}": value for key, value in figures.items()}
+    figures = detection_figures(predicted.boxes, truth.boxes, truth.racks, truth.lacks)
+    return _counts(predicted, truth) | {f"detection.{key}": value for key, value in figures.items()}
 
 
 def detection_figures(
-    found: ObjectRows, true: ObjectRows, racks: ObjectRows, lacks: frozenset[str]
+    predicted: ObjectRows, true: ObjectRows, racks: ObjectRows, lacks: frozenset[str]
 ) -> Figures:
     """Return `nuscenes.map`, `nuscenes.car.ap_2m`, `vad.nds`, … of detections.
 
     Args:
-        found, true: labels are indices into nuScenes' ten classes.
+        predicted, true: labels are indices into nuScenes' ten classes.
         racks: bicycle racks, in which bicycles do not count.
         lacks: columns of `ObjectTruth.lacks`. The figures that need them are None.
     """
     figures: Figures = {}
     for name, protocol in DETECTION_PROTOCOLS.items():
-        scored = evaluate_detections(found, true, racks, protocol)
+        scored = evaluate_detections(predicted, true, racks, protocol)
         judged = _judged_figures(scored, lacks)
         figures |= {f"{name}.{key}": value for key, value in judged.items()}
     return figures
 
 
-def score_tracks(found: FoundObjects, truth: ObjectTruth) -> Figures:
+def score_tracks(predicted: FoundObjects, truth: ObjectTruth) -> Figures:
     """Return the figures of tracks under every protocol; None where nothing can be counted."""
-    figures = tracking_figures(found.boxes, truth.boxes, truth.racks, truth.frames)
-    return _counts(found, truth) | {f"tracking.{key}": value for key, value in figures.items()}
+    figures = tracking_figures(predicted.boxes, truth.boxes, truth.racks, truth.frames)
+    return _counts(predicted, truth) | {f"tracking.{key}": value for key, value in figures.items()}
 
 
-def tracking_figures(found: ObjectRows, true: ObjectRows, racks: ObjectRows, frames: Frames) -> Figures:
+def tracking_figures(predicted: ObjectRows, true: ObjectRows, racks: ObjectRows, frames: Frames) -> Figures:
     """Return `nuscenes.amota`, `nuscenes.car.ids`, `uniad.amota`, … of tracks.
 
     Args:
-        found, true: labels are indices into nuScenes' seven classes.
+        predicted, true: labels are indices into nuScenes' seven classes.
         racks: bicycle racks, in which bicycles do not count.
         frames: all frames, in the order of time within each scene.
     """
     figures: Figures = {}
     for name, protocol in TRACKING_PROTOCOLS.items():
-        scored = evaluate_tracking(found, true, racks, frames, protocol)
+        scored = evaluate_tracking(predicted, true, racks, frames, protocol)
         figures |= _prefixed(name, scored.all_classes)
         for label, values in scored.by_class.items():
             if values["gt"] > 0:
@@ -150,13 +150,13 @@ def tracking_figures(found: ObjectRows, true: ObjectRows, racks: ObjectRows, fra
     return figures
 
 
-def _counts(found: FoundObjects, truth: ObjectTruth) -> Figures:
+def _counts(predicted: FoundObjects, truth: ObjectTruth) -> Figures:
     return {
         "frames_counted": len(truth.names),
         "scenes": len(set(truth.frames.scene.tolist())),
-        "frames_without_results": found.frames_without_results,
+        "frames_without_results": predicted.frames_without_results,
         "objects": len(truth.boxes),
-        "found": len(found.boxes),
+        "found": len(predicted.boxes),
         "truth_lacks": ", ".join(sorted(truth.lacks)) or None,
     }
 

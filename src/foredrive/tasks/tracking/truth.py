@@ -84,10 +84,10 @@ def check_tracks(boxes: ObjectRows, identities: Sequence[str], names: Sequence[s
 
 def lacking(boxes: ObjectRows) -> frozenset[str]:
     """Return the names of the columns in which no box has a value."""
-    known = {
+    columns = {
         "velocity": np.isfinite(boxes.velocity).all(1),
         "attribute": boxes.attribute != UNKNOWN,
         "num_points": boxes.num_points != UNKNOWN,
         "range": np.isfinite(boxes.from_ego).all(1),
     }
-    return frozenset(name for name, each in known.items() if len(boxes) and not each.any())
+    return frozenset(name for name, column in columns.items() if len(boxes) and not column.any())
