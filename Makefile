@@ -27,8 +27,10 @@ docs: $(DOCS_STAMP)
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 	@echo "open build/site/index.html"
 
-# Wheel and sdist; the wheel is installed into an empty environment and tried there, the quick demo included.
+# Wheel and sdist, of the version that a tag of this commit names; the wheel is installed into an empty environment and tried there, the quick demo included.
 dist: install
+	@$(BIN)/python -c 'import sys, foredrive; own = "v" + foredrive.__version__; tags = [tag for tag in sys.argv[1:] if tag != own]; sys.exit(f"This is {own}, not {tags[0]}: the version and the tag differ" if tags else 0)' \
+		$$(git tag --points-at HEAD --list 'v*')
 	rm -rf dist
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check "build>=1.2"
 	$(BIN)/python -m build --outdir dist .

@@ -3,12 +3,16 @@
 import dataclasses
 import inspect
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any, get_args
 
 import pytest
+import yaml
 
 from foredrive.cli import main as program
 from foredrive.cli.main import main
+
+OPTIONS = Path(__file__).with_name("options.yaml")
 
 
 @pytest.mark.parametrize("verb", list(program.VERBS))
@@ -40,6 +44,21 @@ def test_help_has_no_line_breaks_of_the_source() -> None:
     joined = ["Do it.", "", "With the flag --more it does more.", "", "Args:"]
     arguments = ["    first: It is long and needs two lines.", "    second: Short."]
     assert program._reflowed(documented).splitlines() == [*joined, *arguments]
+
+
+def test_options_are_those_of_the_release() -> None:
+    """A script of someone else breaks when an option goes: `options.yaml` changes only on purpose, and by hand."""
+    options = {
+        verb: [written(owner.__annotations__[name], name) for owner, name in flags_of(function)]
+        for verb, function in program.VERBS.items()
+    }
+    assert options == yaml.safe_load(OPTIONS.read_text())
+
+
+def written(kind: Any, name: str) -> str:
+    """Name of an argument on the command line."""
+    named = [mark.name for mark in getattr(kind, "__metadata__", ()) if getattr(mark, "name", None)]
+    return (named or [name.replace("_", "-")])[0]
 
 
 def flags_of(verb: Any) -> Iterator[tuple[Any, str]]:
