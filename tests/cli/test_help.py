@@ -47,7 +47,7 @@ def test_help_has_no_line_breaks_of_the_source() -> None:
 
 
 def test_options_are_those_of_the_release() -> None:
-    """A script of someone else breaks when an option goes: `options.yaml` changes only on purpose, and by hand."""
+    """A script of someone else breaks when an option goes: `options.yaml` changes on purpose, by hand."""
     options = {
         verb: [written(owner.__annotations__[name], name) for owner, name in flags_of(function)]
         for verb, function in program.VERBS.items()

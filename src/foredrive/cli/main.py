@@ -6,6 +6,7 @@ import inspect
 import os
 import re
 import sys
+import traceback
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
@@ -41,6 +42,7 @@ from foredrive.cli.search_index import search_index, search_train
 from foredrive.cli.serve import serve
 from foredrive.cli.train import train
 from foredrive.cli.view import view
+from foredrive.engine.debugging import debugging, is_verbose, take_debugging
 from foredrive.errors import InputError
 from foredrive.files import WHILE_WRITING
 from foredrive.interrupts import LastingInterrupt
@@ -102,7 +104,8 @@ SERVERS = ("view", "serve", "search page")
 """Verbs that send large messages from many threads for hours: memory kept by each thread would add up."""
 DESCRIPTION = (
     "The learning loop of autonomous driving: logs in, 3-D world models and plans out, judged honestly. "
-    "--version says which version this is."
+    "--version says which version this is. With every verb, --verbose logs what is done and shows where "
+    "errors come from, and --profile FILE.json.gz records a trace that ui.perfetto.dev opens."
 )
 # OpenMP threads spin while they wait, which would take the cores from kernels and data workers.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
@@ -140,16 +143,17 @@ def main(args: Sequence[str] | None = None) -> int:
     if args == ["--version"]:
         print(f"foredrive {foredrive.__version__}")
         return 0
-    if " ".join(args[:2]) in VERBS:  # such as `search index`
-        args = [" ".join(args[:2]), *args[2:]]
-    if not args or args[0] not in SERVERS:
-        keep_freed_memory()
     interrupt = LastingInterrupt()
     for verb in VERBS.values():
         verb.__doc__ = _reflowed(verb.__doc__ or "")
     try:
         _check_flags(args)
-        with interrupt:
+        args = take_debugging(args)
+        if " ".join(args[:2]) in VERBS:  # such as `search index`
+            args = [" ".join(args[:2]), *args[2:]]
+        if not args or args[0] not in SERVERS:
+            keep_freed_memory()
+        with interrupt, debugging():
             tyro.extras.subcommand_cli_from_dict(VERBS, prog="foredrive", description=DESCRIPTION, args=args)
     except InputError as error:
         return _give_up(_last_words(error))
@@ -196,6 +200,8 @@ def _end_interrupted() -> int:
 
 
 def _give_up(reason: str) -> int:
+    if is_verbose():
+        traceback.print_exc()
     own = "foredrive" if rank() is None else f"foredrive (rank {rank()})"
     print(f"{own}: {' '.join(reason.split())}", file=sys.stderr)
     return EXIT_INPUT

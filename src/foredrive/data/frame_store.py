@@ -89,6 +89,7 @@ class FrameStore:
         file = self._file(self._folder, log, frame, present)
         kept = self._read_entry(file)
         if kept is None:
+            _log.debug("frame %d of %s is not in the cache", frame, log.path.name)
             kept = self._read(log, frame, cameras, with_images, with_points)
             with atomic_path(file, durable=False) as temporary:
                 safetensors.torch.save_file(_flat(kept), temporary)

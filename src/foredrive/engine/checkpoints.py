@@ -1,6 +1,7 @@
 """Checkpoints as safetensors, written atomically."""
 
 import json
+import logging
 import shutil
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ from foredrive.engine.small_weights import full_precision
 from foredrive.errors import InputError
 from foredrive.files import atomic_path
 
+_log = logging.getLogger(__name__)
 MODEL, OPTIMIZER, PROGRESS = "model.safetensors", "optimizer.safetensors", "progress.json"
 
 
@@ -39,6 +41,7 @@ def save_checkpoint(
         save_file(tensors, temporary / OPTIMIZER)
         (temporary / PROGRESS).write_text(json.dumps({"step": step, "optimizer": scalars}))
     remove_older(final)
+    _log.info("saved %s", final)
     return final
 
 

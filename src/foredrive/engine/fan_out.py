@@ -14,6 +14,7 @@ import contextlib
 import logging
 import multiprocessing
 import os
+import reprlib
 import signal
 import threading
 from collections import deque
@@ -25,6 +26,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import rich
 
+from foredrive.engine.debugging import debugging
 from foredrive.engine.interrupts import end_with_parent, hold_interrupts, start_fork_server
 from foredrive.errors import InputError
 from foredrive.interrupts import LastingInterrupt
@@ -59,6 +61,7 @@ def fan_out(
     if not jobs:
         return
     with (_on_ray if on_ray else _on_processes)(work, workers) as (submit, width):
+        _log.info("%d jobs, %d at a time", len(jobs), width)
         while waiting or lost or running:
             alone = bool(lost) and not running
             if alone:
@@ -69,6 +72,7 @@ def fan_out(
                 running[submit(job)] = job
             for future in wait(running, return_when=FIRST_COMPLETED).done:
                 job, error = running.pop(future), future.exception()
+                _log.info("%s: %s", reprlib.repr(job), "done" if error is None else repr(error))
                 if isinstance(error, BrokenProcessPool) and not alone:
                     lost.append(job)
                 else:
@@ -157,7 +161,8 @@ def _unless_stopped(work: Callable[[J], R], job: J) -> R:
         raise KeyboardInterrupt
     _Worker.is_busy = True
     try:
-        return work(job)
+        with debugging(worker=True):
+            return work(job)
     finally:
         _Worker.is_busy = False
         if _Worker.is_terminated:

@@ -71,6 +71,7 @@ class RunFolder:
         """
         with held(self.path):
             begun = self.check()
+            _log.info("%s: %s", self.path, "goes on" if begun else "begins")
             self._mark(begun)  # before the request: a folder with a request has begun
             if not begun or self.grows:
                 self.write()

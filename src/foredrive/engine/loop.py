@@ -3,6 +3,7 @@
 import contextlib
 import itertools
 import json
+import logging
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -30,6 +31,7 @@ if TYPE_CHECKING:  # slow to import, and not needed to read schedules and metric
     from lightning_fabric import Fabric
     from lightning_fabric.wrappers import _FabricModule
 
+_log = logging.getLogger(__name__)
 CHECKPOINTS = "checkpoints"
 
 
@@ -179,6 +181,8 @@ def train(
             return
         if fabric.is_global_zero:
             write_conditions(folder, fabric, parts)
+        weights_m = sum(p.numel() for p in objective.parameters()) / 1e6
+        _log.info("%s: steps %d to %d on %s, %.2f M weights", folder, done, total, fabric.device, weights_m)
         batches = itertools.islice(
             batch_order(items, schedule.batch_size, schedule.seed, weights), done, total
         )

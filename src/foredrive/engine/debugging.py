@@ -1,0 +1,155 @@
+"""What `--verbose` and `--profile` do, in the process of a command and in its workers.
+
+Workers learn of both from the environment, so no code between a command and its workers passes them on.
+"""
+
+import contextlib
+import dataclasses
+import functools
+import logging
+import os
+import signal
+import tempfile
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+from foredrive.errors import InputError
+
+_log = logging.getLogger(__name__)
+
+VERBOSE, PROFILE = "FOREDRIVE_VERBOSE", "FOREDRIVE_PROFILE"
+"""Variables of the environment: any text; FILE:START_S:LENGTH_S."""
+DEFAULT_START_S, DEFAULT_LENGTH_S = 30.0, 5.0
+
+
+@dataclasses.dataclass(frozen=True)
+class ProfilePlan:
+    """What is profiled.
+
+    Args:
+        file: where the trace goes, gzipped JSON that Perfetto opens. Workers add their process number.
+        start_s: time from the start of a process to that of its recording.
+        length_s: length of the recording; every second takes some 10 MB of memory or more.
+    """
+
+    file: Path
+    start_s: float = DEFAULT_START_S
+    length_s: float = DEFAULT_LENGTH_S
+
+    @classmethod
+    def parse(cls, text: str) -> "ProfilePlan":
+        """Read FILE, FILE:START_S or FILE:START_S:LENGTH_S.
+
+        Raises:
+            InputError: the file has another suffix, or a time is no positive number.
+        """
+        name, *times = text.split(":")
+        try:
+            numbers = [float(time) for time in times]
+        except ValueError:
+            numbers = [-1.0]
+        if not name.endswith(".json.gz") or len(numbers) > 2 or not all(0 < n < 86_400 for n in numbers):
+            raise InputError(
+                f"--profile takes FILE.json.gz or FILE.json.gz:START_S:LENGTH_S, times above 0; got {text!r}"
+            )
+        return cls(Path(name).absolute(), *numbers)
+
+
+def take_debugging(args: Sequence[str]) -> list[str]:
+    """Take `--verbose` and `--profile FILE` out of a command's arguments, into the environment.
+
+    Raises:
+        InputError: `--profile` is without a file, or its text is not understood.
+    """
+    for variable in (VERBOSE, PROFILE):  # of an earlier command in this process
+        os.environ.pop(variable, None)
+    rest: list[str] = []
+    words = iter(args)
+    for word in words:
+        flag, equals, value = word.partition("=")
+        if word == "--verbose":
+            os.environ[VERBOSE] = "1"
+        elif flag == "--profile":
+            plan = ProfilePlan.parse(value if equals else next(words, ""))
+            os.environ[PROFILE] = f"{plan.file}:{plan.start_s}:{plan.length_s}"
+        else:
+            rest.append(word)
+    return rest
+
+
+def is_verbose() -> bool:
+    """Return whether `--verbose` was given to this command."""
+    return VERBOSE in os.environ
+
+
+@contextlib.contextmanager
+def debugging(worker: bool = False) -> Iterator[None]:
+    """Log and profile inside the block, as the environment says.
+
+    Args:
+        worker: whether this is a process of another command: its trace has a name of its own.
+    """
+    if is_verbose():
+        logging.basicConfig(format="%(relativeCreated)7d ms %(process)d %(name)s: %(message)s")
+        logging.getLogger("foredrive").setLevel(logging.DEBUG)
+    if PROFILE not in os.environ or _Recording.is_made:
+        yield
+        return
+    plan = ProfilePlan.parse(os.environ[PROFILE])
+    if worker:
+        plan = dataclasses.replace(
+            plan, file=plan.file.with_suffix("").with_suffix(f".{os.getpid()}.json.gz")
+        )
+    recording = _Recording(plan)
+    signal.signal(signal.SIGALRM, recording)
+    signal.setitimer(signal.ITIMER_REAL, plan.start_s)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        recording.end()
+
+
+class _Recording:
+    """A handler of alarms. The first one starts the profiler, the second one writes the trace."""
+
+    is_made = False
+    """Whether this process has had its recording: a worker records in its first job."""
+
+    def __init__(self, plan: ProfilePlan) -> None:
+        from torch.profiler import profile  # not in the handler, where an import may be half done
+
+        # Stacks make Python's own functions events of the trace, beside those of PyTorch.
+        self._made = functools.partial(profile, with_stack=True)
+        with self._made():  # the first profile of a process loses operators while the profiler sets itself up
+            pass
+        self._plan, _Recording.is_made = plan, True
+        self._profiler: Any = None
+        self._is_over = False
+
+    def __call__(self, number: int, frame: FrameType | None) -> None:
+        if self._profiler is not None:
+            self.end()
+            return
+        self._profiler = self._made()
+        self._profiler.start()
+        signal.setitimer(signal.ITIMER_REAL, self._plan.length_s)
+
+    def end(self) -> None:
+        """Write the trace, once. A command that ends before its recording starts says so."""
+        if self._is_over:
+            return
+        self._is_over = True
+        file = self._plan.file
+        if self._profiler is None:
+            _log.warning("%s was not written: the process ended before %g s", file, self._plan.start_s)
+            return
+        self._profiler.stop()
+        file.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=file.parent) as folder:
+            written = Path(folder) / file.name
+            self._profiler.export_chrome_trace(str(written))
+            written.replace(file)
+        _log.warning("profile of %g s: %s (open it at https://ui.perfetto.dev)", self._plan.length_s, file)
