@@ -192,7 +192,7 @@ class _LiftNumba(torch.autograd.Function):
 
         def job(start: int, stop: int) -> None:
             for item, head in (divmod(i, heads) for i in range(start, stop)):
-                # A head has its own channels, offsets and weights, an item its own images: jobs are independent
+                # A head has its own channels, offsets and weights, an item its own images: jobs do not clash
                 lift_pairs_backward(inputs, first[item * queries], first[(item + 1) * queries], head, grads)
 
         # A job has enough heads that two threads do not write to one cache line of the values' gradient
