@@ -1,4 +1,4 @@
-"""What a driver must see of its path: the next traffic light, and who is in the path, now and later."""
+"""What a driver must see of its path: the next traffic light, and the road users in the path over time."""
 
 from dataclasses import dataclass
 
@@ -56,7 +56,7 @@ class Affordances(Record):
 
 @dataclass(frozen=True)
 class PathEstimate(Record):
-    """The prediction of what is on the path: its next light, and who is in it over time."""
+    """The prediction for the path: its next light, and the road users in it over time."""
 
     light: Float[Tensor, "*b 4"]
     """Probability of each `LightState`."""

@@ -95,10 +95,9 @@ def match_centres(
 @numba.njit(cache=True, nogil=True)
 @no_type_check
 def _match_centres(start, true_start, true_stop, found_xy, true_xy, nearness):
+    # Arguments: ranges of rows by frame (start; true_start, true_stop), positions in m, least -distances
     matched = np.full((len(nearness), len(found_xy)), -1)
     for f in range(len(start) - 1):
-        # Arguments: ranges of rows by frame (start; true_start,
-        # true_stop), positions in m, least -distances
         rows, there = np.arange(start[f + 1] - start[f]), true_xy[true_start[f] : true_stop[f]]
         closeness = np.empty((len(rows), len(there)))
         for i in rows:
