@@ -128,9 +128,9 @@ def profile_numbers(
     before = view.occupied.to(progress_m)[:, None, :-1]
     loose = torch.maximum(occupied, torch.maximum(sooner, before))
     met.append(torch.where(inside & (start_m < ends_m + MARGINS_M[1]), loose, 0.0).amax(-1))
-    # Within some metres of the line, the side on which the front and the judged point are.
     # Probability that the light stops the vehicle
     stops = view.light[:, [LightState.RED, LightState.YELLOW]].sum(-1)
+    # Within some metres of the line, the side on which the front and the judged point are.
     line_m = view.light_m[:, None, None]
     over = ((progress_m - line_m) / NEAR_LINE_M).clamp(-1, 1)
     tail_over = ((progress_m - line_m - TAIL_M) / NEAR_LINE_M).clamp(-1, 1)

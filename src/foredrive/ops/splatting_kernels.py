@@ -236,9 +236,9 @@ def _composite_splat(lists, points, tile, at, touched, active, hits, state):
     x = nearest_turn(splat[MEAN_X], points.tile_bounds[tile], points.period)
     blocks = active & touched
     # Loop over the set bits.
-    # Clear the lowest set bit
     while blocks != 0:
         block = lowest_set_bit(blocks)
+        # Clear the lowest set bit
         blocks &= blocks - np.uint32(1)
         dx, dy, t = offsets(splat, rows, block * ROW, x)
         hit, base = load_row(hits, block * ROW), block * columns * ROW

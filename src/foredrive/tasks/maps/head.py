@@ -143,7 +143,6 @@ class RasterHead(nn.Module):
         assert self.out.bias is not None
         nn.init.constant_(self.out.bias, -2.0)  # lines cover little of the ground
         # Canvases of whole cells over the extent of the truth.
-        # Sizes rounded up, so that whole cells cover the truth's extent
         rows, columns = (math.ceil(size * spec.cell_m / planes.coarse_m) for size in spec.shape_yx)
         times = round(planes.coarse_m / planes.cell_m)
         self.fine_shape, self.coarse_shape = (times * rows, times * columns), (rows, columns)
