@@ -54,13 +54,13 @@ def rule_of(truth: Affordances, speed_mps: float) -> tuple[Float[np.ndarray, "S"
 
     Args:
         truth: unbatched.
-        # Truth without lead velocity: the lead counts as standing
         speed_mps: m/s.
     """
     count = len(truth.path_xy)
     path = PathAhead(truth.path_xy, np.zeros(count), truth.path_valid, FRONT_M, True)
     lead = None
     if bool(truth.lead & truth.lead_known):
+        # A lead vehicle without a velocity counts as standing
         lead_mps = float(truth.lead_mps)
         lead = Obstacle(float(truth.lead_m), max(lead_mps, 0.0) if np.isfinite(lead_mps) else 0.0)
     light = LightState(int(truth.light)) if bool(truth.light_known) else LightState.NONE

@@ -144,8 +144,8 @@ def drive_route(
                 plan = agent.act(stack_records([clip]))
                 pilot.expect(plan, states[-1], index * STEP_S)
                 plans.append((index, waypoints_of(plan)))
-            # Any error of the agent ends the drive; it still counts
             except Exception as problem:  # any error of an agent ends the drive, but the route still counts
+                # Any error of the agent ends the drive; it still counts
                 ending, error = Ending.CRASHED, f"{type(problem).__name__}: {problem}"
                 break
             act_s.append(time.perf_counter() - began)

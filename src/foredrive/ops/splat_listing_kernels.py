@@ -12,7 +12,6 @@ TOLERANCE = np.float32(1e-3)
 """Tolerance of an exponent for rounding errors."""
 MIN_LOG_OPACITY = np.float32(np.log2(1 / 255) - TOLERANCE)
 """log2 of the minimum opacity (1/255, minus the tolerance). A splat whose opacity stays below it in the whole
-# Flags: the compiler may fuse and reorder, but NaN and infinity keep their meaning
 box is not listed."""
 
 # Columns of a packed splat.

@@ -355,7 +355,6 @@ def build_static(
     """Generate the static content of a town.
 
     Objects of the map come first, then the objects that need most space.
-    # The order decides who gets the space: what the map fixes, then large objects, then plants
     """
     plan = make_ground_plan(town)
     terrain = make_terrain(plan, town.bounds_m, rng)

@@ -90,8 +90,8 @@ class BagLog:
             def mounted(topic: str, frame: str | None, mount: Mount | None) -> Float64[np.ndarray, "4 4"]:
                 if mount is not None:
                     T = _matrix(mount)
-                # Sensors do not move on the vehicle, so one time is enough
                 else:
+                    # Sensors do not move on the vehicle, so one time is enough
                     sensor = frame or frame_of(index.first[topic])
                     T = tree.between(topics.ego_frame, sensor, int(times_us[0]))
                 return np.asarray(np.linalg.inv(T_ego_origin) @ T)

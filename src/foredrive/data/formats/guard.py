@@ -49,13 +49,13 @@ def reading_raw(source: Path) -> Iterator[None]:
     with _noting_opened(source):
         try:
             yield
-        # An error that names the log already stays as it is
         except InputError as error:
+            # An error that names the log already stays as it is
             if source.name in str(error):
                 raise
             raise InputError(f"{source}: {error}") from error
-        # Errors of writing are the user's disk, not damaged input
         except Exception as error:
+            # Errors of writing are the user's disk, not damaged input
             if isinstance(error, OSError) and error.errno in REFUSES_WRITING:
                 raise
             raise InputError(f"{source}: cannot read the raw log: {_reason(error)}{_place(error)}") from error

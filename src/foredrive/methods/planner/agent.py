@@ -61,7 +61,6 @@ class PlanningAgent(nn.Module, Generic[W]):
         Args:
             now: belief about now.
             sequences: the clips, if they are the sequences in which heads that carry agents on are trained.
-        # The belief of now is enough: task heads look at the present volume
         """
         return None if self.heads is None else self.perceived(now, sequences)
 

@@ -87,8 +87,8 @@ def matched_loss(
             mean / scale, log_std.exp() / scale, state / scale, found.family, config.energy_samples
         )
         box = score.sum()
-    # Fixed means: the likelihood trains the standard deviations alone
     else:
+        # Fixed means: the likelihood trains the standard deviations alone
         box = ((mean - state).abs() / scale).sum()
         spread = _negative_log_likelihood(mean.detach(), log_std, state, found.family).sum() + spread
     return (

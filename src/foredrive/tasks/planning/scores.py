@@ -321,7 +321,7 @@ def _at_horizons(per_step: Tensor, how: str) -> Float[Tensor, "b H"]:
     # Mean over the steps up to each horizon
     if how == "mean":
         values = values.cumsum(dim=-1) / torch.arange(1, STEPS + 1, device=values.device)
-    # Whether any step up to the horizon collides
     elif how == "any":
+        # Whether any step up to the horizon collides
         values = values.cummax(dim=-1).values
     return values[:, list(HORIZON_STEPS)]

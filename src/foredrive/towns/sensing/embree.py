@@ -126,7 +126,6 @@ def check_release(version: int) -> None:
 def new_triangles(xyz: Float32[np.ndarray, "V 3"], faces: UInt32[np.ndarray, "F 3"]) -> int:
     """Create a scene of triangles.
 
-    # Both arrays stay in numpy's memory; Embree only keeps their addresses
     Both arrays are shared with Embree: keep them unchanged for the lifetime of the scene. One float must
     follow the last vertex in memory, because Embree reads four at a time.
     """
