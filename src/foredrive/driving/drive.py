@@ -145,7 +145,6 @@ def drive_route(
                 pilot.expect(plan, states[-1], index * STEP_S)
                 plans.append((index, waypoints_of(plan)))
             except Exception as problem:  # any error of an agent ends the drive, but the route still counts
-                # Any error of the agent ends the drive; it still counts
                 ending, error = Ending.CRASHED, f"{type(problem).__name__}: {problem}"
                 break
             act_s.append(time.perf_counter() - began)
