@@ -81,17 +81,19 @@ class LightMemory:
             moved_m: distance driven since the plan before.
         """
         p, line_m = view.light[0].tolist(), float(view.light_m[0])
+        # The remembered line comes nearer by the distance driven
         if self._line_m is not None:
             self._line_m -= moved_m
         stops = p[LightState.RED] + p[LightState.YELLOW]
         if 1 - p[LightState.NONE] > SEEN:
-            # Given that there is a light: what says that there is none does not say green.
+            # Odds given that there is a light: the probability of NONE is no evidence for green
             odds = float(np.log((stops + 0.02) / (p[LightState.GREEN] + 0.02)))
             self._evidence = float(np.clip(FADES * self._evidence + odds, -LONGEST, LONGEST))
             self._unseen, self._yellow = 0, p[LightState.YELLOW] > p[LightState.RED]
             self._move_line(line_m)
         else:
-            self._unseen += moved_m > STILL_M  # who stands before a light waits for it
+            # Unseen plans count only while the vehicle moves
+            self._unseen += moved_m > STILL_M  # a standing vehicle waits for the light
             near = self._line_m is not None and -PASSED_M < self._line_m < NEAR_M
             self._evidence *= 1.0 if near else FADES
         if self._unseen > FORGETS or (self._line_m is not None and self._line_m < -PASSED_M):
@@ -99,6 +101,7 @@ class LightMemory:
         if self._line_m is None:
             light = torch.eye(4)[LightState.NONE]
             return PathEstimate(light[None].to(view.light), torch.zeros_like(view.light_m), view.occupied)
+        # Evidence as a probability; the part that stops goes to the colour seen last
         stop = 1 / (1 + float(np.exp(-self._evidence)))
         light = torch.zeros(4)
         light[LightState.YELLOW if self._yellow else LightState.RED] = stop
@@ -109,6 +112,7 @@ class LightMemory:
 
     def _move_line(self, line_m: float) -> None:
         """Take in a reading of the distance of the line."""
+        # Difference of the reading from memory: a much farther line must be confirmed several times
         beyond_m = 0.0 if self._line_m is None else line_m - self._line_m
         self._farther = self._farther + 1 if beyond_m > OTHER_M else 0
         if self._line_m is None or beyond_m < -OTHER_M or self._farther >= CONFIRMED:
@@ -147,6 +151,7 @@ class Perception:
 
     def _patient(self, view: PathEstimate, speed_mps: float) -> PathEstimate:
         """Return the view with less on the route where the vehicle has stood for long."""
+        # Long standing without a red light, or very long standing with one, starts a phase of creeping
         self._stood = self._stood + 1 if speed_mps < STANDS_MPS else 0
         stopped_by_light = float(view.light[0, [LightState.RED, LightState.YELLOW]].sum()) > 0.5
         if (self._stood > WAITS and not stopped_by_light) or self._stood > IMPATIENT:
@@ -154,6 +159,7 @@ class Perception:
         if self._creeping == 0:
             return view
         self._creeping -= 1
+        # Impatient: the light is ignored. In any case only very probable road users stop the vehicle
         light = torch.eye(4)[[LightState.NONE]].to(view.light) if self._impatient else view.light
         return PathEstimate(light, view.light_m, (view.occupied > SURE).to(view.occupied))
 
@@ -175,6 +181,7 @@ class SightDriver:
         view = self._perceive(observation)
         path = given_path(observation)
         speed = ego_speeds(observation)[:, observation.now]
+        # The best speed profile on the route, then points along it
         limit = torch.full_like(speed, curve_speed(path))
         best = int(self._planner(view, speed, limit)[0].argmax())
         progress_m = profile_progress(speed, limit, HORIZON_STEPS)[0, best].double().cpu().numpy()
@@ -222,6 +229,7 @@ def given_path(observation: Clip) -> PathAhead:
     step = (xy[1] - xy[0]) / (along_m[1] - along_m[0])
     xy = np.concatenate([(xy[0] - along_m[0] * step)[None], xy])
     along_m = np.append(0.0, along_m)
+    # A smooth curve through the route's points, at steps of a metre
     last_m = int(along_m[-1])
     line = PchipInterpolator(along_m, xy)(np.arange(last_m + 1.0))
     return _on_grid(line)

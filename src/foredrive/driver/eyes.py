@@ -30,7 +30,7 @@ class CameraEyesConfig:
     """Key frames that are read, now included."""
     cameras: int = 2
     blind: bool = False
-    """Images are black: what the route alone tells."""
+    """Images are black, to measure what follows from the route alone."""
     kind: Literal["cameras"] = "cameras"
 
 
@@ -100,6 +100,7 @@ class CameraEyes(nn.Module):
         self.trunks = nn.ModuleList([Trunk() for _ in range(config.cameras)])
         self.narrow = nn.ModuleList([nn.Conv2d(FINE, FINE_READ, 1) for _ in range(config.cameras)])
         views = config.cameras + config.frames - 1
+        # Per view: coarse and fine features at each height, and whether the camera sees the place
         of_view = len(HEIGHTS_M) * (COARSE + FINE_READ + 1)
         of_motion = (config.frames - 1) * len(HEIGHTS_M) * len(ACROSS_MPS)
         self.reader = RouteReader(views * of_view + of_motion, FINE + COARSE, COARSE, config.cameras)
@@ -114,6 +115,7 @@ class CameraEyes(nn.Module):
         frames = seen_frames(clip, self.config.frames, self.config.cameras)
         features = self._features(frames)
         fine, coarse = features[-1]
+        # Coarse features at the size of the fine ones, for the lamps
         wide = F.interpolate(coarse.flatten(0, 1), size=fine.shape[-2:], mode="nearest")
         wide = wide.unflatten(0, coarse.shape[:2])
         places = route_cells(clip.route_xy, clip.route_valid)
@@ -127,6 +129,7 @@ class CameraEyes(nn.Module):
         """Return the features of each frame: of all cameras at now, of the first one before."""
         images = frames.images
         b, t = images.shape[:2]
+        # The first camera's images of all frames in one pass; the others only at now
         of_first = [map_.unflatten(0, (b, t)) for map_ in self._seen(0, images[:, :, 0].flatten(0, 1))]
         others = [self._seen(c, images[:, -1, c]) for c in range(1, len(self.trunks))]
         past = [FrameFeatures(*(map_[:, k, None] for map_ in of_first)) for k in range(t - 1)]
@@ -156,6 +159,7 @@ class CameraEyes(nn.Module):
             cameras = slice(fine.shape[1])
             rig, valid = frames.rig[:, t, cameras], frames.image_valid[:, t, cameras]
             narrow = torch.stack([self.narrow[c](fine[:, c]) for c in range(fine.shape[1])], dim=1)
+            # The visibility channel is kept once, with the fine features
             at_8 = sample_cameras(coarse, valid, rig, moved)[:, :, :-1]
             at_4 = sample_cameras(narrow, valid, rig, moved)
             both = torch.cat([at_8, at_4], dim=2)  # [b C F N]
@@ -174,6 +178,7 @@ class CameraEyes(nn.Module):
         count, shape = len(HEIGHTS_M), cells.shape[1:3]
         points = _at_heights(cells)
         T_frame_now = _from_now(frames)
+        # Unit vectors from the right to the left of the route, for every cell and height
         left = (cells[:, :, -1:] - cells[:, :, :1]).expand(-1, -1, shape[1], -1)
         left = F.normalize(left, dim=-1).flatten(1, 2).repeat(1, count, 1)
         left = torch.cat([left, torch.zeros_like(left[..., :1])], dim=-1)
@@ -188,9 +193,11 @@ class CameraEyes(nn.Module):
         # What moves into a cell at a speed across the route was that far to the other side then.
         speeds = points.new_tensor(ACROSS_MPS)
         for t in range(len(features) - 1):
+            # Distance that such a road user has moved since that frame
             gone_m = (frames.t_s[:, -1] - frames.t_s[:, t])[:, None] * speeds
             before = points[:, None] - gone_m[..., None, None] * left[:, None]
             then = looks(t, before.flatten(1, 2)).unflatten(-1, before.shape[1:3])
+            # Cosine similarity of the features then and now
             cosines.append((then * now[:, :, None]).sum(1).unflatten(-1, (count, *shape)).flatten(1, 2))
         return torch.cat(cosines, dim=1) if cosines else points.new_zeros(len(points), 0, *shape)
 

@@ -24,7 +24,7 @@ FALSE_AT_MOST = 0.1
 
 
 class Moment(NamedTuple):
-    """Holds what counts of one clip."""
+    """What is judged of one clip."""
 
     state: int
     """True `LightState`."""
@@ -35,7 +35,7 @@ class Moment(NamedTuple):
     visible: bool
     """True if a lamp of the light is in an image."""
     lit: bool
-    """True if the log tells the light."""
+    """True if the log has the state of the light."""
     first: int
     """First cell of the path that is occupied now; -1 without."""
     first_seen: Float[np.ndarray, "K"]
@@ -112,6 +112,7 @@ def missed_by(
 def _moments(driver: Driver, clips: PackedClips, tick: Callable[[], None]) -> Iterator[Moment]:
     for start in range(0, len(clips), BATCH):
         batch = join([clips[index] for index in range(start, min(start + BATCH, len(clips)))])
+        # Rows of the batch, with the lamps that lie in an image
         sight = driver.see(batch.clip)
         estimate, speed = sight.estimate(), ego_speeds(batch.clip)[:, batch.clip.now]
         size = (sight.lamp_logits.shape[-2], sight.lamp_logits.shape[-1])
@@ -123,14 +124,17 @@ def _moments(driver: Driver, clips: PackedClips, tick: Callable[[], None]) -> It
 
 def _moment(truth: Affordances, estimate: PathEstimate, speed_mps: float, visible: bool) -> Moment:
     path = PathAhead(truth.path_xy, np.zeros(len(truth.path_xy)), truth.path_valid, FRONT_M, True)
+    # Only what is known counts, in the truth and in the estimate
     occupied = (truth.occupied & truth.occupied_known).numpy()
     p = torch.where(truth.occupied_known, estimate.occupied, 0.0).numpy()
     # Driving on but for the light, for as long as the truth reaches.
     light = LightState(int(truth.light)) if bool(truth.light_known) else LightState.NONE
+    # Progress of a vehicle that minds its light but no road user
     free_m = rule_progress(
         path, speed_mps, PathView(light, float(truth.light_m), None, np.zeros_like(occupied))
     )
     times = LATER_DT_S * np.arange(1, TIMES)
+    # At the times of the occupancy
     free_m = np.interp(times, LATER_DT_S * np.arange(len(free_m) + 1), np.append(0.0, free_m))
     seen = np.array([meets_somebody(free_m, p >= threshold) for threshold in THRESHOLDS])
     conflict = meets_somebody(free_m, occupied)
@@ -145,6 +149,7 @@ def _moment(truth: Affordances, estimate: PathEstimate, speed_mps: float, visibl
         first_seen=np.array([_first(p[0] >= threshold) for threshold in THRESHOLDS], dtype=float),
         conflict=conflict,
         conflict_seen=seen,
+        # Meets somebody, but nobody who is in the path already now
         crossing=conflict and not meets_somebody(free_m, occupied & occupied[:1]),
     )
 
@@ -169,6 +174,7 @@ def _figures(moments: list[Moment]) -> dict[str, float]:
     first = np.array([m.first for m in moments])
     first_seen = np.stack([m.first_seen for m in moments])[:, THRESHOLDS.index(0.5)]
     obstacle = (first >= 0) & (first * CELL_M < OBSTACLE_M)
+    # A missed obstacle counts as the distance to the end of the range
     error_m = np.where(first_seen < 0, OBSTACLE_M - CELL_M * first, CELL_M * np.abs(first_seen - first))
     return {
         "light_accuracy_40m": _mean(named[near] == state[near]),

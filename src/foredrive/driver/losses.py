@@ -39,7 +39,7 @@ class SightWeights:
 def sight_losses(
     sight: Sight, truth: Affordances, clip: Clip, weights: SightWeights
 ) -> dict[str, Float[Tensor, ""]]:
-    """Return the losses by name; "loss" is their sum. What the truth does not know has none.
+    """Return the losses by name; "loss" is their sum. Entries that the truth does not know have no loss.
 
     Args:
         sight: of b items.
@@ -76,10 +76,12 @@ class LampPlaces:
 def lamp_places(truth: Affordances, rig: CameraRig, size: tuple[int, int]) -> LampPlaces:
     """Return where the lamps of the light on the route are in feature maps of `size` rows and columns."""
     b, cameras = rig.K.shape[:2]
+    # Lamps into the camera frame, then to cells of the feature map
     points = truth.lamp_xyz[:, None].expand(b, cameras, -1, -1)
     uv, _, inside = project(
         transform_points(inverse_se3(rig.T_ego_cam), points), rig.K, rig.dist, rig.size_hw
     )
+    # Lamps are known for this light, and there is a light
     lamps = truth.lamp & (truth.lamps_known & (truth.light != LightState.NONE))[:, None]
     column = (uv[..., 0] * size[1] / rig.size_hw[1]).floor().long().clamp(0, size[1] - 1)
     row = (uv[..., 1] * size[0] / rig.size_hw[0]).floor().long().clamp(0, size[0] - 1)
@@ -90,10 +92,12 @@ def _lamp_loss(sight: Sight, truth: Affordances, lamps: LampPlaces) -> Float[Ten
     """Return the focal loss (Lin et al. 2017, γ = 2) of the lamps in place, per lamp."""
     target = torch.zeros_like(sight.lamp_logits)
     item, camera, lamp = lamps.inside.nonzero(as_tuple=True)
+    # Colour channels begin at red: `LightState` minus 1
     colour = truth.light[item].long() - 1
     target[item, camera, colour, lamps.row[item, camera, lamp], lamps.column[item, camera, lamp]] = 1.0
     error = F.binary_cross_entropy_with_logits(sight.lamp_logits, target, reduction="none")
     p = sight.lamp_logits.sigmoid()
+    # Focal weight: the square of the wrongness of the prediction
     wrong = torch.where(target > 0, 1 - p, p)
     of_item = truth.lamps_known[:, None, None, None, None]
     return (wrong.square() * error * of_item).sum() / target.sum().clamp_min(1)
@@ -110,6 +114,7 @@ def _line_loss(sight: Sight, truth: Affordances, lamps: LampPlaces) -> Float[Ten
 def _occupancy_loss(sight: Sight, truth: Affordances, weights: SightWeights) -> Float[Tensor, ""]:
     """Return the weighted cross-entropy of the cells that are known."""
     occupied = truth.occupied
+    # Cells that become occupied later are rare and count more
     later = occupied & ~occupied[:, :1]
     weight = torch.where(occupied, weights.occupied_cells, 1.0) * torch.where(later, weights.crossing, 1.0)
     error = F.binary_cross_entropy_with_logits(sight.occupied_logits, occupied.float(), reduction="none")

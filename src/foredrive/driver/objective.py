@@ -43,11 +43,13 @@ def _recoloured(example: RouteExample, generator: torch.Generator) -> RouteExamp
     images = example.clip.images
     b, device = len(images), images.device
 
+    # Random numbers on the generator's device, so that they do not depend on the model's
     def normal(*shape: int) -> Tensor:
         return torch.randn(b, *shape, generator=generator, device=generator.device).to(device)
 
     contrast = (1 + CONTRAST * normal(1, 1, 1, 1, 1)).clamp(0.5, 1.6)
     shift = 255 * BRIGHTNESS * normal(1, 1, 1, 1, 1) + 255 * COLOUR * normal(1, 1, 3, 1, 1)
+    # Contrast about a middle grey, so that it does not change the brightness
     changed = images.float().mul_(contrast).add_(GREY * (1 - contrast) + shift).clamp_(0, 255)
     clip = dataclasses.replace(example.clip, images=changed.to(torch.uint8))
     return dataclasses.replace(example, clip=clip)

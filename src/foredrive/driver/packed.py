@@ -128,6 +128,7 @@ class PackedClips(Dataset[RouteExample]):
         road = map_file(log)
         stat = None if road is None else (str(road), road.stat().st_size, road.stat().st_mtime_ns)
         key = (PACK_VERSION, log.fingerprint, stat, dataset.config, dataset.camera_names, frames)
+        # The name changes with everything that the content depends on, so that a stale file is never read
         name = hashlib.blake2b(repr(key).encode(), digest_size=16).hexdigest()
         return self._folder / name[:2] / f"{name}.safetensors"
 
@@ -136,6 +137,7 @@ class PackedClips(Dataset[RouteExample]):
         numbers = [self._dataset.frames_of(index)[1] for index in clips]
         images: dict[int, Tensor] = {}
         for example, frames in zip(examples, numbers, strict=True):
+            # Each frame is stored once; the clips refer to rows
             images |= dict(zip(frames, example.clip.images, strict=True))
         rows = {frame: row for row, frame in enumerate(images)}
         batch = stack_records([_without_images(example) for example in examples])

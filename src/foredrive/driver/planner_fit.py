@@ -43,7 +43,7 @@ class PlanFit(FitSchedule):
 
 
 def true_estimate(truth: Affordances) -> PathEstimate:
-    """Return the truth as an estimate. What is not known is not there."""
+    """Return the truth as an estimate. Unknown lights and unknown cells count as absent."""
     none = torch.full_like(truth.light, int(LightState.NONE))
     light = torch.where(truth.light_known, truth.light, none).long()
     return PathEstimate(torch.eye(4)[light], truth.light_m, (truth.occupied & truth.occupied_known).float())
@@ -60,6 +60,7 @@ def rule_of(truth: Affordances, speed_mps: float) -> tuple[Float[np.ndarray, "S"
     path = PathAhead(truth.path_xy, np.zeros(count), truth.path_valid, FRONT_M, True)
     lead = None
     if bool(truth.lead & truth.lead_known):
+        # A lead vehicle without a velocity counts as standing
         lead_mps = float(truth.lead_mps)
         lead = Obstacle(float(truth.lead_m), max(lead_mps, 0.0) if np.isfinite(lead_mps) else 0.0)
     light = LightState(int(truth.light)) if bool(truth.light_known) else LightState.NONE
@@ -84,6 +85,7 @@ def fit_planner(
         InputError: no clip has a route.
     """
     draws = np.random.default_rng(seed)
+    # A random part of the clips
     chosen = draws.permutation(len(clips))[: fit.clips]
     truths: list[PathEstimate] = []
     seen: list[PathEstimate] = []
@@ -95,8 +97,10 @@ def fit_planner(
         truth, own = true_estimate(batch.truth), ego_speeds(batch.clip)[:, batch.clip.now]
         sight = driver.see(batch.clip).estimate() if fit.seen_share > 0 else truth
         for row in range(len(own)):
+            # A path needs two points
             if int(batch.truth.path_valid[row].sum()) < 2:
                 continue
+            # The clip's own speed and random ones: states that the log does not have
             others = draws.uniform(0.0, FASTEST_MPS, fit.speeds - 1).tolist()
             for speed_mps in (float(own[row]), *others):
                 progress_by_rule_m, limit_mps = rule_of(batch.truth[row], speed_mps)
@@ -109,6 +113,7 @@ def fit_planner(
     if not labels:
         raise InputError("no clip has a route: a planner of speeds has nothing to learn from")
     speed, limit = torch.tensor(speeds), torch.tensor(limits)
+    # Numbers of the planner by truth and by sight, computed in parts to bound the memory
     both = {
         by_sight: torch.cat(
             [
@@ -120,10 +125,12 @@ def fit_planner(
     }
     rule_m = torch.from_numpy(np.stack(labels)).float()
     progress_m = profile_progress(speed, limit, HORIZON_STEPS)
+    # Soft labels by the distance of each profile from the rule
     target = chosen_labels(progress_m, rule_m)
     generator = torch.Generator().manual_seed(seed)
 
     def loss(rows: Tensor) -> Tensor:
+        # One source of perception for the whole batch
         by_sight = bool(torch.rand((), generator=generator) < fit.seen_share)
         logits = driver.planner.logits(both[by_sight][rows])
         return -(target[rows] * logits.log_softmax(-1)).sum(-1).mean()

@@ -50,16 +50,19 @@ def road_user_pixels(
     """
     boxes, rig = clip.boxes[:, clip.now], clip.rig[:, clip.now]
     b, cameras = rig.K.shape[:2]
+    # Corners of all boxes in all cameras, in pixels of the feature map
     corners = box_corners(boxes.centre, boxes.size_lwh, boxes.yaw).flatten(1, 2)
     in_camera = transform_points(inverse_se3(rig.T_ego_cam), corners[:, None].expand(b, cameras, -1, -1))
     uv, depth_m, _ = project(in_camera, rig.K, rig.dist, rig.size_hw)
     uv, depth_m = uv.unflatten(2, (-1, 8)), depth_m.unflatten(2, (-1, 8))
     scale = uv.new_tensor([size[1] / rig.size_hw[1], size[0] / rig.size_hw[0]])
+    # Bounding rectangles in whole cells
     first, last = (uv.amin(-2) * scale).floor(), (uv.amax(-2) * scale).ceil()  # [b C M 2]
     x, y = (torch.arange(count, device=uv.device) for count in size[::-1])
     columns = (x >= first[..., :1]) & (x < last[..., :1])
     rows = (y >= first[..., 1:]) & (y < last[..., 1:]) & (depth_m > MIN_CORNER_M).all(-1, keepdim=True)
 
+    # A cell is filled if any box of the kind covers its row and its column
     def filled(kinds: Bool[Tensor, "b K M"]) -> Bool[Tensor, "b C K h w"]:
         return torch.einsum("bcmh,bkm,bcmw->bckhw", rows.float(), kinds.float(), columns.float()) > 0
 

@@ -27,6 +27,7 @@ def route_cells(
     straight on.
     """
     given_m = route_xy.new_tensor((0.0, *ROUTE_M))
+    # The route's points with the rear axle as the first one
     points = torch.cat([torch.zeros_like(route_xy[:, :1]), route_xy], dim=1)
     direction = _unit(points[:, 1:] - points[:, :-1])
     # Points beyond the end lie on the straight line through the last two valid ones.
@@ -35,11 +36,13 @@ def route_cells(
     for k in range(1, len(given_m)):
         valid = route_valid[:, k - 1 : k]
         moved = (points[:, k] - along[-1]).norm(dim=-1, keepdim=True) > 1e-3
+        # The last valid direction that is longer than a rounding error
         ahead = torch.where(valid & moved, direction[:, k - 1], ahead)
         along.append(torch.where(valid, points[:, k], along[-1] + (given_m[k] - given_m[k - 1]) * ahead))
     line = torch.stack(along, dim=1)
     # Middles lie on the straight piece between the two points around them.
     middle_m = FRONT_M + CELL_M * (torch.arange(CELLS, device=line.device) + 0.5)
+    # Distances are the nominal ones, so the piece of each middle is the same in the whole batch
     before = (torch.searchsorted(given_m, middle_m) - 1).clamp(0, len(given_m) - 2)
     share = (middle_m - given_m[before]) / (given_m[before + 1] - given_m[before])
     step = line[:, before + 1] - line[:, before]
@@ -71,8 +74,10 @@ def sample_cameras(
     b, cameras, channels = features.shape[:3]
     in_camera = transform_points(inverse_se3(rig.T_ego_cam), points[:, None].expand(-1, cameras, -1, -1))
     uv, _, inside = project(in_camera, rig.K, rig.dist, rig.size_hw)
+    # A point counts if it is in the image and the image exists
     inside = (inside & image_valid[..., None]).flatten(0, 1)
     size_wh = uv.new_tensor([rig.size_hw[1], rig.size_hw[0]])
+    # Pixels to grid_sample's range; what lies outside is masked by `seen`
     place = (2 * uv / size_wh - 1).clamp(-2, 2).flatten(0, 1)
     read = F.grid_sample(
         features.flatten(0, 1).float(), place[:, :, None], align_corners=False, padding_mode="border"

@@ -36,8 +36,8 @@ class Sight(Record):
     """The distance of the stop line as it is read at each place: log((m + 4) / 20)."""
     occupied_logits: Float[Tensor, "b T G"]
     user_pixels: Float[Tensor, "b C K h w"]
-    """Tells whether a road user of each kind is at a place of an image. Training alone reads it: it teaches
-    the features where road users are."""
+    """Whether a road user of each kind is at a place of an image. It is used in training only, so that the
+    features contain where road users are."""
     user_cells: Float[Tensor, "b U G L"]
     """The same for the cells along and beside the route; then the velocity along the route and to its left,
     in `VELOCITY_SCALE_MPS`."""
@@ -46,6 +46,7 @@ class Sight(Record):
     def light_m(self) -> Float[Tensor, "b"]:
         """Return the distance of the stop line, read where a lamp is most probable, m."""
         place = self.lamp_logits.amax(2).flatten(1).argmax(1, keepdim=True)
+        # The most probable place of a lamp in all cameras and colours
         return line_m(self.lamp_line.flatten(1).gather(1, place)[:, 0])
 
     def estimate(self) -> PathEstimate:
@@ -55,6 +56,7 @@ class Sight(Record):
 
 def line_m(scaled: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
     """Return the distance of a stop line, m, of a number as in `Sight.lamp_line`."""
+    # Logarithmic scale from some metres before the line: errors near the line count more
     return LIGHT_SCALE_M * scaled.clamp(-3, 2).exp() - LINE_BEFORE_LAMP_M
 
 
@@ -66,7 +68,8 @@ def scaled_line(light_m: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
 class RouteReader(nn.Module):
     """Reads the route from features of any eyes: who is on it, and its light.
 
-    It is not told the speed. Who stands mostly stands at a red light, and eyes that know it see one.
+    The speed is no input: a standing vehicle mostly stands at a red light, so the head would infer red from
+    standing.
 
     Args:
         cells: channels of the features in the cells along and beside the route.
@@ -82,6 +85,7 @@ class RouteReader(nn.Module):
         )
         self.lamps = LampHead(fine, wide, CONTEXT, cameras)
         self.occupancy = OccupancyHead(cells + 3)
+        # Biases for rare events: training begins with small probabilities
         self.users = nn.Conv2d(fine, len(USERS), 1)
         assert self.users.bias is not None
         nn.init.constant_(self.users.bias, RARE_LOGIT)
@@ -105,6 +109,7 @@ class RouteReader(nn.Module):
         route = torch.cat([route, clip.route_valid[..., None].to(route)], dim=-1)
         context = self.context(route.flatten(1))
         light, lamps, lines = self.lamps(fine, mean, context)
+        # Where each cell is: its place, and its distance beside the route
         middles = route_cells(clip.route_xy, clip.route_valid)
         place = torch.cat(
             [
@@ -151,11 +156,13 @@ class LampHead(nn.Module):
         for c, (read, scale, shift, lamps) in enumerate(
             zip(self.read, self.scale, self.shift, self.lamps, strict=True)
         ):
+            # The route scales and shifts the features (FiLM), so that lamps are read for this route
             features = read(torch.cat([fine[:, c], place], dim=1))
             gated = features * (1 + scale(context))[..., None, None] + shift(context)[..., None, None]
             maps.append(lamps(gated.relu()))
         maps_of_all = torch.stack(maps, dim=1).float()
         none = self.none(torch.cat([context, mean.flatten(1)], dim=-1)).float()
+        # Maximum over places and cameras: each colour's best lamp
         lamps_logits = maps_of_all[:, :, : len(COLOURS)]
         colours = lamps_logits.flatten(3).amax(-1).amax(1)
         return torch.cat([none, colours], dim=-1), lamps_logits, maps_of_all[:, :, len(COLOURS)]
@@ -205,6 +212,7 @@ class OccupancyHead(nn.Module):
         """Return the logits of occupancy, and `Sight.user_cells`."""
         plane = self.plane(self.cells(cells))  # [b F G L]
         users = self.users(plane).float()
+        # The plane's columns beside the route become channels along it
         ahead = occupied_at_constant_velocity(users).to(plane)
         logits: Tensor = self.route(torch.cat([plane.permute(0, 1, 3, 2).flatten(1, 2), ahead], dim=1))
         return logits.float(), users
@@ -217,6 +225,7 @@ def occupied_at_constant_velocity(users: Float[Tensor, "b U G L"]) -> Float[Tens
         users: as `Sight.user_cells`.
     """
     b, _, along, _ = users.shape
+    # Probability that any kind is in the cell
     kinds = len(USERS)
     probability = users[:, :kinds].sigmoid().amax(1)
     # Positions along the route, in cells, and beside it, in metres, of what each cell holds.
@@ -224,9 +233,11 @@ def occupied_at_constant_velocity(users: Float[Tensor, "b U G L"]) -> Float[Tens
     t_s = LATER_DT_S * torch.arange(TIMES, device=users.device)[:, None, None]
     first = torch.arange(along, device=users.device)[:, None]
     cell = (first + velocity[:, None, 0] * t_s / CELL_M).round().long()
+    # Weight of a road user beside the path: 1 within half its width, fading to 0 over some distance
     beside_m = users.new_tensor(BESIDE_M) + velocity[:, None, 1] * t_s
     in_way = (1 - (beside_m.abs() - HALF_WIDTH_M) / FADES_M).clamp(0, 1)
     weight = probability[:, None] * in_way * ((cell >= 0) & (cell < along))
+    # Of several road users that reach one cell, the most probable counts
     occupied = users.new_zeros(b, TIMES, along)
     return occupied.scatter_reduce(2, cell.clamp(0, along - 1).flatten(2), weight.flatten(2), "amax")
 

@@ -55,10 +55,12 @@ def profile_progress(
     table = speed_mps.new_tensor(PROFILES)
     v = speed_mps[:, None]
     brakes = torch.arange(len(PROFILES), device=v.device) < BRAKING
+    # Braking profiles never speed up, and the others never slow down, except for the limit
     target = torch.where(brakes, torch.minimum(table[:, 0], v), torch.maximum(table[:, 0], v))
     target = torch.minimum(target, limit_mps[:, None])
     # A profile that goes on as fast as now slows down to the limit all the same.
     rate = torch.where(table[:, 1] > 0, table[:, 1], TO_LIMIT_MPS2)
+    # The speed changes at constant rate until the target, then stays
     changed_s = ((target - v).abs() / rate)[..., None]
     within_s = torch.minimum(t_s, changed_s)
     signed = torch.where(target < v, -rate, rate)[..., None]
@@ -112,6 +114,7 @@ def profile_numbers(
     """
     progress_m = profile_progress(speed_mps, limit_mps, TIMES - 1)  # [b P T]
     b, profiles, times = progress_m.shape
+    # Cells are judged by their place before the front bumper
     start_m = CELL_M * torch.arange(CELLS).to(progress_m)
     occupied = view.occupied.to(progress_m)[:, None, 1:]  # [b 1 T G]
     ends_m = progress_m[..., None]
@@ -125,8 +128,9 @@ def profile_numbers(
     before = view.occupied.to(progress_m)[:, None, :-1]
     loose = torch.maximum(occupied, torch.maximum(sooner, before))
     met.append(torch.where(inside & (start_m < ends_m + MARGINS_M[1]), loose, 0.0).amax(-1))
-    # Within some metres of the line, the side on which the front and the judged point are.
+    # Probability that the light stops the vehicle
     stops = view.light[:, [LightState.RED, LightState.YELLOW]].sum(-1)
+    # Within some metres of the line, the side on which the front and the judged point are.
     line_m = view.light_m[:, None, None]
     over = ((progress_m - line_m) / NEAR_LINE_M).clamp(-1, 1)
     tail_over = ((progress_m - line_m - TAIL_M) / NEAR_LINE_M).clamp(-1, 1)
@@ -163,5 +167,6 @@ def chosen_labels(
         rule_m: progress by the rule at the same times.
         spread_m: mean difference at which the probability falls to 1/√e of the best.
     """
+    # Mean distance from the rule's progress; a second term keeps far profiles unlikely
     away_m = (progress_m - rule_m[:, None]).abs().mean(-1)
     return (-0.5 * ((away_m - away_m.amin(-1, keepdim=True)) / spread_m).square() - away_m).softmax(-1)

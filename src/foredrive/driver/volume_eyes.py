@@ -52,6 +52,7 @@ class VolumeEyes(nn.Module):
             config.world, config.voxels, past_frames=config.frames - 1, max_steps=1, dt_s=0.5, fetch=False
         )
         self.backbone, self.encoder, channels = world.backbone, world.encoder, world.channels
+        # Per frame and height: the volume's channels, and whether the cell is in the volume
         self.reader = RouteReader(
             config.frames * len(HEIGHTS_M) * (channels + 1), channels, channels, config.cameras
         )
@@ -89,6 +90,7 @@ class VolumeEyes(nn.Module):
     ) -> Float[Tensor, "b _N G L"]:
         """Return the features of all frames in the cells, and whether a cell is in the volume."""
         count, spec = len(HEIGHTS_M), self.config.voxels
+        # Cells at each height, in the ego frame of every key frame
         z = cells.new_tensor(HEIGHTS_M)[:, None, None, None].expand(count, *cells.shape[1:3], 1)
         points = torch.cat(
             [cells[:, None].expand(-1, count, -1, -1, -1), z.expand(len(cells), *z.shape)], dim=-1
@@ -98,6 +100,7 @@ class VolumeEyes(nn.Module):
         size_m = spec.voxel_m * points.new_tensor(spec.shape_zyx[::-1])
         read = []
         for t in range(volumes.shape[1]):
+            # Metres to grid_sample's range in the volume
             place = 2 * (transform_points(T_frame_now[:, t], points) - lower) / size_m - 1
             inside = (place.abs() < 1).all(-1)
             values = F.grid_sample(

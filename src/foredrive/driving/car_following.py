@@ -30,7 +30,9 @@ def free_acceleration(
     follow it.
     """
     desired = np.maximum(desired_mps, 0.1)
+    # a (1 - (v / v0)⁴) up to the wanted speed
     below = accel_mps2 * (1 - (np.minimum(speed_mps, desired) / desired) ** EXPONENT)
+    # Above it: remove the excess within a fixed time, with bounded braking
     above = -np.minimum((speed_mps - desired) / SLOWING_TIME_S, 2 * decel_mps2)
     return np.where(speed_mps <= desired, below, above)
 
@@ -55,11 +57,16 @@ def follow_acceleration(
         closing_mps: own speed minus the leader's speed.
         gap_m: gap from bumper to bumper; infinite for an open road.
     """
+    # Dynamic part of the desired gap s*
     dynamic = speed_mps * time_gap_s + speed_mps * closing_mps / (2 * np.sqrt(accel_mps2 * decel_mps2))
+    # Ratio of desired and present gap: below 1 the vehicle may come closer
     z = (standstill_m + np.maximum(0.0, dynamic)) / np.maximum(gap_m, 0.05)
     eager = np.maximum(free_mps2, 1e-3)
+    # Too close: brake by a (1 - z²)
     closer = accel_mps2 * (1 - z**2)
+    # Far enough: the free acceleration, reduced as the gap closes
     closing_in = free_mps2 * (1 - np.minimum(z, 1) ** (2 * accel_mps2 / eager))
     below_wanted = np.where(z >= 1, closer, closing_in)
+    # Faster than wanted: braking for the speed and for the gap add up
     above_wanted = np.where(z >= 1, free_mps2 + closer, free_mps2)
     return np.where(free_mps2 > 0, below_wanted, above_wanted)

@@ -35,6 +35,7 @@ class RoadUsers(NamedTuple):
         """Interpolate linearly towards a later time. A user that is absent then stays where it is."""
         same = self.track_id == later.track_id
         moved = np.where(same, part, 0.0)
+        # Shortest turn between the headings
         turned = (later.yaw - self.yaw + np.pi) % (2 * np.pi) - np.pi
         return self._replace(
             foot_m=self.foot_m + moved[:, None] * (later.foot_m - self.foot_m),
@@ -93,10 +94,12 @@ def collide(
     Args:
         met: contact times so far, as `Contacts.users`.
     """
+    # Impact speed is the norm of the velocity difference
     velocity = ego.speed_mps * np.array([np.cos(ego.yaw_rad), np.sin(ego.yaw_rad)])
     known, events = dict(met), []
     for i in np.flatnonzero(touched(box, users)).tolist():
         track, category = int(users.track_id[i]), Category(int(users.category[i]))
+        # The same road user counts again only after some seconds without contact
         if t_s - known.get(track, -np.inf) > SAME_S:
             kind = "pedestrian" if category is Category.PEDESTRIAN else "vehicle"
             impact_mps = float(np.hypot(*(velocity - users.velocity_mps[i])))
@@ -109,6 +112,7 @@ def collide(
 
 def blocked(box: Box, users: RoadUsers) -> bool:
     """Return whether a vehicle stands directly in front of the bumper."""
+    # A box at the front bumper, narrower than the vehicle: its sides only scrape
     forward = np.array([np.cos(box.yaw_rad), np.sin(box.yaw_rad), 0.0])
     half = np.array([0.5 * BUMPER_M, box.half_lw[1] - FLANK_M])
     bumper = Box(box.foot_m + (box.half_lw[0] - half[0]) * forward, box.yaw_rad, half)
@@ -128,12 +132,15 @@ def touched(box: Box, users: RoadUsers) -> Bool[np.ndarray, "N"]:
     """
     offset = users.foot_m - box.foot_m
     near = (users.track_id >= 0) & (np.abs(offset[:, 2]) < LEVEL_M)
+    # Circumscribed circles first, then the exact test
     reach = np.hypot(*box.half_lw) + np.hypot(users.half_lw[:, 0], users.half_lw[:, 1])
     near &= np.abs(offset[:, :2]).max(axis=1) < reach
     hit = np.zeros(len(near), dtype=np.bool_)
     for i in np.flatnonzero(near).tolist():
         mine, theirs = _axes(box.yaw_rad), _axes(float(users.yaw[i]))
+        # |cos| of the angles between the axes of both boxes
         between = np.abs(mine @ theirs.T)
+        # Separating axes: the centre distance exceeds both half extents along one of the four axes
         apart = np.abs(mine @ offset[i, :2]) > box.half_lw + between @ users.half_lw[i]
         apart |= np.abs(theirs @ offset[i, :2]) > users.half_lw[i] + between.T @ box.half_lw
         hit[i] = not apart.any()

@@ -66,6 +66,7 @@ def comfort_of(
     """
     from scipy.signal import savgol_filter  # takes 0.3 s
 
+    # Odd window lengths near the wanted durations
     window = {seconds: 2 * round(0.5 * seconds / dt_s) + 1 for seconds in (ACCELERATION_S, JERK_S)}
     if len(states) < window[JERK_S]:
         raise InputError(f"the comfort metrics need at least {window[JERK_S]} states, got {len(states)}")
@@ -75,14 +76,17 @@ def comfort_of(
 
     speed = np.array([state.speed_mps for state in states])
     yaw_rate = np.array([yaw_rate_radps(state, vehicle) for state in states])
+    # Acceleration along is the derivative of the speed, across it is v ω
     along = smoothed(speed, ACCELERATION_S, 1)
     aside = smoothed(speed * yaw_rate, ACCELERATION_S, 0)
     jerk_along = smoothed(speed, JERK_S, 2)
+    # Jerk in the turning frame of the vehicle: (a_x' - ω a_y, a_y' + ω a_x)
     jerk = np.hypot(
         smoothed(along, JERK_S, 1) - yaw_rate * aside, smoothed(aside, JERK_S, 1) + yaw_rate * along
     )
     turning = smoothed(yaw_rate, ACCELERATION_S, 0)
     turning_more = smoothed(yaw_rate, JERK_S, 1)
+    # Steps at which all bounds hold
     kept = (along >= bounds.min_longitudinal_mps2) & (along <= bounds.max_longitudinal_mps2)
     for values, bound in (
         (aside, bounds.max_lateral_mps2),

@@ -50,6 +50,7 @@ class ControllerState:
 
     def at(self, t_s: float) -> "ControllerState":
         """Return the state with the newest plan that is available at `t_s`."""
+        # Of the plans that are ready, the one made last; an older plan never replaces a newer one
         ready = [plan for ready_s, plan in self.coming if ready_s <= t_s + 1e-9]
         if not ready:
             return self
@@ -70,23 +71,31 @@ def follow(
 
 
 def _track(plan: Plan, state: BicycleState, after_s: float, vehicle: Vehicle) -> Control:
+    # Position on the path: distance along it and offset to its left
     way_m, left_m = plan.path.project(np.array([state.x_m, state.y_m]))
+    # Mean acceleration of the plan over the next moments, within its horizon
     soon_s = max(after_s, min(after_s + PREVIEW_S, plan.horizon_s))
     speed, soon = plan.speed_mps(after_s), plan.speed_mps(soon_s)
     if max(speed, soon, state.speed_mps) < STANDING_MPS:
         return Control(-HOLDING_MPS2, state.steering_rad)
+    # The lag is limited, so that a vehicle far behind does not accelerate without bound
     lag_m = min(max(plan.progress_m(after_s) - way_m, -MAX_LAG_M), MAX_LAG_M)
     too_slow = speed - state.speed_mps
     fed_forward = (soon - speed) / PREVIEW_S
+    # Feed-forward plus feedback on position and speed: gains ω² and √2 ω
     acceleration = fed_forward + KEEPING_RADPS**2 * lag_m + math.sqrt(2) * KEEPING_RADPS * too_slow
     return Control(acceleration, _steering(plan, state, way_m, left_m, vehicle))
 
 
 def _steering(plan: Plan, state: BicycleState, way_m: float, left_m: float, vehicle: Vehicle) -> float:
+    # λ grows with the speed: gentler steering when fast
     length_m = RETURN_M + RETURN_S * state.speed_mps
     heading, _ = plan.path.course(way_m)
+    # Curvature of the path where the vehicle is when the wheel has turned
     _, ahead = plan.path.course(way_m + STEERING_DELAY_S * state.speed_mps)
     aside_m = min(max(left_m, -length_m), length_m)
     askew = math.remainder(state.yaw_rad - heading, 2 * math.pi)
+    # Feed-forward curvature, and feedback with gains 1 / λ² and √2 / λ
     curvature = ahead - aside_m / length_m**2 - math.sqrt(2) * askew / length_m
+    # Bicycle model: curvature = tan(δ) / wheelbase
     return math.atan(vehicle.wheelbase_m * curvature)

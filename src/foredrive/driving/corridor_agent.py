@@ -72,6 +72,7 @@ def returns_in_corridor(sweep: LidarSweep, path: Float64[np.ndarray, "N 2"], len
     points = points[(points[:, 2] > HEIGHT_M[0]) & (points[:, 2] < HEIGHT_M[1])]
     bumper_m = EGO.axle_to_centre_m + 0.5 * EGO.length_m
     arc_m = arc_lengths(path)
+    # Points every 0.25 m along the corridor, and the distance of each return from the nearest of them
     line = points_at(path, arc_m, np.arange(bumper_m, bumper_m + length_m, 0.25))
     away_m = np.linalg.norm(points[:, None, :2] - line, axis=2).min(axis=1, initial=np.inf)
     ahead = points[:, 0] > bumper_m

@@ -131,11 +131,13 @@ def drive_route(
     pace = pace or PlanningTiming()
     clip = simulator.reset(scenario)
     on_frame()
+    # Time to collision at the first key frame; then at each later one
     states, events, nearest, act_s = [simulator.ego()], list[Event](), [_nearest_s(clip)], list[float]()
     plans = list[tuple[int, np.ndarray]]()
     pilot, ending, error = pilot or FollowingPilot(simulator, pace.latency_s), None, ""
     while ending is None:
         index = len(states) - 1
+        # Plan at the multiples of the planning period
         if index % pace.steps == 0:
             began = time.perf_counter()
             try:
@@ -149,10 +151,12 @@ def drive_route(
         step = pilot.step(states[-1], index * STEP_S)
         states.append(simulator.ego())
         events += step.events
+        # A new clip marks a new key frame
         if step.clip is not clip:
             clip = step.clip
             nearest.append(_nearest_s(clip))
             on_frame()
+        # The first event that is an ending ends the drive
         ending = next((Ending(event.kind) for event in step.events if event.kind in set(Ending)), None)
     infractions = tuple(found for event in events if (found := infraction_of(event)) is not None)
     duration_s, progress = (len(states) - 1) * STEP_S, vars(simulator.progress())
@@ -178,6 +182,7 @@ def _nearest_s(clip: Clip) -> float:
         boxes.velocity.double().numpy()[valid],
     )
     ego = MovingBoxes(
+        # The ego vehicle in its own frame: the origin is the rear axle
         np.array([[EGO.axle_to_centre_m, 0.0]]),
         np.array([[EGO.length_m, EGO.width_m]]),
         np.zeros(1),

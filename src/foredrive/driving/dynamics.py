@@ -52,6 +52,7 @@ def step(state: BicycleState, control: Control, dt_s: float = STEP_S, vehicle: V
     wanted = (control.acceleration_mps2, control.steering_rad)
     if not all(map(math.isfinite, wanted)) or not dt_s > 0:
         raise InputError(f"a step needs finite controls and a positive time, got {control} over {dt_s} s")
+    # Acceleration and steering move towards the commands at limited rates
     acceleration = _towards(
         _clamped(wanted[0], -vehicle.max_braking_mps2, vehicle.max_acceleration_mps2),
         state.acceleration_mps2,
@@ -62,12 +63,14 @@ def step(state: BicycleState, control: Control, dt_s: float = STEP_S, vehicle: V
         state.steering_rad,
         vehicle.max_steering_radps * dt_s,
     )
+    # Mean speed over the step; braking to a halt ends the motion within the step
     speed = state.speed_mps + acceleration * dt_s
     if speed > 0:
         distance_m = 0.5 * (state.speed_mps + speed) * dt_s
     else:
         distance_m = 0.5 * state.speed_mps**2 / -acceleration if acceleration < 0 else 0.0
         speed, acceleration = 0.0, 0.0
+    # The mean steering angle of the step gives the arc's curvature
     curvature = math.tan(0.5 * (state.steering_rad + steering)) / vehicle.wheelbase_m
     x_m, y_m, yaw_rad = _along_arc(state.x_m, state.y_m, state.yaw_rad, distance_m, curvature)
     return BicycleState(x_m, y_m, yaw_rad, speed, steering, acceleration)
@@ -83,6 +86,7 @@ def _along_arc(
 ) -> tuple[float, float, float]:
     """Return the pose (x, y, yaw) at the end of an arc. The chord points along the mean of both headings."""
     half_turn = 0.5 * distance_m * curvature
+    # Length of the chord of an arc: sin(x) / x, with x half the turned angle
     chord_m = distance_m * (math.sin(half_turn) / half_turn if abs(half_turn) > 1e-6 else 1.0)
     along = yaw_rad + half_turn
     turned = math.remainder(yaw_rad + 2 * half_turn, 2 * math.pi)

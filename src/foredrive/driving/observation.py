@@ -45,6 +45,7 @@ def make_clip(
         route: next points of the route. None if it is not known.
     """
     count, rig = len(frames), rig or _no_cameras()
+    # The observation has as many frames as are given; its future is not known
     route_xy, route_valid = clip_route(route)
     yes = torch.ones(count, dtype=torch.bool)
     sensed = torch.tensor([frame.sweep is not None for frame in frames])

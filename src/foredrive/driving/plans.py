@@ -46,6 +46,7 @@ class Path(NamedTuple):
         Both are measured in the axes of the nearest sample.
         """
         offset = xy - self.xy
+        # Nearest sample, then the offset in its axes
         near = int(np.argmin(np.einsum("ni,ni->n", offset, offset)))
         cos, sin = np.cos(self.heading_rad[near]), np.sin(self.heading_rad[near])
         dx, dy = offset[near]
@@ -73,19 +74,25 @@ def fit_path(waypoints: Float64[np.ndarray, "T 2"], dt_s: float, curvature_now: 
     index = _knots(waypoints)
     if not len(index):
         return _integrated(np.zeros(1), np.zeros(1))
+    # Chords between the knots, their lengths and directions
     chords = np.diff(waypoints[index], axis=0, prepend=np.zeros((1, 2)))
     chord_m = np.hypot(chords[:, 0], chords[:, 1])
     direction = np.unwrap(np.arctan2(chords[:, 1], chords[:, 0]))
+    # Speed along each chord, but at least `MIN_MPS`
     pace_mps = np.hypot(chord_m / (dt_s * np.diff(index, prepend=-1)), MIN_MPS)
     unit = np.eye(len(index) + 1)
     heading, offset = np.zeros(len(unit)), np.zeros(len(unit))  # as linear functions of the curvatures
+    # Soft constraint on the first curvature: as much as steering changes in `STEERING_S`
     firm = np.sqrt(SMOOTHING_S5 / STEERING_S) * pace_mps[0] ** 2
     rows, wanted = [firm * unit[0]], [firm * curvature_now]
     for k, (length, pace) in enumerate(zip(chord_m, pace_mps, strict=True)):
+        # Offset and heading at the end of the chord: integrals of a linear curvature
         offset = offset + length * (heading + length * (unit[k] / 3 + unit[k + 1] / 6))
         heading = heading + 0.5 * length * (unit[k] + unit[k + 1])
+        # Lateral jerk v³ dκ/ds of the piece, weighted by its duration
         jerk = pace**3 / length * (unit[k + 1] - unit[k])
         rows += [offset, np.sqrt(SMOOTHING_S5 * length / pace) * jerk]
+        # The offset of the chord's end is given by the directions of the chords
         wanted += [float(chord_m[: k + 1] @ direction[: k + 1]), 0.0]
     curvature = np.linalg.lstsq(np.array(rows), np.array(wanted), rcond=None)[0]
     return _integrated(np.append(0.0, np.cumsum(chord_m)), curvature)
@@ -100,9 +107,11 @@ def _knots(waypoints: Float64[np.ndarray, "T 2"]) -> Int[np.ndarray, "K"]:
     at, towards = np.zeros(2), np.array([1.0, 0.0])
     for k, point in enumerate(waypoints):
         offset = point - at
+        # Only points far enough and ahead of the last knot
         if np.linalg.norm(offset) >= KNOT_M and offset @ towards > 0:
             index.append(k)
             at, towards = point, offset / np.linalg.norm(offset)
+    # The last waypoint replaces the last knot if it lies beyond it
     beyond_m = float((waypoints[-1] - at) @ towards)
     if beyond_m > (0.0 if index else 0.5 * KNOT_M):
         index[max(0, len(index) - 1) :] = [len(waypoints) - 1]
@@ -114,6 +123,7 @@ def _integrated(along_m: Float64[np.ndarray, "K"], knot_curvature: Float64[np.nd
 
     It is linear between them and 0 beyond the last.
     """
+    # Curvature at even steps, integrated once to headings and once more to points
     way_m = np.arange(0.0, along_m[-1] + BEYOND_M, SAMPLE_M)
     curvature = np.interp(way_m, along_m, knot_curvature, right=0.0)
     turned = 0.5 * SAMPLE_M * (curvature[1:] + curvature[:-1])
@@ -165,6 +175,7 @@ def fixed_in_world(
     """
     waypoints = waypoints_of(trajectory)
     local = fit_path(waypoints, trajectory.dt_s, math.tan(seen_from.steering_rad) / vehicle.wheelbase_m)
+    # Waypoints that project behind earlier ones count as standing still
     way_m = np.maximum.accumulate([0.0, *(local.project(point)[0] for point in waypoints)])
     times_s = trajectory.dt_s * np.arange(len(way_m))
     cos, sin = math.cos(seen_from.yaw_rad), math.sin(seen_from.yaw_rad)
@@ -187,6 +198,7 @@ def waypoints_of(trajectory: Trajectory) -> Float64[np.ndarray, "T 2"]:
         raise InputError(f"expected one plan, got a batch of {tuple(trajectory.log_prob.shape[:-1])}")
     best, steps = int(trajectory.log_prob.reshape(-1).argmax()), trajectory.xy.shape[-2]
     valid = trajectory.valid.reshape(-1, steps)[best].cpu().numpy()
+    # Up to the first invalid step
     count = steps if valid.all() else int(np.argmin(valid))
     xy = trajectory.xy.detach().reshape(-1, steps, 2)[best, :count].cpu().double().numpy()
     if not count or not np.isfinite(xy).all():

@@ -48,6 +48,7 @@ class RestartingAgent:
         """Return the agent's plan, or a plan to creep forward."""
         plan, t_s = self._agent.act(observation), self._clock()
         speed_mps = float(observation.ego_speed_mps[0, observation.now])
+        # Standing counts only if the plan does not want to go on either
         if speed_mps > STANDS_MPS or float(plan.xy[0, 0].norm(dim=-1).max()) > STAYS_M:
             self._stands_since_s = None
             self._has_moved |= speed_mps > STANDS_MPS
@@ -55,6 +56,7 @@ class RestartingAgent:
             self._stands_since_s = t_s
         since_s = t_s if self._stands_since_s is None else self._stands_since_s
         patience_s = STUCK_S if self._has_moved else AT_START_S
+        # Patience is short before the first movement and long afterwards
         if t_s - since_s >= patience_s:
             self._creeps_until_s, self._stands_since_s = t_s + CREEPS_S, None
         if t_s < self._creeps_until_s and self._is_free(observation):
@@ -79,6 +81,7 @@ def is_free_ahead(occupancy_logit: Float[Tensor, "Z Y X"], spec: VoxelSpec) -> b
 def _creeping(speed_mps: float) -> Trajectory:
     """Return a straight plan with gentle acceleration."""
     t_s = FRAME_DT_S * torch.arange(1, HORIZON_STEPS + 1)
+    # Accelerate until `CREEPS_MPS`, then keep the speed
     gains_s = max(CREEPS_MPS - speed_mps, 0.0) / CREEPS_MPS2
     gained_s = t_s.clamp_max(gains_s)
     x = speed_mps * t_s + 0.5 * CREEPS_MPS2 * gained_s**2 + CREEPS_MPS2 * gained_s * (t_s - gained_s)

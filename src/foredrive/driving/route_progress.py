@@ -45,6 +45,7 @@ def first_step(xyz: Float64[np.ndarray, "M 3"]) -> Float64[np.ndarray, "3"]:
     Raises:
         InputError: no point is that far away.
     """
+    # The first point beyond a wheelbase gives a direction that rounding does not spoil
     away_m = np.hypot(*(xyz[:, :2] - xyz[0, :2]).T)
     ahead = np.flatnonzero(away_m > EGO.wheelbase_m)
     if not len(ahead):
@@ -62,6 +63,7 @@ class RouteLine:
     def __init__(self, xyz: Float64[np.ndarray, "M 3"]) -> None:
         arc_m = arc_lengths(xyz[:, :2])
         self.length_m = float(arc_m[-1])
+        # Even spacing of about a metre
         self._arc_m = np.linspace(0.0, self.length_m, max(2, int(np.ceil(self.length_m / SPACING_M)) + 1))
         self._xy = points_at(xyz[:, :2], arc_m, self._arc_m)
 
@@ -69,10 +71,12 @@ class RouteLine:
         self, progress: RouteProgress, xy: Float64[np.ndarray, "2"], speed_mps: float, t_s: float
     ) -> RouteProgress:
         """Return the progress of a vehicle that is now at `xy`. Progress never decreases."""
+        # Search only near the last position: a route may cross itself
         first, last = np.searchsorted(self._arc_m, [progress.done_m - BACK_M, progress.done_m + AHEAD_M])
         part = slice(int(first), int(last) + 1)
         away_m = np.hypot(*(self._xy[part] - xy).T)
         nearest = int(np.argmin(away_m))
+        # Progress never decreases
         done_m = max(progress.done_m, float(self._arc_m[part][nearest]))
         arrived = done_m > self.length_m - ARRIVED_M and away_m[nearest] < ARRIVED_M
         return dataclasses.replace(

@@ -129,6 +129,7 @@ def _route(path: Path, number: int, element: ElementTree.Element) -> RouteWaypoi
     if not all(map(math.isfinite, np.ravel(xyz).tolist())):
         raise InputError(f"{where} has a waypoint that is not finite")
     try:
+        # CARLA's y axis points to the right
         return RouteWaypoints(name, town, np.array(xyz) * [1.0, -1.0, 1.0], scenarios)
     except InputError as error:
         raise InputError(f"route number {number + 1} of {path}: {error}") from None

@@ -190,10 +190,12 @@ def score_suite(drives: Sequence[RouteScore]) -> SuiteScore:
         )
     if missing := sorted({(r, n) for r in routes for n in repetitions} - set(keys)):
         raise InputError(f"missing drives, (route, repetition): {missing}; failed drives count too")
+    # Kinds without an event count as 0
     kinds = [infraction.kind for drive in drives for infraction in drive.infractions]
     driven_km = sum(drive.driven_m for drive in drives) / 1000
     counts = {kind: kinds.count(kind) for kind in InfractionKind}
 
+    # Mean over all drives, spread over the means of the repetitions
     def over_repetitions(values: list[float]) -> MeanSpread:
         of = [
             statistics.fmean(v for v, (_, n) in zip(values, keys, strict=True) if n == k) for k in repetitions

@@ -64,6 +64,7 @@ class PathView(NamedTuple):
 
 def rule_progress(path: PathAhead, speed_mps: float, view: PathView) -> Float64[np.ndarray, "S"]:
     """Return the distance along the path at each waypoint of a plan, m."""
+    # A light that stops is a standing obstacle at its line
     obstacles = [] if view.lead is None else [view.lead]
     if must_stop(view.light, view.light_m, speed_mps):
         obstacles.append(Obstacle(_stop_m(view.light_m), 0.0))
@@ -76,6 +77,7 @@ def rule_progress(path: PathAhead, speed_mps: float, view: PathView) -> Float64[
         return nominal_m
     # Somebody comes into its way: the fastest slower profile that meets nobody, at last full braking.
     for target_mps, braking_mps2 in SLOWER:
+        # Only profiles that slow down; the last ones brake to a halt
         if target_mps == 0 or target_mps < max(speed_mps, 1.0):
             slower_m = np.minimum(slowed_m(speed_mps, target_mps, braking_mps2, later_s), followed_m)
             if not meets_somebody(slower_m, view.occupied):
@@ -89,6 +91,7 @@ def must_stop(light: LightState, light_m: float, speed_mps: float) -> bool:
     Beyond the line, it stops as long as its tail has not crossed, because that is what counts.
     """
     room_m = max(light_m, 0.0) + (TAIL_M if light_m < 0 else 0.0)
+    # Deceleration needed to stop in the room that is left
     needed_mps2 = speed_mps**2 / (2 * max(room_m, 0.1))
     if light is LightState.RED:
         return light_m > -TAIL_M and needed_mps2 < LATE_BRAKING_MPS2
@@ -107,6 +110,7 @@ def meets_somebody(along_m: Float64[np.ndarray, "T"], occupied: Bool[np.ndarray,
         along_m: distance along the path at each time.
         occupied: cells at now and at these times.
     """
+    # Cells that the vehicle's body and a margin in front of it cover at each time
     moving = np.diff(along_m, prepend=0.0) / LATER_DT_S > STANDS_MPS
     start_m = CELL_M * np.arange(CELLS)
     front_m = along_m[:, None] + MARGIN_M
@@ -118,6 +122,7 @@ def slowed_m(
     speed_mps: float, target_mps: float, braking_mps2: float, t_s: Float64[np.ndarray, "T"]
 ) -> Float64[np.ndarray, "T"]:
     """Return the distance driven at some times while the speed falls to a target and stays there."""
+    # Brake at a constant rate, then keep the target speed
     braked_s = np.minimum(t_s, max(speed_mps - target_mps, 0.0) / braking_mps2)
     distance_m: Float64[np.ndarray, T] = (
         speed_mps * braked_s - 0.5 * braking_mps2 * braked_s**2 + target_mps * (t_s - braked_s)
@@ -142,6 +147,7 @@ def drive_along(path: PathAhead, speed_mps: float, obstacles: list[Obstacle]) ->
     along_m, speed, waypoints = 0.0, speed_mps, []
     for step in range(HORIZON_STEPS * STEPS_PER_FRAME):
         v = np.array([speed])
+        # IDM behind each obstacle; the strictest one counts
         free = free_acceleration(v, desired, *limits)
         wanted = float(free[0])
         for obstacle in obstacles:
@@ -156,6 +162,7 @@ def drive_along(path: PathAhead, speed_mps: float, obstacles: list[Obstacle]) ->
                 *limits,
             )
             wanted = min(wanted, float(behind[0]))
+        # Speeds do not become negative; distance by the mean speed
         after = max(0.0, speed + max(wanted, -MAX_BRAKING_MPS2) * dt_s)
         along_m, speed = along_m + 0.5 * (speed + after) * dt_s, after
         if (step + 1) % STEPS_PER_FRAME == 0:
@@ -168,6 +175,7 @@ def curve_speed(path: PathAhead) -> float:
     count = min(int(path.valid.sum()), int(LOOKS_M))
     if count < 8:
         return DESIRED_MPS
+    # Heading over 4 m, and its largest change per metre: the curvature
     xy = path.xy[:count].numpy()
     heading = np.unwrap(np.arctan2(*(xy[4:] - xy[:-4]).T[::-1]))
     bend = float(np.abs(np.diff(heading)).max()) if len(heading) > 1 else 0.0
@@ -180,4 +188,5 @@ def waypoints_along(path: PathAhead, along_m: Float64[np.ndarray, "S"]) -> Float
     if len(xy) < 2:
         return np.zeros((len(along_m), 2))
     points = points_at(xy, np.arange(len(xy), dtype=np.float64), along_m)
+    # The lateral offset decays along the path
     return np.asarray(points - np.exp(-along_m / REJOINS_M)[:, None] * xy[0])

@@ -36,20 +36,25 @@ def time_to_collision_s(ego: MovingBoxes, others: MovingBoxes) -> Float64[np.nda
     offset, approach = others.centre_m - ego.centre_m, others.velocity_mps - ego.velocity_mps
     count = len(others.yaw_rad)
     begin, end = np.zeros(count), np.full(count, np.inf)
+    # Axes along the edges of both boxes
     ego_axes, other_axes = _axes(np.repeat(ego.yaw_rad, count)), _axes(others.yaw_rad)
     for axis in (*ego_axes, *other_axes):
+        # Half extent of both boxes along the axis
         reach = sum(
             0.5 * size * np.abs(np.einsum("mi,mi->m", edge, axis))
             for edges, sizes in ((ego_axes, ego.size_lw_m), (other_axes, others.size_lw_m))
             for edge, size in zip(edges, sizes.T, strict=True)
         )
+        # Gap and closing speed along the axis, and the interval of time in which the projections overlap
         gap, speed = np.einsum("mi,mi->m", offset, axis), np.einsum("mi,mi->m", approach, axis)
         moves = np.abs(speed) > 1e-9
         per_speed = 1 / np.where(moves, speed, 1.0)
         enter, leave = np.sort([(-reach - gap) * per_speed, (reach - gap) * per_speed], axis=0)
+        # Without relative motion, they overlap always or never
         apart = ~moves & (np.abs(gap) > reach)
         begin = np.maximum(begin, np.where(moves, enter, np.where(apart, np.inf, 0.0)))
         end = np.minimum(end, np.where(moves, leave, np.inf))
+    # Touching begins when all axes overlap, if that happens before one of them ends
     return np.where((begin <= end) & np.isfinite(begin), begin, np.inf)
 
 

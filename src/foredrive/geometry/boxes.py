@@ -20,6 +20,7 @@ def box_corners(
     The order is front-left, front-right, rear-right, rear-left of the bottom face, then of the top face.
     """
     local = 0.5 * _SIGNS.to(centre) * size_lwh[..., None, :]
+    # Rotate by yaw, then move to the centre
     cos, sin = yaw.cos()[..., None], yaw.sin()[..., None]
     x = cos * local[..., 0] - sin * local[..., 1]
     y = sin * local[..., 0] + cos * local[..., 1]
@@ -34,6 +35,7 @@ def points_in_boxes(
 ) -> Bool[Tensor, "N M"]:
     """Return whether each point lies inside or on the surface of each box."""
     offset = points[:, None] - centre  # [N, M, 3]
+    # Offsets in the axes of each box
     cos, sin = yaw.cos(), yaw.sin()
     along = cos * offset[..., 0] + sin * offset[..., 1]
     across = cos * offset[..., 1] - sin * offset[..., 0]

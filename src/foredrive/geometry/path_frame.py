@@ -22,15 +22,19 @@ def along_path(
     start, step = path_xy[..., :-1, :], path_xy.diff(dim=-2)
     there = path_valid[..., 1:] & path_valid[..., :-1]
     length = step.norm(dim=-1)
+    # Arc length at the start of each segment; segments with an invalid end have no length
     begins = (length * there).cumsum(-1) - length * there
     offset = points[..., :, None, :] - start[..., None, :, :]  # [*b N R-1 2]
+    # Foot of the perpendicular on every segment, clamped to it
     share = (offset * step[..., None, :, :]).sum(-1) / length.square().clamp_min(1e-12)[..., None, :]
     share = share.clamp(0, 1)
     away = offset - share[..., None] * step[..., None, :, :]
+    # Segments that do not exist are infinitely far
     away_m = away.norm(dim=-1).masked_fill(~there[..., None, :], torch.inf)
     nearest_m, segment = away_m.min(dim=-1)
     along = begins[..., None, :] + share * length[..., None, :]
     along_m = along.gather(-1, segment[..., None])[..., 0]
+    # Cross product of segment and offset: positive to the left
     side = step[..., None, :, 0] * offset[..., 1] - step[..., None, :, 1] * offset[..., 0]
     left = side.gather(-1, segment[..., None])[..., 0] >= 0
     return along_m, torch.where(left, nearest_m, -nearest_m)
@@ -43,6 +47,7 @@ def path_headings(
     step = path_xy.diff(dim=-2)
     there = path_valid[..., 1:] & path_valid[..., :-1]
     length = step.norm(dim=-1) * there
+    # The segment that contains the distance; beyond the end the last one
     ends = length.cumsum(-1)
     segment = (along_m[..., :, None] > ends[..., None, :]).sum(-1)
     segment = segment.clamp_max((there.sum(-1, keepdim=True) - 1).clamp_min(0))

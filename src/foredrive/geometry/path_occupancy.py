@@ -38,6 +38,7 @@ def cells_covered(
         start_m: distance along the path at which the first cell begins.
         half_width_m: half the width of the cells.
     """
+    # Footprints that are far beside the path cover nothing and are not sampled
     covered = torch.zeros(*yaw.shape, cells, dtype=torch.bool)
     _, beside_m = along_path(xy.flatten(0, 1), path_xy, path_valid)
     near = valid & (beside_m.view(valid.shape).abs() < NEAR_M)
@@ -46,6 +47,7 @@ def cells_covered(
     # Points all over each footprint that may matter.
     share = torch.cartesian_prod(*(torch.linspace(-0.5, 0.5, count) for count in POINTS_LW))
     size = size_lw[:, None].expand(*yaw.shape, 2)[near]
+    # Points in the box' axes, turned by the heading and moved to the middle
     local = share * size[:, None]
     cos, sin = yaw[near].cos()[:, None], yaw[near].sin()[:, None]
     turned = torch.stack(
@@ -57,6 +59,7 @@ def cells_covered(
     # Points beyond an end of the path are placed at that end: only those beside it are on it.
     length_m = (path_xy.diff(dim=0).norm(dim=-1) * (path_valid[1:] & path_valid[:-1])).sum()
     inside = (left_m.abs() < half_width_m) & (along_m > 0) & (along_m < length_m)
+    # Cells between the first and the last covered point are covered, also where no point fell
     cell = (along_m - start_m) / cell_m
     first = cell.masked_fill(~inside, torch.inf).amin(-1).floor()
     last = cell.masked_fill(~inside, -torch.inf).amax(-1).floor()

@@ -11,9 +11,11 @@ UNDISTORT_ITERATIONS = 10
 def distort(xy: Float[Tensor, "*b N 2"], dist: Float[Tensor, "*b 5"]) -> Float[Tensor, "*b N 2"]:
     """Apply the distortion k1 k2 p1 p2 k3 to normalised image coordinates (x/z, y/z)."""
     k1, k2, p1, p2, k3 = (d[..., None] for d in dist.unbind(-1))
+    # r2 is the squared distance from the optical axis in the plane z = 1
     x, y = xy.unbind(-1)
     r2 = x * x + y * y
     radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    # Radial factor, then the two tangential terms
     return torch.stack(
         [
             x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
@@ -45,6 +47,7 @@ def undistort(xy: Float[Tensor, "*b N 2"], dist: Float[Tensor, "*b 5"]) -> Float
     if _is_ideal(dist):
         return xy
     out = xy
+    # x ← x - (distort(x) - target): a contraction where the distortion is small
     for _ in range(UNDISTORT_ITERATIONS):
         out = out - (distort(out, dist) - xy)
     return out
@@ -73,12 +76,15 @@ def project(
         are rejected before distortion, because the distortion polynomial would fold them back into the image.
     """
     depth = points_cam[..., 2]
+    # The clamp keeps points behind the camera finite; they are masked below
     xy = points_cam[..., :2] / depth.clamp_min(MIN_DEPTH_M)[..., None]
     height, width = size_hw
+    # Largest distance from the axis within the image: that of the most distant corner
     corners = torch.tensor([[0.0, 0.0], [width, 0.0], [0.0, height], [width, height]], dtype=K.dtype)
     rays = pixels_to_rays(corners.to(K.device).expand(*K.shape[:-2], 4, 2), K, dist)
     reach = (rays[..., :2] / rays[..., 2:]).norm(dim=-1).amax(-1)[..., None]
     in_view = (depth > MIN_DEPTH_M) & (xy.norm(dim=-1) <= 1.05 * reach)
+    # Points out of view are set to the axis before the polynomial, which may overflow there
     bent = xy if _is_ideal(dist) else distort(torch.where(in_view[..., None], xy, torch.zeros_like(xy)), dist)
     uv = bent * torch.stack([K[..., 0, 0], K[..., 1, 1]], -1)[..., None, :] + K[..., None, :2, 2]
     inside = (uv >= 0).all(-1) & (uv[..., 0] < width) & (uv[..., 1] < height)
@@ -89,6 +95,7 @@ def pixels_to_rays(
     uv: Float[Tensor, "*b N 2"], K: Float[Tensor, "*b 3 3"], dist: Float[Tensor, "*b 5"]
 ) -> Float[Tensor, "*b N 3"]:
     """Return unit viewing directions of pixel coordinates, in the camera frame."""
+    # Focal lengths in the order of u and v
     focal = torch.stack([K[..., 0, 0], K[..., 1, 1]], -1)[..., None, :]
     xy = undistort((uv - K[..., None, :2, 2]) / focal, dist)
     rays = torch.cat([xy, torch.ones_like(xy[..., :1])], dim=-1)

@@ -12,6 +12,7 @@ def quaternion_from_matrix(R: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 4"]:
     column with the largest diagonal entry is the best conditioned (Shepperd, "Quaternion from rotation
     matrix", 1978).
     """
+    # Sums and differences of entries of R that make up 4 q qᵀ
     xx, yy, zz = R.diagonal(dim1=-2, dim2=-1).unbind(-1)
     wx, wy, wz = R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]
     xy, xz, yz = R[..., 1, 0] + R[..., 0, 1], R[..., 0, 2] + R[..., 2, 0], R[..., 2, 1] + R[..., 1, 2]
@@ -24,6 +25,7 @@ def quaternion_from_matrix(R: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 4"]:
         ],
         dim=-2,
     )  # 4 q qᵀ
+    # The column of the largest diagonal entry is a multiple of q
     best = outer.diagonal(dim1=-2, dim2=-1).argmax(-1)
     column = outer.gather(-2, best[..., None, None].expand(*best.shape, 1, 4))[..., 0, :]
     return torch.nn.functional.normalize(column, dim=-1)

@@ -50,6 +50,7 @@ def attend_volume(
         return attend_volume_triton(values, points, weights)
     if not (small and per_head <= BLOCK and numba_supports(values, points, weights)):
         return attend_volume_reference(values, points, weights)
+    # The kernels apply: their backward pass runs in parallel over slices of the channels
     slices = channel_slices(heads, values.shape[-1])
     with full_precision(values, points, weights) as (values, points, weights):
         out: Tensor = AttendVolume.apply(values, points, weights, slices)
@@ -65,11 +66,16 @@ def attend_volume_reference(
     with full_precision(values, points, weights) as (values, points, weights):
         b, _, heads, _ = weights.shape
         size_xyz = points.new_tensor(values.shape[1:4][::-1])
+        # Voxel units to grid_sample's range -1 … 1. The clamp keeps infinite coordinates finite; one voxel
+        # beyond the border everything is zero, so it does not change the result
         grid = 2 * points.clamp(-torch.ones_like(size_xyz), size_xyz + 1) / size_xyz - 1
+        # Split the channels by head and let each head be a batch item of its own
         maps = values.unflatten(-1, (heads, -1)).permute(0, 4, 5, 1, 2, 3)  # [b H D/H Z Y X]
         grid = grid.transpose(1, 2).flatten(0, 1)[:, None]  # [b·H 1 Q P 3]
         read = F.grid_sample(maps.flatten(0, 1), grid, align_corners=False)
         read = read[:, :, 0].unflatten(0, (b, heads))  # [b H D/H Q P]
+        # grid_sample does not preserve NaN coordinates
         read = read.masked_fill(points.isnan().any(-1).transpose(1, 2)[:, :, None], torch.nan)
+        # Sum over the points P, then join the channels of the heads
         total = (read * weights.transpose(1, 2)[:, :, None]).sum(-1)  # [b H D/H Q]
         return total.permute(0, 3, 1, 2).flatten(2)

@@ -43,6 +43,7 @@ def composite(alpha: Float[Tensor, "*b N"], depth_m: Float[Tensor, "*b N"]) -> C
     with full_precision(alpha, depth_m) as (alpha, depth_m):
         # Memory traffic dominates here: a numba kernel was measured and is not faster.
         passed = torch.cumprod(1 - alpha, dim=-1)
+        # The transmittance in front of sample i is the product over the samples before it
         weights = torch.cat([torch.ones_like(alpha[..., :1]), passed[..., :-1]], dim=-1) * alpha
         return Composite(
             weights=weights,
@@ -66,5 +67,6 @@ def stratified_depths(
         within = torch.full((*shape, bins), 0.5)
     else:
         within = torch.rand((*shape, bins), generator=generator, device=generator.device)
+    # Sample i lies at (i + within) bins from the start, so the distances ascend
     step = torch.arange(bins, device=within.device) + within
     return near_m + (far_m - near_m) / bins * step

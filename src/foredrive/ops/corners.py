@@ -45,11 +45,13 @@ def new_block(axes):
 @no_type_check
 def set_corners(block, i, weight, row0, row1, x0, x1, wy0, wy1, wx0, wx1, channels):
     """Fill `corner` and `part` at i for four corners in one plane. row0 and row1 are starts of pixel rows."""
+    # Offsets count floats, because channels are last: pixel index times channels
     corner, part = block.corner, block.part
     corner[i] = (row0 + x0) * channels
     corner[BLOCK + i] = (row0 + x1) * channels
     corner[2 * BLOCK + i] = (row1 + x0) * channels
     corner[3 * BLOCK + i] = (row1 + x1) * channels
+    # Bilinear weight of each corner, times the weight of the point
     part[i] = weight * wy0 * wx0
     part[BLOCK + i] = weight * wy0 * wx1
     part[2 * BLOCK + i] = weight * wy1 * wx0
@@ -74,6 +76,7 @@ def sample_point(values, base, block, p, corners, total, zero):
 @no_type_check
 def sample_point_backward(values, base, block, p, corners, grad, zero, grad_values, to_points):
     """Add the gradient of `sample_point` to `grad_values` (unless that is empty) and to `block.dots`."""
+    # Dots of the corner values with the gradient, from which the gradients of place and weight follow
     if to_points:
         for k in range(0, corners, 4):
             add_dots(
@@ -85,6 +88,7 @@ def sample_point_backward(values, base, block, p, corners, grad, zero, grad_valu
                 load(values, base + block.corner[(k + 3) * BLOCK + p], zero),
                 grad,
             )
+    # Each corner gets the gradient times its interpolation weight
     if grad_values.size > 0:
         for k in range(corners):
             at = base + block.corner[k * BLOCK + p]

@@ -61,8 +61,10 @@ def grid_levels(
     """
     found, first = [], 0
     for i in range(levels):
+        # N_l = N_min · b^l. The small number keeps floor from losing a cell by rounding
         growth = (finest / coarsest) ** (i / max(levels - 1, 1))
         cells = math.floor(coarsest * growth + 1e-6)
+        # A level has one row per vertex of all actors, as far as the limit of rows allows
         vertices = actors * (cells + 1) ** 3
         rows = min(vertices, 2**log2_rows)
         found.append(Level(cells, first, rows, dense=vertices <= 2**log2_rows))
@@ -95,6 +97,7 @@ def read_hash_grid(
     Raises:
         ValueError: the table has fewer rows than the levels need.
     """
+    # The kernels do not check indices, so a table that is too short must be refused here
     needed = max(level.first_row + level.rows for level in levels)
     if needed > len(table):
         raise ValueError(f"read_hash_grid: levels need {needed} rows, the table has {len(table)}")
@@ -124,15 +127,19 @@ def read_hash_grid_reference(
     with full_precision(table, points) as (table, points):
         found = []
         for level in levels:
+            # Position in cells, moved to the surface of the cube where it lies outside
             place = (points * level.cells).clamp(0, level.cells)
             low = place.detach().floor().clamp(0, level.cells - 1)  # clamp keeps NaN
             inside = place - low
             total = points.new_zeros(len(points), table.shape[1])
+            # NaN cannot be an index: it reads row 0, and its NaN weight makes the result NaN
             cell = low.nan_to_num().long()
             for corner in range(8):
+                # Bits 0, 1 and 2 of the corner tell whether it is the upper one along x, y and z
                 up = torch.tensor([corner & 1, corner >> 1 & 1, corner >> 2], device=points.device)
                 weight = torch.where(up > 0, inside, 1 - inside).prod(-1)
                 total = total + weight[:, None] * table[level.first_row + _row(cell + up, level, actor)]
+            # Fade the levels whose cells are smaller than twice the footprint
             if footprint is not None:
                 total = total / (2 * level.cells * footprint.detach().to(total)).clamp_min(1)[:, None]
             found.append(total.T)
@@ -143,6 +150,7 @@ def _row(vertex: Int[Tensor, "N 3"], level: Level, actor: Int[Tensor, "N"] | Non
     x, y, z = vertex.unbind(-1)
     owner = torch.zeros_like(x) if actor is None else actor.long()
     if level.dense:
+        # Row-major numbering of the vertices: x runs fastest, the actor slowest
         side = level.cells + 1
         return x + side * (y + side * (z + side * owner))
     # The products fit into 64 bits, and the lower bits are those of a product of 32 bits.
@@ -162,6 +170,7 @@ class _ReadHashGrid(torch.autograd.Function):
         actor: Int[Tensor, "N"] | None,
     ) -> Float[Tensor, "LF N"]:
         table, points = table.contiguous(), points.contiguous()
+        # Arrays of size 0 stand for None, because numba compiles for fixed types
         footprint = points.new_empty(0) if footprint is None else footprint.contiguous()
         actor = torch.empty(0, dtype=torch.int32) if actor is None else actor.to(torch.int32).contiguous()
         ctx.save_for_backward(table, points, footprint, actor)
@@ -172,6 +181,7 @@ class _ReadHashGrid(torch.autograd.Function):
         rows = out.numpy()
 
         def job(start: int, stop: int) -> None:
+            # A range of the flat index (level, point) may cover parts of several levels
             for number in range(start // count, -(-stop // count)):
                 before = number * count
                 level = GridLevel(*levels[number])
@@ -185,13 +195,16 @@ class _ReadHashGrid(torch.autograd.Function):
     def backward(ctx: Any, grad_out: Tensor) -> tuple[Tensor | None, ...]:
         table, points, footprint, actor = ctx.saved_tensors
         wants_table, wants_points = ctx.needs_input_grad[:2]
+        # Gradients that are not wanted have size 0
         levels: tuple[Level, ...] = ctx.levels
         grad_table = torch.zeros_like(table) if wants_table else table[:0]
+        # Each level writes its own part, so that the sum over levels has a fixed order
         grad_points = points.new_empty(len(levels) if wants_points else 0, 3, len(points))
         inputs = _inputs(table, points, footprint, actor)
         found = (grad_out.contiguous(), grad_table, grad_points)
         grads = GridGradients(*(tensor.numpy() for tensor in found))
 
+        # One thread does all points of a level: rows of a table are never shared between threads
         def job(start: int, stop: int) -> None:
             for number in range(start, stop):
                 read_level_back(inputs, GridLevel(*levels[number]), number, grads)

@@ -86,6 +86,7 @@ def _fill_block(inputs, block, level, first, count):
     cells = np.float32(level.cells)
     cell = block.dots  # not in use yet: rows 0 to 2 take the cells
     scale = block.scale
+    # Weight of the level: 1, or 1 / (2 · cells · footprint) where that is less
     for i in range(count):
         scale[i] = ONE
     if inputs.footprint.size > 0:
@@ -96,12 +97,15 @@ def _fill_block(inputs, block, level, first, count):
         at = axis * BLOCK
         for i in range(count):
             place = inputs.points[first + i, axis] * cells
+            # NaN differs from itself. A NaN weight carries it to all features of the level
             scale[i] = scale[i] if place == place else np.float32(np.nan)
+            # Positions outside of the cube are clamped, so they have no gradient
             within = (place >= ZERO) & (place <= cells)
             scale[BLOCK + at + i] = cells if within else ZERO
             place = place if place > ZERO else ZERO  # NaN becomes 0 too
             place = place if place < cells else cells
             low = np.floor(place)
+            # The upper face belongs to the last cell, with position 1 in it
             low = low if low < cells - ONE else cells - ONE
             cell[at + i] = low
             block.inside[at + i] = place - low
@@ -119,12 +123,15 @@ def _dense_corners(inputs, block, level, first, count):
     features = np.int32(inputs.table.shape[1])
     side = np.int32(level.cells + 1)
     step_y, step_z = np.int32(side * features), np.int32(side * side * features)
+    # Offset of the lowest corner in floats: x runs fastest, then y, z and the actor
     for i in range(count):
         x, y, z = np.int32(cell[i]), np.int32(cell[BLOCK + i]), np.int32(cell[2 * BLOCK + i])
         corner[i] = np.int32(x * features + y * step_y + z * step_z)
+    # Each actor has side³ vertices
     if inputs.actor.size > 0:
         for i in range(count):
             corner[i] = np.int32(corner[i] + inputs.actor[first + i] * np.int32(step_z * side))
+    # The other corners: bit 0 of the number is one step along x, bit 1 along y, bit 2 along z
     for i in range(count):
         low = corner[i]
         corner[BLOCK + i] = np.int32(low + features)
@@ -141,7 +148,9 @@ def _dense_corners(inputs, block, level, first, count):
 def _hashed_corners(inputs, block, level, first, count):
     cell, corner = block.dots, block.corner
     features = np.int32(inputs.table.shape[1])
+    # The number of rows is a power of two, so the mask replaces the modulo
     mask = np.uint32(level.rows - 1)
+    # The last corner's row of the buffer holds the actor's part of the hash until it is overwritten below
     if inputs.actor.size > 0:
         for i in range(count):
             corner[7 * BLOCK + i] = np.int32(np.uint32(inputs.actor[first + i]) * _PA)
@@ -149,12 +158,15 @@ def _hashed_corners(inputs, block, level, first, count):
         for i in range(count):
             corner[7 * BLOCK + i] = np.int32(0)
     for i in range(count):
+        # Unsigned 32-bit products wrap around, as in the paper's code
         x0 = np.uint32(np.int32(cell[i])) ^ np.uint32(corner[7 * BLOCK + i])
         x1 = np.uint32(np.int32(cell[i]) + np.int32(1)) ^ np.uint32(corner[7 * BLOCK + i])
         y0 = np.uint32(np.uint32(np.int32(cell[BLOCK + i])) * _PY)
         z0 = np.uint32(np.uint32(np.int32(cell[2 * BLOCK + i])) * _PZ)
+        # (y + 1) · π = y · π + π, so the neighbour's product costs one addition
         y1, z1 = np.uint32(y0 + _PY), np.uint32(z0 + _PZ)
         yz0, yz1, yz2, yz3 = y0 ^ z0, y1 ^ z0, y0 ^ z1, y1 ^ z1
+        # XOR of the parts, reduced to the table's rows; the offset counts floats
         corner[i] = np.int32((x0 ^ yz0) & mask) * features
         corner[BLOCK + i] = np.int32((x1 ^ yz0) & mask) * features
         corner[2 * BLOCK + i] = np.int32((x0 ^ yz1) & mask) * features
@@ -172,6 +184,7 @@ def _weights(block, count):
     for i in range(count):
         x1, y1, z1 = inside[i], inside[BLOCK + i], inside[2 * BLOCK + i]
         x0, y0 = ONE - x1, ONE - y1
+        # The weight of the level is multiplied into the weights along z
         low, high = block.scale[i] * (ONE - z1), block.scale[i] * z1
         part[i], part[BLOCK + i] = low * y0 * x0, low * y0 * x1
         part[2 * BLOCK + i], part[3 * BLOCK + i] = low * y1 * x0, low * y1 * x1
@@ -184,6 +197,7 @@ def _weights(block, count):
 def _read(inputs, block, level, first, count, number, zero, out):
     """Write the features of a block, the rows number · F and following of `out`."""
     features, points = inputs.table.shape[1], inputs.points.shape[0]
+    # Features are stored with the points last, so the lanes of a point are `points` apart
     base = level.first_row * features
     place = number * features * points + first
     corner, part, table = block.corner, block.part, inputs.table
@@ -201,6 +215,7 @@ def read_level(inputs, level, number, first, last, out):
     block, features = _new_block(), inputs.table.shape[1]
     for start in range(first, last, BLOCK):
         count = min(BLOCK, last - start)
+        # `zero` selects the version for the number of features: numba compiles one for each type
         _fill_block(inputs, block, level, start, count)
         if features == 1:
             _read(inputs, block, level, start, count, number, ZERO, out)
@@ -224,6 +239,7 @@ def _read_back(inputs, block, level, first, count, number, zero, grads):
     for i in range(count):
         grad = load_lanes(grads.out, place + i, points, zero)
         if to_points:
+            # Dot products first: they need only the table, not its gradient
             for k in range(8):
                 row = load(table, base + corner[k * BLOCK + i], zero)
                 block.dots[k * BLOCK + i] = dot(row, grad)
@@ -244,10 +260,12 @@ def _slopes(block, first, count, number, grad_points):
         x0, y0, z0 = ONE - x1, ONE - y1, ONE - z1
         d0, d1, d2, d3 = dots[i], dots[BLOCK + i], dots[2 * BLOCK + i], dots[3 * BLOCK + i]
         d4, d5, d6, d7 = dots[4 * BLOCK + i], dots[5 * BLOCK + i], dots[6 * BLOCK + i], dots[7 * BLOCK + i]
+        # The derivative along an axis is the difference of its two corners, interpolated along the other axes
         w = scale[i]
         to_x = z0 * (y0 * (d1 - d0) + y1 * (d3 - d2)) + z1 * (y0 * (d5 - d4) + y1 * (d7 - d6))
         to_y = z0 * (x0 * (d2 - d0) + x1 * (d3 - d1)) + z1 * (x0 * (d6 - d4) + x1 * (d7 - d5))
         to_z = y0 * (x0 * (d4 - d0) + x1 * (d5 - d1)) + y1 * (x0 * (d6 - d2) + x1 * (d7 - d3))
+        # Chain rule: the weight of the level, and the derivative of the position in cells
         along_x[first + i] = w * scale[BLOCK + i] * to_x
         along_y[first + i] = w * scale[2 * BLOCK + i] * to_y
         along_z[first + i] = w * scale[3 * BLOCK + i] * to_z
@@ -263,6 +281,7 @@ def read_level_back(inputs, level, number, grads):
     block, features, points = _new_block(), inputs.table.shape[1], inputs.points.shape[0]
     for start in range(0, points, BLOCK):
         count = min(BLOCK, points - start)
+        # Corners and weights are computed again and not kept from the forward pass
         _fill_block(inputs, block, level, start, count)
         if features == 1:
             _read_back(inputs, block, level, start, count, number, ZERO, grads)

@@ -51,6 +51,7 @@ class _ReadHashGrid(torch.autograd.Function):
     ) -> Float[Tensor, "LF N"]:
         table, points = table.contiguous(), points.contiguous()
         ctx.save_for_backward(table, points, shape, footprint, actor)
+        # Float32 output for every input type
         out = torch.empty(shape.shape[1] * table.shape[1], len(points), device=table.device)
         _launch(_read_points, table, points, shape, footprint, actor, [out], {})
         return out
@@ -60,6 +61,7 @@ class _ReadHashGrid(torch.autograd.Function):
     def backward(ctx: Any, grad_out: Tensor) -> tuple[Tensor | None, ...]:
         table, points, shape, footprint, actor = ctx.saved_tensors
         wants_table, wants_points = ctx.needs_input_grad[:2]
+        # Atomic additions need float32, also for a table in half precision
         grad_table = torch.zeros_like(table, dtype=torch.float32) if wants_table else None
         levels = shape.shape[1]
         grad_points = (
@@ -91,6 +93,7 @@ def _launch(
 ) -> None:
     if len(points):
         levels = shape.shape[1]
+        # One program for each block of points and each level
         kernel[(triton.cdiv(len(points), POINTS), levels)](
             table,
             points,
@@ -113,10 +116,13 @@ def _launch(
 def _axis(points, at, inside, axis, cells):
     """Return a coordinate's cell, the place in it, its derivative, and NaN if it is NaN (else 0)."""
     place = tl.load(points + 3 * at + axis, mask=inside, other=0.0).to(tl.float32) * cells
+    # Positions outside of the cube are clamped and have no gradient
     slope = tl.where((place >= 0) & (place <= cells), cells, 0.0)
+    # NaN is carried to the result by adding it to the weight of the level
     wrong = tl.where(place == place, 0.0, float("nan"))
     place = tl.where(place > 0, place, 0.0)
     place = tl.where(place < cells, place, cells)
+    # The upper face belongs to the last cell, with position 1 in it
     low = tl.floor(place)
     low = tl.where(low < cells - 1, low, cells - 1)
     return low.to(tl.int64), place - low, slope, wrong
@@ -136,6 +142,7 @@ def _level_weight(footprint, at, inside, cells, FOOTPRINTS: tl.constexpr):
 @no_type_check
 def _row(x, y, z, owner, cells, rows, dense):
     side = cells + 1
+    # Both numbers are computed for all points; `dense` is the same for a whole program
     direct = x + side * (y + side * (z + side * owner))
     mixed = (x ^ (y * _PRIME_Y) ^ (z * _PRIME_Z) ^ (owner * _PRIME_ACTOR)) & (rows - 1)
     return tl.where(dense != 0, direct, mixed)
@@ -166,10 +173,12 @@ def _read_points(
     ACTORS: tl.constexpr,
     POINTS: tl.constexpr,
 ):
+    # 64-bit indices: the number of points times features may exceed 32 bits
     at = tl.program_id(0).to(tl.int64) * POINTS + tl.arange(0, POINTS)
     level, inside = tl.program_id(1), at < count
     cells, first = tl.load(shape + level), tl.load(shape + levels + level)
     rows, dense = tl.load(shape + 2 * levels + level), tl.load(shape + 3 * levels + level)
+    # Cell and position in the cell along each axis
     x, wx, _, bad_x = _axis(points, at, inside, 0, cells)
     y, wy, _, bad_y = _axis(points, at, inside, 1, cells)
     z, wz, _, bad_z = _axis(points, at, inside, 2, cells)
@@ -178,6 +187,7 @@ def _read_points(
     f = tl.arange(0, FEATURES)
     total = tl.zeros([POINTS, FEATURES], tl.float32)
     for corner in tl.static_range(8):
+        # Bits 0, 1 and 2 of the corner select the upper neighbour along x, y and z
         cx, px = (x + 1, wx) if corner % 2 else (x, 1 - wx)
         cy, py = (y + 1, wy) if corner // 2 % 2 else (y, 1 - wy)
         cz, pz = (z + 1, wz) if corner // 4 else (z, 1 - wz)
@@ -185,6 +195,7 @@ def _read_points(
         place = row[:, None] * FEATURES + f[None, :]
         value = tl.load(table + place, mask=inside[:, None], other=0.0).to(tl.float32)
         total += (scale * pz * py * px)[:, None] * value
+    # The result has the points last: row level · F + f, column `at`
     to = (level * FEATURES + f)[None, :].to(tl.int64) * count + at[:, None]
     tl.store(out + to, total, mask=inside[:, None])
 
@@ -209,6 +220,7 @@ def _read_points_back(
     TO_TABLE: tl.constexpr,
     TO_POINTS: tl.constexpr,
 ):
+    # The same cells, weights and rows as in the forward pass, computed again
     at = tl.program_id(0).to(tl.int64) * POINTS + tl.arange(0, POINTS)
     level, inside = tl.program_id(1), at < count
     cells, first = tl.load(shape + level), tl.load(shape + levels + level)
@@ -224,20 +236,24 @@ def _read_points_back(
     to_x, to_y = tl.zeros([POINTS], tl.float32), tl.zeros([POINTS], tl.float32)
     to_z = tl.zeros([POINTS], tl.float32)
     for corner in tl.static_range(8):
+        # s is the derivative of the interpolation weight along an axis
         cx, px, sx = (x + 1, wx, 1.0) if corner % 2 else (x, 1 - wx, -1.0)
         cy, py, sy = (y + 1, wy, 1.0) if corner // 2 % 2 else (y, 1 - wy, -1.0)
         cz, pz, sz = (z + 1, wz, 1.0) if corner // 4 else (z, 1 - wz, -1.0)
         row = first + _row(cx, cy, cz, owner, cells, rows, dense)
         place = row[:, None] * FEATURES + f[None, :]
         if TO_TABLE:
+            # Points of different programs share rows, so the additions must be atomic
             part = (scale * pz * py * px)[:, None] * grad
             tl.atomic_add(grad_table + place, part, mask=inside[:, None], sem="relaxed")
         if TO_POINTS:
             value = tl.load(table + place, mask=inside[:, None], other=0.0).to(tl.float32)
+            # Derivative of the trilinear weights times the dot product of row and gradient
             dot = scale * tl.sum(value * grad, axis=1)
             to_x += sx * py * pz * dot
             to_y += px * sy * pz * dot
             to_z += px * py * sz * dot
+    # Each level has its own part: the caller sums over the levels
     if TO_POINTS:
         row = grad_points + level.to(tl.int64) * 3 * count + at
         tl.store(row, to_x * slope_x, mask=inside)

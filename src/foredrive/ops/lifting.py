@@ -58,6 +58,7 @@ def lift(
 
         return lift_triton(values, uv, visible, offsets, weights)
     points = weights.shape[3] * weights.shape[4]
+    # More points than a block would not fit into the kernels' buffers
     if not (small and points <= BLOCK and numba_supports(*values, uv, offsets, weights)):
         return lift_reference(values, uv, visible, offsets, weights)
     with full_precision(*values, uv, offsets, weights) as (*values, uv, offsets, weights):
@@ -90,18 +91,24 @@ def lift_reference(
     with full_precision(*values, uv, offsets, weights) as (*values, uv, offsets, weights):
         b, cameras, _ = visible.shape
         heads = offsets.shape[2]
+        # Invisible queries read the image's middle and are masked at the end
         uv = uv.detach().masked_fill(~visible[..., None], 0.5)
         total = values[0].new_zeros(())
         for level, value in enumerate(values):
             height, width = value.shape[2:4]
             size_wh = uv.new_tensor([width, height])
+            # Place in pixels of this level: the query's position plus the offsets of its heads
             place = (uv * size_wh)[:, :, None, :, None] + offsets[:, None, :, :, level].transpose(2, 3)
+            # Pixels to grid_sample's range -1 … 1; the clamp keeps infinite coordinates finite
             grid = 2 * place.clamp(-uv.new_ones(2), size_wh + 1) / size_wh - 1  # [b C H Q P 2]
             maps = value.unflatten(-1, (heads, -1)).permute(0, 1, 4, 5, 2, 3)  # [b C H D/H h w]
             read = F.grid_sample(maps.flatten(0, 2), grid.flatten(0, 2), align_corners=False)
             read = read.unflatten(0, (b, cameras, heads))  # [b C H D/H Q P]
+            # grid_sample does not preserve NaN coordinates
             read = read.masked_fill(place.isnan().any(-1)[:, :, :, None], torch.nan)
+            # Attention-weighted sum over the points of all levels
             total = total + (read * weights[:, None, :, :, level].transpose(2, 3)[:, :, :, None]).sum(-1)
+        # Mean over the cameras that see the query; 0 if there is none
         seen = total.masked_fill(~visible[:, :, None, None], 0).sum(1)  # [b H D/H Q]
         mean = seen / visible.sum(1).clamp_min(1)[:, None, None]
         return mean.permute(0, 3, 1, 2).flatten(2)
@@ -121,6 +128,7 @@ class _Pairs(NamedTuple):
 def _visible_pairs(uv: Float[Tensor, "b C Q 2"], visible: Bool[Tensor, "b C Q"]) -> _Pairs:
     b, cameras, queries = visible.shape
     by_query = visible.transpose(1, 2)  # [b Q C]
+    # nonzero is sorted by item, query, camera: the pairs of a query are adjacent
     item, query, camera = by_query.nonzero(as_tuple=True)
     count = by_query.sum(-1).flatten()
     row = item * queries + query
@@ -155,6 +163,7 @@ class _LiftNumba(torch.autograd.Function):
         out = values.new_zeros(b * queries, values.shape[-1])
         rows = out.numpy()
 
+        # Queries own rows of the result, and pairs are sorted by query: ranges do not overlap
         def job(start: int, stop: int) -> None:
             lift_pairs(inputs, pairs.first[start], pairs.first[stop], rows)
 
@@ -168,6 +177,7 @@ class _LiftNumba(torch.autograd.Function):
         wants_values, wants_offsets, wants_weights = ctx.needs_input_grad[:3]
         wants_points = wants_offsets or wants_weights
         grad_values = torch.zeros_like(values) if wants_values else values[:0]
+        # Several cameras add to the same offsets and weights, so these begin at zero
         grad_offsets = torch.zeros_like(offsets) if wants_points else offsets[:0]
         grad_weights = torch.zeros_like(weights) if wants_points else weights[:0]
         inputs = _inputs(values, offsets, weights, ctx.sizes, ctx.pairs)
@@ -182,8 +192,10 @@ class _LiftNumba(torch.autograd.Function):
 
         def job(start: int, stop: int) -> None:
             for item, head in (divmod(i, heads) for i in range(start, stop)):
+                # A head has its own channels, offsets and weights, an item its own images: jobs do not clash
                 lift_pairs_backward(inputs, first[item * queries], first[(item + 1) * queries], head, grads)
 
+        # A job has enough heads that two threads do not write to one cache line of the values' gradient
         in_parallel(job, b * heads, grain=-(-CACHE_LINE // (values.shape[-1] // heads)))
         return (
             grad_values if wants_values else None,

@@ -56,15 +56,18 @@ def _fill_block(inputs, block, first, last, head):
     """Fill `block` with the points of pairs first … last - 1, sorted by level, then by pair."""
     levels, points = inputs.weights.shape[2:]
     count = (last - first) * points
+    # Points are sorted by level, then pair: so each level's corners are found in one loop
     for pair in range(first, last):
         q, share = inputs.query[pair], inputs.share[pair]
         for level in range(levels):
+            # Position of the query in pixels of the level; -½ makes integers the pixel centres
             u = inputs.uv[pair, 0] * np.float32(inputs.sizes[level, 1]) - HALF
             v = inputs.uv[pair, 1] * np.float32(inputs.sizes[level, 0]) - HALF
             i = level * count + (pair - first) * points
             for p in range(points):
                 block.place[i + p] = u + inputs.offsets[q, head, level, p, 0]
                 block.place[BLOCK + i + p] = v + inputs.offsets[q, head, level, p, 1]
+                # The weight includes the share of the camera in the mean
                 block.weight[i + p] = inputs.weights[q, head, level, p] * share
     for level in range(levels):
         _corners(_level(block, level * count), count, inputs.sizes[level], np.int32(inputs.values.shape[2]))
@@ -76,6 +79,7 @@ def _corners(block, count, size, channels):
     """Fill `corner` and `part` for one level."""
     height, width, start = size
     for i in range(count):
+        # Bilinear neighbours within the level; `start` is the level's first pixel
         x, y = block.place[i], block.place[BLOCK + i]
         x0, x1, wx0, wx1, _, _ = neighbours(x, width)
         y0, y1, wy0, wy1, _, _ = neighbours(y, height)
@@ -91,6 +95,7 @@ def _read(inputs, block, first, last, channel, zero, out):
     levels, points = inputs.weights.shape[2:]
     pixels, channels = inputs.values.shape[1:]
     for pair in range(first, last):
+        # Offset of the camera's image and of the query's result, in floats
         base = inputs.image[pair] * pixels * channels + channel
         at = inputs.query[pair] * channels + channel
         total = load(out, at, zero)
@@ -110,6 +115,7 @@ def lift_pairs(inputs, first_pair, last_pair, out):
     whole = width - width % WIDTH
     block, step = new_block(2), BLOCK // (inputs.weights.shape[2] * inputs.weights.shape[3])
     for first in range(first_pair, last_pair, step):
+        # Blocks have whole pairs, all levels and points of one head
         last = min(first + step, last_pair)
         for head in range(heads):
             _fill_block(inputs, block, first, last, head)
@@ -126,6 +132,7 @@ def _read_back(inputs, block, first, last, channel, zero, grads):
     """Add the gradient of the samples to the values and to `block.dots`."""
     levels, points = inputs.weights.shape[2:]
     pixels, channels = inputs.values.shape[1:]
+    # The gradient of a pair's result is that of its query; the camera's share is in the weights
     for pair in range(first, last):
         base = inputs.image[pair] * pixels * channels + channel
         grad = load(grads.out, inputs.query[pair] * channels + channel, zero)
@@ -146,8 +153,10 @@ def _slopes(block, count, size):
     for i in range(count):
         _, _, wx0, wx1, dx0, dx1 = neighbours(block.place[i], width)
         _, _, wy0, wy1, dy0, dy1 = neighbours(block.place[BLOCK + i], height)
+        # Dot products of the four corners, row by row of pixels: d00 d01 / d10 d11
         d00, d01, d10, d11 = dots[4 * i], dots[4 * i + 1], dots[4 * i + 2], dots[4 * i + 3]
         w = block.weight[i]
+        # Derivatives of the bilinear weights by x and y, and the sample itself for the weight
         slope[i] = w * (wy0 * (dx0 * d00 + dx1 * d01) + wy1 * (dx0 * d10 + dx1 * d11))
         slope[BLOCK + i] = w * (wx0 * (dy0 * d00 + dy1 * d10) + wx1 * (dy0 * d01 + dy1 * d11))
         slope[2 * BLOCK + i] = wy0 * (wx0 * d00 + wx1 * d01) + wy1 * (wx0 * d10 + wx1 * d11)
@@ -161,6 +170,7 @@ def _scatter_gradients(inputs, block, first, last, head, grads):
     count = (last - first) * points
     for level in range(levels):
         _slopes(_level(block, level * count), count, inputs.sizes[level])
+    # A query has one pair for each camera, so its gradients add up
     for pair in range(first, last):
         q, share = inputs.query[pair], inputs.share[pair]
         for level in range(levels):

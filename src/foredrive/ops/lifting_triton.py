@@ -31,6 +31,7 @@ def lift_triton(
     """
     joined, sizes = join_levels(values)
     places = uv.detach().float().contiguous()
+    # Visibility divided by the number of cameras that see the query: mean and mask in one factor
     share = visible / visible.sum(1, keepdim=True).clamp_min(1)
     out: Tensor = _LiftTriton.apply(
         joined, offsets, weights, places, share, torch.tensor(sizes, dtype=torch.int32, device=uv.device)
@@ -62,6 +63,7 @@ class _LiftTriton(torch.autograd.Function):
         values, offsets, weights = inputs[:3]
         wants_values, wants_offsets, wants_weights = ctx.needs_input_grad[:3]
         wants_points = wants_offsets or wants_weights
+        # Atomic additions need float32, also for values in half precision
         grad_values = torch.zeros_like(values, dtype=torch.float32) if wants_values else None
         grad_offsets = torch.zeros_like(offsets) if wants_points else None
         grad_weights = torch.zeros_like(weights) if wants_points else None
@@ -102,6 +104,7 @@ def _points(offsets, weights, at, inside):
 @no_type_check
 def _camera(share, query, queries, camera, cameras, exists):
     """Return the rows' images of a camera, their pairs of query and camera, and the shares of the pairs."""
+    # Image index of the batch item's camera, then the index of the pair into [b C Q]
     image = query // queries * cameras + camera
     pair = image * queries + query % queries
     return image, pair, tl.load(share + pair, mask=exists, other=0.0)
@@ -142,12 +145,14 @@ def _lift_rows(
     row, exists, query, head = rows_of_program(row_count, ROWS, HEADS)
     c = tl.arange(0, W)
     total = tl.zeros([ROWS, W], tl.float32)
+    # Loops over levels, tiles of points, and cameras; offsets and weights are loaded once for all cameras
     for level in range(0, levels):
         height, width = tl.load(sizes + 3 * level), tl.load(sizes + 3 * level + 1)
         start = tl.load(sizes + 3 * level + 2)
         for first in range(0, POINTS, P):
             p = first + tl.arange(0, P)
             inside = exists[:, None] & (p < POINTS)[None, :]
+            # Flat index into [b·Q H L P]
             at = ((row * levels + level) * POINTS)[:, None] + p[None, :]
             dx, dy, weight = _points(offsets, weights, at, inside)
             for camera in range(0, cameras):
@@ -161,7 +166,9 @@ def _lift_rows(
                     # NaN coordinates must give NaN.
                     w = tl.where((x == x) & (y == y), weight * part[:, None], float("nan"))
                     w = tl.where(seen, w, 0.0)
+                    # First channel of the head at the level's first pixel
                     base = ((image * pixels + start) * CHANNELS + head * WIDTH)[:, None]
+                    # Bits 0 and 1 of the corner select the right and the lower pixel
                     for corner in tl.static_range(4):
                         cx, wx = (x1, wx1) if corner % 2 else (x0, wx0)
                         cy, wy = (y1, wy1) if corner // 2 else (y0, wy0)
@@ -201,6 +208,7 @@ def _lift_rows_back(
     row, exists, query, head = rows_of_program(row_count, ROWS, HEADS)
     c = tl.arange(0, W)
     to = (query * CHANNELS + head * WIDTH)[:, None] + c[None, :]
+    # The gradient of a row, for all levels and cameras
     grad = tl.load(grad_out + to, mask=exists[:, None] & (c < WIDTH)[None, :], other=0.0)
     for level in range(0, levels):
         height, width = tl.load(sizes + 3 * level), tl.load(sizes + 3 * level + 1)
@@ -223,6 +231,7 @@ def _lift_rows_back(
                     w = tl.where((x == x) & (y == y), weight, float("nan"))
                     w = tl.where(seen, w, 0.0)
                     base = ((image * pixels + start) * CHANNELS + head * WIDTH)[:, None]
+                    # The camera's share is in the gradient here, and not in the weights
                     g = grad * part[:, None]
                     # `dot` is the dot product of the corner's value and the gradient.
                     for corner in tl.static_range(4):
@@ -232,9 +241,11 @@ def _lift_rows_back(
                         dot = read_back(
                             values, grad_values, cell, w * wy * wx, seen, g, c, WIDTH, TO_VALUES, TO_POINTS
                         )
+                        # Product rule: the derivative by x or y replaces that axis' interpolation weight
                         to_x += w * wy * sx * dot
                         to_y += w * sy * wx * dot
                         to_weight += wy * wx * dot
+            # A row owns its offsets and weights, so a plain store suffices
             if TO_POINTS:
                 tl.store(grad_offsets + 2 * at, to_x, mask=inside)
                 tl.store(grad_offsets + 2 * at + 1, to_y, mask=inside)

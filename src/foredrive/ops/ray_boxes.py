@@ -74,7 +74,9 @@ def cross_boxes(
         boxes = boxes._replace(
             T_scene_box=T, key_t_s=boxes.key_t_s.to(T), half_size_m=boxes.half_size_m.to(T)
         )
+        # Which pairs there are has no gradient. Distances are computed again for the pairs found
         segment, share = _segments(boxes.key_t_s, t_s.detach())
+        # A segment shows a box if both of its key times do
         shown = boxes.present[:, :1] if boxes.present.shape[1] == 1 else _both(boxes.present)
         plain = (origin.detach(), direction.detach(), segment, share, boxes)
         if len(T) == 0 or len(origin) == 0:
@@ -87,6 +89,7 @@ def cross_boxes(
             pair = _crossing_pairs(key_poses(*plain, shown))
         else:
             pair = crossing_pairs_reference(*plain, shown)
+        # Beyond the key times, motion continues for a limited time only
         pair = pair[_near(boxes, t_s.detach(), share)[pair[:, 0]]]
         return _crossings(pair, origin, direction, t_s, segment, boxes)
 
@@ -116,6 +119,7 @@ def key_poses(
     """Return the boxes' motion in the form that the kernels read."""
     T = boxes.T_scene_box.detach()
     rotation = T[..., :3, :3]
+    # Rotation vector in the box' axes between successive key times
     turn = torch.zeros_like(T[..., :3, 3])
     turn[:, :-1] = log_so3(rotation[:, :-1].transpose(-1, -2) @ rotation[:, 1:])
     given = (origin, direction, segment.to(torch.int32), share, T[..., :3, 3], rotation, turn)
@@ -128,6 +132,7 @@ def _segments(
     """Return the key time before each time, and the part of the way to the next one."""
     if len(key_t_s) == 1:
         return torch.zeros_like(t_s, dtype=torch.int64), torch.zeros_like(t_s)
+    # Times before the first and after the last key time use the outer segment: share < 0 or > 1
     after = torch.searchsorted(key_t_s.contiguous(), t_s.contiguous()).clamp(1, len(key_t_s) - 1)
     before_s = key_t_s[after - 1]
     return after - 1, (t_s - before_s) / (key_t_s[after] - before_s)
@@ -155,10 +160,12 @@ def crossing_pairs_reference(
     """Return the crossing pairs (ray, box) in plain PyTorch: every ray with every box."""
     T = boxes.T_scene_box.detach()
     poses = torch.stack([_pose(T, a, segment, share) for a in range(len(T))], dim=1)  # [R A 4 4]
+    # Rays in the frame of every box at the ray's time
     R_box_scene = poses[..., :3, :3].transpose(-1, -2)
     start = (R_box_scene @ (origin[:, None] - poses[..., :3, 3])[..., None])[..., 0]
     way = (R_box_scene @ direction[:, None, :, None])[..., 0]
     enter, leave = _span(start, way, boxes.half_size_m.detach())
+    # Sort by entry; rays that miss go to the end
     crossed = (enter < leave) & shown[:, segment].T
     enter = enter.masked_fill(~crossed, torch.inf)
     order = enter.argsort(dim=1, stable=True)
@@ -170,11 +177,13 @@ def _pose(
     T: Float[Tensor, "A K 4 4"], box: Int[Tensor, "P"] | int, segment: Int[Tensor, "P"], share: Tensor
 ) -> Float[Tensor, "P 4 4"]:
     """Return the poses of boxes in given segments of time."""
+    # A flat index, so that the gather below is an index_select (see the module's text)
     poses, first = T.flatten(0, 1).flatten(1), box * T.shape[1] + segment
     before = poses.index_select(0, first).unflatten(1, (4, 4))
     if T.shape[1] == 1:
         return before
     after = poses.index_select(0, first + 1).unflatten(1, (4, 4))
+    # Rotation turns about one fixed axis, position moves linearly
     turn = log_so3(before[:, :3, :3].transpose(-1, -2) @ after[:, :3, :3])
     turned = before @ exp_se3(torch.cat([torch.zeros_like(turn), share[:, None] * turn], dim=-1))
     moved = before[:, :, 3] + share[:, None] * (after - before)[:, :, 3]
@@ -185,12 +194,14 @@ def _span(
     start: Float[Tensor, "*p 3"], way: Float[Tensor, "*p 3"], half: Float[Tensor, "*#p 3"]
 ) -> tuple[Float[Tensor, "*p"], Float[Tensor, "*p"]]:
     """Return the distances at which rays enter and leave boxes about the origin (enter > leave: a miss)."""
+    # Parallel rays would divide by zero: their span is everything or nothing, set below
     parallel = way == 0
     way = torch.where(parallel, 1, way)
     low, high = (-half - start) / way, (half - start) / way
     outside = start.abs() > half
     near = torch.where(parallel, torch.where(outside, torch.inf, -torch.inf), torch.minimum(low, high))
     far = torch.where(parallel, torch.where(outside, -torch.inf, torch.inf), torch.maximum(low, high))
+    # Intersection of the spans of three axes; the ray starts at 0
     return near.amax(-1).clamp_min(0), far.amin(-1)
 
 
@@ -203,6 +214,7 @@ def _crossings(
     boxes: MovingBoxes,
 ) -> Crossings:
     """Compute the distances and the rays in the boxes' frames of given pairs, differentiably."""
+    # The pairs are fixed: all that follows is differentiable
     ray, box = pair.unbind(-1)
     keys, at = boxes.key_t_s, segment[ray]
     if len(keys) == 1:
@@ -229,6 +241,7 @@ def _crossing_pairs(keys: KeyPoses) -> Int[Tensor, "P 2"]:
         arrays = [tensor.numpy() for tensor in (counts, starts, ray, box, span)]
         in_parallel(lambda start, stop: cross_rays(inputs, start, stop, *arrays), rays, grain=MIN_RAYS)
 
+    # First pass: count the crossings of each ray, so that the second can write without gaps
     run(nothing, nothing, nothing, torch.empty(0, 2))
     starts = counts.cumsum(0) - counts
     ray, box = (torch.empty(int(counts.sum()), dtype=torch.int64) for _ in range(2))

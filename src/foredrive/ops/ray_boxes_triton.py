@@ -32,6 +32,7 @@ def crossing_pairs_triton(keys: "KeyPoses") -> Int[Tensor, "P 2"]:
         keys.shown.shape[1],
         RAYS=RAYS,
     )
+    # Sort each ray's boxes by distance of entry. Misses are infinite and go to the end
     order = enter.argsort(dim=1, stable=True)
     ray, place = enter.gather(1, order).isfinite().nonzero(as_tuple=True)
     return torch.stack([ray, order[ray, place]], dim=-1)
@@ -51,6 +52,7 @@ def _into(rotation, x, y, z):
 @triton.jit
 @no_type_check
 def _turned(x, y, z, ux, uy, uz, c, s):
+    # Rodrigues' rotation about the unit vector u; c and s are cosine and sine of the angle
     along = (ux * x + uy * y + uz * z) * (1 - c)
     return (
         c * x + s * (uy * z - uz * y) + along * ux,
@@ -62,6 +64,7 @@ def _turned(x, y, z, ux, uy, uz, c, s):
 @triton.jit
 @no_type_check
 def _slab(q, e, half, near, far):
+    # A parallel ray is between the planes everywhere or nowhere; `safe` avoids the division by zero
     parallel = e == 0
     safe = tl.where(parallel, 1.0, e)
     a, b = (-half - q) / safe, (half - q) / safe
@@ -104,20 +107,25 @@ def _enter_boxes(
     dx, dy, dz = _row_of(direction, r, inside)
     k = tl.load(segment + r, mask=inside, other=0)
     part = tl.load(share + r, mask=inside, other=0.0)
+    # With a single key time both poses are the same
     step = tl.where(times > 1, 1, 0)
     for a in range(boxes):
         key = a * times + k
         x0, y0, z0 = _row_of(position, key, inside)
         x1, y1, z1 = _row_of(position, key + step, inside)
+        # Origin of the ray relative to the box' centre, which moves linearly between key times
         px, py, pz = ox - x0 - part * (x1 - x0), oy - y0 - part * (y1 - y0), oz - z0 - part * (z1 - z0)
+        # Into the axes of the box at the key time before
         qx, qy, qz = _into(rotation + 9 * key, px, py, pz)
         ex, ey, ez = _into(rotation + 9 * key, dx, dy, dz)
         tx, ty, tz = _row_of(turn, key, inside)
+        # Then back by the rotation since: the sine is negative for the inverse
         angle = tl.sqrt(tx * tx + ty * ty + tz * tz)
         safe = tl.where(angle > 1e-12, angle, 1.0)
         c, s = tl.cos(part * angle), -tl.sin(part * angle)
         qx, qy, qz = _turned(qx, qy, qz, tx / safe, ty / safe, tz / safe, c, s)
         ex, ey, ez = _turned(ex, ey, ez, tx / safe, ty / safe, tz / safe, c, s)
+        # Intersect the spans between the three pairs of sides
         near, far = tl.zeros([RAYS], tl.float32), tl.full([RAYS], float("inf"), tl.float32)
         near, far = _slab(qx, ex, tl.load(half_size + 3 * a), near, far)
         near, far = _slab(qy, ey, tl.load(half_size + 3 * a + 1), near, far)

@@ -35,11 +35,13 @@ def attend_within(
         counts: number of tokens in each set, at least 1.
     """
     given = (query_key, value)
+    # The kernel has no backward pass, and reads exactly one row of 16 channels per head
     wanted = torch.is_grad_enabled() and any(t.requires_grad for t in given)
     single = all(t.dtype == torch.float32 for t in given)
     if wanted or not single or value.shape[1] != heads * ROW or not numba_supports(*given, order):
         return attend_within_reference(query_key, value, order, counts, heads)
     out = torch.empty_like(value, memory_format=torch.contiguous_format)
+    # Start of each set in `order`, and the end of the last one
     ends = torch.cat([counts.new_zeros(1), counts.cumsum(0)])
     arrays = [t.detach().contiguous().numpy() for t in (query_key, value, order, ends)]
 
@@ -59,8 +61,10 @@ def attend_within_reference(
 ) -> Float[Tensor, "K C"]:
     """Compute `attend_within` in plain PyTorch."""
     groups = _groups(order, counts)
+    # Queries, keys and values side by side, so that one gather fetches all three
     split = torch.cat([query_key, value], dim=-1)
     parts = [_attend(split[group.token], group.filled, heads) for group in groups]
+    # Back to the order of the tokens: each token is in exactly one set
     kept = torch.cat([group.token[group.filled] for group in groups])
     return torch.empty_like(value).index_copy_(0, kept, torch.cat(parts))
 
@@ -76,6 +80,7 @@ class _Group(NamedTuple):
 def _groups(order: Int[Tensor, "K"], counts: Int[Tensor, "S"]) -> list[_Group]:
     starts, groups, min_count = counts.cumsum(0) - counts, [], 0
     max_count = int(counts.max())
+    # One group for each size up to the largest, so that little is padded
     for length in (*(bucket for bucket in BUCKETS if bucket < max_count), max_count):
         chosen = (counts > min_count) & (counts <= length)
         min_count = length
@@ -88,6 +93,7 @@ def _groups(order: Int[Tensor, "K"], counts: Int[Tensor, "S"]) -> list[_Group]:
 
 
 def _attend(split: Float[Tensor, "s L C3"], filled: Bool[Tensor, "s L"], heads: int) -> Float[Tensor, "F C"]:
+    # The mask keeps padded keys out of the softmax; padded queries are dropped at the end
     query, key, value = (part.unflatten(-1, (heads, -1)).transpose(1, 2) for part in split.chunk(3, -1))
     out = F.scaled_dot_product_attention(query, key, value, attn_mask=filled[:, None, None])
     return out.transpose(1, 2).flatten(2)[filled]

@@ -26,6 +26,7 @@ MASKED = np.float32(-1e30)
 
 @kernel
 @no_type_check
+# query_key Float32[K 2C], value and out Float32[K C], order and ends Int64
 def attend_sets(first, last, query_key, value, order, ends, max_count, out):
     """Compute sets `first` to `last` - 1 of `attend_within` into out[K C].
 
@@ -41,10 +42,12 @@ def attend_sets(first, last, query_key, value, order, ends, max_count, out):
     for group in range(first, last):
         tokens = order[ends[group] : ends[group + 1]]
         blocks = (len(tokens) + ROW - 1) // ROW
+        # Padded keys begin at -1e30, so that their exponentials vanish; their values are 0
         start[: len(tokens)], start[len(tokens) :] = ZERO, MASKED
         for channel in range(0, width, ROW):
             _load_head(query_key, value, tokens, channel, padded, keys, values)
             for token in tokens:
+                # The scaled query: 16 channels of this head, at the token's row
                 store(query, 0, load_row(query_key, 2 * width * token + channel) * SCALE)
                 best = _scores(query, keys, start, padded, blocks, scores)
                 total = broadcast(ZERO)
@@ -68,6 +71,7 @@ def _load_head(query_key, value, tokens, channel, padded, keys, values):
         for k in range(ROW):
             keys[padded * k + place] = query_key[token, width + channel + k]
     for place in range(count, (count + ROW - 1) // ROW * ROW):
+        # Whole blocks of 16 keys are read, so the rest of the last one must be defined
         store(values, ROW * place, broadcast(ZERO))
         for k in range(ROW):
             keys[padded * k + place] = ZERO
@@ -80,6 +84,7 @@ def _scores(query, keys, start, padded, blocks, scores):
     best = broadcast(MASKED)
     for block in range(blocks):
         # Two accumulators shorten the chain of dependent additions.
+        # The score of 16 keys at a time: sum over the channels of key · query
         even, odd = load_row(start, ROW * block), broadcast(ZERO)
         for k in range(0, ROW, 2):
             even = even + load_row(keys, padded * k + ROW * block) * query[k]
@@ -94,6 +99,7 @@ def _scores(query, keys, start, padded, blocks, scores):
 @no_type_check
 def _weighted_sum(scores, values, blocks):
     """Return the sum of the values, each multiplied by its score."""
+    # Four accumulators for the same reason
     a, b, c, d = broadcast(ZERO), broadcast(ZERO), broadcast(ZERO), broadcast(ZERO)
     for place in range(0, ROW * blocks, 4):
         a = a + load_row(values, ROW * place) * scores[place]

@@ -45,6 +45,7 @@ def load_lanes(typing_context, array, index, stride, like):
     """Read a value of `like`'s type whose lanes lie `stride` numbers apart, without a bounds check."""
 
     def codegen(context: Any, builder: ir.IRBuilder, signature: Any, args: Any) -> ir.Value:
+        # One scalar load per lane, `stride` apart
         read = [builder.load(_place(context, builder, signature, args, k)) for k in range(_lanes(like))]
         if not isinstance(like, Vector):
             return read[0]

@@ -73,19 +73,23 @@ def pack_splats(start, stop, splats, period, packed):
     for i in range(start, stop):
         row = packed[i]
         x = splats.mean[i, 0]
+        # Wrap x to ±half a period
         row[MEAN_X] = x - period * np.floor(x / period + HALF) if period > 0 else x
         row[MEAN_Y] = splats.mean[i, 1]
         row[VELOCITY_X], row[VELOCITY_Y] = splats.velocity[i, 0], splats.velocity[i, 1]
         xx, xy = splats.inverse_covariance[i, 0], splats.inverse_covariance[i, 1]
         yy = splats.inverse_covariance[i, 2]
+        # Exponent of the Gaussian in base 2: the factors -½ and log2(e) are part of the coefficients
         row[XX], row[XY], row[YY] = -HALF * LOG2_E * xx, -LOG2_E * xy, -HALF * LOG2_E * yy
         opacity = splats.opacity[i]
         log_opacity = np.log2(opacity) if opacity > 0 else np.float32(-np.inf)
         row[LOG_OPACITY] = log_opacity
         row[RANGE], row[RATE] = splats.range_m[i], splats.range_rate_mps[i]
         row[SLOPE_X], row[SLOPE_Y] = splats.range_slope[i, 0], splats.range_slope[i, 1]
+        # Where the exponent's derivative along the other axis is zero
         row[TILT_Y], row[TILT_X] = -xy / yy, -xy / xx
         # The ellipse dᵀ A d ≤ c reaches √(c · yy / det A) along x and √(c · xx / det A) along y.
+        # Double precision: thin ellipses have a determinant near zero
         area = np.float64(xx) * np.float64(yy) - np.float64(xy) * np.float64(xy)
         square = max(2 * (log_opacity - MIN_LOG_OPACITY) / LOG2_E, 0) / max(area, 1e-30)
         row[EXTENT_X], row[EXTENT_Y] = np.sqrt(square * yy), np.sqrt(square * xx)
@@ -103,8 +107,11 @@ def touches(row, bounds, x):
     x0, x1 = bounds[0] - x - max(vx * t0, vx * t1), bounds[1] - x - min(vx * t0, vx * t1)
     y = row[MEAN_Y]
     y0, y1 = bounds[2] - y - max(vy * t0, vy * t1), bounds[3] - y - min(vy * t0, vy * t1)
+    # Point of the box nearest to the mean along each axis: 0 if the box contains the mean's coordinate
     near_x, near_y = min(max(x0, 0), x1), min(max(y0, 0), y1)
+    # The best place on the nearest vertical and on the nearest horizontal side, within the box
     along_y, along_x = min(max(row[TILT_Y] * near_x, y0), y1), min(max(row[TILT_X] * near_y, x0), x1)
+    # Exponents are negative or zero: the larger one is the largest in the box
     at_side = near_x * (row[XX] * near_x + row[XY] * along_y) + row[YY] * along_y * along_y
     at_edge = along_x * (row[XX] * along_x + row[XY] * near_y) + row[YY] * near_y * near_y
     return row[LOG_OPACITY] + max(at_side, at_edge) >= MIN_LOG_OPACITY
@@ -129,6 +136,7 @@ def _last_at_most(values, start, stop, x):
     """
     span = values[stop - 1] - values[start]
     guess = (x - values[start]) / span * np.float32(stop - 1 - start) if span > 0 else ZERO
+    # Correct the guess by steps
     k = start + int(min(max(guess, ZERO), np.float32(stop - 1 - start)))
     while k > start and values[k] > x:
         k -= 1
@@ -146,10 +154,12 @@ def _find_tiles_in_box(row, points, box, turn, found, count):
     """
     x0, x1, y0, y1 = box
     rows = points.lower_edge.size
+    # The last row that begins at or below the box is the first that may reach into it
     first_row = _last_at_most(points.lower_edge, 0, rows, y0)
     r = first_row
     while r < rows and points.lower_edge[r] <= y1:
         first, last = points.first_tile[r], points.first_tile[r + 1]
+        # Likewise within the row: tiles follow each other without gaps along x
         first_here = _last_at_most(points.left_edge, first, last, x0)
         t = first_here
         while t < last and points.left_edge[t] <= x1:
@@ -166,6 +176,7 @@ def _find_tiles_in_box(row, points, box, turn, found, count):
             else:
                 touched = touches(row, bounds, x)
             if touched:
+                # Beyond the end of the buffer only count: the caller comes again with a longer one
                 if count < found.size:
                     found[count] = t
                 count += 1
@@ -183,11 +194,13 @@ def find_tiles(start, stop, packed, points, per_splat, found):
     the function again with a longer array.
     """
     count = 0
+    # On a periodic plane, the copies one period to the left and right count too
     turns = 1 if points.period > 0 else 0
     half_turn = HALF * points.period
     for i in range(start, stop):
         row, before = packed[i], count
         if row[LOG_OPACITY] >= MIN_LOG_OPACITY and points.lower_edge.size > 0:
+            # Box of the ellipse, enlarged by the motion over all measurement times
             vx, vy, t0, t1 = row[VELOCITY_X], row[VELOCITY_Y], points.first_s, points.last_s
             x0 = row[MEAN_X] - row[EXTENT_X] + min(vx * t0, vx * t1)
             x1 = row[MEAN_X] + row[EXTENT_X] + max(vx * t0, vx * t1)
@@ -195,6 +208,7 @@ def find_tiles(start, stop, packed, points, per_splat, found):
             y1 = row[MEAN_Y] + row[EXTENT_Y] + max(vy * t0, vy * t1)
             for turn in range(-turns, turns + 1):
                 away = turn * points.period
+                # Only copies that reach into one period about 0 meet tiles
                 if turns == 0 or (x1 + away >= -half_turn and x0 + away <= half_turn):
                     count = _find_tiles_in_box(
                         row, points, (x0 + away, x1 + away, y0, y1), turn, found, count
@@ -220,12 +234,15 @@ def sort_by_range(packed, order):
         # Map the float's bits to an unsigned integer of the same order.
         key = ~key if key >> np.uint32(31) else key | np.uint32(1 << 31)
         keys[i], order[i] = key, i
+        # Histograms of all three digits in one pass over the keys
         for digit in range(3):
             starts[digit, (key >> np.uint32(11 * digit)) & np.uint32(2047)] += 1
     for digit in range(3):
+        # Exclusive prefix sum: counts become the first place of each value
         place, at = starts[digit], 0
         for value in range(2048):
             place[value], at = at, at + place[value]
+        # Stable distribution by the digit, least significant digit first
         for i in range(count):
             value = (keys[i] >> np.uint32(11 * digit)) & np.uint32(2047)
             other_keys[place[value]], other[place[value]] = keys[i], order[i]
@@ -248,10 +265,13 @@ def fill_tile_lists(order, first_slot, tile_of, first, splat, slot):
     # t.
     for tile in tile_of:
         first[tile + 2] += 1
+    # Prefix sum: first[t + 1] becomes the start of tile t
     for t in range(2, first.size):
         first[t] += first[t - 1]
+    # Splats come in order of range, so that each list is sorted front to back
     for i in order:
         for k in range(first_slot[i], first_slot[i + 1]):
             at = first[tile_of[k] + 1]
+            # `slot` leads back from a list entry to the pair's row, which is contiguous per splat
             splat[at], slot[at] = i, k
             first[tile_of[k] + 1] = at + 1

@@ -96,15 +96,18 @@ def pixel_points(size_hw: tuple[int, int], readout_s: float = 0.0) -> TiledPoint
     """
     height, width = size_hw
     rows, columns = -(-height // SIDE_PX), -(-width // SIDE_PX)
+    # Slot to pixel: 4×4 blocks in a tile, 4×4 pixels in a block
     slot = torch.arange(SLOTS)
     block, lane = slot // LANES, slot % LANES
     dv, du = 4 * (block // 4) + lane // 4, 4 * (block % 4) + lane % 4
     tile = torch.arange(rows * columns)[:, None]
     v, u = SIDE_PX * (tile // columns) + dv, SIDE_PX * (tile % columns) + du
+    # Slots beyond the image repeat the pixel at its border
     inside = (v < height) & (u < width)
     v, u = v.clamp(max=height - 1), u.clamp(max=width - 1)
     return TiledPoints(
         position=torch.stack([u + 0.5, v + 0.5], -1),
+        # Readout time of a pixel's row, relative to the middle of the image
         time_s=((v + 0.5) / height - 0.5) * readout_s,
         index=torch.where(inside, v * width + u, -1),
         count=height * width,
@@ -129,23 +132,29 @@ def beam_points(
         azimuth_rad, elevation_rad: beam directions in the sensor frame at the firing time.
         time_s: firing time relative to the time of the splats.
     """
+    # Azimuth to -π … π, so that quadrants and left edges are comparable
     azimuth_rad = torch.remainder(azimuth_rad + math.pi, 2 * math.pi) - math.pi
+    # Rows of tiles: cut the beams, sorted by elevation, at the chosen starts
     by_elevation = elevation_rad.argsort(stable=True)
     starts = _row_starts(elevation_rad[by_elevation])
     row = torch.repeat_interleave(torch.arange(len(starts) - 1), starts.diff())
+    # Within a row by azimuth, then cut at the quarters of a turn
     order = by_elevation[_sorted_within(row, azimuth_rad[by_elevation])]
     quadrant = ((azimuth_rad[order] + math.pi) * (QUADRANTS / (2 * math.pi))).long().clamp(0, QUADRANTS - 1)
     part = row * QUADRANTS + quadrant
+    # Each quarter of a row fills whole tiles; its last one may be partly empty
     lengths = part.bincount(minlength=QUADRANTS * (len(starts) - 1))
     zero = torch.zeros(1, dtype=torch.long)
     first_in_part = torch.cat([zero, (-(-lengths // SLOTS)).cumsum(0)])  # in tiles
     slot_in_part = torch.arange(len(order)) - torch.cat([zero, lengths.cumsum(0)])[part]
     tile = first_in_part[part] + slot_in_part // SLOTS
+    # Within a tile, sort each quarter by elevation: blocks of 16 become compact in both directions
     column = tile * 4 + slot_in_part % SLOTS // (SLOTS // 4)  # four columns of blocks, of four blocks each
     order = order[_sorted_within(column, elevation_rad[order])]
     index = torch.full((int(first_in_part[-1]) * SLOTS,), -1)
     index[tile * SLOTS + slot_in_part % SLOTS] = order
     index = index.view(-1, SLOTS)
+    # Empty slots repeat a beam of their own tile, so that bounds stay tight
     filled = torch.where(index >= 0, index, index.amax(1, keepdim=True))
     position = torch.stack([azimuth_rad, elevation_rad], -1)[filled]
     return TiledPoints(
@@ -168,9 +177,12 @@ def _row_starts(ascending: Float[Tensor, "P"]) -> Int[Tensor, "R1"]:
     count = len(ascending)
     if count == 0:
         return torch.tensor([0])
+    # Twice the range of the middle half stands for the height: outliers do not count
     height_rad = float(ascending[count * 3 // 4] - ascending[count // 4]) * 2
+    # Side by side, rows · columns ≈ count / 256 with columns / rows = 2π / height
     rows = max(1, round(math.sqrt(height_rad * count / (2 * math.pi * SLOTS))))
     gap = ascending.diff()
+    # Look for the widest gap within a third of a row around the even division
     reach = count // (3 * rows)
     starts = [0]
     for k in range(1, rows):
@@ -181,5 +193,6 @@ def _row_starts(ascending: Float[Tensor, "P"]) -> Int[Tensor, "R1"]:
 
 def _sorted_within(group: Int[Tensor, "P"], value: Float[Tensor, "P"]) -> Int[Tensor, "P"]:
     """Return the permutation that sorts by group, and by value within each group."""
+    # Stable sorts: first by the minor key, then by the major one
     by_value = value.argsort(stable=True)
     return by_value[group[by_value].argsort(stable=True)]

@@ -114,6 +114,7 @@ def _composite_image(splats: Splats, points: TiledPoints) -> Composited:
     from foredrive.ops.splatting_gsplat import composite_gsplat  # it is optional
 
     assert points.size_hw is not None
+    # gsplat composites any channels; the range is one more of them
     with full_precision(*splats) as fields:
         splats = Splats(*fields)
         feature, expected_m, alpha = composite_gsplat(
@@ -153,14 +154,17 @@ def composite_splats_reference(
     points = points.to(splats.mean.device, splats.mean.dtype)
     lengths = lists.first.diff()
     hits = splats.range_m.new_zeros(points.count) if hit_range_m is None else hit_range_m
+    # Features, then expected range, median range, alpha, alpha before the hit
     columns = splats.feature.shape[1] + 4
     out = splats.feature.new_zeros(points.count, columns)
     tiles = lengths.argsort(descending=True)  # lists of similar lengths together: little padding
     while len(tiles):
         max_length = int(lengths[tiles[0]])
+        # As many tiles at once as the memory limit allows for the longest list
         chunk, tiles = tiles.split([n := min(_chunk(points, max_length), len(tiles)), len(tiles) - n])
         index = points.index[chunk].flatten()
         values = _composite_tiles(splats, points, hits, lists, chunk, max_length, before_hit).flatten(0, 1)
+        # Empty slots have index -1 and are dropped
         out = out.index_copy(0, index[index >= 0], values[index >= 0])
     return _composited(out, hit_range_m is not None)
 
@@ -185,25 +189,33 @@ def _composite_tiles(
     before_hit: BeforeHit,
 ) -> Float[Tensor, "C S D4"]:
     """Return, per slot: feature, expected range, median range, alpha, alpha before the hit."""
+    # Entries of each tile's list, padded to the longest
     place = lists.first[tiles, None] + torch.arange(max_length, device=tiles.device)  # [C L]
     listed = (place < lists.first[tiles + 1, None])[:, None]
     chosen = lists.splat[place.clamp(max=len(lists.splat) - 1)]
     position, time_s = points.position[tiles], points.time_s[tiles, :, None]
+    # Offset d of each point from each splat at the point's time
     mean = _nearest_image(splats.mean[chosen], position, points.period)[:, None]
     offset = position[:, :, None] - mean - splats.velocity[chosen][:, None] * time_s[..., None]  # [C S L 2]
     dx, dy = offset.unbind(-1)
     xx, xy, yy = splats.inverse_covariance[chosen][:, None].unbind(-1)
+    # α = o exp(-dᵀ A d / 2), limited to 0.999 and dropped below 1/255
     exponent = -0.5 * (xx * dx * dx + yy * dy * dy) - xy * dx * dy
     alpha = (splats.opacity[chosen][:, None] * exponent.clamp(max=0).exp()).clamp(max=MAX_ALPHA)
     alpha = torch.where(listed & (alpha >= MIN_ALPHA), alpha, 0.0)
+    # Transmittance behind and in front of each splat
     passed = torch.cumprod(1 - alpha, -1)
     before = torch.cat([torch.ones_like(passed[..., :1]), passed[..., :-1]], -1)
+    # A ray ends before the splat that would take its transmittance to 1e-4
     weight = torch.where(passed > MIN_TRANSMITTANCE, alpha * before, 0.0)
+    # Range at the point: slope over the plane, and motion until the point's time
     range_m = splats.range_m[chosen][:, None] + (splats.range_slope[chosen][:, None] * offset).sum(-1)
     range_m = range_m + splats.range_rate_mps[chosen][:, None] * time_s
+    # The splat at which the transmittance falls through one half (infinite if none does)
     half = (weight > 0) & (before > 0.5) & (passed <= 0.5)
     median = F.pad(torch.where(half, range_m.detach(), math.inf), (0, 1), value=math.inf).amin(-1)
     hit = hit_range_m[points.index[tiles].clamp(min=0)][..., None]
+    # SplatAD compares centres and adds opacities; "weights" compares ranges at the point
     if before_hit == "opacities":
         alpha = torch.where(passed > MIN_TRANSMITTANCE, alpha, 0.0)
         nearer = (alpha * (splats.range_m[chosen][:, None] < hit)).sum(-1)
@@ -219,7 +231,9 @@ def list_splats(splats: Splats, points: TiledPoints) -> SplatLists:
     points = points.to(splats.mean.device, splats.mean.dtype)
     low, high = points.tile_bounds[:, 0::2], points.tile_bounds[:, 1::2]  # [T 3]: x y time
     tiles, count = len(low), len(splats.opacity)
+    # From o exp(-x / 2) = 1/255
     max_exponent = 2 * (splats.opacity / MIN_ALPHA).clamp(min=1e-30).log()  # largest dᵀ A d that counts
+    # Front to back, without splats that are too faint everywhere
     order = splats.range_m.argsort(stable=True)
     order = order[max_exponent[order] >= 0]
     found, tile_of = [], []
@@ -227,6 +241,7 @@ def list_splats(splats: Splats, points: TiledPoints) -> SplatLists:
         touched = _touches(
             splats, order, max_exponent, low[start : start + step], high[start : start + step], points
         )
+        # Row-major: tile by tile, and front to back within each tile
         tile, rank = touched.nonzero(as_tuple=True)
         found.append(order[rank])
         tile_of.append(tile + start)
@@ -244,19 +259,23 @@ def _touches(
     points: TiledPoints,
 ) -> Bool[Tensor, "C M"]:
     """Return whether the ellipses dᵀ A d ≤ max_exponent of splats reach boxes in x, y and time."""
+    # Offsets of the box from the mean, enlarged by the motion over the box' time interval
     mean = splats.mean[chosen].expand(len(low), -1, -1)
     mean = _nearest_image(mean, torch.stack([low[:, :2], high[:, :2]], 1), points.period)
     moved = splats.velocity[chosen] * torch.stack([low[:, 2:], high[:, 2:]])[..., None]  # [2 C M 2]
     x0, y0 = (low[:, None, :2] - mean - moved.amax(0)).unbind(-1)
     x1, y1 = (high[:, None, :2] - mean - moved.amin(0)).unbind(-1)
     xx, xy, yy = splats.inverse_covariance[chosen].unbind(-1)
+    # Offset of the box nearest to 0 along each axis
     near_x, near_y = x0.clamp(min=0) + x1.clamp(max=0), y0.clamp(min=0) + y1.clamp(max=0)
     along_y = torch.minimum(torch.maximum(-xy / yy * near_x, y0), y1)  # the minimum on the nearest side
     along_x = torch.minimum(torch.maximum(-xy / xx * near_y, x0), x1)
+    # A quadratic form has its minimum over a box on the nearest sides, or at 0 if the box contains it
     min_exponent = torch.minimum(
         xx * near_x * near_x + 2 * xy * near_x * along_y + yy * along_y * along_y,
         xx * along_x * along_x + 2 * xy * along_x * near_y + yy * near_y * near_y,
     )
+    # A small tolerance: the float32 bounds may be rounded to the wrong side
     return min_exponent <= max_exponent[chosen] * (1 + 1e-5) + 1e-5
 
 
@@ -268,11 +287,13 @@ def _nearest_image(
         return mean
     x = position[..., 0].detach()
     middle = 0.5 * (x.amin(1) + x.amax(1))[:, None]
+    # Whole turns carry no gradient
     turns = ((middle - mean[..., 0].detach()) / period).round()
     return torch.stack([mean[..., 0] + period * turns, mean[..., 1]], -1)
 
 
 def _check(splats: Splats, points: TiledPoints, hit_range_m: Tensor | None) -> None:
+    # A finite sum proves that all values are finite and is cheaper than the exact test
     for name, value in splats._asdict().items():
         if not value.detach().sum().isfinite() and not (finite := value.isfinite()).all():
             bad = int((~finite).flatten(1).any(1).sum() if value.dim() > 1 else (~finite).sum())

@@ -34,6 +34,7 @@ def composite_gsplat(
         ) from error
     height, width = size_hw
     rows, columns = -(-height // SIDE_PX), -(-width // SIDE_PX)
+    # Lists of splats per tile, sorted by tile and depth
     _, ids, splat = isect_tiles(
         mean[None],
         _extent_px(inverse_covariance, opacity)[None],
@@ -42,6 +43,7 @@ def composite_gsplat(
         columns,
         rows,
     )
+    # The range is composited as one more feature channel
     image, alpha = rasterize_to_pixels(
         mean[None],
         inverse_covariance[None].contiguous(),
@@ -61,5 +63,6 @@ def composite_gsplat(
 def _extent_px(inverse_covariance: Float[Tensor, "N 3"], opacity: Float[Tensor, "N"]) -> Tensor:
     """Return the distance along u and v at which the opacity falls to 1/255, whole px; 0 if it is lower."""
     xx, xy, yy = inverse_covariance.unbind(-1)
+    # o exp(-x / 2) = 1/255 gives x; the ellipse reaches √(x · yy / det A) along u
     square = 2 * (opacity.clamp(min=1e-30).log() + math.log(255)).clamp(min=0) / (xx * yy - xy * xy)
     return (square[:, None] * torch.stack([yy, xx], -1)).sqrt().ceil().int()

@@ -74,6 +74,7 @@ class TileLists(NamedTuple):
 @no_type_check
 def aligned_rows(rows):
     """Return memory for `rows` rows that starts at a cache line."""
+    # One row more than needed leaves room for the shift to the alignment
     buffer = np.empty((rows + 1) * ROW, np.float32)
     skip = (ROW - buffer.ctypes.data // 4 % ROW) % ROW
     return buffer[skip : skip + rows * ROW]
@@ -89,11 +90,13 @@ def blocks_touched(splat, bounds, x):
     y, vx, vy = splat[MEAN_Y], splat[VELOCITY_X], splat[VELOCITY_Y]
     t0, t1 = load_row(bounds, 4 * ROW), load_row(bounds, 5 * ROW)
     moved, moved_to = t0 * vx, t1 * vx
+    # Offsets of the 16 boxes from the mean, enlarged by the motion over their time intervals
     x0 = load_row(bounds, 0) - x - maximum(moved, moved_to)
     x1 = load_row(bounds, ROW) - x - minimum(moved, moved_to)
     moved, moved_to = t0 * vy, t1 * vy
     y0 = load_row(bounds, 2 * ROW) - y - maximum(moved, moved_to)
     y1 = load_row(bounds, 3 * ROW) - y - minimum(moved, moved_to)
+    # Nearest point of each box along each axis, and the best place on the nearest sides
     near_x, near_y = minimum(maximum(x0, ZERO), x1), minimum(maximum(y0, ZERO), y1)
     along_y = minimum(maximum(near_x * splat[TILT_Y], y0), y1)
     along_x = minimum(maximum(near_y * splat[TILT_X], x0), x1)
@@ -159,6 +162,7 @@ def _accumulate(splat, feature, base, state, dx, dy, t, hit, by_centre):
     alpha = minimum(opacity_at(splat, dx, dy), MAX_ALPHA)
     passed = transmittance - transmittance * alpha
     # A ray ends, without counting the splat, when its transmittance would fall to MIN_TRANSMITTANCE.
+    # Weight T α of the splat
     weight = select_greater(passed, MIN_TRANSMITTANCE, transmittance * alpha, ZERO)
     range_m = range_at(splat, dx, dy, t)
     store(state, base, select_greater(passed, MIN_TRANSMITTANCE, passed, ZERO))
@@ -171,11 +175,13 @@ def _accumulate(splat, feature, base, state, dx, dy, t, hit, by_centre):
     store(state, base + 2 * ROW, select_greater(crossed, ZERO, range_m, median))
     store(state, base + 3 * ROW, load_row(state, base + 3 * ROW) + weight)
     if by_centre is not None:
+        # The opacity itself, of rays that have not ended, compared by the range of the centre
         alpha = select_greater(passed, MIN_TRANSMITTANCE, alpha, ZERO)
         nearer = select_greater(hit, splat[RANGE], alpha, ZERO)
     else:
         nearer = select_greater(hit, range_m, weight, ZERO)
     store(state, base + 4 * ROW, load_row(state, base + 4 * ROW) + nearer)
+    # Features follow the transmittance and the four other sums
     at = base + (EXTRA_COLUMNS + 1) * ROW
     for d in range(feature.size):
         store(state, at, load_row(state, at) + weight * feature[d])
@@ -191,6 +197,7 @@ def find_touched_blocks(lists, points, tile, begin, end, touched):
     last = lists.splat.size - 1
     for at in range(begin, end):
         splat = lists.packed[lists.splat[at]]
+        # The splats of a list are scattered in memory: fetch those of the next steps ahead
         soon = lists.splat[min(at + PREFETCH_DISTANCE, last)]
         prefetch(lists.packed, soon * lists.packed.shape[1])
         prefetch(lists.feature, soon * lists.feature.shape[1])
@@ -213,6 +220,7 @@ def composite_tiles(start, stop, lists, points, out):
             end = min(begin + BATCH, lists.first[tile + 1])
             find_touched_blocks(lists, points, tile, begin, end, touched)
             for at in range(begin, end):
+                # Front to back: the order of the list
                 active = _composite_splat(lists, points, tile, at, touched[at - begin], active, hits, state)
             if active == 0:
                 break
@@ -230,9 +238,11 @@ def _composite_splat(lists, points, tile, at, touched, active, hits, state):
     # Loop over the set bits.
     while blocks != 0:
         block = lowest_set_bit(blocks)
+        # Clear the lowest set bit
         blocks &= blocks - np.uint32(1)
         dx, dy, t = offsets(splat, rows, block * ROW, x)
         hit, base = load_row(hits, block * ROW), block * columns * ROW
+        # No ray of the block continues: later splats skip it
         if not _accumulate(splat, feature, base, state, dx, dy, t, hit, points.by_centre):
             active &= ~(np.uint32(1) << np.uint32(block))
     return active
@@ -245,6 +255,7 @@ def _write(points, tile, state, columns, out):
     for s in range(POINTS):
         p = points.point[tile, s]
         if p >= 0:
+            # State is by block, then column, then lane
             base = s // ROW * columns * ROW + s % ROW
             for d in range(depth):
                 out[p, d] = state[base + (EXTRA_COLUMNS + 1 + d) * ROW]

@@ -46,6 +46,7 @@ class CompositeSplats(torch.autograd.Function):
         fields = tuple(tensor.detach().contiguous() for tensor in fields)
         splats = SplatArrays(*(tensor.numpy() for tensor in fields))
         points = _arrays(tiled, hit_range_m, by_centre)
+        # Forward: list the splats of each tile, then composite tile by tile
         lists, first_slot = _list(splats, points)
         # numpy requests huge pages
         composited = np.empty((tiled.count, splats.feature.shape[1] + EXTRA_COLUMNS), np.float32)
@@ -65,6 +66,7 @@ class CompositeSplats(torch.autograd.Function):
         """Return the gradients of the fields of `Splats`."""
         out, *fields = ctx.saved_tensors
         lists, points, first_slot = ctx.found
+        # Columns of a pair, padded to whole rows of 16
         columns = -(-(GEOMETRY_COLUMNS + lists.feature.shape[1]) // ROW) * ROW
         pairs = np.zeros((len(lists.splat), columns), np.float32)
         composited, upstream = out.numpy(), grad_out.contiguous().numpy()
@@ -73,6 +75,7 @@ class CompositeSplats(torch.autograd.Function):
             composite_tiles_backward(start, stop, lists, points, composited, upstream, pairs)
 
         in_parallel(backward_tiles, len(points.point), grain=MIN_TILES)
+        # Sum each splat's pairs and apply the chain rule
         grads = [torch.empty_like(tensor) for tensor in fields]
         splats, to_splats = (SplatArrays(*(tensor.numpy() for tensor in some)) for some in (fields, grads))
 
@@ -91,6 +94,7 @@ def _arrays(tiled: TiledPoints, hit_range_m: Float[Tensor, "P"], by_centre: bool
         tile_bounds=tiled.tile_bounds.numpy(),
         point=tiled.index.int().numpy(),
         hit=hit_range_m.numpy(),
+        # None instead of False: numba compiles a kernel for each type
         by_centre=by_centre or None,
         left_edge=tiled.left_edge.numpy(),
         lower_edge=tiled.lower_edge.numpy(),
@@ -110,6 +114,7 @@ def _list(splats: SplatArrays, points: PointArrays) -> tuple[TileLists, np.ndarr
 
     def job(start: int, stop: int) -> None:
         pack_splats(start, stop, splats, points.period, packed)
+        # A splat touches few tiles: guess 8, and repeat with the number found
         buffer = np.empty(8 * (stop - start), np.int32)
         needed = find_tiles(start, stop, packed, points, per_splat, buffer)
         if needed > len(buffer):
@@ -118,6 +123,7 @@ def _list(splats: SplatArrays, points: PointArrays) -> tuple[TileLists, np.ndarr
         found[start] = buffer[:needed]
 
     in_parallel(job, count, grain=MIN_SPLATS)
+    # By splat: each thread found a range of splats
     tile_of = np.concatenate([np.empty(0, np.int32), *(found[start] for start in sorted(found))])
     first_slot = np.concatenate([np.zeros(1, np.int64), per_splat.cumsum()])
     order = np.empty(count, np.int32)

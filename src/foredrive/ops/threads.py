@@ -24,12 +24,14 @@ def in_parallel(job: Callable[[int, int], None], count: int, grain: int = 1) -> 
     The last range may be shorter.
     """
     threads = torch.get_num_threads()
+    # Several ranges per thread, but none shorter than the grain
     step = max(grain, -(-count // (RANGES_PER_THREAD * threads)))
     starts = range(0, count, step)
     if threads == 1 or len(starts) <= 1:
         if count:
             job(0, count)
         return
+    # The result of each future raises what the job raised
     for done in [_pool(threads).submit(job, start, min(start + step, count)) for start in starts]:
         done.result()
 
@@ -41,6 +43,7 @@ def prefetched(items: Iterator[T]) -> Iterator[T]:
         return
     end = object()
     with ThreadPoolExecutor(1, thread_name_prefix="foredrive-ahead") as worker:
+        # One item ahead: it is requested before the current one is used
         coming = worker.submit(next, items, end)
         while (item := coming.result()) is not end:
             coming = worker.submit(next, items, end)

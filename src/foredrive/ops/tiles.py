@@ -28,6 +28,7 @@ class TileShape(NamedTuple):
 
 def tile_shape(points: int, channels: int) -> TileShape:
     """Return the tile for rows of given size: it has all channels, some points and some rows."""
+    # All channels in a tile; then as many points as fit; then as many rows
     wide = int(triton.next_power_of_2(channels))
     count = min(int(triton.next_power_of_2(points)), MAX_POINTS, max(TILE // wide, 1))
     return TileShape(rows=max(min(TILE // wide, MAX_PLACES) // count, 1), points=count, channels=wide)
@@ -53,6 +54,7 @@ def launch(
     rows, width = len(weights) * queries * heads, channels // heads
     tile = tile_shape(points, width)
     if rows:
+        # One program for each tile of rows
         kernel[(triton.cdiv(rows, tile.rows),)](
             *tensors,
             rows,
@@ -72,6 +74,7 @@ def launch(
 @no_type_check
 def rows_of_program(row_count, ROWS: tl.constexpr, HEADS: tl.constexpr):
     """Return the rows of a program, whether they exist, their queries and their heads."""
+    # 64-bit, because offsets are multiples of the row
     row = tl.program_id(0).to(tl.int64) * ROWS + tl.arange(0, ROWS)
     return row, row < row_count, row // HEADS, row % HEADS
 
@@ -88,6 +91,7 @@ def neighbours(x, size):
     high = low + 1
     has_low = (low >= 0) & (low < size)
     has_high = (high >= 0) & (high < size)
+    # Indices are clamped to stay in memory; the weights outside are zero
     return (
         tl.minimum(tl.maximum(low, 0), size - 1),
         tl.minimum(tl.maximum(high, 0), size - 1),
@@ -127,10 +131,12 @@ def read_back(
     """
     place = address[:, :, None] + c[None, None, :]
     dot = tl.zeros(address.shape, tl.float32)
+    # The dot product is needed also where the interpolation weight is 0: its slope may not be
     if TO_POINTS:
         value = tl.load(values + place, mask=inside[:, :, None] & (c < WIDTH)[None, None, :], other=0.0)
         dot = tl.sum(value.to(tl.float32) * grad[:, None, :], axis=2)
     if TO_VALUES:
+        # Cells are shared between points and programs: atomic additions
         needed = (part != 0)[:, :, None] & (c < WIDTH)[None, None, :]
         tl.atomic_add(grad_values + place, part[:, :, None] * grad[:, None, :], mask=needed, sem="relaxed")
     return dot

@@ -63,6 +63,7 @@ def _shuffle(builder: ir.IRBuilder, a: ir.Value, b: ir.Value, lanes: Iterable[in
 
 
 def _broadcast(builder: ir.IRBuilder, scalar: ir.Value, form: ir.VectorType = _ROW_TYPE) -> ir.Value:
+    # LLVM has no broadcast: put the number in lane 0, then shuffle lane 0 to all lanes
     undefined = ir.Constant(form, ir.Undefined)
     first = builder.insert_element(undefined, scalar, ir.Constant(cgutils.int32_t, 0))
     return _shuffle(builder, first, undefined, [0] * form.count)
@@ -77,6 +78,7 @@ def _address(context: Any, builder: ir.IRBuilder, signature: Any, args: Any, for
 def _add_adjacent(builder: ir.IRBuilder, a: ir.Value, b: ir.Value, run: int) -> ir.Value:
     """Add adjacent runs of lanes within a and within b. The sums of a and of b alternate in the result."""
     count = a.type.count
+    # Lanes of the even runs of a and b, alternately; the odd runs follow each by `run` lanes
     even = [lane for lane in range(count) if lane // run % 2 == 0]
     order = [
         lane + shift
@@ -145,10 +147,12 @@ def add_dots(typing_context, array, index, a, b, c, d, other):
 
     def codegen(context: Any, builder: ir.IRBuilder, signature: Any, args: Any) -> ir.Value:
         four = ir.VectorType(ir.FloatType(), 4)
+        # Products of all lanes first, then a tree of additions over adjacent lanes
         products = [builder.fmul(value, args[6], flags=_CONTRACT) for value in args[2:6]]
         if other is float32x8:
             ab, cd = (_add_adjacent(builder, *pair, 1) for pair in (products[:2], products[2:]))
             abcd = _add_adjacent(builder, ab, cd, 2)
+            # Lanes 0-3 and 4-7 hold partial sums of a, b, c, d in the same order
             halves = (_shuffle(builder, abcd, abcd, lanes) for lanes in (range(4), range(4, 8)))
             sums = builder.fadd(*halves)
         else:
@@ -170,6 +174,7 @@ def neighbours(x, size):
     Slopes are the derivatives of the weights. Weights and slopes are zero for cells outside 0 … size - 1. NaN
     counts as outside.
     """
+    # One cell outside all weights are zero: the clamp keeps the conversion to int32 defined, also for NaN
     x = x if x > -2 else np.float32(-2)
     x = x if x < size else np.float32(size)
     floor = np.floor(x)
@@ -178,6 +183,7 @@ def neighbours(x, size):
     high = low + np.int32(1)
     has_low = (low >= 0) & (low < size)
     has_high = (high >= 0) & (high < size)
+    # Clamped indices stay in memory; where they are clamped the weight is zero
     return (
         min(max(low, np.int32(0)), np.int32(size - 1)),
         min(max(high, np.int32(0)), np.int32(size - 1)),
@@ -285,6 +291,7 @@ def _reduction(combine: Emit) -> Any:
     """Return an intrinsic that reduces a row to one float32 by halving it repeatedly."""
 
     def emit(builder: ir.IRBuilder, value: ir.Value) -> ir.Value:
+        # Rotate by half, a quarter, …: after four steps every lane has the result
         for half in (8, 4, 2, 1):
             other = [(lane + half) % ROW for lane in range(ROW)]
             value = combine(builder, value, _shuffle(builder, value, value, other))
@@ -309,6 +316,7 @@ def row_sums(typing_context, array, index):
         places = [builder.gep(first, [ir.Constant(cgutils.int32_t, k)]) for k in range(ROW)]
         rows = [builder.load(place, align=4) for place in places]
         while len(rows) > 1:  # halve the rows, and the lanes of each row
+            # After k steps each of 16 / 2^k rows holds partial sums of 2^k original rows
             run = ROW // len(rows)
             rows = [_add_adjacent(builder, a, b, run) for a, b in zip(rows[::2], rows[1::2], strict=True)]
         return rows[0]
@@ -339,6 +347,7 @@ def _emit_floor(builder: ir.IRBuilder, row: ir.Value) -> ir.Value:
 
 def _emit_power_of_2(builder: ir.IRBuilder, row: ir.Value) -> ir.Value:
     """Return 2^n of integers n from -126 to 127, written directly into the exponent bits."""
+    # Biased exponent of a float32 in bits 23 to 30
     exponent = builder.add(builder.fptosi(row, _INT_ROW_TYPE), ir.Constant(_INT_ROW_TYPE, [127] * ROW))
     return builder.bitcast(builder.shl(exponent, ir.Constant(_INT_ROW_TYPE, [23] * ROW)), _ROW_TYPE)
 
@@ -357,6 +366,7 @@ _MIN_EXPONENT = np.float32(-126)
 def exp2_row(x):
     """Return 2^x for x ≤ 127, with relative error below 3e-7. For x < -126 return 2^-126."""
     x = maximum(x, _MIN_EXPONENT)
+    # 2^x = 2^⌊x⌋ · 2^f
     whole = _floor(x)
     f = x - whole
     polynomial = ((((f * _C5 + _C4) * f + _C3) * f + _C2) * f + _C1) * f + ONE

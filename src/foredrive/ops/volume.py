@@ -46,6 +46,7 @@ def sample_volume_reference(
     """Compute `sample_volume` in plain PyTorch."""
     with full_precision(volume, points) as (volume, points):
         size_xyz = points.new_tensor(volume.shape[1:4][::-1])
+        # Voxel units to grid_sample's range -1 … 1; beyond one voxel outside all is zero
         grid = 2 * points.clamp(-torch.ones_like(size_xyz), size_xyz + 1) / size_xyz - 1
         read = F.grid_sample(volume.permute(0, 4, 1, 2, 3), grid[:, None, None], align_corners=False)
         read = read[:, :, 0, 0].transpose(1, 2)
@@ -72,7 +73,9 @@ def warp_volume(
         lower_m, voxel_m: lower corner (x y z) and voxel size of the grid, equal in both frames.
     """
     with full_precision(volume, flow, T_src_dst) as (volume, flow, T_src_dst):
+        # y of every result voxel, in voxels of src
         points = source_points(T_src_dst, volume.shape[2:], lower_m, voxel_m)
+        # y + f(y): where the content at y came from
         points = points + read_grid(flow, points).permute(0, 2, 3, 4, 1) / voxel_m
         return read_grid(volume, points)
 
@@ -82,6 +85,7 @@ def compose_flows(
 ) -> Float[Tensor, "b 3 Z Y X"]:
     """Return the flow of two motions on one grid: y ↦ last(y) + before(y + last(y)), m."""
     with full_precision(last, before) as (last, before):
+        # First back along the last motion, then along the one before
         points = _centres(last) + last.permute(0, 2, 3, 4, 1) / voxel_m
         return last + read_grid(before, points)
 
@@ -101,6 +105,7 @@ def source_points(
     voxel_m: float,
 ) -> Float[Tensor, "b Z Y X 3"]:
     """Return the positions (voxel units of src) of the voxel centres of an equal grid in the frame dst."""
+    # Voxel centres of dst in metres, moved to src, back to voxel units of src
     centres = _centres(T_src_dst.new_empty(1, 1, *shape_zyx))
     lower = T_src_dst.new_tensor(lower_m)
     centres_m = (centres * voxel_m + lower).flatten(0, 2)

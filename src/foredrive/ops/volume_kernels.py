@@ -51,6 +51,7 @@ def _fill_block(inputs, block, item, first, last, head):
         i = (q - first) * points
         for p in range(points):
             for axis in range(3):
+                # -½ makes integers the voxel centres
                 block.place[axis * BLOCK + i + p] = inputs.points[item, q, head, p, axis] - HALF
             block.weight[i + p] = inputs.weights[item, q, head, p]
     _corners(block, (last - first) * points, inputs.values.shape)
@@ -70,6 +71,7 @@ def _corners(block, count, shape):
         z0, z1, wz0, wz1, _, _ = neighbours(z, depth)
         # NaN coordinates must give NaN, although `neighbours` treats them as outside.
         w = block.weight[i] if (x == x) & (y == y) & (z == z) else np.float32(np.nan)
+        # Lower plane of four corners, then the upper one; rows are starts along x
         row0, row1 = (z0 * height + y0) * width, (z0 * height + y1) * width
         set_corners(block, i, w * wz0, row0, row1, x0, x1, wy0, wy1, wx0, wx1, channels)
         row0, row1 = (z1 * height + y0) * width, (z1 * height + y1) * width
@@ -82,6 +84,7 @@ def _read(inputs, block, item, first, last, channel, zero, out):
     """Write the samples of each query of a block, in the channels from `channel` on."""
     points, channels = inputs.weights.shape[3], inputs.values.shape[4]
     queries = out.shape[1]
+    # Offset of the batch item's volume, in floats
     base = item * inputs.values[0].size + channel
     for q in range(first, last):
         total = zero
@@ -140,8 +143,10 @@ def _slopes(block, count, shape):
         _, _, wy0, wy1, dy0, dy1 = neighbours(place[BLOCK + i], height)
         _, _, wz0, wz1, dz0, dz1 = neighbours(place[2 * BLOCK + i], depth)
         j = 8 * i
+        # Dot products of the eight corners, numbered z y x
         d000, d001, d010, d011 = block.dots[j], block.dots[j + 1], block.dots[j + 2], block.dots[j + 3]
         d100, d101, d110, d111 = block.dots[j + 4], block.dots[j + 5], block.dots[j + 6], block.dots[j + 7]
+        # Interpolate along x, then y, as the forward pass does
         d00, d01, d10, d11 = (
             wx0 * d000 + wx1 * d001,
             wx0 * d010 + wx1 * d011,
@@ -149,9 +154,11 @@ def _slopes(block, count, shape):
             wx0 * d110 + wx1 * d111,
         )
         d0, d1 = wy0 * d00 + wy1 * d01, wy0 * d10 + wy1 * d11
+        # For x, the derivative replaces the first interpolation
         along_x0 = wy0 * (dx0 * d000 + dx1 * d001) + wy1 * (dx0 * d010 + dx1 * d011)
         along_x1 = wy0 * (dx0 * d100 + dx1 * d101) + wy1 * (dx0 * d110 + dx1 * d111)
         w = block.weight[i]
+        # Gradients by x, y, z, and the sample itself for the weight
         slope[i] = w * (wz0 * along_x0 + wz1 * along_x1)
         slope[BLOCK + i] = w * (wz0 * (dy0 * d00 + dy1 * d01) + wz1 * (dy0 * d10 + dy1 * d11))
         slope[2 * BLOCK + i] = w * (dz0 * d0 + dz1 * d1)
@@ -191,6 +198,7 @@ def read_back(inputs, item, part, grads):
         last = min(first + step, queries)
         _fill_block(inputs, block, item, first, last, part.head)
         block.dots[:] = 0
+        # Vectors of eight channels, then single channels; all add to the same dots
         for c in range(part.first_channel, whole, WIDTH):
             _read_back(inputs, block, item, first, last, c, zeros8(), grads)
         for c in range(whole, part.last_channel):

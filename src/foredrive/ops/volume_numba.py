@@ -53,6 +53,7 @@ class AttendVolume(torch.autograd.Function):
         rows = out.numpy()
 
         def job(start: int, stop: int) -> None:
+            # A range of the flat index (item, query) may cover parts of several items
             for item in range(start // queries, -(-stop // queries)):
                 before = item * queries
                 read_queries(inputs, item, max(start - before, 0), min(stop - before, queries), rows)
@@ -70,6 +71,7 @@ class AttendVolume(torch.autograd.Function):
         b, queries, heads, per_head = weights.shape
         grad_values = torch.zeros_like(values) if wants_values else values[:0]
         slots = len(slices)
+        # One slot per slice: slices of one head do not add to the same numbers
         grad_points = points.new_empty(b, queries, slots if wants_points else 0, per_head, 3)
         grad_weights = weights.new_empty(b, queries, slots if wants_weights else 0, per_head)
         inputs = VolumeInputs(*(tensor.numpy() for tensor in (values, points, weights)))
@@ -81,6 +83,7 @@ class AttendVolume(torch.autograd.Function):
                 read_back(inputs, item, slices[index], grads)
 
         in_parallel(job, b * len(slices))
+        # Sum the slots of each head in fixed order
         if slots > heads:
             grad_points, grad_weights = (
                 grad.unflatten(2, (heads, -1)).sum(3) if grad.numel() else grad

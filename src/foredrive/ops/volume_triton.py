@@ -39,6 +39,7 @@ class _AttendVolume(torch.autograd.Function):
     ) -> Float[Tensor, "b Q D"]:
         inputs = [x.contiguous() for x in (values, points, weights)]
         ctx.save_for_backward(*inputs)
+        # Float32 output for every input type
         out = torch.empty(*weights.shape[:2], values.shape[-1], device=values.device)
         _launch(_attend_rows, inputs, [out])
         return out
@@ -49,6 +50,7 @@ class _AttendVolume(torch.autograd.Function):
         values, points, weights = ctx.saved_tensors
         wants_values, wants_points, wants_weights = ctx.needs_input_grad
         to_points = wants_points or wants_weights
+        # Atomic additions need float32, also for values in half precision
         grad_values = torch.zeros_like(values, dtype=torch.float32) if wants_values else None
         grad_points = torch.empty_like(points) if to_points else None
         grad_weights = torch.empty_like(weights) if to_points else None
@@ -105,6 +107,7 @@ def _attend_rows(
 ):
     CHANNELS: tl.constexpr = HEADS * WIDTH
     row, exists, query, head = rows_of_program(row_count, ROWS, HEADS)
+    # First channel of the head in the batch item's volume
     base = (query // queries * depth * height * width * CHANNELS + head * WIDTH)[:, None]
     c = tl.arange(0, W)
     total = tl.zeros([ROWS, W], tl.float32)
@@ -115,6 +118,7 @@ def _attend_rows(
         x0, x1, wx0, wx1, _, _ = neighbours(x, width)
         y0, y1, wy0, wy1, _, _ = neighbours(y, height)
         z0, z1, wz0, wz1, _, _ = neighbours(z, depth)
+        # Bits 0, 1 and 2 of the corner select the upper voxel along x, y and z
         for corner in tl.static_range(8):
             cx, wx = (x1, wx1) if corner % 2 else (x0, wx0)
             cy, wy = (y1, wy1) if corner // 2 % 2 else (y0, wy0)
@@ -155,6 +159,7 @@ def _attend_rows_back(
     c = tl.arange(0, W)
     to = (query * CHANNELS + head * WIDTH)[:, None] + c[None, :]
     grad = tl.load(grad_out + to, mask=exists[:, None] & (c < WIDTH)[None, :], other=0.0)
+    # Tiles of points: a row may have more points than a tile
     for first in range(0, POINTS, P):
         p = first + tl.arange(0, P)
         inside = exists[:, None] & (p < POINTS)[None, :]
@@ -175,10 +180,12 @@ def _attend_rows_back(
             dot = read_back(
                 values, grad_values, at_corner, w * part, inside, grad, c, WIDTH, TO_VALUES, TO_POINTS
             )
+            # Product rule: the derivative replaces one axis' interpolation weight
             to_x += w * wz * wy * sx * dot
             to_y += w * wz * sy * wx * dot
             to_z += w * sz * wy * wx * dot
             to_weight += part * dot
+        # A row owns its points and weights, so a plain store suffices
         if TO_POINTS:
             tl.store(grad_points + 3 * at, to_x, mask=inside)
             tl.store(grad_points + 3 * at + 1, to_y, mask=inside)

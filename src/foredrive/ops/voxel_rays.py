@@ -56,23 +56,28 @@ def first_hits(
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
+# origin and direction Float64[N 3] in voxels, occupied_zyx Bool[Z Y X], voxel Int64[N], distance Float64[N]
 @no_type_check
 def _first_hits(origin, direction, occupied_zyx, start, stop, voxel, distance):
     nz, ny, nx = occupied_zyx.shape
     occupied = occupied_zyx.reshape(-1)
     for ray in range(start, stop):
+        # Per axis: cell, step, distance of the next border, distance between borders
         x, step_x, next_x, delta_x = _begin(origin[ray, 0], direction[ray, 0])
         y, step_y, next_y, delta_y = _begin(origin[ray, 1], direction[ray, 1])
         z, step_z, next_z, delta_z = _begin(origin[ray, 2], direction[ray, 2])
         end, end_distance = -1, -1.0
         while True:
             inside = 0 <= x < nx and 0 <= y < ny and 0 <= z < nz
+            # Outside: go on only while the ray may still enter the grid
             if not inside and (
                 end >= 0 or _leaves(x, step_x, nx) or _leaves(y, step_y, ny) or _leaves(z, step_z, nz)
             ):
                 break
+            # The last voxel inside is the end unless an occupied one comes first
             if inside:
                 end = (z * ny + y) * nx + x
+            # Cross the nearest border. The order of the tests decides ties as in the public renderer
             if next_x < next_y and next_x < next_z:
                 border = next_x
                 x += step_x
@@ -85,6 +90,7 @@ def _first_hits(origin, direction, occupied_zyx, start, stop, voxel, distance):
                 border = next_z
                 z += step_z
                 next_z += delta_z
+            # The distance at which the ray leaves the voxel that it was in
             if inside:
                 end_distance = border
                 if occupied[end]:
@@ -96,11 +102,13 @@ def _first_hits(origin, direction, occupied_zyx, start, stop, voxel, distance):
 @no_type_check
 def _begin(o, d):
     """Return, for one axis: cell of the origin, step, distance to the next border, distance of borders."""
+    # int rounds towards zero, as in the public renderer
     cell = int(o)
     if d > 0.0:
         return cell, 1, (cell + 1 - o) / d, 1.0 / d
     if d < 0.0:
         return cell, -1, (cell - o) / d, -1.0 / d
+    # A ray parallel to the axis never crosses its borders
     return cell, 1, np.inf, np.inf
 
 
@@ -119,6 +127,7 @@ def first_hits_reference(
     cell = np.trunc(origin).astype(np.int64)
     step = np.where(direction >= 0, 1, -1)
     with np.errstate(divide="ignore", invalid="ignore"):
+        # Distance of the next border: the upper one for positive steps, else the lower one
         following = np.where(direction != 0, (cell + (step > 0) - origin) / direction, np.inf)
         delta = np.where(direction != 0, step / direction, np.inf)
     voxel, distance = np.full(len(origin), -1), np.full(len(origin), -1.0)
@@ -126,22 +135,27 @@ def first_hits_reference(
     while len(active):
         inside = ((cell >= 0) & (cell < size)).all(axis=1)
         away = (((cell < 0) & (step < 0)) | ((cell >= size) & (step > 0))).any(axis=1)
+        # Drop the rays that have left the grid or can no longer enter it
         going = inside | ((voxel[active] < 0) & ~away)
         active, inside = active[going], inside[going]
         cell, step, following, delta = (part[going] for part in (cell, step, following, delta))
 
         x, y, z = following.T
+        # The nearest border, with the same order of tests as in the kernel
         axis = np.where((x < y) & (x < z), 0, np.where((y < z) & (y <= x), 1, 2))
         rows = np.arange(len(active))
         border = following[rows, axis]
+        # Record the voxel that each ray is in, and where it leaves it
         entered = cell[inside]
         voxel[active[inside]] = np.ravel_multi_index(tuple(entered.T[::-1]), occupied_zyx.shape)
         distance[active[inside]] = border[inside]
         stopped = np.zeros(len(active), np.bool_)
         stopped[inside] = occupied_zyx[entered[:, 2], entered[:, 1], entered[:, 0]]
+        # Step across the border
         cell[rows, axis] += step[rows, axis]
         following[rows, axis] += delta[rows, axis]
 
+        # Rays in an occupied voxel are done; their result is already written
         active = active[~stopped]
         cell, step, following, delta = (part[~stopped] for part in (cell, step, following, delta))
     return RayEnds(voxel, distance)

@@ -51,6 +51,7 @@ def in_box_range(actors: Sequence[ActorState], T_world_ego: Float64[np.ndarray, 
 
 def boxes_in_ego_frame(actors: Sequence[ActorState], T_world_ego: Float64[np.ndarray, "4 4"]) -> Boxes:
     """Return the boxes of road users in the ego frame, unbatched."""
+    # Centres and headings into the ego frame; velocities stay over ground, only their axes change
     T_ego_world = np.linalg.inv(T_world_ego)
     centre = (
         np.array([a.centre_m for a in actors]).reshape(-1, 3) @ T_ego_world[:3, :3].T + T_ego_world[:3, 3]

@@ -1,4 +1,4 @@
-"""Holds what a driver must see of its path: the next traffic light, and who is in the path, now and later."""
+"""What a driver must see of its path: the next traffic light, and the road users in the path over time."""
 
 from dataclasses import dataclass
 
@@ -50,13 +50,13 @@ class Affordances(Record):
     occupied: Bool[Tensor, "*b T G"]
     """Whether a road user is in each of `CELLS` of the path at each of `TIMES`, by the recorded futures."""
     occupied_known: Bool[Tensor, "*b T G"]
-    """False beyond the end of the route, where nobody annotated the time, and where only road users are that
-    cannot be seen now."""
+    """False beyond the end of the route, at times without annotation, and where all road users of the cell
+    are hidden now."""
 
 
 @dataclass(frozen=True)
 class PathEstimate(Record):
-    """The prediction of what is on the path: its next light, and who is in it over time."""
+    """The prediction for the path: its next light, and the road users in it over time."""
 
     light: Float[Tensor, "*b 4"]
     """Probability of each `LightState`."""

@@ -41,7 +41,7 @@ VEHICLES = frozenset(
 """The seven vehicle classes of nuScenes' detection task, on which UniAD judges motion and occupancy."""
 
 UNKNOWN = -1
-"""Value of `num_points`, `attribute` and `visibility` where a log does not tell."""
+"""Value of `num_points`, `attribute` and `visibility` where a log has none."""
 
 
 class Attribute(enum.IntEnum):

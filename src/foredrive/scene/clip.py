@@ -82,6 +82,7 @@ class Clip(Record):
         Raises:
             InputError: no single frame is at t = 0, or its index differs within the batch.
         """
+        # Every row of the batch must have exactly one frame at t = 0, at the same index
         at_now = self.t_s.reshape(-1, self.t_s.shape[-1]).abs() <= NOW_TOLERANCE_S
         if not bool((at_now == at_now[:1]).all()) or int(at_now[0].sum()) != 1:
             raise InputError(f"a clip needs one frame at t = 0, the same for the batch, got t_s = {self.t_s}")

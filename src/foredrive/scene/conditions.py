@@ -66,11 +66,11 @@ CONDITIONS = {
 }
 """Conditions by their names on the command line."""
 ANY_CONDITIONS = "any"
+"""Name for all conditions, distributed evenly."""
 COSTLY = "night_fog"
 """A frame of these conditions costs five times as much as by night: every lamp lights the fog."""
 DRAWN = tuple(name for name in CONDITIONS if name != COSTLY) * 4 + (COSTLY,)
 """Conditions among which a drive in `ANY_CONDITIONS` draws one: the costly ones are a quarter as frequent."""
-"""Name for all conditions, distributed evenly."""
 
 
 def find_conditions(name: str) -> Conditions:

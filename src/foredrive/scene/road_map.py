@@ -1,4 +1,4 @@
-"""The roads around a drive as areas: what judges need of a map."""
+"""The roads around a drive as areas: the parts of a map that judges need."""
 
 from dataclasses import dataclass
 

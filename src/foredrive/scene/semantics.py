@@ -77,7 +77,7 @@ class SemanticVoxels(Record):
 
 @dataclass(frozen=True)
 class RayTruth(Record):
-    """What metrics of rays judge by beside the semantic voxels."""
+    """Truth that metrics of rays need beside the semantic voxels."""
 
     origin_m: Float[Tensor, "*b O 3"]
     """Places of the drive's lidar from which this frame is looked at, in the ego frame at now."""

@@ -22,11 +22,13 @@ def camera_rays(rig: CameraRig, samples_per_pixel: int = 1) -> TimedRays:
         relative to the exposure of the middle image row. The ego frame is the destination frame of
         `T_ego_cam`.
     """
+    # Sub-positions in each pixel, and viewing directions rotated to the ego frame
     offsets = _subpixel_offsets(samples_per_pixel).to(rig.K)
     uv = (pixel_centres(rig.size_hw).to(rig.K)[:, :, None] + offsets).reshape(-1, 2)  # [H·W·samples, 2]
     batch = rig.K.shape[:-2]
     direction = rotate_vectors(rig.T_ego_cam, pixels_to_rays(uv.expand(*batch, -1, 2), rig.K, rig.dist))
     return TimedRays(
+        # All rays of a camera start at its optical centre
         origin_ego=rig.T_ego_cam[..., None, :3, 3].expand_as(direction),
         dir_ego=direction,
         dt_s=readout_time_s(uv[:, 1], rig),

@@ -59,6 +59,7 @@ class SpinningLidar:
         for table in (self.firing_s, self.azimuth_offset_rad):
             if table is not None and len(table) != len(self.elevation_rad):
                 raise ValueError(f"{len(self.elevation_rad)} channels, but a table of {len(table)}")
+        # All lasers must have fired before the next column begins
         column_s = 1.0 / (self.rate_hz * self.azimuth_steps)
         if self.firing_s is not None and max(self.firing_s) - min(self.firing_s) > column_s:
             raise ValueError(f"the lasers of a column fire longer than the {column_s * 1e6:.1f} µs it takes")
@@ -81,8 +82,10 @@ class SpinningLidar:
             Rays [N] in the ego frame at the end of the revolution. dt_s runs from -1/rate to 0.
         """
         dt_s, direction = self._firing
+        # The ego frame moves while the head turns: pose at firing in the frame at the end
         T_end_then = exp_se3(dt_s[..., None] * twist_ego)  # ego frame at firing -> at the end
         T = T_end_then @ self.T_ego_lidar
+        # Beams start at the lidar's centre at their own time
         origin = transform_points(T, torch.zeros_like(direction))
         return TimedRays(
             origin_ego=origin.reshape(-1, 3),
@@ -94,9 +97,12 @@ class SpinningLidar:
     def _firing(self) -> tuple[Float[Tensor, "columns moments"], Float[Tensor, "columns moments _ 3"]]:
         """Return firing times relative to the end of the revolution, s, and directions in the lidar frame."""
         steps = torch.arange(self.azimuth_steps)
+        # Columns end at equal steps of time, the last one at 0
         dt_s = (((steps + 1) / self.azimuth_steps - 1) / self.rate_hz)[:, None]
+        # Clockwise from backwards: the azimuth falls from π
         azimuth = (math.pi - (steps + 0.5) * (2 * math.pi / self.azimuth_steps))[:, None]
         if self.firing_s is not None:
+            # Channels that fire earlier point further back in the turn, that is at a larger azimuth
             early_s = max(self.firing_s) - torch.tensor(self.firing_s)
             dt_s = dt_s - early_s
             azimuth = azimuth + 2 * math.pi * self.rate_hz * early_s
@@ -124,11 +130,14 @@ class SpinningLidar:
         if self.rays_per_beam == 1:
             return beams
         k = torch.arange(self.rays_per_beam)
+        # Equal shares of the disc's area: the radius grows with the square root
         radius = 0.5 * self.divergence_rad * ((k + 0.5) / self.rays_per_beam).sqrt()
         ahead = beams.dir_ego[..., None, :]
+        # Two unit vectors across the beam: level and upright
         up = torch.tensor([0.0, 0.0, 1.0]).expand_as(ahead)
         level = torch.nn.functional.normalize(ahead.cross(up, dim=-1), dim=-1)
         upright = level.cross(ahead, dim=-1)
+        # Successive rays turn by the golden angle
         aside = (k * GOLDEN_ANGLE_RAD).cos()[:, None] * level + (k * GOLDEN_ANGLE_RAD).sin()[
             :, None
         ] * upright

@@ -32,13 +32,16 @@ def estimate_lidar(
     """
     if not len(sweep.beam) or bool((sweep.beam < 0).any()):
         return None
+    # Directions in the ego frame at the time of firing
     T_then_ego = exp_se3(-sweep.dt_s[:, None] * twist_ego)
     upwards = rotate_vectors(T_then_ego, sweep.dir_ego[:, None])[:, 0, 2]
     elevation = torch.asin(upwards.clamp(-1, 1))
+    # Mean elevation of each channel; a large spread means that the assumption does not hold
     channels = [elevation[sweep.beam == channel] for channel in sweep.beam.unique()]
     if max(float(channel.std(correction=0)) for channel in channels) > _MAX_SPREAD_RAD:
         return None
     steps = max(len(channel) for channel in channels)
+    # Time from the first to the last column: one step less than a revolution
     span_s = float(sweep.dt_s.max() - sweep.dt_s.min())
     T_ego_lidar = torch.eye(4)
     T_ego_lidar[:3, 3] = sweep.origin_ego[sweep.dt_s.abs().argmin()]

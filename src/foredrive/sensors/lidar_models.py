@@ -44,6 +44,7 @@ def pandar64(T_ego_lidar: Float[Tensor, "4 4"], rate_hz: float = 10.0) -> Spinni
     """
     before_end_us = [0.0] * 64
     for k, pair in enumerate(_PANDAR64_PAIRS):
+        # Firing sequence of the manual, counted backwards from the last pair
         for laser in pair:
             before_end_us[laser - 1] = 1.304 * min(k, 15) + 1.968 * max(k - 15, 0)
     first_us = max(before_end_us)
@@ -110,5 +111,6 @@ def _radians(angles_deg: tuple[float, ...]) -> tuple[float, ...]:
 def _in_turn(channels: int, step_s: float) -> tuple[float, ...]:
     """Return firing times, s: lower and upper half of the channels alternate, each from the bottom up."""
     half = channels // 2
+    # Laser number by channel: even shots for the lower half, odd ones for the upper half
     order = [2 * ring if ring < half else 2 * (ring - half) + 1 for ring in range(channels)]
     return tuple(step_s * k for k in order)

@@ -30,6 +30,7 @@ def with_missed_beams(sweep: LidarSweep, lidar: SpinningLidar, twist_ego: Float[
         lidar: firing pattern. Of `T_ego_lidar` the rotation is used, and for misses also the position.
         twist_ego: velocity (m/s) and turn rate (rad/s) of the ego frame in its own axes.
     """
+    # Directions in the lidar frame at the time of firing, and the channel by elevation
     T_then_ego = exp_se3(-sweep.dt_s[:, None] * twist_ego)
     fired = rotate_vectors(T_then_ego, sweep.dir_ego[:, None])[:, 0] @ lidar.T_ego_lidar[:3, :3]
     elevation = torch.asin(fired[:, 2].clamp(-1, 1))
@@ -45,10 +46,15 @@ def with_missed_beams(sweep: LidarSweep, lidar: SpinningLidar, twist_ego: Float[
     for number, (table_rad, offset_rad) in enumerate(zip(lidar.elevation_rad, offsets, strict=True)):
         mine = (channel == number).nonzero()[:, 0]
         enough = len(mine) >= _FEWEST
+        # Lag and phase of this channel from its own returns, or the table if there are too few
         channel_lag = _mean_angle(lag[mine]) if enough else all_of_it - offset_rad
+        # Angle of the head since the sweep began, for each return
         since = turn_radps * (sweep.dt_s[mine] - begin_s) + _wrapped(lag[mine] - channel_lag)
+        # Circular mean of the position within a column step
         phase = _mean_angle(since / step * 2 * math.pi) / (2 * math.pi) * step if enough else 0.0
+        # Columns without a return nearby
         since_missed = _alone(torch.arange(lidar.azimuth_steps) * step + phase, since, _NEAR_STEPS * step)
+        # Time and azimuth of the missed beams, from the head's angle
         dt_s = begin_s + since_missed / turn_radps
         azimuth = -(since_missed + turn_radps * begin_s + channel_lag)
         upward = elevation[mine].mean() if enough else torch.tensor(table_rad)
@@ -61,6 +67,7 @@ def with_missed_beams(sweep: LidarSweep, lidar: SpinningLidar, twist_ego: Float[
 def _alone(place: Float[Tensor, "S"], taken: Float[Tensor, "N"], reach: float) -> Float[Tensor, "M"]:
     """Return the places on a circle (rad) that have no element of `taken` within `reach`."""
     place, taken = place % (2 * math.pi), (taken % (2 * math.pi)).sort().values
+    # The circle is repeated to both sides, so that neighbours across 0 are found
     taken = torch.cat([taken - 2 * math.pi, taken, taken + 2 * math.pi])
     if not len(taken):
         return place
@@ -78,6 +85,7 @@ def _misses(
 ) -> LidarSweep:
     level = elevation_rad.cos()
     fired = torch.stack([azimuth_rad.cos() * level, azimuth_rad.sin() * level, elevation_rad.sin()], dim=-1)
+    # Pose of the lidar when the beam was fired
     T = exp_se3(dt_s[:, None] * twist_ego) @ lidar.T_ego_lidar
     zero, no = torch.zeros_like(dt_s), torch.zeros_like(dt_s, dtype=torch.bool)
     return LidarSweep(

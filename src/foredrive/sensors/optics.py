@@ -56,6 +56,7 @@ class CameraOptics:
         """
         if math.isinf(self.white_electrons):
             return linear
+        # Shot noise grows with the square root of the light; both noises add as variances
         per_electron = np.float32(self.gain / self.white_electrons)
         read = np.float32(self.read_noise_electrons) * per_electron
         noise = rng.standard_normal(linear.shape, dtype=np.float32)

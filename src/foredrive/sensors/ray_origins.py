@@ -21,9 +21,11 @@ def ray_origins(
     They are the positions of the lidar in all key frames of the drive less than 39 m away, forward and
     sideways. Of more than 8, 8 evenly spaced ones are taken.
     """
+    # Positions of the lidar at all key frames, in the lidar frame of this one
     T_world_lidar = T_world_ego @ T_ego_lidar
     position = (np.linalg.inv(T_world_lidar[frame]) @ T_world_lidar)[:, :3, 3].astype(np.float32)
     position[frame] = 0.0
+    # Into the ego frame of this frame
     in_ego = position.astype(np.float64) @ T_ego_lidar[frame, :3, :3].T + T_ego_lidar[frame, :3, 3]
     near = in_ego[(np.abs(in_ego[:, :2]) < ORIGIN_REACH_M).all(axis=1)]
     if len(near) > MAX_ORIGINS:

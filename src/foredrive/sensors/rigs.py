@@ -159,8 +159,10 @@ def rig_of_cameras(rig: CameraRig) -> RigPlan:
     for i, name in enumerate(rig.names):
         T = rig.T_ego_cam[i].double()
         x, y, z = T[:3, 3].tolist()
+        # Columns of the rotation: image right, down, and the optical axis
         right, _, ahead = T[:3, :3].unbind(dim=1)
         yaw = math.atan2(ahead[1], ahead[0])
+        # Roll: angle of the image's right from the level direction to the right of the axis
         level = torch.tensor([math.sin(yaw), -math.cos(yaw), 0.0], dtype=T.dtype)
         roll = math.atan2(-right[2], math.hypot(ahead[0], ahead[1]) * (right @ level))
         mounts[name] = Mount(
@@ -186,6 +188,7 @@ def camera_rig(
     height, width = size_hw or plan.image_hw
     K, T_ego_cam = [], []
     for mount in plan.cameras.values():
+        # Focal length from the horizontal field of view
         focal_px = 0.5 * width / math.tan(math.radians(0.5 * mount.fov_deg))
         K.append(torch.tensor([[focal_px, 0.0, 0.5 * width], [0.0, focal_px, 0.5 * height], [0.0, 0.0, 1.0]]))
         T_ego_cam.append(_pose(mount))
@@ -210,6 +213,7 @@ def _pose(mount: Mount) -> Float[Tensor, "4 4"]:
     cos, sin = math.cos(roll), math.sin(roll)
     rolled = torch.tensor([[1.0, 0.0, 0.0], [0.0, cos, -sin], [0.0, sin, cos]])
     T = torch.eye(4)
+    # Camera axes into ego axes first, then roll, pitch and yaw
     T[:3, :3] = yawed @ pitched @ rolled @ _EGO_FROM_CAM_AXES
     T[:3, 3] = torch.tensor(mount.xyz_m)
     return T

@@ -78,6 +78,7 @@ def solve(cost, free):
     Return the column of each row, the row prices and the column prices. Column C means "no column". Every row
     has its own such column, so these never conflict.
     """
+    # cost Float64[R C], free Float64[R]
     rows, columns = cost.shape
     column_of, row_of = np.full(rows, -1), np.full(columns, -1)
     u, v = np.zeros(rows), np.zeros(columns)
@@ -122,6 +123,7 @@ def _shortest_path(cost, free, u, v, row_of, start, distance, before, done):
     done[:] = False
     row, reached = start, 0.0
     none_distance, none_row = np.inf, start
+    # Path to the "no column" of the present row
     while True:
         to_none = reached + free[row] - u[row]
         if to_none < none_distance:
@@ -155,6 +157,7 @@ def _rank(cost, free, k):
     and r must not take its own. Only the cost of a subproblem is computed at first. Its assignment is
     computed when it is the cheapest one left.
     """
+    # cost Float64[R C], free Float64[R]. Prices of "no column" nodes follow those of the columns
     rows, columns = cost.shape
     column_of, total = np.empty((k, rows), np.int64), np.empty(k)
     u, v = np.empty((k, rows)), np.zeros((k, columns + rows))

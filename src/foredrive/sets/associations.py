@@ -42,17 +42,21 @@ def bound_component(scaled: Scaled, k: int) -> Interval:
     At least one association must be possible.
     """
     rows, columns = scaled.log_pair.shape
+    # Weights relative to the best association, so that they do not underflow
     column, cost = _k_best(scaled, k)
     weight = np.exp(cost[0] - cost)
+    # Associations with an impossible member weigh nothing
     weight *= ~((column < 0) & (scaled.row_alone == 0)).any(1)
     for c in np.flatnonzero(scaled.column_alone == 0):
         weight *= (column == c).any(1)
+    # Share of each pair: the weights of the associations that contain it
     share = np.zeros((rows, columns))
     which, row = np.nonzero(column >= 0)
     np.add.at(share, (row, column[which, row]), weight[which] / weight.sum())
     best = np.full(columns + 1, -1)
     best[scaled.column] = np.arange(rows)
     log_lower = scaled.log_best + float(np.log(weight.sum()))
+    # All associations have been listed: the sum is exact
     if len(weight) < k:
         return Interval(log_lower, log_lower, share, best[:columns])
     return Interval(log_lower, max(log_lower, bound_choices(scaled)), share, best[:columns])
@@ -72,6 +76,7 @@ def _k_best(scaled: Scaled, k: int) -> RankedAssignments:
     The costs are those of the untransposed problem, up to a constant.
     """
     rows, columns = scaled.log_pair.shape
+    # More rows than columns: solve the transposed problem and turn the result back
     if rows <= columns:
         return k_best_assignments(scaled.cost, scaled.free, k)
     turned_cost, turned_free = turn_costs(scaled.cost, scaled.free, scaled.column_free)
@@ -94,9 +99,11 @@ def choice_bound(
     (alone_i + Σ_j pair_ij / c_j). The bound is smallest when each column is chosen once on average.
     Sinkhorn's iteration converges to these costs.
     """
+    # Lists of the possible columns of each row: the matrix is sparse
     column, start = list_true(pair > 0.0)
     cost, log_smallest = np.ones(pair.shape[1]), np.inf
     for _ in range(_ROUNDS):
+        # log of Π_j c_j Π_i (alone_i + Σ_j pair_ij / c_j)
         log_bound = np.log(cost).sum()
         chosen = np.zeros(pair.shape[1])
         for r in range(len(pair)):
@@ -105,6 +112,7 @@ def choice_bound(
             for c in choices:
                 total += pair[r, c] / cost[c]
             log_bound += np.log(total)
+            # Mean number of rows that choose the column
             for c in choices:
                 chosen[c] += pair[r, c] / cost[c] / total
         log_smallest = min(log_smallest, log_bound)
@@ -182,10 +190,12 @@ def sum_associations(
     _check("pair (detection, object)", log_pair)
     _check("absent detection", log_absent)
     _check("background object", log_background)
+    # Leave out what cannot matter, then sum the components of what is left
     row, column, lost_nats = gate(log_pair, log_absent, log_background, gate_nats)
     sum_large = partial(_sum_large, k=k, max_states=max_states)
     found = _sum_kept(log_pair, log_absent, log_background, row, column, max_states, sum_large)
     return AssociationSum(
+        # Alone is what no pair accounts for; rounding may leave the range
         found.log_lower, found.log_upper + lost_nats, found.row, found.column, found.share,
         np.clip(1.0 - np.bincount(found.row, found.share, len(log_absent)), 0.0, 1.0),
         np.clip(1.0 - np.bincount(found.column, found.share, len(log_background)), 0.0, 1.0),
@@ -231,6 +241,7 @@ def _sum_kept(
     if len(exact.too_large) == 0:
         return found
     parts, summed = [], np.ones(len(row), bool)
+    # Components that were too large to be summed: a dense matrix of each one
     for n in exact.too_large:
         i, j, edge = _members(components, n)
         here = np.full((len(i), len(j)), -np.inf)
@@ -238,10 +249,12 @@ def _sum_kept(
         part = sum_large(here, log_row[i], log_column[j])
         found.log_lower += part.log_lower
         found.log_upper += part.log_upper
+        # Indices of the part become those of the whole
         found.best[j] = np.where(part.best < 0, -1, i[part.best])
         found.log_freed[j] = part.log_freed
         summed[edge] = False
         parts.append((i[part.row], j[part.column], part.share))
+    # Pairs that were summed exactly, and those kept in the large components
     found.row, found.column, found.share = (
         np.concatenate(each)
         for each in zip((row[summed], column[summed], exact.share[summed]), *parts, strict=True)
@@ -269,6 +282,7 @@ def _sum_large(
 ) -> _Found:
     """Sum a subset of the pairs of a component that is too large, and bound the contribution of the rest."""
     found = _sum_thinned(log_pair, log_row, log_column, k, max_states, _THINNING_NATS)
+    # Pairs left out by the thinning: bound their contribution
     left_out = log_pair > -np.inf
     left_out[found.row, found.column] = False
     row, column = np.nonzero(left_out)
@@ -276,6 +290,7 @@ def _sum_large(
     log_weight = np.full(len(row), np.inf)
     log_weight[alone] = (log_pair[row, column] + found.log_freed[column])[alone] - log_row[row][alone]
     found.log_upper += bound_left_out(log_weight, row, column)
+    # A wide interval may have a better bound from independent choices
     if found.log_upper - found.log_lower > _LOOSE_NATS:
         found.log_upper = min(found.log_upper, bound_choices(scale(log_pair, log_row, log_column)))
     return found
@@ -290,6 +305,7 @@ def _sum_thinned(
     thinning_nats: tuple[float, ...],
 ) -> _Found:
     """Leave out pairs until the rest can be summed. If it never can, sum the k best associations."""
+    # Thin more and more; what cannot be summed even then is bounded
     scaled = scale(log_pair, log_row, log_column)
     if thinning_nats:
         row, column = thin(scaled, thinning_nats[0])

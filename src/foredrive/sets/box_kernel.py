@@ -27,6 +27,7 @@ def box_log_prob(mean, chol, state, laplace):
         out = log_prob[i]
         constant = 0.0
         for d in range(dims):
+            # log of the constant: Σ log L_dd, and ½ log 2π (or ½ log 2) for each dimension
             constant -= np.log(chol[i, d, d]) + (0.5 * math.log(2) if laplace else 0.5 * _LOG_2PI)
         out[:] = constant
         for d in range(dims):
@@ -58,6 +59,7 @@ def add_heading(log_prob, mean_yaw, concentration, log_i0e, yaw):
 
     The shapes are mean_yaw, concentration, log_i0e [M] and yaw [N].
     """
+    # κ cos(yaw - mean) by the addition theorem: one product per box instead of a cosine
     cos, sin = np.cos(yaw), np.sin(yaw)
     for i in range(len(mean_yaw)):
         out, kappa = log_prob[i], concentration[i]
@@ -75,6 +77,7 @@ def log_sum_exp(log_terms):
     top = np.full(log_terms.shape[1], -np.inf)
     for row in log_terms:
         for j in range(len(top)):
+            # Largest term of each column first, then the sum relative to it
             top[j] = max(top[j], row[j])
     total[:] = 0.0
     for row in log_terms:

@@ -73,11 +73,13 @@ class BoxDensity(Record):
         self._require_boxes(boxes)
         if self.mean.dim() == 2 and self.mean.device.type == "cpu" and not needs_gradient(self, boxes):
             return torch.as_tensor(self._values(boxes))
+        # Whitened offsets L⁻¹ (state - mean)
         chol = self.chol.double()
         offset = boxes.state.double()[..., None, :, :] - self.mean.double()[..., :, None, :]
         white = torch.linalg.solve_triangular(chol, offset.mT, upper=False).mT  # [*b M N D]
         log_scale = chol.diagonal(dim1=-2, dim2=-1).log().sum(-1)[..., None]
         log_prob = self._log_white(white) - log_scale
+        # log |L|, half the log-determinant of the covariance
         if self.yaw is None or self.concentration is None or boxes.yaw is None:
             return log_prob
         turn = boxes.yaw.double()[..., None, :] - self.yaw.double()[..., :, None]
@@ -125,6 +127,7 @@ class BoxDensity(Record):
         """Draw one state and one heading from each component, float64."""
         shape = self.mean.shape
         scale = math.sqrt(0.5)
+        # A Laplace variable of variance 1 has scale 1/√2
         white = rng.normal(size=shape) if self.family == "gaussian" else rng.laplace(0.0, scale, shape)
         shift = self.chol.double().cpu() @ torch.as_tensor(white)[..., None]
         state = self.mean.double().cpu() + shift[..., 0]

@@ -38,9 +38,11 @@ def fit_existence(probability: Float[ndarray, "n"], happened: Shaped[ndarray, "n
     if len(probability) == 0:
         raise InputError("calibration of existence needs detections")
     order = np.argsort(probability, kind="stable")
+    # Equal predictions share one value, weighted by their number
     predicted, which = np.unique(probability[order], return_inverse=True)
     count = np.bincount(which)
     mean = np.bincount(which, np.asarray(happened, dtype=float)[order]) / count
+    # Isotonic regression: the closest increasing sequence
     fitted = isotonic_regression(mean, weights=count.astype(float)).x
     margin = 0.5 / len(probability)
     return ExistenceMap(predicted, np.clip(fitted, margin, 1 - margin))
@@ -62,6 +64,7 @@ def fit_scale(boxes: BoxDensity, objects: LabelledBoxes, weight: Float[ndarray, 
     weight = np.ones(len(white)) if weight is None else weight
     if not weight.sum() > 0:
         raise InputError("calibration of covariances needs detections that have an object")
+    # Maximum likelihood: root mean square for normal, √2 times the mean absolute value for Laplace
     if boxes.family == "gaussian":
         return math.sqrt(float(weight @ (white**2).mean(1) / weight.sum()))
     return math.sqrt(2) * float(weight @ np.abs(white).mean(1) / weight.sum())
@@ -76,6 +79,7 @@ class SetCalibration:
 
     def __call__(self, detected: MultiBernoulli) -> MultiBernoulli:
         """Return the detections with calibrated existence and covariance."""
+        # Existence by the map, covariance by the factor on L
         r = torch.as_tensor(self.existence(detected.log_existence.exp().cpu().numpy()))
         r = r.to(detected.log_existence)
         boxes = dataclasses.replace(detected.boxes, chol=detected.boxes.chol * self.std_factor)
@@ -92,9 +96,11 @@ def fit_set_calibration(
     """
     existence, has_object, boxes, paired = [], [], [], []
     for found, truth in zip(detected, objects, strict=True):
+        # Associations of the frame under the detector's own densities
         pairs = set_nll(PoissonMultiBernoulli(found, background), truth).associations
         existence.append(found.log_existence.exp().cpu().numpy())
         has_object.append(1.0 - pairs.absent)
+        # Scales are fitted on the most likely pairs only
         has = np.flatnonzero(pairs.best >= 0)
         boxes.append(found.boxes[pairs.best[has]])
         paired.append(truth[has])
@@ -119,6 +125,7 @@ def conformal_factor(boxes: BoxDensity, objects: LabelledBoxes, coverage: float)
     too few pairs.
     """
     score = np.sort(conformal_scores(boxes, objects))
+    # Rank of the score with the finite-sample correction of split conformal prediction
     rank = math.ceil((len(score) + 1) * coverage)
     return float(score[rank - 1]) if 1 <= rank <= len(score) else math.inf
 
@@ -127,5 +134,6 @@ def conformal_scores(boxes: BoxDensity, objects: LabelledBoxes) -> Float[ndarray
     """Return the largest |error| / σ over the coordinates of box i."""
     with torch.no_grad():
         error = (objects.state.double() - boxes.mean.double()).abs()
+        # Standard deviation of a coordinate: norm of its row of L
         std = boxes.chol.double().square().sum(-1).sqrt()
         return (error / std).amax(-1).cpu().numpy()

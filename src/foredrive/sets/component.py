@@ -99,6 +99,7 @@ def sum_components(components, row, column, log_edge, log_row, log_column, max_s
 
     See `ComponentSums` for the result.
     """
+    # Nodes without an edge contribute their weights alone
     share, best, log_freed = np.zeros(len(row)), np.full(len(log_column), -1), -log_column
     alone, unpaired = np.ones(len(log_row), np.bool_), np.ones(len(log_column), np.bool_)
     alone[components.row] = False
@@ -152,6 +153,7 @@ def sum_scaled(scaled, max_states):
         `column_freed` of `AssignmentTotals`.
     """
     rows, columns = scaled.log_pair.shape
+    # Impossible: report the pairs of the association with the fewest impossible members
     if scaled.log_best == -np.inf:
         pair = np.zeros((rows, columns))
         for r in range(rows):
@@ -159,6 +161,7 @@ def sum_scaled(scaled, max_states):
                 pair[r, scaled.column[r]] = 1.0
         return True, -np.inf, pair, np.zeros(columns)
     pair = np.exp(scaled.log_pair)
+    # The sweep may run over rows or columns; take the cheaper direction
     sweep = plan_sweep(pair > 0.0, max_states)
     turned = np.ascontiguousarray(pair.T)
     other = plan_sweep(turned > 0.0, max_states)
@@ -179,6 +182,7 @@ def scale(
 ) -> Scaled:
     """Rescale the weights by the dual prices of the best assignment."""
     rows, columns = log_pair.shape
+    # Best assignment with its dual prices: they scale every weight to at most 1
     cost, free, column_free = _costs(log_pair, log_row, log_column)
     column, row_price, column_price = _solve_shorter_side(cost, free, column_free)
     taken = np.zeros(columns + 1, np.bool_)
@@ -186,12 +190,15 @@ def scale(
     log_scaled, log_best = np.empty((rows, columns)), 0.0
     for r in range(rows):
         taken[column[r]] = True
+        # Weight of the best association, unscaled
         log_best += log_row[r] if column[r] == columns else log_pair[r, column[r]]
         if log_row[r] > -np.inf:
             row_alone[r] = np.exp(row_price[r] - free[r])
         else:
             bad_rows[r] = column[r] == columns
         for c in range(columns):  # values above 0 come from rounding
+            # Reduced costs are ≥ 0, so scaled logarithms are ≤ 0, and 0
+            # for the pairs of the best association
             log_scaled[r, c] = min(row_price[r] + column_price[c] - cost[r, c], 0.0)
     column_alone, bad_columns = np.zeros(columns), np.zeros(columns, np.bool_)
     log_column_scale = np.empty(columns)
@@ -199,6 +206,7 @@ def scale(
         log_best += 0.0 if taken[c] else log_column[c]
         log_column_scale[c] = column_price[c] + column_free[c]
         if log_column[c] > -np.inf:
+            # The alone weight of a column after scaling by its price
             column_alone[c] = np.exp(column_price[c])
         else:
             bad_columns[c] = not taken[c]
@@ -228,10 +236,12 @@ def _costs(log_pair, log_row, log_column):
     price = _price_of_the_impossible(log_pair, log_row, log_column)
     cost, free, column_free = np.empty((rows, columns)), np.empty(rows), np.empty(columns)
     for c in range(columns):
+        # A zero weight becomes a large finite cost
         column_free[c] = price if log_column[c] == -np.inf else -log_column[c]
     for r in range(rows):
         free[r] = price if log_row[r] == -np.inf else -log_row[r]
         for c in range(columns):
+            # A column's own cost is paid by all, and saved by the pair that takes it
             cost[r, c] = -log_pair[r, c] - column_free[c]
     return cost, free, column_free
 
@@ -243,6 +253,7 @@ def _solve_shorter_side(cost, free, column_free):
     rows, columns = cost.shape
     if rows <= columns:
         return solve(cost, free)
+    # Transposed: prices of rows and columns change places, and the column costs are put back
     of_column, column_price, row_price = solve(*turn_costs(cost, free, column_free))
     column = np.full(rows, columns)
     for c in range(columns):
@@ -286,6 +297,7 @@ def _price_of_the_impossible(log_pair, log_row, log_column):
 @no_type_check
 def _root(parent, node):
     while parent[node] != node:
+        # Path halving keeps the trees flat
         parent[node] = parent[parent[node]]
         node = parent[node]
     return node
@@ -295,6 +307,7 @@ def _root(parent, node):
 @no_type_check
 def _group(of, count):
     """Group indices by `of` (-1 is no group). Return the indices by group, and the start of each group."""
+    # Counting sort by group
     start = np.zeros(count + 1, np.int64)
     for group in of:
         if group >= 0:

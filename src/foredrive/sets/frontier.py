@@ -73,6 +73,7 @@ def plan_sweep(possible: Bool[ndarray, "R C"], max_states: int) -> Sweep:
     """
     column, start = list_true(possible)
     row, row_start = list_true(np.ascontiguousarray(possible.T))
+    # Start at row 0; from the row where this sweep ends, another may be narrower
     sweep = _plan_from(np.int64(0), column, start, row, row_start, max_states)
     if sweep.states <= _CHEAP:
         return sweep
@@ -155,6 +156,7 @@ def _plan_from(next_row, column, start, row, row_start, max_states):
 @no_type_check
 def sum_sweep(pair, row_alone, column_alone, sweep):
     """Sweep forward and back over the rows. The products of both sweeps give the share of each pair."""
+    # Offset of each row's subsets in one flat array
     start = np.zeros(len(pair) + 1, np.int64)
     start[1:] = np.cumsum(sweep.size)
     ahead = np.zeros(start[-1])
@@ -175,7 +177,9 @@ def _sweep_forward(pair, row_alone, column_alone, sweep, start, ahead):
     `ahead[start[place] + s]` is the weight of all choices of the rows before `place` that take exactly the
     subset s of the frontier's columns, relative to the largest of its row.
     """
+    # pair Float64[R C], row_alone Float64[R], column_alone Float64[C]
     column, weight, bit_of = _no_choices(pair)
+    # Columns that no row may take are certainly alone
     log_total = np.log(column_alone[sweep.last < 0]).sum()
     state = np.zeros(sweep.size.max())
     state[0] = 1.0

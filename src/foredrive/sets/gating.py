@@ -27,6 +27,7 @@ def gate(
     pairs) · Π_j (1 + Σ_i odds_ij), over the left-out pairs. Odds are infinite for certain detections and for
     objects without background. There, prices decide instead (see `_prices`).
     """
+    # Infinite odds need the second test by prices
     infinite = bool((log_row == -np.inf).any() or (log_column == -np.inf).any())
     by_odds = (0.5 if infinite else 1.0) * budget_nats
     row, column, lost_nats = _keep_likely(log_pair, log_row, log_column, by_odds)
@@ -53,8 +54,10 @@ def _keep_likely(
     Return the kept pairs and the loss in nats. Pairs with odds of at least 1 are always kept. The pairs left
     out are in no best association.
     """
+    # Pairs with odds below half the budget over their number can all be left out
     log_min_odds = np.log(0.5 * budget_nats / max(log_pair.size, 1))
     row, column, log_odds, lost_nats = _list_odds(log_pair, log_row, log_column, log_min_odds)
+    # Of the rest, leave out the least likely ones as far as the other half of the budget goes
     unlikely = np.flatnonzero(log_odds < 0.0)
     unlikely = unlikely[np.argsort(log_odds[unlikely])]
     total = np.cumsum(np.exp(log_odds[unlikely]))
@@ -79,10 +82,12 @@ def _list_odds(log_pair, log_row, log_column, log_min_odds):
         for c in range(columns):
             if log_pair[r, c] == -np.inf:
                 continue
+            # Odds of the pair against both members being alone
             log_odds = log_pair[r, c] - log_row[r] - log_column[c]
             if log_odds > log_min_odds:
                 row[count], column[count], odds[count], count = r, c, log_odds, count + 1
             elif log_odds > log_min_odds - _NEGLIGIBLE_NATS:
+                # Tiny odds are bounded together below; the others are added up by column
                 lost[c] += np.exp(log_odds)
     lost += rows * np.exp(log_min_odds - _NEGLIGIBLE_NATS)
     return row[:count].copy(), column[:count].copy(), odds[:count].copy(), np.log1p(lost).sum()
@@ -98,6 +103,7 @@ def _prices(scaled):
     kept.
     """
     rows, columns = scaled.log_pair.shape
+    # Every choice is at most 1; pairs too small to matter are bounded by their number
     by_row, by_column = scaled.row_alone.copy(), scaled.column_alone.copy()
     by_row += columns * np.exp(-_NEGLIGIBLE_NATS)
     by_column += rows * np.exp(-_NEGLIGIBLE_NATS)
@@ -108,6 +114,7 @@ def _prices(scaled):
                 by_row[r] += pair
                 by_column[c] += pair
     by_row, by_column = np.log(by_row), np.log(by_column)
+    # The smaller of both bounds: independent choices of the rows, or of the columns
     if by_row.sum() <= by_column.sum():
         return by_row - by_row.sum(), np.zeros(columns)
     return np.zeros(rows), by_column - by_column.sum()
@@ -118,6 +125,7 @@ def thin(scaled: Scaled, limit_nats: float) -> tuple[Int[ndarray, "E"], Int[ndar
 
     The pairs of the best association and of rows that cannot be alone are always kept.
     """
+    # Keep the pairs with the largest charges; the others add up to at most the limit
     row, column, charge = _estimate_charges(np.exp(scaled.log_pair), scaled.row_alone, scaled.column_alone)
     order = np.argsort(charge)
     kept = np.empty(len(row), bool)
@@ -181,4 +189,5 @@ def bound_left_out(
     """
     with np.errstate(over="ignore"):
         weight = np.exp(log_weight)
+    # Π (1 + Σ) over the columns, or over the rows; the smaller one is the bound
     return float(min(np.log1p(np.bincount(each, weight)).sum() for each in (row, column)))

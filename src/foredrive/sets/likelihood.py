@@ -66,11 +66,13 @@ def set_nll(
     """
     detected, background = predicted.detected, predicted.background
     log_absent = detected.log_absence.double()
+    # Without a background, an object without a detection is impossible
     if background is None:
         log_background = torch.full_like(objects.label, -math.inf, dtype=torch.float64)
         expected = torch.zeros((), dtype=torch.float64, device=log_absent.device)
     else:
         log_background, expected = background.log_intensity(objects), background.expected_count
+    # The sum needs no gradient: it enters through the probabilities of its pairs
     with torch.no_grad():
         log_pair = detected.boxes.log_prob(objects) + detected.log_label(objects)
     found = sum_associations(
@@ -78,16 +80,20 @@ def set_nll(
         k=k, max_states=max_states, gate_nats=gate_nats,
     )  # fmt: skip
     i, j = (torch.as_tensor(index, device=log_absent.device) for index in (found.detection, found.object))
+    # Terms with gradients, for the pairs that matter
     log_box = detected.boxes.log_prob_of_pairs(i, objects, j)
     log_label = detected.log_label_of_pairs(i, objects, j)
     localisation, classification = (_expected(found.probability, log) for log in (log_box, log_label))
     false, missed = _expected(found.absent, log_absent), _expected(found.background, log_background)
+    # Energy: expected negative log-weight under the association probabilities
     energy = localisation + classification + false + missed + expected
     value = energy.new_tensor(-found.log_lower) + expected.detach()
     # d(-log Σ w) = Σ P(association) d(-log w): the gradient of the energy at fixed probabilities.
+    # The value of the sum with the gradient of the energy
     nll = energy + (value - energy).detach()
     false = false + (math.inf if len(found.impossible_detections) else 0.0)
     missed = missed + (math.inf if len(found.impossible_objects) else 0.0)
+    # Difference between the value and its parts: minus the entropy of the associations
     ambiguity = nll - (localisation + classification + false + missed + expected)
     lower = float(expected.detach()) - found.log_upper
     return SetNll(

@@ -49,6 +49,7 @@ class MultiBernoulli(Record):
     @classmethod
     def from_softmax(cls, logits: Float[Tensor, "*b M K_1"], boxes: BoxDensity) -> "MultiBernoulli":
         """Convert the logits of a detector with one softmax over the classes and "no object" (DETR)."""
+        # Softmax over K classes and "no object": existence is the sum over the classes
         log_prob = logits.double().log_softmax(-1)
         log_existence = log_prob[..., :-1].logsumexp(-1)
         return cls(log_existence, log_prob[..., -1], log_prob[..., :-1] - log_existence[..., None], boxes)
@@ -68,6 +69,7 @@ class MultiBernoulli(Record):
         top = logits.double().amax(-1)
         log_score = torch.nn.functional.logsigmoid(logits.double())
         log_existence = torch.nn.functional.logsigmoid(top)
+        # Largest score as existence; the published variant keeps each class' own score
         normalised = classes == "normalised"
         log_total = log_score.logsumexp(-1) if normalised else log_existence
         log_absence = torch.nn.functional.logsigmoid(-top)
@@ -76,6 +78,7 @@ class MultiBernoulli(Record):
     def log_label(self, objects: LabelledBoxes) -> Float[Tensor, "*b M N"]:
         """Return the log-probability that each object exists with its label."""
         label = checked_labels(objects.label, self.log_class.shape[-1])
+        # One row of labels for every component
         index = label[..., None, :].expand(*self.log_class.shape[:-1], label.shape[-1])
         return self.log_existence.double()[..., None] + self.log_class.double().gather(-1, index)
 
@@ -149,6 +152,7 @@ class UniformPoisson(Record):
 
     def sample(self, rng: np.random.Generator) -> LabelledBoxes:
         """Draw one set."""
+        # Number of objects by class, then their states
         counts = rng.poisson(self.rate.cpu().numpy())
         label = torch.as_tensor(np.repeat(np.arange(len(counts)), counts))
         unit = torch.as_tensor(rng.random((len(label), len(self.lower))))
@@ -225,6 +229,7 @@ class PoissonMultiBernoulli:
         process `other`, such as a uniform one, is added to it. Without it, objects far from every detection
         have almost zero density.
         """
+        # Unsure detections become the intensity of the background
         low = detections.log_existence <= math.log(confidence)
         unsure = detections[low]
         log_class = unsure.log_class if unsure.normalised else unsure.log_class.log_softmax(-1)
@@ -264,6 +269,7 @@ def checked_labels(label: Int[Tensor, "..."], classes: int) -> Int[Tensor, "..."
 
 
 def _sample_labels(log_class: Float[Tensor, "M K"], rng: np.random.Generator) -> Tensor:
+    # Inverse transform sampling of the class
     cumulative = log_class.double().exp().cpu().cumsum(-1)
     draw = torch.as_tensor(rng.random(len(cumulative)))[:, None] * cumulative[:, -1:]
     return (draw >= cumulative).sum(-1).clamp_max(log_class.shape[-1] - 1)

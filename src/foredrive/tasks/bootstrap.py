@@ -43,15 +43,20 @@ def bootstrap_mean(
     """
     if len(values) == 0 or not np.isfinite(values).all():
         raise InputError("a mean needs values, all of them finite")
+    # Sum and number of frames of each sequence: resampled means need nothing else
     _, which = np.unique(np.asarray(sequence), return_inverse=True)
     total, count = np.bincount(which, values), np.bincount(which)
     mean = float(values.mean())
     if len(total) < 2:
         return BootstrapMean(mean, np.nan, np.nan, np.nan)
+    # Whole sequences with replacement; the mean weighs every frame equally
     drawn = rng.integers(0, len(total), (resamples, len(total)))
     means = total[drawn].sum(1) / count[drawn].sum(1)
     low, high = np.quantile(means, [(1 - level) / 2, (1 + level) / 2])
+    # Randomisation test: flip the sign of every sequence's sum at random
     by_chance = np.abs(rng.choice([-1.0, 1.0], (resamples, len(total))) @ total)
+    # The tolerance counts sums that are equal but for rounding
     as_large = by_chance >= (1 - 1e-9) * abs(total.sum())
+    # The observed signs are one of the draws, hence + 1
     p_value = float((as_large.sum() + 1) / (resamples + 1))
     return BootstrapMean(mean, float(low), float(high), p_value)

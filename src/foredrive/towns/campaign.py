@@ -131,6 +131,7 @@ def _town_drives(
     if campaign.conditions and not any_conditions:
         groups = list(dict.fromkeys(campaign.conditions))
     if isinstance(campaign.seeds, int):
+        # Candidate routes of all seeds; the balance chooses among them by their commands
         drives = campaign.seeds * len(groups)
         routes = count_route_commands(town, campaign.seconds, range(CANDIDATES_PER_DRIVE * drives))
         chosen = select_balanced(
@@ -138,16 +139,19 @@ def _town_drives(
         )
         for commands in chosen.values():
             counts.update(commands)
+        # Distribute the chosen seeds over the conditions in turn
         found = [(groups[i % len(groups)], seed) for i, seed in enumerate(chosen)]
     else:
         found = [(group, seed) for group in groups for seed in dict.fromkeys(campaign.seeds)]
     if any_conditions:
+        # Every drive takes the next of all conditions
         found = [(next(conditions_cycle), seed) for _, seed in found]
     return sorted(found, key=lambda drive: (groups.index(drive[0]) if not any_conditions else 0, drive[1]))
 
 
 def _cycle_conditions() -> Iterator[str]:
     """Yield all conditions in random order, again and again."""
+    # Each round has all conditions in another order
     for round_ in itertools.count():
         order = np.random.default_rng(round_).permutation(len(CONDITIONS))
         yield from (list(CONDITIONS)[i] for i in order)
@@ -163,6 +167,7 @@ def count_route_commands(town: str, seconds: float, seeds: Sequence[int]) -> lis
     routes = (plan_route(lanes, starts, seed, seconds) for seed in seeds)
     window_s = SETTLE_S, SETTLE_S + seconds
     return [
+        # Commands between the end of the settling time and the end of the drive, by expected pace
         Counter(route.commands(lanes, until_m, from_m))
         for route in routes
         for from_m, until_m in [(route.distance_m(lanes, s) for s in window_s)]
@@ -194,17 +199,22 @@ def select_balanced(
     command that no route has is ignored.
     """
     commands = list(Command)
+    # Commands of each route, one row per route; at first those that are expected
     times = np.array([[route[kind] for kind in commands] for route in routes])
     total = np.array([counts[kind] for kind in commands], dtype=np.int64)
     available, tries, known = np.ones(len(routes), dtype=bool), 0, dict[int, Counter[Command]]()
     chosen: dict[int, Counter[Command]] = {}
     while len(chosen) < count:
+        # Totals after each possible choice, over the commands that occur at all
         after = (total + times)[:, times.any(axis=0)]
         number, mean = after.sum(axis=1), after.mean(axis=1, keepdims=True) if after.size else 0.0
+        # Many commands are good, uneven ones bad
         gain = np.where(available, number - np.sum((after - mean) ** 2, axis=1), -np.inf)
+        # Enough routes driven for this choice: only those whose commands are known remain
         if tries == MAX_TRIES_PER_DRIVE:
             gain[[i for i in range(len(routes)) if i not in known]] = -np.inf
         best = int(gain.argmax())
+        # Drive a route before it is chosen, because traffic may change what it meets
         if best not in known:
             known[best], tries = drive_route(best), tries + 1
             times[best] = [known[best][kind] for kind in commands]

@@ -126,12 +126,14 @@ def record(
     sensors = sensors or SensorSuite(camera_rig((144, 256)), roof_lidar())
     background_traffic = background_traffic or BackgroundTraffic()
     labels = labels or LabelOptions()
+    # World, traffic and route follow from town and seed
     world = World(town_map, seed, conditions)
     traffic = Traffic(town_map, seed, background_traffic.vehicles + 1, background_traffic.pedestrians)
     drive = ExpertDrive(traffic, seconds)
     maps = write_town_map(town, out)
     name, count = log_name or f"{town}_seed{seed}", max(1, round(seconds * rate_hz))
     collector = FactCollector(town_map, traffic.lanes, drive.route, world.conditions, world.signal_xyz)
+    # The next frame is rendered while the labels of the present one are computed
     sensed = prefetched(_sense(world, drive.snapshots(count, 1 / rate_hz), sensors, seed))
     route = drive.route.polyline(traffic.lanes)
     with LogWriter(out, split_of(town), name, camera_specs(sensors.rig), maps, town, route) as writer:
@@ -150,6 +152,7 @@ def _map_objects(town: str) -> Iterator[BaseMapObject]:
     strings."""
     for item in OpenDriveMapParser(MAP_FOLDER / f"{town}.xodr.gz").iter_map_objects():
         if isinstance(item, Lane | LaneGroup):
+            # py123d collects these ids in sets, whose order differs from run to run
             item.predecessor_ids.sort()
             item.successor_ids.sort()
         yield item
@@ -211,6 +214,7 @@ def _sense(
             sensors,
             snapshot.T_world_ego,
             snapshot.twist_ego,
+            # Noise from seed and frame number: frames could be rendered in any order
             noise_seed=np.random.SeedSequence((seed, index)).generate_state(1)[0].item(),
             lights=snapshot.lights,
         )
@@ -224,9 +228,11 @@ def _frame(
     snapshot, frame, seed = sensed
     actors = [*snapshot.actors, *world.parked]
     near = in_box_range(actors, snapshot.T_world_ego)
+    # Track ids of the beams that returned, to count the lidar points of each box
     returned = None if frame.sweep is None else frame.beam_ids[frame.sweep.returned.numpy()]
     boxes = boxes_in_ego_frame(near, snapshot.T_world_ego)
     visibility, setting, text = None, None, None
+    # Captions need the visibility too, also if it is not recorded
     if labels.visibility or labels.captions:
         visibility = world.visibility(near, sensors, snapshot.T_world_ego, frame)
         if labels.captions:

@@ -97,8 +97,10 @@ class _Inserted:
 
     def at(self, t_s: float) -> ActorState:
         """Return the actor at a time since the beginning of the window."""
+        # It stands before its time and then moves at a constant velocity
         moving = t_s >= self.waits_s
         velocity = self.speed_mps * moving * np.array([np.cos(self.yaw), np.sin(self.yaw), 0.0])
+        # The velocity is 0 while it waits, so the product vanishes
         centre_m = self.foot_m + max(t_s - self.waits_s, 0.0) * velocity
         centre_m[2] += 0.5 * self.size_lwh[2]
         return ActorState(
@@ -143,6 +145,7 @@ def record_virtual_egos(
     """
     split = split_of(town)
     folders = [out / "logs" / split / f"{town}_seed{seed}_ego{number:04d}" for number in range(count)]
+    # All logs exist: nothing to do
     if all((folder / "sync.arrow").is_file() for folder in folders):  # without growing the town again
         return [LogPath(folder, out / "maps") for folder in folders]
     town_map = load_town_map(town)
@@ -156,6 +159,7 @@ def record_virtual_egos(
         for ego in egos[: count - len(logs)]:
             of_log = np.random.default_rng((seed, 6, len(logs)))  # whether the logs before are there or not
             path = LogPath(folders[len(logs)], maps)
+            # A log gets its final name when it is whole; incomplete ones are recorded again
             if not (path.folder / "sync.arrow").is_file():  # logs get their names when they are whole
                 world = worlds[int(of_log.integers(len(worlds)))]
                 inserted = _insert_all(window, ego, of_log)
@@ -190,6 +194,7 @@ def _windows(town: TownMap, seed: int, rng: np.random.Generator) -> Iterator[tup
     state = traffic.start()
     wait_s = SETTLE_S
     while True:
+        # Let the traffic run between windows, so that they show different situations
         for _ in range(round(wait_s / STEP_S)):
             state = traffic.step(state, STEP_S)
         moments = []
@@ -209,9 +214,11 @@ def _choose_egos(window: _Window, rng: np.random.Generator) -> list[_Ego]:
     Those that come to a light first, up to their share.
     """
     first, last = window.moments[0].state.vehicles, window.moments[-1].state.vehicles
+    # The slot must hold the same vehicle at the end
     lasting = first.active & last.active & (first.track_id == last.track_id)
     rows = np.flatnonzero(lasting & (first.category == int(Category.CAR)))
     rng.shuffle(rows)
+    # Of the standing ones only a share is kept
     standing = rows[first.speed_mps[rows] < STANDING_MPS][round(STANDING_SHARE * EGOS_PER_WINDOW) :]
     rows = rows[~np.isin(rows, standing)]
     egos = []
@@ -222,6 +229,7 @@ def _choose_egos(window: _Window, rng: np.random.Generator) -> list[_Ego]:
             lateral_m, yaw_rad = rng.normal(0.0, (0.35, 0.05)) * (rng.random(2) < 0.5)
             deviation = PathDeviation(lateral_m=float(lateral_m), yaw_rad=float(yaw_rad))
             egos.append(_Ego(row, route, deviation, _comes_to_light(window, row)))
+    # Egos with a light ahead first, then the others
     at_light = [ego for ego in egos if ego.at_light][: round(AT_LIGHT_SHARE * EGOS_PER_WINDOW)]
     others = [ego for ego in egos if ego not in at_light]
     return (at_light + others)[:EGOS_PER_WINDOW]
@@ -234,12 +242,14 @@ def _route(window: _Window, row: int) -> Float64[np.ndarray, "M 3"] | None:
     ahead = [lane for lane in before[BEHIND - 1 :].tolist() if lane >= 0]
     if int(after[BEHIND]) not in ahead:
         return None
+    # Lanes between the first and the last moment, and the lanes that follow
     lanes = ahead[: ahead.index(int(after[BEHIND]))] + [lane for lane in after[BEHIND:].tolist() if lane >= 0]
     parts = [window.traffic.lanes.samples(lane) for lane in lanes]
     xyz = np.concatenate(parts)
     begin_m, end_m = (window.moments[k].poses.axle_xyz[row] for k in (0, -1))
     # Looked for in the first lanes alone: a route may come by here again.
     first = int(np.hypot(*(np.concatenate(parts[:2])[:, :2] - begin_m[:2]).T).argmin())
+    # Leave out repeated points where lanes join
     step_m = np.hypot(*np.diff(xyz[first:, :2], axis=0).T)
     xyz = xyz[first:][np.concatenate([[True], step_m > 0.05])]
     arc_m = arc_lengths(xyz)
@@ -252,6 +262,7 @@ def _comes_to_light(window: _Window, row: int) -> bool:
     vehicles, lanes = window.moments[0].state.vehicles, window.traffic.lanes
     path = vehicles.path[row, BEHIND:]
     path = path[path >= 0]
+    # Distance from the front bumper to the end of each lane, which is the start of the next one
     gap_m = np.cumsum(lanes.length_m[path]) - vehicles.front_m[row]
     return bool((window.traffic.signals.guarded[path[1:]] & (gap_m[:-1] < LIGHT_M)).any())
 
@@ -269,18 +280,22 @@ def _insert(window: _Window, ego: _Ego, track_id: int, rng: np.random.Generator)
     ahead_m = rng.uniform(8.0, 45.0)
     if ahead_m + 1.0 > arc_m[-1]:
         return None
+    # Place on the route, and the heading from a point 1 m further on
     place, further = points_at(ego.route_xyz, arc_m, np.array([ahead_m, ahead_m + 1.0]))
     heading = float(np.arctan2(*(further - place)[1::-1]))
     cycles = rng.random() < 0.6
     side = float(rng.choice([-1.0, 1.0]))
     beside_m = rng.uniform(2.0, 15.0 if cycles else 12.0)
+    # Beside the road on either side, facing across it
     foot_m = place + side * beside_m * np.array([-np.sin(heading), np.cos(heading), 0.0])
     yaw = heading - side * 0.5 * np.pi + rng.normal(0.0, 0.25)
     if rng.random() < 0.15:  # along the road in place of across it
         yaw += 0.5 * np.pi * rng.choice([-1.0, 1.0])
     speed_mps = float(rng.uniform(3.5, 6.0) if cycles else rng.uniform(0.6, 2.5))
+    # Most of them start at a random time, some never
     waits_s = float(rng.uniform(-1.0, 6.0)) if rng.random() < 0.85 else np.inf
     comes_s = _comes_by_s(window, ego, float(ahead_m))
+    # If the ego comes by, most start so that they meet it at about that time
     if rng.random() < MEETING_SHARE and comes_s is not None:
         waits_s = comes_s + float(rng.uniform(-MEETING_S, MEETING_S)) - beside_m / speed_mps
     return _Inserted(
@@ -300,6 +315,7 @@ def _comes_by_s(window: _Window, ego: _Ego, ahead_m: float) -> float | None:
     xyz = np.stack([moment.poses.axle_xyz[ego.row] for moment in window.moments])
     driven_m = arc_lengths(xyz)
     if driven_m[-1] < ahead_m:
+        # Time at which the driven distance is reached, between key frames
         return None
     return float(np.interp(ahead_m, driven_m, KEY_DT_S * np.arange(len(driven_m))))
 
@@ -316,11 +332,13 @@ def _frame(
     """Return the recorded data of one key frame; from `IMAGES` on without images."""
     moment = window.moments[k]
     vehicles: Vehicles = moment.state.vehicles.rows(slice(ego.row, ego.row + 1))
+    # The recording vehicle deviates from the car that it replaces, and so do pose and motion
     T_world_ego = moment.poses.axle_frame(ego.row) @ T_path_ego(ego.deviation)
     twist = ego_twist(window.traffic.lanes, vehicles, T_world_ego, ego.deviation)
     actors = [actor for actor in moment.actors if actor.track_id != int(vehicles.track_id[0])]
     actors += [person.at(KEY_DT_S * k) for person in inserted]
     near = in_box_range([*actors, *world.parked], T_world_ego)
+    # Later key frames have no sensor data: they are the future of the others
     images, sweep, visibility = {}, None, None
     if k < IMAGES:
         noise_seed = int(np.random.SeedSequence(seed).generate_state(1)[0])

@@ -67,7 +67,7 @@ HEADLIGHT_LIT, TAIL_LIT, BRAKE_LIT, STREET_LAMP_LIT = srgb_to_linear(
 
 @dataclass(frozen=True)
 class SensorFrame:
-    """The sensor data at one time. Ids are track ids, NOBODY where there is no road user."""
+    """The sensor data at one time. Ids are track ids, `NO_ACTOR` where there is no road user."""
 
     images: dict[str, UInt8[np.ndarray, "H W 3"]]
     pixel_ids: dict[str, Int[np.ndarray, "H W"]]
@@ -111,7 +111,7 @@ class StaticWorld:
 
     mesh: Mesh
     track: Int32[np.ndarray, "F"]
-    """Track id of the parked car to which a triangle belongs, NOBODY for all others."""
+    """Track id of the parked car to which a triangle belongs, `NO_ACTOR` for all others."""
     parked: tuple[ActorState, ...]
     heads: tuple[SignalHead, ...]
     thin: ThinPoints
@@ -134,6 +134,7 @@ class World:
         conditions: Conditions | None = None,
         assets: AssetSet | None = None,
     ) -> None:
+        # Independent random numbers for place and weather: other conditions do not change the place
         rng, weather_rng = np.random.default_rng([seed, *town.name.encode()]).spawn(2)
         table = MaterialTable()
         chosen = assets_of(assets or asset_set_of(town.name))
@@ -144,6 +145,7 @@ class World:
         self._lens_seed = int(weather_rng.integers(1 << 30))
         self._shapes = make_shape_library(table, chosen)
         self.static = build_static(town, table, self._shapes, chosen, rng)
+        # The table is complete only when everything is built
         self._materials = table.arrays()
         self._scene = raycast.TriangleScene(self.static.mesh)
         static = self.static
@@ -193,8 +195,10 @@ class World:
             noise_seed: seed of range noise, of lost beams and of image noise.
             lights: a `LightState` for each of the town's stop zones. None: all lamps are off.
         """
+        # Parked cars are part of the static mesh
         near = [a for a in actors if not a.parked and _distance(a, T_world_ego) < ACTOR_REACH_M]
         tracer = self._ray_tracer(near, lights, T_world_ego)
+        # Independent noise for images, lidar and rain
         ego = capture.EgoMotion(T_world_ego, twist_ego)
         images, buffer = capture.render_images(tracer, sensors, ego, np.random.default_rng((noise_seed, 1)))
         images = self._through_air_and_lens(images, sensors, noise_seed)
@@ -225,6 +229,7 @@ class World:
         Raises:
             InputError: the voxels are finer than `occupancy.FINEST_VOXEL_M`.
         """
+        # Road users whose body may reach into the grid
         reach_m = float(np.linalg.norm([*spec.lower_m, *spec.upper_m]))
         moving = [actor for actor in actors if not actor.parked]
         near = [a for a in (*moving, *self.parked) if _distance(a, T_world_ego) < reach_m + ACTOR_RADIUS_M]
@@ -251,6 +256,7 @@ class World:
         Returns:
             The distance, in lengths of `direction`, and the `Surface`; infinite and -1 if a ray hits nothing.
         """
+        # Rays need no unit length: distances are multiples of the direction
         hits = self._scene.cast(origin, direction)
         met = hits.triangle != shading.MISS
         surface = self._materials.surface[self.static.mesh.material[np.where(met, hits.triangle, 0)]]
@@ -262,6 +268,7 @@ class World:
         material, xyz = self.static.mesh.material, self.static.mesh.xyz
         points = {}
         for head in self.static.heads:
+            # Middles of the yellow lamps' faces; one point per head
             middle = xyz[material == head.lamps[1]].mean(axis=1, dtype=np.float64)
             _, first = np.unique(np.round(middle), axis=0, return_index=True)  # over the road and on the post
             points[head.zone] = middle[first]
@@ -273,11 +280,13 @@ class World:
         lights: Int[np.ndarray, "Z"] | None,
         T_world_ego: Float64[np.ndarray, "4 4"],
     ) -> capture.RayTracer:
+        # Each actor is an instance of its shape, moved and scaled from the unit box
         shapes = [self._shapes.shape_of(actor) for actor in actors]
         T = np.array([unit_to_world(actor) for actor in actors]).reshape(-1, 4, 4)
         velocity_mps = np.array([actor.velocity_mps for actor in actors]).reshape(-1, 3)
         placed = raycast.ShapeInstances(tuple(shape.scene for shape in shapes), T, velocity_mps)
         rear = self.static.vehicle_lights
+        # The last paint slot is the rear light: braking or not
         paints = [self._shapes.paint_of(a, rear.brake if a.braking else rear.rear) for a in actors]
         paint = np.array(paints, dtype=np.int32).reshape(-1, SLOTS)
         first = np.array([shape.first for shape in shapes], dtype=np.int32)
@@ -287,6 +296,7 @@ class World:
             actors=shading.ActorArrays(placed.T_world_unit, first, paint),
             materials=self._lit_materials(lights),
         )
+        # Lamps only at night: by day they add nothing visible
         light = self.light
         if street_lamps_on(self.conditions):
             light = light._replace(lamps=gather_lamps(self.static.lamps.xyz, actors, T_world_ego))
@@ -310,6 +320,7 @@ class World:
         return np.stack(drops)
 
     def _lit_materials(self, lights: Int[np.ndarray, "Z"] | None) -> MaterialArrays:
+        # Materials that shine in this state of lights
         """Return the materials with the lights that are on."""
         shining: dict[int, Rgb] = {self.static.vehicle_lights.brake: BRAKE_LIT}
         if headlights_on(self.conditions):
@@ -324,6 +335,7 @@ class World:
                 for lamp, shown, rgb in zip(head.lamps, LAMP_ORDER, LAMP_LIT, strict=True):
                     if lights[head.zone] == shown:
                         shining[lamp] = rgb
+        # Shining materials become luminous: the texture emits the albedo as light
         texture, albedo = self._materials.texture.copy(), self._materials.albedo.copy()
         texture[list(shining)] = Texture.GLOW
         albedo[list(shining)] = np.array(list(shining.values()))
@@ -366,6 +378,7 @@ def build_static(
     plants, trunks = build_vegetation(site, assets, table, rng)
     place = join([place, furniture, lamps.mesh, land, farm, plants])
     vehicle_lights = VehicleLights.of(table)
+    # Parked cars become part of the static mesh, with their track ids by triangle
     vehicles = [_standing(car, shapes, vehicle_lights) for car in parked]
     track = [np.full(len(place.material), NO_ACTOR, dtype=np.int32)]
     track += [
@@ -386,6 +399,7 @@ def _standing(car: ActorState, shapes: ShapeLibrary, lights: VehicleLights) -> M
     """Build the mesh of a parked car as a part of the town, with its lights off."""
     shape, paint = shapes.shape_of(car).mesh, shapes.paint_of(car, lights.rear_off)
     moved = shape.transformed(unit_to_world(car))
+    # Paint slots have negative numbers
     slot = np.clip(-1 - moved.material, 0, SLOTS - 1)
     material = np.where(moved.material < 0, paint[slot], moved.material)
     material = np.where(material == lights.front, lights.front_off, material)

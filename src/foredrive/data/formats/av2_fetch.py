@@ -73,6 +73,7 @@ def list_folders(bucket: str, prefix: str) -> Iterator[str]:
 def _pages(bucket: str, query: dict[str, str]) -> Iterator[ET.Element]:
     token: str | None = None
     seen: set[str] = set()
+    # S3 lists 1000 objects a page; a token continues the listing
     while True:
         asked = {"list-type": "2", **query} | ({"continuation-token": token} if token else {})
         url = f"{bucket}/?{urllib.parse.urlencode(asked)}"
@@ -88,6 +89,7 @@ def _pages(bucket: str, query: dict[str, str]) -> Iterator[ET.Element]:
         token = _text(page, "NextContinuationToken")
         if _text(page, "IsTruncated") != "true" or not token:
             return
+        # A repeated token would never end
         if token in seen:
             raise InputError(f"{bucket}: its listing does not end")
         seen.add(token)
@@ -139,11 +141,13 @@ def download(
 
 def _continue(url: str, entry: S3Object, part: Path, tick: Callable[[int], None]) -> None:
     """Download what is missing of `part`, and check it."""
+    # What an interrupted download left behind
     have = part.stat().st_size if part.is_file() else 0
     if have > entry.size:
         part.unlink()
         have = 0
     if have < entry.size or not part.is_file():
+        # If-Range sends the rest only if the object is the same as before
         headers = {"Range": f"bytes={have}-", "If-Range": f'"{entry.etag}"'} if have else {}
         with _opened(url, headers) as answer:
             if have and answer.status != http.client.PARTIAL_CONTENT:  # it has changed, or knows no ranges
@@ -158,6 +162,7 @@ def _continue(url: str, entry: S3Object, part: Path, tick: Callable[[int], None]
                     tick(len(chunk))
         if have < entry.size:
             raise ConnectionError(f"it ended after {have} of {entry.size} bytes")
+    # An ETag of another form is no MD5 and cannot be checked
     if entry.md5 is not None and _md5(part) != entry.md5:
         part.unlink()
         raise InputError(
@@ -173,6 +178,7 @@ def _opened(url: str, headers: dict[str, str]) -> Iterator[Any]:
         ) as answer:
             yield answer
     except urllib.error.HTTPError as error:
+        # Errors of the server may pass and are tried again; others are final
         if error.code >= 500:
             raise ConnectionError(f"error {error.code}") from error
         raise InputError(f"{url}: error {error.code} {error.reason}") from error
@@ -237,6 +243,7 @@ def find_log(
         files = [file for file in list_objects(bucket, prefix) if not file.key.endswith("/")]
         if files:
             for file in files:
+                # Keys become paths: nothing may lead out of the log's folder
                 if not file.key.startswith(prefix) or ".." in PurePosixPath(file.key).parts or file.size < 0:
                     raise InputError(f"{bucket}: the key {file.key!r} is not in the folder of {log_id}")
             return RemoteLog(log_id, split, _wanted(files, seconds, images))
@@ -263,6 +270,7 @@ def fetch_log(
     Raises:
         InputError: the disk has too little space, or a file cannot be had or is damaged.
     """
+    # Check the free space before the first byte
     missing = sum(file.size for file in log.files if not (out / log.path(file)).is_file())
     out.mkdir(parents=True, exist_ok=True)
     free = shutil.disk_usage(out).free
@@ -281,8 +289,10 @@ def fetch_log(
 
 def _wanted(files: Sequence[S3Object], seconds: float | None, images: bool) -> list[S3Object]:
     """Return the files of images and sweeps that are wanted, and all others."""
+    # Names of images and sweeps are their times in ns
     timed = {file: int(stem) for file in files if (stem := PurePosixPath(file.key).stem).isdecimal()}
     sweeps = [t_ns for file, t_ns in timed.items() if "/sensors/lidar/" in file.key]
+    # Seconds count from the first sweep
     end_ns = min(sweeps or timed.values(), default=0) + (seconds or 0.0) * 1e9
     return [
         file

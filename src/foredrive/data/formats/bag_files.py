@@ -80,6 +80,7 @@ def open_bag(path: Path) -> Iterator[Bag]:
     for package in ("rosbags", "mcap"):
         if importlib.util.find_spec(package) is None:
             raise InputError(f"bags need the package {package}: pip install 'foredrive[bags]'")
+    # A ROS 2 bag is a folder with its metadata, or a single file
     ros2_folder = path.is_dir() and (path / "metadata.yaml").is_file()
     if not ros2_folder and path.suffix not in (".bag", ".db3", ".mcap"):
         raise InputError(f"{path}: neither a .bag, .db3 or .mcap nor the folder of a ROS 2 bag")
@@ -105,6 +106,7 @@ def _open_ros(path: Path) -> Iterator[Bag]:
         }
 
         def read(names: Collection[str]) -> Iterator[Message]:
+            # Only connections of the named topics are read
             wanted = [one for one in reader.connections if one.topic in names]
             for connection, t_ns, data in reader.messages(connections=wanted) if wanted else ():
                 content = functools.partial(decode, data, connection.msgtype)

@@ -37,9 +37,10 @@ def index_bag(bag: Bag, topics: BagTopics) -> BagIndex:
     """Read the stamps, transforms and calibrations of a bag.
 
     Raises:
-        InputError: of a topic no message can be read.
+        InputError: no message of a topic can be read.
     """
     index = BagIndex()
+    # Cameras, lidar and poses by topic; transforms from all topics that have them
     infos = {camera.info for camera in topics.cameras.values() if camera.info is not None}
     sensed = {camera.images for camera in topics.cameras.values()}
     sensed |= {topics.lidar.topic} if topics.lidar else set()
@@ -50,17 +51,19 @@ def index_bag(bag: Bag, topics: BagTopics) -> BagIndex:
     for message in bag.read(names):
         topic, number = message.topic, numbers[message.topic]
         numbers[topic] += 1
+        # One calibration is enough for a camera
         if topic in infos and topic in index.calibrations:
             continue
         read = functools.partial(_read_message, message, index, topics, number)
         readers[topic](f"message {number}, recorded at {message.recorded_s:.3f} s", read)
+    # Every wanted topic needs at least one readable message
     for topic in sorted(names - tf):
         readers[topic].check()
     return index
 
 
 def _read_message(message: Message, index: BagIndex, topics: BagTopics, number: int) -> None:
-    """Add what one message says to an index."""
+    """Add the content of one message to an index."""
     topic, content = message.topic, message.decode()
     sensed = topic in {camera.images for camera in topics.cameras.values()}
     if sensed or (topics.lidar is not None and topic == topics.lidar.topic):
@@ -84,6 +87,7 @@ def transforms(index: BagIndex, topics: BagTopics) -> list[Placed]:
         return index.placed
     tree = FrameTree(index.placed)
     posed = []
+    # Transform from the posed frame to the ego frame, looked up once for each frame
     T_child_ego: dict[str, np.ndarray] = {}
     for one in index.posed:
         child = one.child or topics.ego_frame
@@ -94,6 +98,7 @@ def transforms(index: BagIndex, topics: BagTopics) -> list[Placed]:
         posed.append(Placed(one.parent, topics.ego_frame, one.t_us, T_parent_ego))
     parents = {one.parent for one in posed}
     others = [
+        # Transforms of the ego frame from elsewhere would contradict the poses
         one
         for one in index.placed
         if one.child != topics.ego_frame and not (one.parent == topics.ego_frame and one.child in parents)

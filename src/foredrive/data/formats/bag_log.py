@@ -50,6 +50,7 @@ def find_bags(source: Path, topics: Path | None = None) -> Iterator[RawLog]:
     """
     bags = [source] if source.is_file() or (source / "metadata.yaml").is_file() else []
     if not bags:
+        # A folder without metadata may hold several bags, each with its YAML beside it
         files = sorted(source.glob("*.topics.yaml"))
         bags = [source / file.name.removesuffix(".topics.yaml") for file in files]
     for bag in bags:
@@ -76,8 +77,10 @@ class BagLog:
         with open_bag(self.bag) as bag:
             self._check_topics(bag)
             index = index_bag(bag, topics)
+            # One tree of transforms gives the path of the vehicle and all mounts
             tree = FrameTree(transforms(index, topics))
             times_us = self._frame_times(index, tree)
+            # The log's ego frame is on the ground below the rear axle, which may be off the bag's frame
             T_ego_origin = np.eye(4)
             T_ego_origin[:3, 3] = topics.ego_origin_m
             poses = (
@@ -88,12 +91,14 @@ class BagLog:
                 if mount is not None:
                     T = _matrix(mount)
                 else:
+                    # Sensors do not move on the vehicle, so one time is enough
                     sensor = frame or frame_of(index.first[topic])
                     T = tree.between(topics.ego_frame, sensor, int(times_us[0]))
                 return np.asarray(np.linalg.inv(T_ego_origin) @ T)
 
             images, image_t_s, cameras = {}, {}, []
             for name, camera in topics.cameras.items():
+                # Each camera is a stream of images, read one at a time
                 calibration = _calibration(camera, index)
                 T_ego_cam = mounted(camera.images, camera.frame, camera.mount)
                 spec = CameraSpec(name, calibration.K, T_ego_cam, calibration.size_hw, dist=calibration.dist)
@@ -104,6 +109,7 @@ class BagLog:
                 if camera.value_range is not None:
                     low, high = camera.value_range
                     note(camera.images, f"images of 16 bits; {low:g} became 0 and {high:g} became 255")
+            # Without a lidar its position is unimportant: a usual place on a roof
             sweeps, position = None, np.array([0.0, 0.0, 1.8])
             if topics.lidar is not None:
                 lidar = topics.lidar
@@ -111,6 +117,7 @@ class BagLog:
                 points = self._points(T_ego_lidar, self._time_unit(index))
                 position, stamps = T_ego_lidar[:3, 3], index.stamps[lidar.topic]
                 sweeps = _Stream(bag, lidar.topic, stamps, times_us, points)
+            # A sensor without a single readable message is an error
             for stream in [*images.values(), *([] if sweeps is None else [sweeps])]:
                 stream.check()
             return write_log(
@@ -133,6 +140,7 @@ class BagLog:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return times and poses of the vehicle at the rate of the bag."""
         topics = self.topics
+        # The path has all poses of the bag between the frames, not only those at the frames
         at_us = np.union1d(tree.times_us(topics.world_frame, topics.ego_frame), times_us)
         poses = tree.pose(topics.world_frame, topics.ego_frame, at_us.astype(np.float64))
         return at_us * 1e-6, poses @ T_ego_origin
@@ -147,9 +155,11 @@ class BagLog:
         lidar = self.topics.lidar
         first = index.first[lidar.topic]
         times = read_cloud(first).times
+        # A given unit takes precedence over the guess
         if lidar.point_times is not None or times is None:
             return None if lidar.point_times == "none" else lidar.point_times
         stamps_us = np.unique(index.stamps_us(lidar.topic))
+        # Period between sweeps; a single sweep has the usual one
         period_s = float(np.median(np.diff(stamps_us))) * 1e-6 if len(stamps_us) > 1 else DEFAULT_PERIOD_S
         unit = time_unit(times, stamp_us(first), period_s)
         if unit is None:
@@ -167,6 +177,7 @@ class BagLog:
 
         def read(message: Any) -> Points:
             cloud = read_cloud(message)
+            # Points from the lidar's frame to the bag's ego frame
             xyz = cloud.xyz_m @ T_ego_lidar[:3, :3].T + T_ego_lidar[:3, 3]
             intensity = (
                 None if cloud.intensity is None else np.nan_to_num(cloud.intensity / lidar.intensity_max)
@@ -177,6 +188,7 @@ class BagLog:
             dt_s = None
             if unit is not None and cloud.times is not None:
                 dt_s = seconds_since_stamp(cloud.times, stamp_us(message), unit)
+            # Channels are stored in 8 bits
             fits = cloud.channel is not None and ((cloud.channel >= 0) & (cloud.channel <= 255)).all()
             return Points(
                 xyz,
@@ -203,6 +215,7 @@ class BagLog:
         """Return the times of the frames, as far as there are poses."""
         topics = self.topics
         first = topics.lidar.topic if topics.lidar else next(iter(topics.cameras.values())).images
+        # Frames are at the stamps of the lidar, or of the first camera, within the span of the poses
         stamps = np.unique(index.stamps_us(first))
         for frame in (topics.world_frame, topics.ego_frame):
             if frame not in tree.frames:
@@ -222,10 +235,12 @@ def _calibration(camera: CameraTopics, index: BagIndex) -> Calibration:
     if camera.intrinsics is None:
         assert camera.info is not None
         return index.calibrations[camera.info]
+    # ROS has pixel centres at whole numbers, the log at +0.5
     lens = camera.intrinsics
     K = np.array([[lens.fx, 0, lens.cx + 0.5], [0, lens.fy, lens.cy + 0.5], [0, 0, 1]])
     dist = np.zeros(5)
     dist[: len(lens.distortion)] = lens.distortion
+    # Intrinsics hold for the size of the images
     height, width = read_pixels(index.first[camera.images]).shape[:2]
     return Calibration(K, dist, (height, width))
 
@@ -259,20 +274,24 @@ class _Stream(PartSequence):
     ) -> None:
         super().__init__(topic, "messages", len(times_us))
         numbers, stamps_us = np.array(stamps, np.int64).reshape(-1, 2).T
+        # Messages may come out of order: note them and sort by stamp
         for row in np.flatnonzero(np.diff(stamps_us) < 0) + 1:
             place = f"message {numbers[row]}, {stamps_us[row] * 1e-6:.3f} s"
             note(topic, "messages out of order, sorted by their stamps", place)
         order = np.argsort(stamps_us, kind="stable")
         numbers, stamps_us = numbers[order], stamps_us[order]
+        # Messages before and after each frame, and the nearer one of the two
         after = np.searchsorted(stamps_us, times_us).clip(1, max(len(stamps_us) - 1, 1))
         before = after - 1
         after = after.clip(0, len(stamps_us) - 1)
         nearest = np.where(times_us - stamps_us[before] <= stamps_us[after] - times_us, before, after)
         period_us = float(np.median(np.diff(times_us))) if len(times_us) > 1 else 1e5
+        # A message more than half a period away belongs to another frame
         self._exists = np.abs(stamps_us[nearest] - times_us) <= 0.5 * period_us
         self.t_us = np.where(self._exists, stamps_us[nearest], times_us)
         self._numbers = numbers[nearest]
         frames = np.flatnonzero(self._exists)
+        # The last frame that needs each message, after which it can be dropped
         self._last_frame = dict(zip(self._numbers[frames].tolist(), frames.tolist(), strict=True))
         self._bag, self._topic, self._decode = bag, topic, decode
         self._rewind()
@@ -284,6 +303,7 @@ class _Stream(PartSequence):
 
     def _message(self, number: int) -> Message:
         """Return a message by its number. Those passed on the way are kept if a later frame needs them."""
+        # A message that was passed and not kept: read the bag from its start again
         if number <= self._position and number not in self._ahead:
             self._rewind()
         while self._position < number:
@@ -297,6 +317,7 @@ class _Stream(PartSequence):
             return None
         number = int(self._numbers[frame])
         message = self._message(number)
+        # Free a message after the last frame that needs it
         if self._last_frame[number] == frame:
             del self._ahead[number]
         place = f"message {number}, {self.t_us[frame] * 1e-6:.3f} s"

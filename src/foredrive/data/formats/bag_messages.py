@@ -87,6 +87,7 @@ class Placed:
 def stamp_us(message: Any) -> int:
     """Return the time at which a message's content was measured, µs."""
     stamp = message.header.stamp if hasattr(message, "header") else message.timestamp
+    # Stamps of Foxglove have seconds and nanos, those of ROS sec and nanosec
     if hasattr(stamp, "seconds"):
         return int(stamp.seconds) * 1_000_000 + int(stamp.nanos) // 1000
     return int(stamp.sec) * 1_000_000 + int(stamp.nanosec) // 1000
@@ -133,10 +134,12 @@ def read_pixels(message: Any) -> Shaped[np.ndarray, "H W *channels"]:
     depth = np.dtype("u2" if encoding in _DEEP else "u1")
     channels = 2 if encoding in _PAIRED else _CHANNELS.get(encoding, 1)
     data = np.frombuffer(bytes(message.data), np.uint8)
+    # Rows may be padded to a step, but never shorter than their pixels
     row = width * channels * depth.itemsize
     if data.size != height * step or row > step or not row or not height:
         raise InputError(f"an image of {height} x {width} px in rows of {step} bytes has {data.size} bytes")
     pixels = np.ascontiguousarray(data.reshape(height, step)[:, :row])
+    # 16 bits stay grey, with the byte order of the message
     if depth.itemsize == 2:
         big = bool(getattr(message, "is_bigendian", 0))
         return pixels.view(depth.newbyteorder(">" if big else "<")).reshape(height, width)
@@ -160,6 +163,7 @@ def read_calibration(message: Any) -> Calibration:
     if model not in ("plumb_bob", "rational_polynomial", "") or dist[5:].any():
         raise InputError(f"lenses of the model {model!r} are not read; undistort the images first")
     K = K.reshape(3, 3)
+    # Pixel centres at +0.5
     K[:2, 2] += 0.5
     five = np.zeros(5)
     five[: min(len(dist), 5)] = dist[:5]
@@ -177,6 +181,7 @@ def read_cloud(message: Any) -> Cloud:
     if not {"x", "y", "z"} <= set(names):
         raise InputError(f"a point cloud without x, y and z; it has {', '.join(names) or 'no fields'}")
     xyz = np.stack([cells[axis].astype(np.float64) for axis in "xyz"], axis=-1)
+    # Points without return are NaN in many drivers
     kept = np.isfinite(xyz).all(axis=-1)
 
     def column(wanted: tuple[str, ...]) -> np.ndarray | None:
@@ -192,6 +197,7 @@ def read_cloud(message: Any) -> Cloud:
     )
 
 
+# Fields of arbitrary types at arbitrary offsets, as numpy's structured arrays
 def _cells(message: Any) -> np.ndarray:
     """Return the points of a cloud as a structured array."""
     if hasattr(message, "point_step"):
@@ -233,12 +239,16 @@ def time_unit(times: Shaped[np.ndarray, "N"], stamp_us: int, period_s: float) ->
     if not values.size or not np.isfinite(values).all():
         return None
     largest = float(np.abs(values).max())
+    # Spacing of neighbouring numbers at the largest time: the resolution of the stored type
     step = float(np.spacing(np.abs(times).max())) if times.dtype.kind == "f" else 1.0
+    # Absolute times: near the stamp, beyond a second, and precise enough
     for unit, ns in UNITS_NS.items():
         off_s = float(np.abs(values * (ns * 1e-9) - stamp_us * 1e-6).max())
         if off_s <= _MAX_OFF_STAMP_S < largest * ns * 1e-9 and step * ns * 1e-9 < _MIN_RESOLUTION_S:
             return unit
+    # Relative times: the first unit, from large to small, in which they fit between two sweeps
     fitting = [unit for unit, ns in UNITS_NS.items() if largest * ns * 1e-9 <= _MAX_SHARE * period_s]
+    # Much shorter than the period, the type of the numbers decides
     if fitting and largest * UNITS_NS[fitting[0]] * 1e-9 >= _MIN_SHARE * period_s:
         return fitting[0]
     usual = "ns" if times.dtype.kind in "iu" else "s"
@@ -253,6 +263,7 @@ def seconds_since_stamp(times: Shaped[np.ndarray, "N"], stamp_us: int, unit: str
     """
     ns = UNITS_NS[unit]
     values = times.astype(np.float64)
+    # Times beyond a day can only be absolute
     absolute = bool(values.size) and np.abs(values).max() * ns * 1e-9 > _DAY_S
     if absolute and times.dtype.kind in "iu":  # exact, as whole numbers of ns
         since_s = (times.astype(np.int64) * ns - stamp_us * 1000) * 1e-9
@@ -272,6 +283,7 @@ def read_placed(message: Any) -> Iterator[Placed]:
     elif hasattr(message, "parent_frame_id"):
         yield _transform(message)
     else:
+        # A pose with covariance holds the pose one level deeper
         pose = message.pose.pose if hasattr(message.pose, "pose") else message.pose
         child = str(getattr(message, "child_frame_id", "")).lstrip("/")
         T = _matrix(pose.position, pose.orientation)
@@ -290,6 +302,7 @@ def _transform(message: Any) -> Placed:
 def _matrix(xyz: Any, turn: Any) -> Float64[np.ndarray, "4 4"]:
     quaternion = np.array([turn.x, turn.y, turn.z, turn.w], np.float64)
     position = np.array([xyz.x, xyz.y, xyz.z], np.float64)
+    # Quaternions are normalised below; one far from length 1 is none
     if not np.isfinite(position).all() or not 0.5 < np.linalg.norm(quaternion) < 2.0:
         raise InputError("a pose that is not finite, or whose quaternion is none")
     T = np.eye(4)

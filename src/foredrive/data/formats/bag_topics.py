@@ -157,6 +157,7 @@ def propose_topics(bag: Path, file: Path) -> str:
     """
     if file.exists():
         raise InputError(f"{file}: is there already; remove it to propose topics anew")
+    # Faults of single messages are collected and not written: the conversion names them
     with open_bag(bag) as opened, collecting():
         proposal = _Proposal(opened)
         topics = proposal.topics(bag)
@@ -198,6 +199,7 @@ class _Proposal:
         Raises:
             InputError: there are neither images nor points.
         """
+        # Topics by kind of data, those without messages left out
         by_kind: dict[str, list[Topic]] = {}
         for topic in self._bag.topics.values():
             if topic.kind is not None and topic.count:
@@ -205,7 +207,9 @@ class _Proposal:
         if not {"image", "points"} & set(by_kind):
             names = ", ".join(self._bag.topics) or "none"
             raise InputError(f"{path}: no topic with images or points; there are: {names}")
+        # Poses first: they decide about the frames of the world and the vehicle
         world, ego, pose = self._poses(by_kind)
+        # The lidar with most messages is read; a log has one
         lidar = max(by_kind.get("points", []), key=lambda one: one.count, default=None)
         for topic in by_kind.get("points", []):
             if topic is not lidar:
@@ -230,10 +234,12 @@ class _Proposal:
         The frames are those of the usual names, else the first that moves. A topic of poses in a frame that
         moves with the vehicle tells nothing of its path.
         """
+        # All transforms of the bag
         tf: list[Placed] = []
         for message in self._bag.read([one.name for one in by_kind.get("tf", [])]):
             content = _attempt(message.decode)
             tf += [] if content is None else _attempt(_placed, content) or []
+        # First pose of each topic that has poses
         candidates: dict[str, Placed] = {}
         for topic in [*by_kind.get("odometry", []), *by_kind.get("pose", [])]:
             for content in self._first(topic.name):
@@ -241,10 +247,12 @@ class _Proposal:
                 candidates |= {topic.name: placed[0]} if placed else {}
         stated = [*tf, *(one for one in candidates.values() if one.child)]
         tree = FrameTree(stated)
+        # The vehicle's frame by its usual names, in any case
         names = {name.lower(): name for name in sorted(tree.frames)}
         ego = next((names[name] for name in _EGO_NAMES if name in names), None)
         ego = ego or (stated[0].child if stated else _EGO_NAMES[0])
         pose = None
+        # A pose in a frame that moves with the vehicle does not tell its path
         for topic_name, one in candidates.items():
             if one.parent == ego or tree.is_below(one.parent, ego):
                 self._left_out[topic_name] = f"its frame {one.parent} moves with {ego}"
@@ -254,6 +262,7 @@ class _Proposal:
                 self._left_out[topic_name] = f"poses are those of {pose}"
         if pose is not None:
             return candidates[pose].parent, ego, pose
+        # Without a topic of poses, the world is the usual frame above the vehicle
         above = [name for name in _WORLD_NAMES if name in names and tree.is_below(ego, names[name])]
         world = names[above[0]] if above else (stated[0].parent if stated else _WORLD_NAMES[0])
         return world, ego, None
@@ -263,6 +272,7 @@ class _Proposal:
         used: dict[str, str] = {}
         names: set[str] = set()
         frames = {topic.name: [frame_of(content) for content in self._first(topic.name)] for topic in infos}
+        # Compressed images come first: of two topics of one camera, they are smaller
         for topic in sorted(images, key=lambda one: (not one.type.endswith("CompressedImage"), one.name)):
             first = self._first(topic.name)
             if not first:
@@ -311,8 +321,10 @@ class _Proposal:
             raise InputError(f"{topic.name}: none of its messages can be read")
         cloud = read_cloud(first[0])
         largest = 0.0 if cloud.intensity is None or not cloud.intensity.size else float(cloud.intensity.max())
+        # The usual scale of intensity that holds the largest value
         scale = next((scale for scale in (1.0, 255.0, 65_535.0) if largest <= scale), largest)
         stamps_us = [stamp_us(content) for content in first]
+        # Two sweeps give the period
         period_s = (stamps_us[-1] - stamps_us[0]) * 1e-6 or DEFAULT_PERIOD_S
         unit = None if cloud.times is None else time_unit(cloud.times, stamps_us[0], period_s)
         return LidarTopic(
@@ -341,6 +353,7 @@ def _calibration_of(images: str, frame: list[str], frames: dict[str, list[str]])
     That is the one in the nearest namespace around it. One in the root, or in another namespace, could belong
     to any camera, so it must name the same frame.
     """
+    # The namespace of a topic is its path without the last part
     spaces = {info: info.rpartition("/")[0] for info in frames}
     around = [info for info, space in spaces.items() if space and images.startswith(f"{space}/")]
     if around:

@@ -48,7 +48,7 @@ class PosedImage:
     lens: tuple[float, ...]
     """Width, height, focal lengths and centre in px, then distortion."""
     camera: str | None = None
-    """Name of the camera, if the data set tells."""
+    """Name of the camera, if the data set states it."""
 
 
 @dataclass(frozen=True)
@@ -114,6 +114,7 @@ def split_into_cameras(images: Sequence[PosedImage], where: str) -> list[RigCame
 def _groupings(images: Sequence[PosedImage]) -> Iterator[_Grouping]:
     """Yield the ways to group images that could be meant, the clearest first."""
     stems = [Path(image.path).stem for image in images]
+    # What the file says, then folders, names, lenses, and the order at each time
     if all(image.camera is not None for image in images):
         yield _Grouping("the file", [str(image.camera) for image in images], stems)
     folders = [Path(image.path).parent.name for image in images]
@@ -163,6 +164,7 @@ def _times_us(images: Sequence[PosedImage], grouping: _Grouping) -> list[int] | 
         stamps = [float(image.t_s or 0.0) for image in images]
         times = [round(stamp * _scale_us(max(map(abs, stamps)))) for stamp in stamps]
     else:
+        # Frames by the numbers in names, in the order of their values
         ranks = {number: rank for rank, number in enumerate(sorted(set(grouping.numbers), key=_natural))}
         times = [round(PERIOD_S * 1e6) * ranks[number] for number in grouping.numbers]
         # Names alone show several cameras only where each has several images.
@@ -184,8 +186,10 @@ def _natural(text: str) -> list[tuple[int, str]]:
 def _rig(images: Sequence[PosedImage], names: list[str], times_us: list[int]) -> list[RigCamera] | str:
     """Return the cameras of a grouping, or why they are none."""
     rows: dict[str, list[int]] = {}
+    # Rows of each camera in order of time
     for row in np.argsort(times_us, kind="stable").tolist():
         rows.setdefault(names[row], []).append(row)
+    # The camera with most images is the base of the rig
     order = sorted(rows, key=lambda name: (-len(rows[name]), min(rows[name])))
     t_us = np.array(times_us, np.int64)
     T = np.stack([image.T_world_cam for image in images])
@@ -193,12 +197,14 @@ def _rig(images: Sequence[PosedImage], names: list[str], times_us: list[int]) ->
     cameras = []
     for name in order:
         lenses = np.array([images[row].lens for row in rows[name]])
+        # Images of one camera have one size and nearly one lens
         if not all(_alike(images[rows[name][0]].lens, images[row].lens) for row in rows[name]):
             return f"the images of {name} have different sizes or intrinsics"
         T_base_cam = np.eye(4) if name == order[0] else _mount(t_us, T, base, rows[name])
         if T_base_cam is None:
             return f"{name} has no constant place to {order[0]}"
         files = [images[row].file for row in rows[name]]
+        # Estimated intrinsics differ a little: their median is the camera's
         if len(np.unique(lenses, axis=0)) > 1:
             note(_plain(name), "calibrations differ a little between images; their median is used")
         lens = tuple(np.median(lenses, axis=0).tolist())
@@ -210,6 +216,7 @@ def _mount(
     t_us: Int64[np.ndarray, "N"], T: Float64[np.ndarray, "N 4 4"], base: list[int], other: list[int]
 ) -> Float64[np.ndarray, "4 4"] | None:
     """Return the constant pose of one camera in the frame of another, or None if it varies or is unknown."""
+    # Images within the time of the base camera; those at equal times need no interpolation
     inside = [row for row in other if t_us[base[0]] <= t_us[row] <= t_us[base[-1]]]
     shared = [row for row in inside if t_us[row] in t_us[base]]
     used = shared or inside
@@ -219,6 +226,7 @@ def _mount(
         T_world_base = T[base]
     else:
         T_world_base = interpolated_poses(t_us[base], T[base], t_us[used].astype(np.float64))
+    # Pose of the camera in the base camera's frame at each time
     T_base_cam = np.linalg.inv(T_world_base) @ T[used]
     turns = Rotation.from_matrix(T_base_cam[:, :3, :3])
     mean = turns.mean()
@@ -226,6 +234,7 @@ def _mount(
     # Estimated poses have outliers, so nine of ten images have to agree.
     off_rad = np.percentile((mean.inv() * turns).magnitude(), 90)
     off_m = np.percentile(np.linalg.norm(T_base_cam[:, :3, 3] - place, axis=-1), 90)
+    # Limits grow with the path (drift of estimated poses) and with the baseline (scale errors)
     path_m = np.linalg.norm(np.diff(T[base][:, :3, 3], axis=0), axis=-1).sum()
     limit_m = max(_MAX_SHIFT_OF_PATH * path_m, _MAX_SHIFT_OF_BASELINE * float(np.linalg.norm(place)))
     if off_rad > _MAX_TURN_RAD or off_m > limit_m + 1e-6:

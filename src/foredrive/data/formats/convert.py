@@ -61,6 +61,7 @@ def find_raw_logs(source: Path, dataset: str, topics: Path | None = None) -> Ite
         with reading_raw(source):
             raw = next(logs, None)
         if raw is None:
+            # Errors of a parser become an error that names the log
             break
         any_log = True
         yield raw
@@ -95,6 +96,7 @@ def convert_log(raw: RawLog, out: Path, tick: Callable[[], None] = lambda: None)
         path = log_path(metadata, out)
         if isinstance(raw.log, OwnLog):
             return raw.log.write(out, tick)
+        # The log appears complete or not at all
         with atomic_path(path.folder, alone=True) as temporary:
             scratch = temporary.parent
             if raw.map is not None:
@@ -118,6 +120,7 @@ def _write_frames(
     writer = ArrowLogWriter(config, scratch, scratch)
     writer.reset(metadata)
     files, frames = SensorFiles(source, metadata.dataset), 0
+    # Frames of the parser, checked and loaded one at a time
     for frame in log.iter_modalities_sync():
         for modality in frame.modalities:
             check_inside(modality, source)
@@ -126,6 +129,7 @@ def _write_frames(
         writer.write_sync(ModalitiesSync(frame.timestamp, loaded))
         frames += 1
         tick()
+    # A sensor of which nothing can be read is an error
     files.check()
     writer.close()
     return frames
@@ -135,16 +139,19 @@ def _write_map(parser: BaseMapParser, scratch: Path, out: Path) -> None:
     """Write the map of one log below `scratch`, or a shared map below `out` unless it is there."""
     metadata = parser.get_map_metadata()
     check_names(metadata)
+    # A map of one log lies beside it
     if metadata.map_is_per_log:
         _fill_map(parser, scratch, scratch)
         (scratch / metadata.split / metadata.log_name).mkdir(parents=True, exist_ok=True)
         return
     name = Path(metadata.dataset) / f"{metadata.dataset}_{metadata.location}.arrow"
     final = out / "maps" / name
+    # A shared map is written once
     if final.is_file():
         return
     with atomic_path(final) as temporary:
         _fill_map(parser, temporary.parent, temporary.parent)
+        # The map appears complete or not at all
         os.replace(temporary.parent / name, temporary)
 
 

@@ -1,4 +1,4 @@
-"""A tree of frames whose poses change over time, as tf messages tell them."""
+"""A tree of frames whose poses change over time, as tf messages state them."""
 
 from collections.abc import Iterable
 
@@ -24,12 +24,14 @@ class FrameTree:
         for one in placed:
             if one.child == one.parent:
                 continue
+            # The first parent of a frame stays; poses in another parent are left out
             parent = self._parent.setdefault(one.child, one.parent)
             if parent == one.parent:
                 poses.setdefault(one.child, {})[one.t_us] = one.T_parent_child
             else:
                 place = f"{one.child} in {one.parent}, at {one.t_us * 1e-6:.3f} s"
                 note("transforms", f"second parents of a frame, beside {parent}, left out", place)
+        # Poses of each frame in order of time; of two at one time the later message counts
         self._times = {child: np.array(sorted(stamped), np.int64) for child, stamped in poses.items()}
         self._poses = {
             child: np.stack([poses[child][t_us] for t_us in times.tolist()])
@@ -47,6 +49,7 @@ class FrameTree:
 
     def span_us(self, top: str, frame: str) -> tuple[int, int]:
         """Return the times between which all moving frames from `frame` up to `top` have poses."""
+        # Frames with a single pose are fixed and have no span
         moving = [self._times[one] for one in self._chain(frame, top) if len(self._times[one]) > 1]
         if not moving:
             raise InputError(f"the frame {frame!r} does not move in {top!r}: poses of the vehicle are needed")
@@ -65,6 +68,7 @@ class FrameTree:
             InputError: `top` is not above `frame`.
         """
         T = np.tile(np.eye(4), (len(t_us), 1, 1))
+        # From the frame up: each pose is multiplied from the left
         for one in self._chain(frame, top):
             times, poses = self._times[one], self._poses[one]
             T = (poses[0] if len(times) == 1 else interpolated_poses(times, poses, t_us)) @ T
@@ -87,6 +91,7 @@ class FrameTree:
         """Return the frames from `frame` up to the one below `top`, or below the root."""
         chain: list[str] = []
         while frame != top and frame in self._parent:
+            # A frame that comes up again shows a circle
             if frame in chain:
                 raise InputError(f"the transforms of {frame!r} go in a circle")
             chain.append(frame)

@@ -50,10 +50,12 @@ def reading_raw(source: Path) -> Iterator[None]:
         try:
             yield
         except InputError as error:
+            # An error that names the log already stays as it is
             if source.name in str(error):
                 raise
             raise InputError(f"{source}: {error}") from error
         except Exception as error:
+            # Errors of writing are the user's disk, not damaged input
             if isinstance(error, OSError) and error.errno in REFUSES_WRITING:
                 raise
             raise InputError(f"{source}: cannot read the raw log: {_reason(error)}{_place(error)}") from error
@@ -82,6 +84,7 @@ class PartReader:
             place: names the part: its number, file and time.
             read: reads it.
         """
+        # Errors of code are raised; all others are damage of this part
         try:
             part = read()
         except _MISTAKES:
@@ -135,6 +138,7 @@ class PartSequence(Sequence[Any]):
         Raises:
             InputError: none can.
         """
+        # The first readable part is enough
         _ = any(self[frame] is not None for frame in range(len(self)))
         self._read.check()
 
@@ -192,6 +196,7 @@ def _whole_image(parsed: ParsedCamera) -> BaseModality:
     file = Path(parsed._dataset_root) / parsed._relative_path
     if not parsed.has_jpeg_file_path:
         return Camera(parsed.metadata, read_rgb(file), parsed.camera_to_global_se3, parsed.timestamp)
+    # JPEG decoding at an eighth of the size is fast and finds cut files
     with Image.open(file) as opened:
         opened.draft("RGB", (opened.width // 8, opened.height // 8))
         opened.load()
@@ -213,6 +218,7 @@ def _noting_opened(source: Path) -> Iterator[None]:
 
 
 def _note(event: str, details: tuple[Any, ...]) -> None:
+    # Only files opened for reading below the folder
     if event == "open" and _LastOpened.below is not None and isinstance(details[0], str | os.PathLike):
         path = os.path.abspath(details[0])
         if details[1] in _READ_MODES and path.startswith(_LastOpened.below):
@@ -250,6 +256,7 @@ def check_names(metadata: LogMetadata | MapMetadata) -> None:
     """
     for what in ("split", "log_name", "location", "dataset"):
         name = getattr(metadata, what)
+        # Names become folders: letters, digits and few signs, no path
         if name is not None and what != "location" and not _NAME.fullmatch(str(name)):
             raise InputError(f"the name {name!r} ({what}) cannot be that of a folder")
         if name is not None and what == "location" and re.search(r"[/\\\0]|^\.", str(name)):
@@ -267,6 +274,7 @@ def check_inside(modality: BaseModality, source: Path) -> None:
     root, relative = modality._dataset_root, modality._relative_path
     if root is None or relative is None:
         return
+    # Links are not resolved: a link of the user inside of the data set may lead elsewhere
     whole = os.path.abspath(os.path.join(root, relative))
     if os.path.commonpath([whole, os.path.abspath(root)]) != os.path.abspath(root):
         raise InputError(f"{source}: it names the file {str(relative)!r}, which is outside of the data set")

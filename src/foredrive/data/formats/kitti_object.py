@@ -79,7 +79,7 @@ class KittiObjectParser(BaseLogParser):
         return LogMetadata("kitti", self._split, self._frame, location=None)
 
     def iter_modalities_sync(self) -> Iterator[ModalitiesSync]:
-        """Yield the frame: what is there of lidar, cameras and boxes."""
+        """Yield the frame with the lidar, cameras and boxes that it has."""
         calibration = _Calibration.read(self._file("calib", "txt"))
         modalities: list[BaseModality] = [
             EgoStateSE3.from_imu(PoseSE3.identity(), KITTI360_EGO_STATE_SE3_METADATA, _NOW)
@@ -98,6 +98,7 @@ class KittiObjectParser(BaseLogParser):
     def _lidar(self, calibration: "_Calibration") -> Lidar:
         file = self._file("velodyne", "bin")
         points = read_points(file, KITTI)
+        # Points are stored in the IMU's frame
         T = calibration.T_imu_velo
         intensity = IntensityScale(f"velodyne/{file.name}")(points[:, 3])
         return Lidar(
@@ -134,6 +135,7 @@ class KittiObjectParser(BaseLogParser):
                 continue
             label = read(f"line {number + 1}", functools.partial(_Label.of, line))
             if label is None:
+                # Camera frame to IMU frame
                 continue
             pose = _pose(calibration.T_imu_rect @ label.T_rect_box)
             category = category_or_other(label.kind, f"label_2/{file.name}")
@@ -167,6 +169,7 @@ class _Label:
         """
         kind, *words = line.split()
         if len(words) < _COLUMNS - 1 or kind.replace(".", "").lstrip("-").isdigit():
+            # Order of KITTI's columns: height, width, length, then place and turn
             raise InputError(f"not {_COLUMNS} columns that begin with a class")
         height, width, length, x, y, z, turn = (float(word) for word in words[7:14])
         if not np.isfinite([x, y, z, turn]).all() or not min(height, width, length) > 0:
@@ -203,6 +206,7 @@ class _Calibration:
             T_ego_velo = np.eye(4)
             T_ego_velo[2, 3] = _HEIGHT_M
             T_imu_velo = imu_from_ego(KITTI360_EGO_STATE_SE3_METADATA) @ T_ego_velo
+        # Velodyne to camera 0, then to the rectified frame
         T_rect_velo = _rigid(values["R0_rect"].reshape(3, 3)) @ _rigid(values["Tr_velo_to_cam"].reshape(3, 4))
         projections = {name: values[name].reshape(3, 4) for name, _ in _CAMERAS.values() if name in values}
         return cls(T_imu_velo, T_imu_velo @ np.linalg.inv(T_rect_velo), projections)
@@ -211,6 +215,7 @@ class _Calibration:
         """Return K and T_imu_cam of a camera. Its projection matrix contains its offset from camera 0."""
         P = self.projections[name]
         T_cam_rect = np.eye(4)
+        # P = K [I | t]: the offset of the camera from camera 0, in its own axes
         T_cam_rect[:3, 3] = np.linalg.solve(P[:, :3], P[:, 3])
         return P[:, :3], self.T_imu_rect @ np.linalg.inv(T_cam_rect)
 
@@ -222,6 +227,7 @@ def _rigid(rows: Float64[np.ndarray, "3 _"]) -> Float64[np.ndarray, "4 4"]:
     """
     T = np.eye(4)
     U, _, V = np.linalg.svd(rows[:, :3])
+    # The nearest rotation
     T[:3, :3] = U @ V
     T[:3, 3:] = rows[:, 3:] if rows.shape[1] == 4 else 0.0
     return T

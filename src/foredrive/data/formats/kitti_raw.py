@@ -75,12 +75,14 @@ class KittiRawParser(BaseLogParser):
             for name in (_LIDAR, *_CAMERAS)
             if name == _LIDAR or (self._folder / name / "data").is_dir()
         }
+        # Begin and end of each turn of the lidar, and the path that its points are moved along
         spans_us = self._spans_us(times_us[_LIDAR])
         path = _Path.read(self._folder / "oxts")
-        _ = self._calibration  # a log without one is refused; it is no matter of single files
+        _ = self._calibration  # read once here: a missing one is a fault of the log, not of single files
         readers = {name: PartReader(name, "files") for name in (_LIDAR, *_CAMERAS)}
         scale = IntensityScale(_LIDAR)
         for frame, files in self._files().items():
+            # The first stream that has a time for the frame
             t_us = next((t for stream in times_us.values() if (t := _time_of(stream, frame))), 0)
             if not t_us:
                 note(self._folder.name, "frames without a time, left out", f"{frame:010d}")
@@ -123,6 +125,7 @@ class KittiRawParser(BaseLogParser):
         xyz = points[:, :3].astype(np.float64)
         azimuth = np.arctan2(xyz[:, 1], xyz[:, 0])
         share = 0.5 * (1 - azimuth / np.pi)  # 0 at the rear, ½ ahead, clockwise
+        # The time of a point follows from its azimuth, as the lidar turns evenly
         at_us = (span_us[0] + share * (span_us[1] - span_us[0])).astype(np.int64)
         T_imu_velo = self._calibration.T_imu_velo
         features = {
@@ -136,6 +139,7 @@ class KittiRawParser(BaseLogParser):
             timestamp=Timestamp.from_us(int(span_us[0])),
             timestamp_end=Timestamp.from_us(int(span_us[1])),
             metadata=LidarMetadata("velodyne", LidarID.LIDAR_TOP, _pose(T_imu_velo)),
+            # Each point goes to the IMU's frame at its own time, then to that at the time of the frame
             point_cloud_3d=path.moved(_transformed(T_imu_velo, xyz), at_us, t_us).astype(np.float32),
             point_cloud_features=features,
         )
@@ -161,6 +165,7 @@ class KittiRawParser(BaseLogParser):
             camera_to_imu_se3=_pose(T_imu_cam),
             is_undistorted=True,
         )
+        # The camera is where the vehicle is when the image is taken, not at the time of the frame
         T_world_cam = path.at(np.array([t_us]))[0] @ T_imu_cam
         return Camera(metadata, image, _pose(T_world_cam), Timestamp.from_us(t_us))
 
@@ -173,6 +178,7 @@ class KittiRawParser(BaseLogParser):
         files = [self._folder / _LIDAR / f"timestamps_{end}.txt" for end in ("start", "end")]
         if all(file.is_file() for file in files):
             return np.stack([_times_us(file) for file in files], axis=-1)
+        # Without the files of begin and end, the sweep lies about its time
         return times_us[:, None] + np.array([-_PERIOD_US // 2, _PERIOD_US // 2])
 
 
@@ -199,18 +205,22 @@ class _Path:
         read.check()
         rows, frames = np.array(list(records.values())), np.array(list(records))
         latitude, longitude = np.radians(rows[:, 0]), np.radians(rows[:, 1])
+        # Mercator projection, scaled to metres at the first latitude
         scale_m = np.cos(latitude[0]) * _EARTH_M
         north_m = scale_m * np.log(np.tan(0.25 * np.pi + 0.5 * latitude))
+        # East, north, up
         position_m = np.stack([scale_m * longitude, north_m, rows[:, 2]], axis=-1)
         times_us = t_us[frames]
         if len(rows) == 1:  # a vehicle that stands; a Slerp needs two
             rows, times_us = np.repeat(rows, 2, axis=0), times_us + np.array([0, 1])
             position_m = np.repeat(position_m, 2, axis=0)
+        # Yaw, pitch, roll as intrinsic rotations about z, y, x
         turn = Rotation.from_euler("ZYX", rows[:, [5, 4, 3]])
         return cls(times_us, position_m - position_m[0], Slerp(times_us, turn))
 
     def at(self, t_us: Int64[np.ndarray, "M"]) -> Float64[np.ndarray, "M 4 4"]:
         """Return T_world_imu at times: linear in between, standing still before and after."""
+        # Before the first and after the last record the vehicle stands still
         t_us = t_us.clip(self.t_us[0], self.t_us[-1])
         T = np.tile(np.eye(4), (len(t_us), 1, 1))
         T[:, :3, :3] = self.turn(t_us).as_matrix()
@@ -223,6 +233,7 @@ class _Path:
     ) -> Float64[np.ndarray, "P 3"]:
         """Return points, each in the IMU's frame at its own time, in the frame at one time."""
         T = self.at(at_us)
+        # Every point has a pose of its own
         world = np.einsum("pij,pj->pi", T[:, :3, :3], points) + T[:, :3, 3]
         return _transformed(np.linalg.inv(self.at(np.array([t_us]))[0]), world)
 
@@ -244,6 +255,7 @@ class _Calibration:
             _numbers(folder / f"calib_{name}.txt") for name in ("imu_to_velo", "velo_to_cam", "cam_to_cam")
         )
         T_imu_velo = np.linalg.inv(_rigid(imu["R"], imu["T"]))
+        # Velodyne to camera 0, then to the rectified frame
         T_rect_velo = _rigid(cameras["R_rect_00"], np.zeros(3)) @ _rigid(velo["R"], velo["T"])
         numbers = [number for number, _ in _CAMERAS.values()]
         return cls(
@@ -259,13 +271,16 @@ class _Calibration:
         """Return K for images of a size, which may be shrunk, and T_imu_cam."""
         P = self.projections[number]
         T_cam_rect = np.eye(4)
+        # Offset of the camera from camera 0: P = K [I | t]
         T_cam_rect[:3, 3] = np.linalg.solve(P[:, :3], P[:, 3])
+        # Shrunk images scale the rows of K
         K = np.diag([*(size_wh / self.sizes[number]), 1.0]) @ P[:, :3]
         return K, self.T_imu_rect @ np.linalg.inv(T_cam_rect)
 
 
 def _channels(azimuth: Float64[np.ndarray, "P"]) -> np.ndarray | None:
     """Return the row of each point, or None if there are more rows than the lidar has channels."""
+    # A jump of the azimuth back to the front begins a new row
     row = np.cumsum(np.diff(azimuth % (2 * np.pi), prepend=0.0) < -np.pi)
     return row.astype(np.uint8) if not len(row) or row[-1] < _CHANNELS else None
 
@@ -308,6 +323,7 @@ def _times_us(file: Path) -> Int64[np.ndarray, "N"]:
         else:
             whole, _, part = line.strip().partition(".")
             seconds = datetime.fromisoformat(whole).replace(tzinfo=UTC).timestamp()
+            # Whole µs, without rounding by floating point
             times.append(round(seconds) * 1_000_000 + int(part.ljust(6, "0")[:6]))
     return np.array(times, dtype=np.int64)
 

@@ -43,6 +43,7 @@ _DISTORTION = ("k1", "k2", "p1", "p2", "k3")
 _CAMERA_KEYS = ("camera_id", "camera_name", "camera_label", "camera", "cam_id", "cam", "sensor_id")
 """Entries of a frame that name its camera."""
 _T_EGO_CAM = np.array([[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, HEIGHT_M], [0, 0, 0, 1]], np.float64)
+# From OpenGL's camera axes (x right, y up, z back) to x right, y down, z ahead
 _OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 _RANGE_IMAGES, _RANGE_PERCENT = 20, (0.1, 99.9)
 """Images of a camera with 16 bits whose values are looked at, and the percentiles that become 0 and 255."""
@@ -66,6 +67,7 @@ class NerfstudioLog:
 
     def write(self, out: Path, tick: Callable[[], None]) -> LogPath:
         """Write the images in the order of their times, or of the numbers in their names without times."""
+        # Cameras with constant mounts, the one with most images first
         cameras = split_into_cameras(self._frames, str(self.folder / _FILE))
         base = cameras[0]
         t_us, T_world_cam = _frames_of(cameras)
@@ -82,6 +84,7 @@ class NerfstudioLog:
             out,
             self.get_log_metadata().log_name,
             t_us * 1e-6,
+            # The vehicle is where the base camera is, without its mount
             T_world_cam @ np.linalg.inv(_T_EGO_CAM),
             cameras=rig,
             images=images,
@@ -128,6 +131,7 @@ class _ImageFiles(PartSequence):
     def _value_range(self, name: str) -> tuple[float, float] | None:
         """Return the range of grey values of a camera with more than 8 bits, and note it; None for others."""
         files = [file for file in self._files if file is not None]
+        # Images spread over the sequence
         rows = np.unique(np.linspace(0, len(files) - 1, _RANGE_IMAGES).round().astype(int))
         read = PartReader(name, "images")
         values = []
@@ -138,6 +142,7 @@ class _ImageFiles(PartSequence):
             values += [] if pixels is None else [pixels.reshape(-1)]
         if not values:
             return None
+        # Percentiles instead of extremes, so that single pixels do not set the range
         low, high = np.percentile(np.concatenate(values), _RANGE_PERCENT)
         note(name, f"images of more than 8 bits; {low:g} became 0 and {high:g} became 255")
         return float(low), float(high)
@@ -146,11 +151,13 @@ class _ImageFiles(PartSequence):
 def _frames_of(cameras: list[RigCamera]) -> tuple[Int64[np.ndarray, "T"], Float64[np.ndarray, "T 4 4"]]:
     """Return times and poses of the frames: those of the first camera, and of other images between them."""
     base = cameras[0]
+    # Images of other cameras between those of the base camera make frames of their own
     half_us = _half_period_us(base.t_us)
     others = np.unique(np.concatenate([camera.t_us for camera in cameras]))
     off_us = np.abs(others[:, None] - base.t_us[None]).min(axis=1)
     inside = (others > base.t_us[0]) & (others < base.t_us[-1])
     t_us = np.union1d(base.t_us, others[inside & (off_us > half_us)])
+    # A single image has no motion to interpolate
     if len(base.t_us) == 1:
         return t_us, base.T_world_cam
     return t_us, interpolated_poses(base.t_us, base.T_world_cam, t_us.astype(np.float64))
@@ -160,6 +167,7 @@ def _beside(
     camera: RigCamera, t_us: Int64[np.ndarray, "T"]
 ) -> tuple[list[Path | None], Int64[np.ndarray, "T"]]:
     """Return the image of a camera beside each frame, and its time; that of the frame where there is none."""
+    # Nearest image of the camera to each frame
     nearest = np.abs(camera.t_us[None] - t_us[:, None]).argmin(axis=1)
     near = np.abs(camera.t_us[nearest] - t_us) <= _half_period_us(t_us)
     files = [
@@ -183,12 +191,14 @@ def _camera(name: str, lens: tuple[float, ...], T_ego_cam: Float64[np.ndarray, "
 def _frame(folder: Path, shared: dict[str, Any], entry: Any, where: str) -> PosedImage:
     if not isinstance(entry, dict):
         raise InputError(f"{where}: not an object of entries")
+    # Entries of a frame take precedence over those of the file
     merged = shared | entry
     _check_lens(merged, where)
     for key in ("file_path", "transform_matrix", *_INTRINSICS):
         if key not in merged:
             raise InputError(f"{where}: {key} is missing")
     values = [_number(merged.get(key, 0.0), key, where) for key in (*_INTRINSICS, *_DISTORTION)]
+    # w, h, fl_x and fl_y
     if min(values[:4]) <= 0:
         raise InputError(f"{where}: sizes and focal lengths must be above 0")
     t_s = next((_number(merged[key], key, where) for key in ("timestamp", "time") if key in merged), None)
@@ -205,6 +215,7 @@ def _check_lens(merged: dict[str, Any], where: str) -> None:
         InputError: it is another one.
     """
     model = str(merged.get("camera_model", "OPENCV"))
+    # Any entry that names another lens and is set
     flags = [key for key, value in merged.items() if _OTHER_LENS.search(key) and value]
     if model.upper() not in _PINHOLE or flags:
         what = flags[0] if flags else f"the model {model!r}"

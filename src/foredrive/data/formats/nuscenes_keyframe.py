@@ -72,6 +72,7 @@ class NuScenesKeyframeParser(BaseLogParser):
 
     def iter_modalities_sync(self) -> Iterator[ModalitiesSync]:
         """Yield the frame: ego pose at the lidar's time, boxes, lidar and six cameras."""
+        # Rows of sample_data by the channel of their sensor
         by_channel = {self._channel(row): row for row in self._rows["sample_data"]}
         lidar = by_channel["LIDAR_TOP"]
         timestamp = Timestamp.from_us(lidar["timestamp"])
@@ -97,10 +98,12 @@ class NuScenesKeyframeParser(BaseLogParser):
 
     def _boxes(self, T_world_lidar: np.ndarray, timestamp: Timestamp) -> BoxDetectionsSE3:
         info = load_pickle(next(self._folder.glob("*.pkl")))
+        # Names of the classes by their numbers in the info file
         names = {number: name for name, number in info["metainfo"]["categories"].items()}
         detections = []
         for track, instance in enumerate(info["data_list"][0]["instances"]):
             *values, yaw = (float(value) for value in instance["bbox_3d"])  # lidar frame, z of the centre
+            # Boxes are stored in the lidar's frame
             T = T_world_lidar @ _yaw_matrix(yaw, values[:3])
             velocity = T_world_lidar[:3, :3] @ [*(float(v) for v in instance["velocity"]), 0.0]
             name = names.get(instance["bbox_label_3d"], "other")
@@ -119,6 +122,7 @@ class NuScenesKeyframeParser(BaseLogParser):
         rows, detections = self._rows.get("sample_annotation", []), list(boxes.box_detections)
         if not rows or not detections:
             return []
+        # The info file has no annotation tokens: annotations are found by their places
         centres = np.array([box.bounding_box_se3.center_se3.point_3d.array for box in detections])
         apart_m, nearest = KDTree([row["translation"] for row in rows]).query(centres)
         near_enough = (np.atleast_1d(apart_m) < _SAME_PLACE_M).tolist()

@@ -87,6 +87,7 @@ def nuscenes_tables(folder: Path) -> NuScenesTables:
         file.stem: _read_table(file) for file in sorted(folder.glob("*.json")) if file.name != "splits.json"
     }
     tables = NuScenesTables(rows, {}, {})
+    # Readings of each scene and channel in order of time
     for reading in sorted(rows["sample_data"].values(), key=lambda row: int(row["timestamp"])):
         scene = rows["sample"][reading["sample_token"]]["scene_token"]
         of_scene = tables.readings.setdefault(scene, {})
@@ -144,6 +145,7 @@ class NuScenesTablesParser(BaseLogParser):
 
     def _frames(self) -> Iterator[ModalitiesSync]:
         readings = self._tables.readings.get(self._scene_token, {})
+        # The frames are those of the lidar, or of the camera with most images
         cameras = {camera_id: readings[name] for name, camera_id in self._camera_ids(readings).items()}
         frames = readings.get(LIDAR) or max(cameras.values(), key=len, default=[])
         for frame in frames:
@@ -154,6 +156,7 @@ class NuScenesTablesParser(BaseLogParser):
             modalities: list[BaseModality] = [
                 EgoStateSE3.from_imu(pose, NUSCENES_EGO_STATE_SE3_METADATA, timestamp)
             ]
+            # Only samples have boxes
             if frame["is_key_frame"]:
                 modalities += self._boxes(frame["sample_token"], timestamp)
             if LIDAR in readings:
@@ -169,6 +172,7 @@ class NuScenesTablesParser(BaseLogParser):
         for channel, rows in readings.items():
             calibration = self._tables.calibration(rows[0])
             modality = self._tables.rows["sensor"][calibration["sensor_token"]]["modality"]
+            # What is neither a camera with intrinsics nor the lidar is left out, with a notice
             if modality != "camera" or not calibration["camera_intrinsic"]:
                 if channel != LIDAR and modality != "radar":
                     lidar = f"the lidar that is read is {LIDAR}"
@@ -189,6 +193,7 @@ class NuScenesTablesParser(BaseLogParser):
         detections = []
         for row in rows:
             category = tables["category"][tables["instance"][row["instance_token"]]["category_token"]]["name"]
+            # Categories beyond nuScenes' own become the nearest one, or other
             label = NUSCENES_DETECTION_NAME_DICT.get(category)
             if label is None:
                 label = LABEL_OF_CATEGORY[category_or_other(category, "sample_annotation")]
@@ -248,6 +253,7 @@ class NuScenesTablesParser(BaseLogParser):
     def _in_world(self, row: Row) -> np.ndarray:
         """Return a pose of the global frame in the world frame."""
         T = matrix_of_row(row)
+        # The export moved the global frame: undo it
         T[:2, 3] += self._tables.log(self._scene).get("world_offset_m", (0.0, 0.0))
         return T
 
@@ -285,6 +291,7 @@ def pose_of_matrix(T: np.ndarray) -> PoseSE3:
 
 def _beside(frame: Row, rows: list[Row]) -> Row | None:
     """Return the reading of the same sample, or near to a frame between samples. None if there is none."""
+    # At a sample, only images of the same sample belong to it
     if frame["is_key_frame"]:
         same = (row for row in rows if row["is_key_frame"] and row["sample_token"] == frame["sample_token"])
         return next(same, None)

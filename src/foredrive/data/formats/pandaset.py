@@ -86,6 +86,7 @@ class PandasetParser(PandasetLogParser):
     """
 
     def _iter_modalities_sync_from_path(self, source_log_path: Path) -> Iterator[ModalitiesSync]:
+        # Check all JSON files before py123d reads them, as its errors do not name them
         for file in sorted([*source_log_path.glob("meta/*.json"), *source_log_path.glob("camera/*/*.json")]):
             if file.name in _SCHEMAS:
                 _check_json(file, _SCHEMAS[file.name])
@@ -94,6 +95,7 @@ class PandasetParser(PandasetLogParser):
             raise InputError(f"{source_log_path}: no poses of {_FRONT}, which are those of the vehicle")
         sweep_s = _by_number(source_log_path / "meta" / "timestamps.json")
         sweeps = set(_numbers(source_log_path / "lidar", ".pkl.gz"))
+        # Every number between the first and the last is a frame or noted as missing
         numbers = frame_numbers(source_log_path)
         for number in range(min(numbers, default=0), max(numbers, default=-1) + 1):
             place = f"{number:02d}"
@@ -104,6 +106,7 @@ class PandasetParser(PandasetLogParser):
             if pose is None or time_s is None or number not in sweep_s:
                 note("frames", "without a pose or a time, left out", place)
                 continue
+            # The log's time is that of the begin of the sweep
             now = Timestamp.from_s(sweep_s[number] - _SWEEP_S)
             modalities: list[Any] = [
                 pandaset_parser._extract_pandaset_sensor_ego_state(
@@ -214,8 +217,10 @@ def _by_number(file: Path) -> dict[int, Any]:
     log = file.parents[1] if file.parent.name == "meta" else file.parents[2]
     numbers = frame_numbers(log)
     first, last = min(numbers, default=0), max(numbers, default=-1)
+    # A whole list: entries are numbered from 0
     if last < len(entries):
         return dict(enumerate(entries))
+    # A list that was cut to the frames of a part of the log
     if len(entries) == last - first + 1:
         return dict(enumerate(entries, start=first))
     raise InputError(
@@ -238,6 +243,7 @@ def _attributes(cuboids: Path) -> dict[str, int]:
     """Return the attribute of each cuboid by its uuid."""
     table = load_table(cuboids)
     attributes = dict.fromkeys(table["uuid"].tolist(), UNKNOWN)
+    # The first column that gives an attribute decides
     for column, attribute_of in _ATTRIBUTE_OF_VALUE.items():
         values = table[column].tolist() if column in table.columns else []
         for uuid, value in zip(table["uuid"].tolist(), values, strict=False):

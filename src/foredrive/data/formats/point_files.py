@@ -27,6 +27,7 @@ def read_points(file: Path, columns: tuple[str, ...]) -> Float32[np.ndarray, "N 
         InputError: the size or the values are not those of such columns.
     """
     numbers = np.fromfile(file, dtype="<f4")
+    # Another layout that fits is named in the error
     if file.stat().st_size % 4 or not _fits(numbers, columns):
         others = [layout for layout in _LAYOUTS if layout != columns and _fits(numbers, layout)]
         hint = f"; {len(others[0])} columns would fit ({' '.join(others[0])})" if others else ""
@@ -40,6 +41,7 @@ def _fits(numbers: Float32[np.ndarray, "M"], columns: tuple[str, ...]) -> bool:
     if numbers.size % len(columns):
         return False
     rows = numbers.reshape(-1, len(columns))
+    # The columns are judged by points with finite coordinates
     rows = rows[np.isfinite(rows[:, :3]).all(axis=-1)]  # some drivers write NaN where nothing returned
     if (np.abs(rows[:, :3]) > _MAX_M).any():
         return False
@@ -66,6 +68,7 @@ class IntensityScale:
             InputError: a later sweep exceeds the scale of the first.
         """
         largest = float(values.max(initial=0.0))
+        # The smallest usual scale that holds the first sweep
         if self._scale is None:
             self._scale = next((scale for scale in _SCALES if largest <= scale), largest)
             if self._scale != 1.0:

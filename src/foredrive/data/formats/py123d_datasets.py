@@ -54,11 +54,13 @@ def _nuscenes(source: Path, name: str) -> Iterator[RawLog]:
         "v1.0-mini": [f"{name}-mini_train", f"{name}-mini_val"],
     }
     for version, splits in versions.items():
+        # nuScenes' own versions, by py123d's parser
         for root in folders_with(source, f"{version}/scene.json"):
             module = _module("nuscenes.nuscenes_parser", "nuscenes")
             _leave_unknown_speed_out(module)
             maps = root if (root / "maps" / "expansion").is_dir() else None
             yield from _of(module.NuScenesParser(splits, root, maps), root / version)
+    # Other versions, by the parser of tables
     for root in folders_with(source, "v[0-9]*-*/scene.json"):
         for tables in sorted(root.glob("v[0-9]*-*")):
             if tables.name not in versions and (tables / "scene.json").is_file():
@@ -83,6 +85,7 @@ def _leave_unknown_speed_out(parser: Any) -> None:
     """Make py123d's parser of nuScenes leave speeds out where there is no CAN bus; it writes 0 m/s there."""
     extraction = _module("nuscenes.utils.nuscenes_extraction", "nuscenes")
     real_bus, find = parser.NuScenesCanBus, extraction._find_dynamic_state_from_can_bus
+    # The replacement is made once
     if real_bus is _can_bus:
         return
 
@@ -112,6 +115,7 @@ def nuplan(source: Path) -> Iterator[RawLog]:
     }.items():
         for root in folders_with(source, f"nuplan-v1.1/splits/{kind}"):
             module = _module("nuplan.nuplan_parser", "nuplan")
+            # Every module that unpickles gets the restricted reader
             unpickling = [importlib.import_module(f"nuplan.database.{name}") for name in _NUPLAN_UNPICKLES]
             for reader in (module, *unpickling):
                 reader.pickle = PlainPickle(_NUPLAN_LISTS)
@@ -262,6 +266,7 @@ def _module(name: str, needs: str = "") -> Any:
 
 def _of(parser: BaseDatasetParser, source: Path) -> Iterator[RawLog]:
     """Yield the logs of a parser, each with its map."""
+    # Maps by log, or by location where they are shared
     maps = {_map_key(one.get_map_metadata()): one for one in parser.get_map_parsers()}
     for log in parser.get_log_parsers():
         metadata = log.get_log_metadata()

@@ -1,4 +1,4 @@
-"""Reading of affordances: the light of the path, and who is in the path over time, from a log alone.
+"""Reading of affordances: the light of the path, and the road users in it over time, from a log alone.
 
 Logs of towns have the states of lights by the lanes behind their stop lines, so nothing else is recorded for
 this. Other logs have no lights, and their path is the driven one.
@@ -65,7 +65,7 @@ class PathAhead(NamedTuple):
     front_m: float
     """Distance along the path of the front bumper."""
     given: bool
-    """It is a route that was provided. Beyond its end, nothing matters."""
+    """True for a route that was given to the vehicle. Beyond its end there is nothing to judge."""
 
 
 class _StopLines(NamedTuple):
@@ -77,7 +77,7 @@ class _StopLines(NamedTuple):
 
 
 def read_affordances(log: Log, frame: int) -> Affordances:
-    """Read the affordances at a frame, unbatched. What the log lacks is not known.
+    """Read the affordances at a frame, unbatched. Values that the log lacks are marked as unknown.
 
     Raises:
         InputError: the route, the map, the lights or the boxes cannot be read.
@@ -110,8 +110,10 @@ def _path(log: Log, frame: int) -> PathAhead:
     """Return the route from beside the rear axle on, or the driven path where there is no route."""
     route = route_at(log, frame)
     centre, size = log.ego_box
+    # Distance from the rear axle to the front bumper
     front_m = float(centre[0] + 0.5 * size[0])
     if route is None:
+        # Without a route, the driven path from now on stands for it
         xyz = log.T_world_ego[frame:, :3, 3]
         return path_ahead(xyz, arc_lengths(xyz), 0.0, log.T_world_ego[frame], front_m, given=False)
     arc_m, xyz, progress_m = route
@@ -137,11 +139,13 @@ def path_ahead(
         given: whether it is a route that the vehicle was given.
     """
     at_m = np.arange(POINTS, dtype=np.float64)
+    # Points a metre apart, up to the end of the path
     on_path = at_m <= arc_m[-1] - progress_m
     ahead = _in_frame(points_at(xyz, arc_m, progress_m + at_m), T_world_ego) * on_path[:, None]
     return PathAhead(
         torch.from_numpy(ahead[:, :2]).float(),
         ahead[:, 2],
+        # A single point is no path
         torch.from_numpy(on_path & (on_path.sum() > 1)),
         front_m,
         given,
@@ -149,17 +153,21 @@ def path_ahead(
 
 
 def _light(log: Log, frame: int, path: PathAhead) -> tuple[LightState, float, bool, int | None]:
-    """Return state and distance of the next light on the path, whether the log tells, and its lane."""
+    """Return state and distance of the next light on the path, whether they are known, and its lane."""
     shown, lines = read_traffic_lights(log, frame), _stop_lines(log)
     if shown is None or lines is None or not path.given or not bool(path.valid.any()):
+        # Lights matter on a given route only: the driven path ends where the drive does
         return LightState.NONE, 0.0, False, None
     if not len(lines.lane):
         return LightState.NONE, 0.0, True, None
+    # Stop lines in the ego frame, then along and beside the path
     xyz = _in_ego_frame(lines.xyz, log, frame)
     along_m, left_m = along_path(torch.from_numpy(xyz[:, :2]).float(), path.xy, path.valid)
     heading = path_headings(along_m, path.xy, path.valid).double().numpy()
+    # Direction of each lane behind its stop line, in the ego frame
     ahead = (lines.ahead @ log.T_world_ego[frame, :3, :3])[:, :2]
     distance_m = along_m.double().numpy() - path.front_m
+    # Height of the path at the stop line, so that lines on bridges above or below do not count
     height_m = np.interp(along_m.numpy(), np.arange(POINTS), path.z)
     on_path = (
         (left_m.abs().numpy() < BESIDE_M)
@@ -168,6 +176,7 @@ def _light(log: Log, frame: int, path: PathAhead) -> tuple[LightState, float, bo
         & (distance_m > -PASSED_M)
         & (distance_m <= LIGHT_RANGE_M)
     )
+    # The nearest line on the path whose light has a known state
     for row in sorted(np.flatnonzero(on_path).tolist(), key=distance_m.__getitem__):
         lane = int(lines.lane[row])
         state = STATE_OF_STATUS.get(shown.get(lane, TrafficLightStatus.UNKNOWN))
@@ -177,8 +186,9 @@ def _light(log: Log, frame: int, path: PathAhead) -> tuple[LightState, float, bo
 
 
 def _lamps(log: Log, frame: int, lane: int | None) -> tuple[Float[Tensor, "L 3"], bool]:
-    """Return the places of the lamps for a lane in the ego frame, and whether the log tells."""
+    """Return the places of the lamps for a lane in the ego frame, and whether they are known."""
     shown = read_signal_lamps(log, frame)
+    # Without a light on the path, it is known that there are no lamps
     if shown is None or lane is None or lane not in shown:
         return torch.zeros(0, 3), shown is not None and lane is None
     return torch.from_numpy(_in_ego_frame(shown[lane], log, frame)).float(), True
@@ -194,6 +204,7 @@ def _stop_lines(log: Log) -> _StopLines | None:
             return None
         by_name = {name: api.get_map_object_in_layer(name, MapLayer.LANE) for name in shown}
     lanes = {name: lane for name, lane in by_name.items() if isinstance(lane, Lane)}
+    # The first two points of a lane's centre line give its begin and direction
     starts = [np.asarray(lane.centerline_3d.array, dtype=np.float64)[:2] for lane in lanes.values()]
     two = np.array(starts).reshape(-1, 2, 3)
     ahead = two[:, 1] - two[:, 0]
@@ -205,24 +216,28 @@ def lead_of(boxes: Boxes | None, path: PathAhead) -> tuple[bool, float, float, b
     """Return whether a vehicle is in the path, its gap and its speed, and whether that is known.
 
     Args:
-        boxes: unbatched, in the frame of the path. None if nobody annotated them.
+        boxes: unbatched, in the frame of the path. None without annotation.
         path: the path.
     """
     if boxes is None or not bool(path.valid.any()):
         return False, 0.0, 0.0, False
     vehicles = torch.isin(boxes.category, torch.tensor([int(kind) for kind in VEHICLES]))
     chosen = boxes[vehicles & boxes.valid]
+    # Points all over the footprint, since the corner nearest to the path may be any
     points = _points_of(chosen)
     along_m, left_m = along_path(points.flatten(0, 1), path.xy, path.valid)
     gap_m = (along_m - path.front_m).view(points.shape[:2])
+    # Vehicles within half the width of the way, from a metre behind the front bumper on
     in_way = (left_m.view(points.shape[:2]).abs() < HALF_WIDTH_M) & (gap_m > -1.0)
     nearest_m = gap_m.masked_fill(~in_way, torch.inf).amin(-1)
     if len(nearest_m) and float(nearest_m.min()) <= LEAD_RANGE_M:
         row = int(nearest_m.argmin())
         gap = float(nearest_m[row])
         direction = path_headings(torch.tensor([gap + path.front_m]), path.xy, path.valid)[0]
+        # Speed of the lead vehicle along the path at its gap
         speed_mps = float((chosen.velocity[row] * direction).sum())
         return True, max(gap, 0.0), speed_mps, True
+    # On the driven path, the absence of a lead vehicle is known only as far as the path reaches
     reach_m = float(path.valid.sum()) - 1.0 - path.front_m
     return False, 0.0, 0.0, path.given or reach_m >= LEAD_RANGE_M
 
@@ -230,12 +245,13 @@ def lead_of(boxes: Boxes | None, path: PathAhead) -> tuple[bool, float, float, b
 def _occupied(
     log: Log, frame: int, boxes: Boxes | None, path: PathAhead
 ) -> tuple[Bool[Tensor, "T G"], Bool[Tensor, "T G"]]:
-    """Return which cells of the path are occupied at which times, and where the log tells."""
+    """Return which cells of the path are occupied at which times, and where this is known."""
     tracks = read_tracks(log)
     if boxes is None or tracks is None or not bool(path.valid.any()):
         nothing = torch.zeros(TIMES, CELLS, dtype=torch.bool)
         return nothing, nothing
     future = read_futures(log, frame, TIMES - 1, LATER_DT_S)
+    # Each road user now and later, in the ego frame at now
     by_user = occupied_by(
         boxes,
         torch.cat([boxes.centre[:, None, :2], future.xy], dim=1),
@@ -248,10 +264,12 @@ def _occupied(
     if (share := read_visibility(log, frame)) is not None:
         seen = share > 0
     occupied = by_user[seen].any(0)
+    # Cells that the path covers whole
     reach_m = path.front_m + CELL_M * torch.arange(1, CELLS + 1)
     inside = reach_m <= float(path.valid.sum()) - 1.0
     t_us = log.t_us[frame] + np.round(np.arange(TIMES) * LATER_DT_S * 1e6).astype(np.int64)
     annotated = torch.from_numpy(annotated_at(tracks, t_us))
+    # Cells are judged at annotated times, unless only an invisible road user covers them
     judged = annotated[:, None] & inside & (occupied | ~by_user[~seen].any(0))
     return occupied & judged, judged
 
@@ -273,6 +291,7 @@ def occupied_by(
         path: the path.
     """
     x, y, z = boxes.centre.unbind(-1)
+    # Road users behind the rear axle, in a strip that widens with distance
     behind = (x < 0) & (y.abs() < FOLLOWS_M - FOLLOWS_SLOPE * x)
     level = z.abs() < LEVEL_M + 0.5 * boxes.size_lwh[:, 2]
     return cells_covered(
@@ -292,6 +311,7 @@ def occupied_by(
 def _points_of(boxes: Boxes) -> Float[Tensor, "M P 2"]:
     """Return points all over the footprints of boxes."""
     share = torch.cartesian_prod(torch.linspace(-0.5, 0.5, 7), torch.linspace(-0.5, 0.5, 3))
+    # A grid of points on the footprint, turned by the heading
     local = share * boxes.size_lwh[:, None, :2]
     cos, sin = boxes.yaw.cos()[:, None], boxes.yaw.sin()[:, None]
     turned = torch.stack(
@@ -307,6 +327,7 @@ def _in_ego_frame(xyz: Float64[np.ndarray, "N 3"], log: Log, frame: int) -> Floa
 def _in_frame(
     xyz: Float64[np.ndarray, "N 3"], T_world_ego: Float64[np.ndarray, "4 4"]
 ) -> Float64[np.ndarray, "N 3"]:
+    # Column vectors times the inverse pose, as rows
     T_ego_world = np.linalg.inv(T_world_ego)
     moved: Float64[np.ndarray, "N 3"] = xyz @ T_ego_world[:3, :3].T + T_ego_world[:3, 3]
     return moved

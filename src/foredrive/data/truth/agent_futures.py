@@ -47,6 +47,7 @@ def read_futures(log: Log, frame: int, steps: int, dt_s: float) -> AgentFutures:
     boxes, tracks = read_boxes(log, frame), read_tracks(log)
     if boxes is None or tracks is None or not len(boxes.yaw):
         return AgentFutures(torch.zeros(0, steps, 2), torch.zeros(0, steps), _no(0, steps), dt_s)
+    # Times of the steps, from the annotation at now on
     t_us = _now_us(log, frame, tracks) + np.round(np.arange(1, steps + 1) * dt_s * 1e6).astype(np.int64)
     states = track_states(tracks, log.T_world_ego[frame], boxes.track_id.numpy(), t_us)
     valid = torch.from_numpy(states.valid)
@@ -72,6 +73,7 @@ def read_instances(log: Log, frame: int, steps: int, dt_s: float, spec: PlaneSpe
     if tracks is None or box_row(log, frame) is None:
         return InstanceRaster(spec, torch.from_numpy(drawn).long(), _no(steps + 1), dt_s)
     t_us = _now_us(log, frame, tracks) + np.round(np.arange(steps + 1) * dt_s * 1e6).astype(np.int64)
+    # Tracks of vehicles; a track has one number in the drawing
     vehicles = np.isin(tracks.category, [int(kind) for kind in VEHICLES]) & tracks.is_object
     ids = np.unique(tracks.track_id[vehicles])
     states = track_states(tracks, log.T_world_ego[frame], ids, t_us)
@@ -79,9 +81,11 @@ def read_instances(log: Log, frame: int, steps: int, dt_s: float, spec: PlaneSpe
     for step in range(steps + 1):
         rows = np.flatnonzero(states.valid[:, step] & valid[step])
         size_m = tracks.size_lwh[states.box[rows, step], :2]
+        # Cells of each box at the step, by the size of the observation before it
         quads = _corners(states.xy[rows, step], size_m, states.yaw[rows, step])
         for track, quad in zip(rows.tolist(), quads, strict=True):
             fill_polygon([quad], track + 1, spec, drawn[step])
+    # The drawing holds rows + 1: replace them by track ids + 1
     track_id = np.concatenate([[0], ids + 1])[drawn]
     return InstanceRaster(spec, torch.from_numpy(track_id), torch.from_numpy(valid), dt_s)
 
@@ -95,23 +99,29 @@ def track_states(
     """Return tracks at any times in an ego frame, linear between the observations around each time."""
     order, ids, key = _in_order_of_tracks(tracks)
     start_us = tracks.row_t_us[0]
+    # Range of each track's boxes in the sorted key
     wanted = np.searchsorted(ids, track_id)[:, None] * _TRACK_US
     first = np.searchsorted(key, wanted)
     end = np.searchsorted(key, wanted + _TRACK_US)
+    # Observations before and after each time; at the ends of a track the two nearest ones
     row = np.searchsorted(key, wanted + np.maximum(t_us - start_us, 0), side="right")
     before = np.clip(row - 1, first, np.maximum(end - 2, first))
     after = np.minimum(before + 1, end - 1)
     rows = order[np.stack([before, after])]  # [2 K S]
     time_us = tracks.t_us[rows]
     span_us = time_us[1] - time_us[0]
+    # Share of the time between the two observations; beyond the ends the motion continues
     share = np.where(span_us > 0, (t_us - time_us[0]) / np.maximum(span_us, 1), 0.0)
     slack_us = SLACK_S * 1e6
+    # Valid within a short gap, or next to an observation
     inside = (t_us >= time_us[0] - slack_us) & (t_us <= time_us[1] + slack_us)
     observed = (np.abs(t_us - time_us) <= slack_us).any(axis=0)
     T_ego_world = np.linalg.inv(T_world_ego)
     centre = tracks.centre[rows] @ T_ego_world[:3, :3].T + T_ego_world[:3, 3]
+    # First column of the rotation: the direction ahead of the box
     ahead = tracks.R_world_box[rows][..., 0] @ T_ego_world[:3, :3].T
     yaw = np.arctan2(ahead[..., 1], ahead[..., 0])
+    # The shorter way round
     turn = _wrapped(yaw[1] - yaw[0])
     xy = centre[0] + share[..., None] * (centre[1] - centre[0])
     return TrackStates(
@@ -126,6 +136,7 @@ def track_states(
 def _in_order_of_tracks(tracks: Tracks) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the boxes by track and time, the ids of the tracks, and the sorted key of each box."""
     ids, number = np.unique(tracks.track_id, return_inverse=True)
+    # One sortable number for each box: track first, then time
     key = number * _TRACK_US + (tracks.t_us - tracks.row_t_us[0])
     order = np.argsort(key, kind="stable")
     return order, ids, key[order]
@@ -139,6 +150,7 @@ def _now_us(log: Log, frame: int, tracks: Tracks) -> int:
 def annotated_at(tracks: Tracks, t_us: Int64[np.ndarray, "S"]) -> Bool[np.ndarray, "S"]:
     """Return whether there are annotated rows of a log close before and after each time, µs."""
     row_t_us = tracks.row_t_us
+    # First annotated row after, and last one before, each time
     after = np.searchsorted(row_t_us, t_us - SLACK_S * 1e6)
     before = np.searchsorted(row_t_us, t_us + SLACK_S * 1e6, side="right") - 1
     inside = (after < len(row_t_us)) & (before >= 0)

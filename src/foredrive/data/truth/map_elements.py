@@ -76,11 +76,13 @@ def read_map_elements(log: Log, frame: int, patch_lw_m: tuple[float, float]) -> 
     if own_map is not None:
         upper = (0.5 * patch_lw_m[0], 0.5 * patch_lw_m[1])
         for kind, lines in own_map.lines.items():
+            # Parts of each line inside of the patch
             inside = _inside(lines, log, frame, own_map.flat, (-upper[0], -upper[1]), upper)
             pieces += [(int(kind), piece) for piece in inside]
     count, longest = len(pieces), max((len(piece) for _, piece in pieces), default=0)
     vertices = torch.zeros(count, longest, 2)
     valid = torch.zeros(count, longest, dtype=torch.bool)
+    # Padding behind each line's vertices is not valid
     for row, (_, piece) in enumerate(pieces):
         vertices[row, : len(piece)] = torch.from_numpy(piece[:, :2]).float()
         valid[row, : len(piece)] = True
@@ -113,10 +115,12 @@ def read_map_raster(log: Log, frame: int, spec: PlaneSpec, line_px: int) -> MapR
             RasterLayer.CROSSING: own_map.crossing_edges,
             RasterLayer.BOUNDARY: own_map.lines[ElementKind.BOUNDARY],
         }
+        # Later layers erase what lies around their lines in the layers before
         for layer, lines in sources.items():
             parts = _inside(lines, log, frame, own_map.flat, spec.lower_m, spec.upper_m)
             layers[:layer, draw_lines(parts, line_px + _ERASED_PX, spec) > 0] = 0
             layers[layer] = draw_lines(parts, line_px, spec)
+        # A drivable area counts if any of its outline is on the vehicle's level
         for area in own_map.drivable:
             rings = _in_ego_frame(area, log, frame, own_map.flat)
             if np.abs(rings[0][:, 2]).min() <= LEVEL_M:
@@ -135,8 +139,10 @@ def read_shared_drivable(log: Log) -> list[list[Line]] | None:
     """
     with reading(log.path.folder, "its map"):
         api = log.scene.get_map_api()
+        # A map of this log alone is not shared with others
         if api is None or api.get_map_metadata().map_is_per_log:
             return None
+        # The whole map
         everywhere = shapely.box(*(-_EVERYWHERE_M,) * 2, *(_EVERYWHERE_M,) * 2)
         return _drivable(api.query(everywhere, list(_DRIVABLE), "intersects"))
 
@@ -158,13 +164,16 @@ def _log_map(log: Log) -> LogMap | None:
         return None
     driven = log.T_world_ego[:, :2, 3]
     around = shapely.box(*(driven.min(axis=0) - REACH_M), *(driven.max(axis=0) + REACH_M))
+    # A map without heights is taken to lie on the ground under the vehicle
     flat = not api.get_map_metadata().map_has_z
     objects = api.query(around, [MapLayer.ROAD_EDGE, MapLayer.CROSSWALK, *_DRIVABLE], "intersects")
     lanes = [lane for lane in objects[MapLayer.LANE] if isinstance(lane, Lane)]
     edges = [edge for edge in objects[MapLayer.ROAD_EDGE] if isinstance(edge, RoadEdge)]
     junctions = [_polygon(item) for item in _surfaces(objects[MapLayer.INTERSECTION])]
+    # Road edges without the parts that lie deep in a junction, which border gaps between its lanes
     edge_lines = without_near(line_strings(edge.polyline_3d.array for edge in edges), junctions, -EDGE_M)
     crossings = [_polygon(item) for item in _surfaces(objects[MapLayer.CROSSWALK])]
+    # Dividers: lane boundaries outside of junctions, once each, without those along road edges
     kinds = {
         ElementKind.DIVIDER: merged(
             without_near(distinct(_inner_boundaries(lanes)), edge_lines, EDGE_M), MIN_LENGTH_M
@@ -206,6 +215,7 @@ def _polygon(item: BaseMapSurfaceObject) -> Polygon:
     outline = np.asarray(item.outline_3d.array, dtype=np.float64)
     holes = [shapely.force_3d(hole, float(outline[:, 2].mean())) for hole in item.shapely_polygon.interiors]
     polygon = Polygon(outline, holes)
+    # An outline that crosses itself is replaced by its largest valid part
     return polygon if polygon.is_valid else _largest(polygon)
 
 
@@ -223,6 +233,7 @@ def _rings(polygon: Polygon) -> list[Line]:
 def _long_edges(ring: LinearRing) -> list[Line]:
     """Return the two longest edges of a ring."""
     xyz = coordinates(ring)
+    # Lengths over ground, without heights
     longest = np.argsort(np.linalg.norm(np.diff(xyz[:, :2], axis=0), axis=-1), kind="stable")[-2:]
     return [xyz[edge : edge + 2] for edge in longest]
 
@@ -231,8 +242,10 @@ def _in_ego_frame(lines: Sequence[Line], log: Log, frame: int, flat: bool) -> li
     """Transform lines from the world to the ego frame. In a flat map they are on the ground."""
     if not lines:
         return []
+    # All lines in one transform, then split again
     points, T_world_ego = np.concatenate(lines), log.T_world_ego[frame]
     if flat:
+        # In a flat map all lines get the height of the ego vehicle
         points[:, 2] = T_world_ego[2, 3]
     T_ego_world = np.linalg.inv(T_world_ego)
     points = points @ T_ego_world[:3, :3].T + T_ego_world[:3, 3]
@@ -250,10 +263,12 @@ def _inside(
     """Return the parts of lines in a rectangle of the ego frame, on the ego vehicle's level of the road."""
     out = []
     for line in _in_ego_frame(lines, log, frame, flat):
+        # A cheap test of extents before the exact clipping
         if (line[:, :2].min(axis=0) > upper_m).any() or (line[:, :2].max(axis=0) < lower_m).any():
             continue
         for piece in clipped(line, lower_m, upper_m):
             length_m = np.linalg.norm(np.diff(piece[:, :2], axis=0), axis=-1).sum()
+            # Short remains, and lines of other levels of the road, are left out
             if length_m >= MIN_PIECE_M and np.abs(piece[:, 2]).min() <= LEVEL_M:
                 out.append(piece)
     return out

@@ -34,17 +34,20 @@ def without_near(
     """
     if not others:
         return list(lines)
+    # Zones around the others; a tree finds those that a line can meet
     zones = shapely.buffer(np.array(others, dtype=object), reach_m, quad_segs=2)
     tree = STRtree(zones)
     kept: list[LineString] = []
     for line in lines:
         near = tree.query(line, predicate="intersects")
+        # The rest of the line outside of all near zones
         kept += _parts(line.difference(shapely.union_all(zones[near])) if len(near) else line)
     return kept
 
 
 def distinct(lines: Sequence[LineString]) -> list[LineString]:
     """Return lines without the parts that an earlier line has too (within `SAME_M`)."""
+    # Exact duplicates first, of which the earliest stays
     unique = list({_key(line): line for line in reversed(lines)}.values())[::-1]
     if len(unique) < 2:
         return unique
@@ -53,6 +56,7 @@ def distinct(lines: Sequence[LineString]) -> list[LineString]:
     kept: list[LineString] = []
     for number, line in enumerate(unique):
         near = tree.query(line, predicate="intersects")
+        # Only earlier lines take parts away, so that one of two equal parts stays
         earlier = near[near < number]
         kept += _parts(line.difference(shapely.union_all(zones[earlier])) if len(earlier) else line)
     return kept
@@ -70,6 +74,7 @@ def merged(lines: Sequence[LineString], min_length_m: float, directed: bool = Fa
     """
     if not lines:
         return []
+    # line_merge joins lines where exactly two meet
     joined = shapely.line_merge(shapely.multilinestrings(_with_common_ends(lines)), directed=directed)
     whole = [shapely.simplify(line, SIMPLIFIED_M) for line in _parts(joined)]
     return [line for line in whole if line.length >= min_length_m]
@@ -80,6 +85,7 @@ def united(polygons: Sequence[Polygon]) -> list[Polygon]:
     if not polygons:
         return []
     tree = STRtree(polygons)
+    # Groups of touching polygons are connected components
     pairs = tree.query(np.array(polygons, dtype=object), predicate="intersects")
     count, group = _components(pairs, len(polygons))
     out = []
@@ -102,6 +108,7 @@ def clipped(
     line: Line, lower_m: tuple[float, float], upper_m: tuple[float, float]
 ) -> list[Float64[np.ndarray, "_ 3"]]:
     """Return the parts of a line within a rectangle of its own frame. A closed line keeps no seam."""
+    # The clipped line may come in pieces at the seam of a closed line: merge them again
     inside = LineString(line).intersection(shapely.box(*lower_m, *upper_m))
     if isinstance(inside, shapely.MultiLineString):
         inside = shapely.line_merge(inside)
@@ -111,10 +118,12 @@ def clipped(
 def _with_common_ends(lines: Sequence[LineString]) -> list[LineString]:
     """Move ends within `SAME_M` of each other to their mean. A line that collapses is left out."""
     points = [coordinates(line) for line in lines]
+    # Both ends of every line, and groups of ends that are close
     ends = np.array([[line[0], line[-1]] for line in points]).reshape(-1, 3)
     pairs = KDTree(ends).query_pairs(SAME_M, output_type="ndarray")
     count, group = _components(pairs.T, len(ends))
     size = np.bincount(group, minlength=count)
+    # Mean of each group, coordinate by coordinate
     mean = np.stack([np.bincount(group, ends[:, axis], count) / size for axis in range(3)], axis=-1)
     for number, line in enumerate(points):
         line[0], line[-1] = mean[group[2 * number]], mean[group[2 * number + 1]]
@@ -137,6 +146,7 @@ def _parts(geometry: BaseGeometry) -> list[LineString]:
 
 def _key(line: LineString) -> tuple[float, ...]:
     """Return a key that is the same for a line and its reverse."""
+    # Adding 0 turns -0.0 into 0.0, so that equal lines have equal keys
     rounded = np.round(coordinates(line), 2) + 0.0
     flat, back = tuple(rounded.ravel().tolist()), tuple(rounded[::-1].ravel().tolist())
     return min(flat, back)

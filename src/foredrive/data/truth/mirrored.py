@@ -20,10 +20,12 @@ def mirrored_truth(truth: TaskTruth, chosen: Bool[Tensor, "b"]) -> TaskTruth:
     """
     futures, elements = truth.futures, truth.elements
     raster, semantics, instances = truth.raster, truth.semantics, truth.instances
+    # Reversing the rows of a grid mirrors it only if the grid is symmetric about y = 0
     for grid in (raster, instances):
         if grid is not None and abs(grid.spec.lower_m[1] + grid.spec.upper_m[1]) > 1e-6 * grid.spec.cell_m:
             raise InputError(f"a raster is mirrored only if it is symmetric about y = 0: {grid.spec}")
     if futures is not None:
+        # Mirroring changes the sign of y and of headings
         xy, yaw = _negated_y(futures.xy, chosen), _pick(chosen, -futures.yaw, futures.yaw)
         futures = dataclasses.replace(futures, xy=xy, yaw=yaw)
     if elements is not None:

@@ -27,6 +27,7 @@ def fill_polygon(
         spec: the grid.
         out_yx: the cells.
     """
+    # OpenCV draws between whole numbers: vertices go to the nearest border of cells
     cells = [np.round(_in_cells(ring, spec)).astype(np.int32) for ring in rings]
     cv2.fillPoly(out_yx, cells, value)
 
@@ -42,6 +43,7 @@ def draw_lines(
     for line in lines:
         flat = line[:, :2]
         along = arc_lengths(flat)
+        # Points at whole steps from the start; the rest of the line is lost, as in UniAD
         sampled = points_at(flat, along, np.arange(0.0, along[-1], LINE_STEP_M))
         if len(sampled) > 1:
             cells = np.trunc(_in_cells(sampled, spec)).astype(np.int32)

@@ -24,12 +24,14 @@ def read_rays(log: Log, frame: int, spec: VoxelSpec) -> RayTruth:
     origin, valid = torch.zeros(MAX_ORIGINS, 3), torch.zeros(MAX_ORIGINS, dtype=torch.bool)
     T_ego_lidar = lidar_pose(log)
     if T_ego_lidar is not None:
+        # The mount is the same at all frames
         mounted = np.broadcast_to(T_ego_lidar, (len(log), 4, 4))
         places = torch.from_numpy(ray_origins(log.T_world_ego, mounted, frame)).float()
         origin[: len(places)], valid[: len(places)] = places, True
     recorded = read_occupancy(log, frame)
     if recorded is None:
         return RayTruth(origin, valid, torch.zeros(2, *spec.shape_zyx))
+    # Over ground: x and y
     return RayTruth(origin, valid, resampled_labels(recorded, spec).flow_mps[:2])
 
 
@@ -40,5 +42,6 @@ def lidar_pose(log: Log) -> Float64[np.ndarray, "4 4"] | None:
             metadata = next(iter(metadata.lidar_metadatas.values()))
         if isinstance(metadata, LidarMetadata):
             pose: Float64[np.ndarray, "4 4"] = metadata.lidar_to_imu_se3.transformation_matrix
+            # Lidar poses are relative to the IMU: bring them to the ego frame
             return np.linalg.inv(log.T_imu_ego) @ pose
     return None

@@ -84,10 +84,14 @@ def read_semantics(
     recorded = read_occupancy(log, frame)
     if recorded is not None:
         codes, which = np.unique(recorded.category, return_inverse=True)
+        # Class of each recorded category that occurs
         kinds = [_class_name(code) for code in codes.tolist()]
+        # The recorded class of highest rank in each voxel of the grid
         held, known = held_voxels(recorded, np.array([_rank(kind) for kind in kinds])[which], spec)
         occupied = known & (held != NOTHING)
+        # Numbers in the taxonomy; classes that it lacks get one beyond its end
         number = np.array([names.index(kind) if kind in names else len(names) for kind in kinds])[which]
+        # A voxel of a class that the taxonomy lacks is unknown
         known[occupied] &= number[held[occupied]] < len(names)
         index[occupied & known] = number[held[occupied & known]]
         camera = known & _camera_mask(log, frame, occupied, spec, cameras)
@@ -124,12 +128,14 @@ def _camera_mask(
     that level ground is seen up to the border of the grid, and to the centres of the outermost voxels, so
     that all free space in view is crossed.
     """
+    # Voxels are occupied or unknown; beams mark free ones and the first occupied one
     state = np.where(occupied, OCCUPIED, UNKNOWN).astype(np.uint8)
     aims = _aims(occupied, spec)
     for metadata in cameras:
         size_hw = (metadata.height, metadata.width)
         camera = read_camera(log, frame, metadata, size_hw, with_image=False)
         in_camera = transform_points(inverse_se3(camera.T_ego_cam), torch.from_numpy(aims).float())
+        # Lines of sight to the aims that the image shows
         in_view = project(in_camera, camera.K, camera.dist, size_hw)[2].numpy()
         ends = (aims[in_view] - np.asarray(spec.lower_m)) / spec.voxel_m
         origin = (camera.T_ego_cam[:3, 3].double().numpy() - np.asarray(spec.lower_m)) / spec.voxel_m
@@ -140,8 +146,10 @@ def _camera_mask(
 def _aims(occupied: Bool[np.ndarray, "Z Y X"], spec: VoxelSpec) -> Float64[np.ndarray, "N 3"]:
     """Return the centres of occupied and outermost voxels, and the tops of occupied ones, ego frame, m."""
     outer = occupied.copy()
+    # The outermost layer of voxels along each axis
     for axis in range(3):
         np.moveaxis(outer, axis, 0)[[0, -1]] = True
+    # x, y, z of the centres and tops in voxel units
     centres = np.argwhere(outer)[:, ::-1] + 0.5
     tops = np.argwhere(occupied)[:, ::-1] + [0.5, 0.5, _NEARLY_AT_TOP]
     return np.asarray(spec.lower_m) + np.concatenate([centres, tops]) * spec.voxel_m

@@ -65,7 +65,7 @@ class TaskTruthConfig:
     rays: bool = False
     """Read the lidar's places and the velocities of voxels, which metrics of rays need."""
     affordances: bool = False
-    """Read the next light, the lead vehicle and who will cross."""
+    """Read the next light, the lead vehicle, and the road users that occupy the path over time."""
 
 
 class TaskTruthStore:
@@ -89,6 +89,7 @@ class TaskTruthStore:
         present = [camera for camera in cameras if camera is not None]
         file = self._file(log, frame, present)
         truth = None if file is None else self._read_entry(file)
+        # A part of the truth comes from the cache, or is made and stored
         if truth is None:
             truth = self._make(log, frame, present)
             if file is not None:
@@ -120,11 +121,14 @@ class TaskTruthStore:
     def _file(self, log: Log, frame: int, cameras: Sequence[PinholeCameraMetadata]) -> Path | None:
         if self._folder is None:
             return None
+        # The shared map can change without the log
         shared = map_file(log)
         stat = None if shared is None else (str(shared), shared.stat().st_size, shared.stat().st_mtime_ns)
         names = [camera.modality_key for camera in cameras]
         now_us = int(log.t_us[frame])
+        # Parts that are not cached do not change the entry's name
         kept = {name: value for name, value in vars(self.config).items() if name not in NOT_CACHED}
+        # Everything that the entry depends on
         key = (TRUTH_VERSION, log.fingerprint, stat, now_us, names, kept, self.voxels)
         name = hashlib.blake2b(repr(key).encode(), digest_size=16).hexdigest()
         return self._folder / name[:2] / f"{name}.truth"
@@ -141,6 +145,7 @@ class TaskTruthStore:
             return None
 
     def _decode(self, data: bytes) -> TaskTruth:
+        # The checksum finds entries that were cut off
         if zlib.crc32(data[4:]).to_bytes(4, "little") != data[:4]:
             raise ValueError("checksum")
         stored = msgpack_decode_with_numpy(data[4:])
@@ -175,6 +180,7 @@ def _packed(tensor: Tensor) -> dict[str, Any]:
     array = tensor.numpy()
     if array.dtype != np.bool_:
         return squeeze_array(array)
+    # A mask takes an eighth as bits; its shape is stored as the last byte may be padded
     return {**squeeze_array(np.packbits(array)), "mask": list(array.shape)}
 
 

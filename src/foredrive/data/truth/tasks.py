@@ -39,6 +39,7 @@ def tasks_of(log: Log) -> tuple[TaskSupport, ...]:
         InputError: the boxes cannot be read.
     """
     tracks = read_tracks(log)
+    # The longest track and the drive decide about horizons
     lasting_s = 0.0 if tracks is None else _longest_s(tracks)
     driven_s = float(log.t_us[-1] - log.t_us[0]) * 1e-6
     return (
@@ -99,6 +100,7 @@ def _longest_s(tracks: Tracks) -> float:
     if not len(number):
         return 0.0
     t_us = tracks.t_us[tracks.is_object]
+    # First and last time of each track
     first, last = np.full(number.max() + 1, np.inf), np.full(number.max() + 1, -np.inf)
     np.minimum.at(first, number, t_us)
     np.maximum.at(last, number, t_us)

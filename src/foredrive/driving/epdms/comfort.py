@@ -1,7 +1,7 @@
 """Comfort sub-scores of the EPDMS: HC (with the vehicle's past) and EC (two plans 0.5 s apart).
 
 Signals are smoothed and derived as in the devkit. Its acceleration at the middle of the vehicle has no
-lateral part at all, so that nuPlan's bound of it holds always; we keep that.
+lateral part at all, so that nuPlan's bound of it always holds. This is kept here.
 """
 
 import numpy as np
@@ -51,6 +51,7 @@ def extended_comfort(before: EgoMotion, now: EgoMotion, apart_s: float) -> float
     Raises:
         InputError: they are of different lengths, or hardly overlap.
     """
+    # The later plan begins `apart` steps after the first: compare the steps that both have
     apart = round(apart_s / STEP_S)
     if len(before.yaw_rad) != len(now.yaw_rad) or not 0 < apart < len(now.yaw_rad) - JERK_WINDOW:
         raise InputError(
@@ -82,6 +83,7 @@ def _signals(plan: EgoMotion) -> tuple[Float64[np.ndarray, "T"], ...]:
 
 def _along_mps2(ego: EgoMotion, body: EgoBody) -> Float64[np.ndarray, "T"]:
     """Return the acceleration at the middle as the devkit computes it: both shifts point forward."""
+    # Turn rate squared and its change shift the acceleration from axle to middle, as the devkit has it
     turning_more = np.diff(ego.yaw_rate_radps, prepend=ego.yaw_rate_radps[:1]) / STEP_S
     return np.asarray(ego.acceleration_mps2 + body.axle_to_centre_m * (ego.yaw_rate_radps**2 + turning_more))
 
@@ -89,6 +91,7 @@ def _along_mps2(ego: EgoMotion, body: EgoBody) -> Float64[np.ndarray, "T"]:
 def _smoothed(values: Float64[np.ndarray, "T"]) -> Float64[np.ndarray, "T"]:
     from scipy.signal import savgol_filter  # takes 0.3 s
 
+    # Rounded as in the devkit
     return np.round(savgol_filter(values, min(SMOOTHED, len(values)), 2), 8)
 
 

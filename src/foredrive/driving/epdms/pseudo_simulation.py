@@ -118,6 +118,7 @@ class PseudoSimulation:
     def starts_s(self, every_s: float) -> list[float]:
         """Return the times at which both stages fit into the log and it drives on, every `every_s`."""
         drive = LoggedDrive(self._place.vehicle, torch.eye(4))
+        # The first time with enough past frames and enough past for the comfort
         first_s = drive.first_s + max((self._past_frames + 1) * FRAME_DT_S, PAST_S + FRAME_DT_S)
         first_s = FRAME_DT_S * np.ceil(first_s / FRAME_DT_S - 1e-6)
         last_s = drive.end_s - 2 * HORIZON_S
@@ -136,9 +137,11 @@ class PseudoSimulation:
         groups, second = [], []
         later_s = start_s + HORIZON_S
         pairs = [
+            # Each follow-up state is planned from twice, half a second apart, for the extended comfort
             _with_comfort(*(self._planned(t_s, offset) for t_s in (later_s - FRAME_DT_S, later_s)))
             for offset in self._follow_ups
         ]
+        # Both moments of the first stage are scored with the follow-ups of the same moment
         for moment, planned in enumerate(first):
             follow_ups = [pair[moment] for pair in pairs]
             groups.append(
@@ -158,6 +161,7 @@ class PseudoSimulation:
         Args:
             human: whether what the log itself does wrong is forgiven.
         """
+        # The state beside the log: its pose is the logged one times the offset
         yaw, xyz = torch.tensor(offset.yaw_rad), torch.tensor([offset.ahead_m, offset.left_m, 0.0])
         drive = LoggedDrive(self._place.vehicle, matrix_from_yaw(yaw, xyz))
         graph = self._place.graph
@@ -166,12 +170,15 @@ class PseudoSimulation:
         state, seen = drive.state_at(start_s), stack_records([clip])
         plan = self._agent_in(simulator).act(seen)
         past, others = past_motion(drive, start_s), self._others(start_s)
+        # Reference of progress: the privileged expert from the same state
         reference = self._scored(ReplayExpert(drive).act(seen), state, past, others, 0.0)
         reference_m = reference[1].multiplied * self._progress_m(reference[0])
         ego, scores = self._scored(plan, state, past, others, reference_m)
+        # What the log's own driver does wrong is forgiven
         if human:
             logged = ReplayAgent(LoggedDrive(self._place.vehicle, torch.eye(4)), lambda: start_s).act(seen)
             scores = scores.forgiven(self._scored(logged, state, past, others, reference_m)[1])
+        # End of the plan in the world frame
         xy = waypoints_of(plan)[-1]
         cos, sin = np.cos(state.yaw_rad), np.sin(state.yaw_rad)
         start_m = np.array([state.x_m, state.y_m])

@@ -51,16 +51,18 @@ class DriverScores:
     @property
     def epdms(self) -> float:
         """Return the score: the multipliers times the weighted mean of the others."""
+        # Without extended comfort the weights of the others are normalised
         known = {name: weight for name, weight in WEIGHTS.items() if getattr(self, name) is not None}
         mean = sum(weight * getattr(self, name) for name, weight in known.items()) / sum(known.values())
         return self.multiplied * mean
 
     def forgiven(self, human: "DriverScores") -> "DriverScores":
-        """Return the scores with 1 where the human driver has 0: whom no rule can be asked of.
+        """Return the scores with 1 where the human driver has 0: a rule that the human breaks is not asked.
 
         EP and HC stay. The devkit scores the human driver without a reference and without a past, so that
         there both are always 1. EC is not among the scores that it compares.
         """
+        # Only a complete failure of the human forgives
         changed = {name: 1.0 for name in FORGIVEN if getattr(human, name) == 0.0}
         return dataclasses.replace(self, **changed)
 
@@ -114,6 +116,7 @@ def follow_up_weights(
 
     If the plan ends far from all of them, they count equally, as in the devkit.
     """
+    # Gaussian kernel of the distance between the plan's end and each start
     weights = np.exp(-((starts_m - end_m) ** 2).sum(axis=1) / (2 * SIGMA2_M2))
     total = float(weights.sum())
     if np.isclose(total, 0.0):

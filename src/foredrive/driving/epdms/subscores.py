@@ -47,12 +47,14 @@ class EgoAreas:
 
 def ego_areas(ego: EgoMotion, body: EgoBody, roads: Roads) -> EgoAreas:
     """Return where the ego vehicle is at each step."""
+    # Corners in lanes, middle on the route, and corners in the drivable area, for all steps at once
     corners, centres = ego.corners(body), ego.centres(body)
     steps = len(corners)
     flat = corners.reshape(-1, 2).T
     inside = np.array([shapely.contains_xy(lane, *flat) for lane in roads.lanes]).reshape(-1, steps, 4)
     route = [lane for lane, on_route in zip(roads.lanes, roads.on_route, strict=True) if on_route]
     on_route = np.array([shapely.contains_xy(lane, *centres.T) for lane in route]).reshape(-1, steps)
+    # Several lanes are touched, and none holds all four corners
     touched = inside.any(axis=2).sum(axis=0) > 1
     whole = (inside.sum(axis=2) == 4).any(axis=0)
     drivable = shapely.contains_xy(roads.drivable, *flat).reshape(steps, 4)
@@ -71,8 +73,10 @@ def no_at_fault_collision(ego: EgoMotion, body: EgoBody, areas: EgoAreas, others
         for row, other in enumerate(others.outlines[step]):
             if other is None or row in forgiven or not outline.intersects(other):
                 continue
+            # What stands is judged first, then the side of the impact
             hit = _kind(ego, step, corners, other, others.stopped(row, STOPPED_TRACK_MPS))
             leaves = bool(areas.multiple_lanes[step] or areas.off_road[step])
+            # At fault: front, standing objects, and sides while off the lane
             if hit in (Hit.FRONT, Hit.STOPPED_TRACK) or (leaves and hit is Hit.LATERAL):
                 score = min(score, 0.0 if others.moves_by_itself[row] else 0.5)
             else:
@@ -108,9 +112,11 @@ def drivable_area_compliance(areas: EgoAreas) -> float:
 def driving_direction_compliance(ego: EgoMotion, body: EgoBody, areas: EgoAreas, roads: Roads) -> float:
     """Return DDC: 1, 0.5 or 0 by the longest way off the route's lanes within 1 s, intersections left out."""
     centres = ego.centres(body)
+    # Way of each step, counted only off the route's lanes and outside of intersections
     way_m = np.append(0.0, np.hypot(*np.diff(centres, axis=0).T))
     way_m[~areas.oncoming | roads.in_intersection(centres)] = 0.0
     window = round(DIRECTION_S / STEP_S)
+    # Longest sum over a window of 1 s
     longest_m = max(float(way_m[max(0, step - window) : step + 1].sum()) for step in range(len(way_m)))
     return 1.0 if longest_m < COMPLIES_M else 0.5 if longest_m < VIOLATES_M else 0.0
 
@@ -140,6 +146,7 @@ def ego_progress(driven_m: float, multiplied: float, reference_m: float) -> floa
         reference_m: progress of the reference times the product of its multipliers.
     """
     best_m = max(driven_m * multiplied, reference_m)
+    # Short references ask for no progress
     return 1.0 if best_m <= FAR_ENOUGH_M else min(max(driven_m / best_m, 0.0), 1.0)
 
 
@@ -154,6 +161,7 @@ def time_to_collision(
     forgiven = set[int]()
     corners, crossing = ego.corners(body), roads.in_intersection(ego.xy_m)
     heading = np.stack([np.cos(ego.yaw_rad), np.sin(ego.yaw_rad)], axis=1)
+    # Every step as a start; the vehicle goes on straight at its present speed
     for step in range(len(corners) - max(TTC_STEPS)):
         if ego.speed_mps[step] < TTC_STOPPED_MPS:
             continue
@@ -164,6 +172,7 @@ def time_to_collision(
                     continue
                 angle_rad = _angle_rad(ego, step, other)
                 leaves = bool(areas.multiple_lanes[step] or areas.off_road[step] or crossing[step])
+                # Ahead counts always; beside only while the vehicle leaves its lane or crosses
                 if angle_rad < AHEAD_RAD or (leaves and angle_rad <= BEHIND_RAD):
                     return 0.0
                 forgiven.add(row)
@@ -178,6 +187,7 @@ def lane_keeping(ego: EgoMotion, body: EgoBody, roads: Roads) -> float:
     centres = ego.centres(body)
     away_m = shapely.distance(shapely.points(centres), roads.centreline)
     needed, run = math.ceil(ASIDE_S / STEP_S), 0
+    # Consecutive steps outside of intersections
     for far in (away_m > ASIDE_M)[~roads.in_intersection(centres)].tolist():
         run = run + 1 if far else 0
         if run >= needed:

@@ -73,6 +73,7 @@ def aggregate(
     means, as in neuro-ncap.
     """
     rng = np.random.default_rng(seed)
+    # Runs by scenario, scenarios by kind; both in the order in which they occur
     by_scenario = {name: [run for run in runs if run.scenario == name] for name in _names(runs)}
     kind_of = {name: of[0].result.kind for name, of in by_scenario.items()}
     by_kind = {
@@ -131,6 +132,7 @@ def _values(groups: Groups, value: Callable[[TestedRun], float | None]) -> list[
     of_kinds = [
         [
             np.array(of)
+            # Failed runs have no value and drop out here
             for runs in of_kind.values()
             if (of := [v for run in runs if (v := value(run)) is not None])
         ]
@@ -143,6 +145,7 @@ def _mean(groups: Groups, value: Callable[[TestedRun], float | None]) -> float |
     values = _values(groups, value)
     if not values:
         return None
+    # Mean over runs, then over the scenarios of a kind, then over the kinds
     return statistics.fmean(statistics.fmean(of.mean() for of in of_kind) for of_kind in values)
 
 
@@ -152,6 +155,7 @@ def _interval(
     values, mean = _values(groups, value), _mean(groups, value)
     if mean is None:
         return None
+    # Bootstrap: draw the runs of each scenario again, and average as above
     resampled = np.mean(
         [
             np.mean([of[rng.integers(0, len(of), (RESAMPLES, len(of)))].mean(1) for of in of_kind], axis=0)

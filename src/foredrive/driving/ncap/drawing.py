@@ -40,10 +40,12 @@ class DrawnRun:
 
 def draw_run(scenario: SafetyScenario, number: int) -> DrawnRun:
     """Return run `number` of a scenario, from 0. Equal numbers give equal runs."""
+    # A separate generator for the start, as in the public code
     start, half = scenario.start_frame, scenario.start_jitter_frames
     if half:
         start = max(0, start + int(np.random.default_rng(number).integers(-half, half + 1)))
     rng, groups, actors = np.random.default_rng(number), set[str](), list[DrawnActor]()
+    # Actors in random order: of each group only the first one takes part
     for index in rng.permutation(len(scenario.actors)).tolist():
         actor = scenario.actors[index]
         if actor.group is not None and actor.group in groups:
@@ -69,8 +71,10 @@ def _jittered(way: Polyline, jitter: Jitter, rng: np.random.Generator) -> tuple[
             return 0.0
         return float(rng.uniform(-half, half) if jitter.uniform else rng.normal(scale=half))
 
+    # The order of the draws is part of the protocol
     along, right = draw(jitter.longitudinal_m), draw(jitter.lateral_m)
     cos, sin = math.cos(jitter.along_rad), math.sin(jitter.along_rad)
+    # Right is the direction turned by -90°
     dx, dy = along * cos + right * sin, along * sin - right * cos
     moved = Polyline(way.t_s, tuple((x + dx, y + dy, z) for x, y, z in way.xyz_m))
     return moved, draw(jitter.yaw_rad)

@@ -78,9 +78,11 @@ def hd_score(
         raise InputError("an HD-Score needs at least one plan")
     rows = []
     for plan in plans:
+        # A plan that hardly moves has no reliable headings of its own
         yaw = plan.yaw_rad if _length_m(plan) >= SHORT_M else np.full_like(plan.yaw_rad, plan.yaw_rad[0])
         nc = _no_collision(plan.xy_m, yaw, plan, size_lw)
         dac = _drivable(plan.xy_m, yaw, drivable, size_lw)
+        # Velocities between the points, the first one repeated
         velocity = np.diff(plan.xy_m, axis=0) / plan.dt_s
         velocity = np.vstack([velocity[:1], velocity])
         ttc = min(_no_collision(plan.xy_m + ahead_s * velocity, yaw, plan, size_lw) for ahead_s in AHEAD_S)
@@ -102,6 +104,7 @@ def _no_collision(
     size_lw: tuple[float, float],
 ) -> float:
     for step, (xy, yaw) in enumerate(zip(xy_m, yaw_rad.tolist(), strict=True)):
+        # Behind the known times the last outlines stay
         others = plan.others[min(step, len(plan.others) - 1)] if plan.others else ()
         ego = shapely.Polygon(_points(xy, yaw, size_lw, 0.5))
         if any(ego.intersects(other) for other in others):
@@ -119,6 +122,7 @@ def _drivable(
 
     The public code has a value of 0.5 too, which no number of quarters can reach.
     """
+    # Share of the four quarters' middles that are on the road, at each step
     shares = [
         float(shapely.contains_xy(drivable, *_points(xy, yaw, size_lw, 0.25).T).mean())
         for xy, yaw in zip(xy_m, yaw_rad.tolist(), strict=True)
@@ -139,6 +143,7 @@ def _comfort(xy_m: Float64[np.ndarray, "T 2"], yaw_rad: Float64[np.ndarray, "T"]
     """Return 1 if acceleration, jerk and turning of a plan are within bounds. Short plans are comfortable."""
     if len(xy_m) < 4:
         return 1.0
+    # Finite differences of the plan's points
     speed = np.hypot(*np.diff(xy_m, axis=0).T) / dt_s
     along = np.diff(speed) / dt_s
     turning = np.diff(np.unwrap(yaw_rad)) / dt_s
@@ -192,11 +197,13 @@ def _in_traffic(
     state = drive.states[index]
     path = np.vstack([np.zeros(2), points])
     steps = np.diff(path, axis=0)
+    # Steps too short for a direction keep the last heading
     moves = np.append(True, np.hypot(*steps.T) > STANDS_M)
     turns = np.append(0.0, np.arctan2(steps[:, 1], steps[:, 0]))
     last_moved = np.maximum.accumulate(np.where(moves, np.arange(len(path)), 0))
     yaw = state.yaw_rad + turns[last_moved]
     cos, sin = math.cos(state.yaw_rad), math.sin(state.yaw_rad)
+    # Points from the ego frame to the world; the outline is about the middle of the vehicle
     axle = path @ np.array([[cos, sin], [-sin, cos]]) + [state.x_m, state.y_m]
     middle = axle + EGO.axle_to_centre_m * np.stack([np.cos(yaw), np.sin(yaw)], axis=1)
     others = tuple(

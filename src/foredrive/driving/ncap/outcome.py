@@ -98,6 +98,7 @@ def judge(
     changes nothing.
     """
     hit = first_collision(drive)
+    # A collision decides, whatever the drive's own ending
     impact_mps = None if hit is None else hit.severity
     outcome = OUTCOME_OF[drive.score.ending] if hit is None else Outcome.COLLIDED
     scores = {Outcome.FAILED: None, Outcome.LEFT_WAY: left_way_score}

@@ -40,6 +40,7 @@ def place_actors(
         InputError: the log has no track of an actor's name.
     """
     logged = graph.tracks
+    # Add the actors one by one; then remove the moving ones of the log unless the rules keep them
     for actor in run.actors:
         graph = _with_actor(graph, actor, T_world_scene, track_ids)
     if moving_stay:
@@ -57,6 +58,7 @@ def _with_actor(
     copied = apply_edits(graph, [Duplicate(track_ids[actor.name], unused_id(graph))]).graph
     tracks = copied.tracks
     poses = way_poses(actor.way, actor.yaw_rad, tracks.t_s.double().cpu().numpy())
+    # The way gives the foot; the box' centre lies half its height above, along its own z axis
     poses[:, :3, 3] += 0.5 * float(tracks.size_lwh[-1, 2]) * poses[:, :3, 2]
     T_scene_actor = inverse_se3(T_world_scene) @ torch.from_numpy(poses)
     of_all, present = tracks.T_scene_actor.clone(), tracks.present.clone()
@@ -68,6 +70,7 @@ def _with_actor(
 
 def way_points(way: Polyline, t_s: Float64[np.ndarray, "K"]) -> Float64[np.ndarray, "K 3"]:
     """Return the positions on a way at some times, m, world frame."""
+    # Interpolation, and extrapolation beyond both ends
     line = interp1d(way.t_s, np.array(way.xyz_m, dtype=float), axis=0, fill_value="extrapolate")
     return np.asarray(line(t_s))
 
@@ -87,10 +90,12 @@ def way_poses(
     given heading and is level.
     """
     points = way_points(way, t_s)
+    # The actor heads to where it is one key frame later; while it stands, as given
     forward = way_points(way, t_s + FRAME_DT_S) - points
     moved_m = np.linalg.norm(forward, axis=1, keepdims=True)
     level = np.array([np.cos(standing_yaw_rad), np.sin(standing_yaw_rad), 0.0])
     forward = np.where(moved_m > STANDS_M, forward / np.maximum(moved_m, STANDS_M), level)
+    # Left is horizontal: the actor does not roll
     left = np.cross([0.0, 0.0, 1.0], forward)
     left /= np.linalg.norm(left, axis=1, keepdims=True)
     poses = np.tile(np.eye(4), (len(t_s), 1, 1))

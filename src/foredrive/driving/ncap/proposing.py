@@ -66,6 +66,7 @@ def propose(place: Place, scene: str) -> list[SafetyScenario]:
     drive = LoggedDrive(place.vehicle, torch.eye(4))
     models, found = _models(place, drive), list[SafetyScenario]()
     others_at = functools.cache(functools.partial(_others, place))
+    # Starts on the grid of key frames, as long as the log covers the test
     first = math.ceil(drive.first_s / FRAME_DT_S) + 1
     for frame in range(first, int(drive.end_s / FRAME_DT_S), EVERY_FRAMES):
         begin_s = FRAME_DT_S * (frame + PRIMING_FRAMES)
@@ -85,6 +86,7 @@ def _models(place: Place, drive: LoggedDrive) -> tuple[str, ...]:
     """Return the names of the actors that are cars and were seen best, from near."""
     tracks, token = place.graph.tracks, {number: name for name, number in place.track_ids.items()}
     rows = []
+    # Cars seen from near at any time, then those that the reconstruction observed best
     for t_s in np.arange(drive.first_s, drive.end_s, FRAME_DT_S).tolist():
         users = users_at(tracks, place.vehicle.T_world_scene, t_s)
         away_m = np.hypot(*(users.foot_m[:, :2] - drive.pose_at(t_s)[:2, 3]).T)
@@ -112,18 +114,22 @@ def _actor(
     """Return the actor of a test. None if the log is too slow, or its path too short for it."""
     arc_m = arc_lengths(path[:, :2])
     bumper_m = EGO.axle_to_centre_m + 0.5 * EGO.length_m
+    # Where the front bumper would be at constant speed after `IMPACT_S`
     at_m = speed_mps * IMPACT_S + bumper_m
     if speed_mps < MIN_MPS or at_m + 4.0 > arc_m[-1]:
         return None
+    # The spot of the impact and the heading of the path there
     before, spot, after = points_at(path, arc_m, np.array([at_m - 0.5, at_m, at_m + 0.5]))
     yaw = float(math.atan2(after[1] - before[1], after[0] - before[0]))
     x, y, z = spot.tolist()
     impact_s, names = begin_s + IMPACT_S, tuple(models)
     shift = Jitter(yaw, longitudinal_m=2.0, lateral_m=0.5)
+    # A standing car with its rear at the spot, about half its length further on
     if kind is Threat.STATIONARY:
         centre = (x + 2.2 * math.cos(yaw), y + 2.2 * math.sin(yaw), z)
         standing = Jitter(yaw, longitudinal_m=2.0, lateral_m=0.5, yaw_rad=0.3)
         return ScenarioActor(names, Rectilinear(centre, impact_s, yaw), yaw, jitter=standing)
+    # From the right, so that it is at the spot at the time of the impact
     if kind is Threat.SIDE:
         way = Rectilinear((x, y, z), impact_s, yaw + 0.5 * math.pi, ACTOR_MPS)
         return ScenarioActor(names, way, jitter=Jitter(yaw, longitudinal_m=0.5, lateral_m=0.5))
@@ -139,6 +145,7 @@ def _oncoming(
     shift: Jitter,
 ) -> ScenarioActor:
     """Return the actor that comes along the logged path, as far as the log knows it, and straight before."""
+    # Backwards from the spot along the logged path, at constant speed
     ahead_m = np.arange(0.0, min(float(arc_m[-1]) - at_m, 30.0), 2.0)
     points = points_at(path, arc_m, at_m + ahead_m[::-1])
     times = impact_s - ahead_m[::-1] / ACTOR_MPS
@@ -161,17 +168,21 @@ def _feasible(
     """
     way = actor.way if isinstance(actor.way, Polyline) else actor.way.polyline()
     speed_mps = drive.state_at(begin_s).speed_mps
+    # Reaction and comfortable braking must fit into the way to the impact
     if speed_mps * REACTION_S + speed_mps**2 / (2 * BRAKING_MPS2) > speed_mps * IMPACT_S:
         return False
     end_s = begin_s + IMPACT_S + AFTERWARDS_S
     for t_s in np.arange(begin_s, end_s + 1e-6, FRAME_DT_S).tolist():
         others = others_at(t_s)
+        # The actor's body must be free at all times
         foot = way_points(way, np.array([t_s]))[0, :2]
         if shapely.Point(foot).buffer(BODY_M).intersects(others):
             return False
+        # Around the impact the actor must be on a lane
         near = abs(t_s - begin_s - IMPACT_S) <= ON_LANE_S
         if near and place.lanes is not None and place.lanes.outside(foot):
             return False
+        # Until the impact: the ego vehicle's way is free, and shortly before it the actor is in sight
         if t_s <= begin_s + IMPACT_S:
             ego = shapely.Point(drive.pose_at(t_s)[:2, 3]).buffer(0.5 * EGO.width_m)
             sight = shapely.LineString([drive.pose_at(t_s)[:2, 3], foot])

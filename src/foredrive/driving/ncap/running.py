@@ -63,6 +63,7 @@ def set_up_run(
         InputError: the log does not cover the run, or has no actor of a name.
     """
     drawn = draw_run(scenario, number)
+    # The vehicle drives itself after the priming
     start_s = FRAME_DT_S * (drawn.start_frame + scenario.priming_frames)
     length_s = scenario.length_s - FRAME_DT_S * scenario.priming_frames - rules.unchecked_end_s
     T_world_scene = place.vehicle.T_world_scene
@@ -72,6 +73,7 @@ def set_up_run(
             f"{scenario.label}: run {number} lasts to {start_s + length_s:g} s, but the log ends at "
             f"{drive.end_s:.1f} s"
         )
+    # The agent's past frames must lie in the log
     first_s = drive.first_s + FRAME_DT_S * past_frames
     if start_s < first_s - STEP_S:
         raise InputError(
@@ -113,6 +115,7 @@ class LqrPilot:
 
     def step(self, ego: BicycleState, t_s: float) -> Step:
         """Move the vehicle on by one step of the simulation, half a step of the regulator."""
+        # Every second step of the simulation is halfway between two commands
         if self._next is not None:
             arrived, self._next = self._next, None
             return self._simulator.step_to(arrived)
@@ -149,9 +152,11 @@ class ConstantSpeedAgent:
         """Return points on the path ahead, for a batch of one. Behind the log's end the path is straight."""
         T_world_ego = observation.T_world_ego[0, -1].numpy()
         line = self.drive.line
+        # From the nearest point of the path on, at constant speed
         from_m = line.project(shapely.Point(T_world_ego[:2, 3]))
         ahead_m = self.speed_mps * FRAME_DT_S * np.arange(1, HORIZON_STEPS + 1)
         xy = np.array([line.interpolate(from_m + way).coords[0] for way in ahead_m])
+        # Row vectors times the rotation give ego coordinates
         local = (xy - T_world_ego[:2, 3]) @ T_world_ego[:2, :2]
         return plan_of(torch.from_numpy(local).float()[None, None])
 
@@ -183,6 +188,7 @@ def reference_mps(rules: Rules, drive: LoggedDrive, drawn: DrawnRun, no_action_m
     if rules.reference is Reference.NO_ACTION:
         return no_action_mps
     after_s = FRAME_DT_S * drawn.start_frame + REFERENCE_S
+    # Speeds by the rule: of the log after 4 s, or at its end as in the released code
     from_s = after_s if rules.reference is Reference.AFTER_4_S else drive.end_s - FRAME_DT_S
     before, after = (drive.pose_at(t_s)[:2, 3] for t_s in (from_s, from_s + FRAME_DT_S))
     ego = (after - before) / FRAME_DT_S

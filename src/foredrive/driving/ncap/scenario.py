@@ -70,6 +70,7 @@ class Rectilinear:
         """Return the same way through two points, 1 s apart."""
         x_m, y_m, z_m = self.at_m
         step = self.speed_mps * math.cos(self.yaw_rad), self.speed_mps * math.sin(self.yaw_rad)
+        # Two points determine a straight way, because ways are extrapolated
         return Polyline((self.at_s, self.at_s + 1.0), (self.at_m, (x_m + step[0], y_m + step[1], z_m)))
 
 

@@ -35,6 +35,7 @@ def load_scenarios(path: Path) -> tuple[SafetyScenario, ...]:
     Raises:
         InputError: a file cannot be read, an entry is wrong, or two scenarios have one name.
     """
+    # Files that are named directly are read; those outside of the protocol are left out of folders
     outside = outside_protocol(path)
     files = sorted(path.rglob("*.yaml")) if path.is_dir() else [path]
     scenarios = tuple(each for file in files if file not in outside for each in _read(file))
@@ -139,6 +140,7 @@ def _neuro_ncap(written: Mapping[str, Any], file: Path) -> SafetyScenario:
             f"{file}: the kind of a scenario of neuro-ncap is the name of its folder: one of "
             f"{', '.join(Threat)}, not {kind!r}"
         )
+    # neuro-ncap writes dashes in its keys
     plain = _underscored(written)
     general = {key: value for key, value in plain["general"].items() if key not in UNREAD}
     settings: _General = _validated(_General, general, file)
@@ -165,6 +167,7 @@ def _neuro_ncap(written: Mapping[str, Any], file: Path) -> SafetyScenario:
 
 
 def _actor(there: _ActorThere) -> ScenarioActor:
+    # Without an angle, the shift has no direction and is not applied
     shift = there.jitter if there.jitter.long_lat_angle is not None else None
     return ScenarioActor(
         names=there.uuids or ((there.uuid,) if there.uuid else ()),

@@ -61,10 +61,12 @@ class LoggedDrive:
         Its acceleration is the change from the mean speed before to that after, over twice `SPEED_OVER_S`
         each. At the log's ends it is that of the nearest time at which both are known.
         """
+        # Speed and turn rate from poses before and after, within the log
         from_s, to_s = max(t_s - SPEED_OVER_S, self.first_s), min(t_s + SPEED_OVER_S, self.end_s)
         before, now, after = (self.pose_at(at) for at in (from_s, t_s, to_s))
         speed = float(np.hypot(*(after - before)[:2, 3])) / (to_s - from_s)
         turned = np.remainder(_yaw(after) - _yaw(before) + np.pi, 2 * np.pi) - np.pi
+        # Curvature is turn per distance; at low speed it is not measurable
         curvature = turned / (to_s - from_s) / speed if speed > STEERS_FROM_MPS else 0.0
         max_rad = EGO.max_steering_rad
         steering = np.clip(np.arctan(EGO.wheelbase_m * curvature), -max_rad, max_rad)
@@ -77,6 +79,7 @@ class LoggedDrive:
         first_s, last_s = self.first_s + over_s, self.end_s - over_s
         if first_s > last_s:
             return 0.0
+        # Near the log's ends: the nearest time at which both speeds are known
         middle_s = min(max(t_s, first_s), last_s)
         before, now, after = (
             self.pose_at(at)[:2, 3] for at in (middle_s - over_s, middle_s, middle_s + over_s)
@@ -99,6 +102,7 @@ class LoggedDrive:
 
     def _way(self, t_s: float) -> Float64[np.ndarray, "M 3"]:
         points = [self.pose_at(t_s)[:3, 3]]
+        # Points closer than `SPACING_M` are left out
         for point in self.poses[self.vehicle.t_s.numpy() > t_s, :3, 3]:
             if np.hypot(*(point - points[-1])[:2]) >= SPACING_M:
                 points.append(point)
@@ -108,6 +112,7 @@ class LoggedDrive:
     def line(self) -> shapely.LineString:
         """Return the logged path in the plane, m, world frame. Behind the log's end it goes straight on."""
         xy, forward = self.poses[:, :2, 3], self.poses[-1, :2, 0]
+        # Beyond the end the path goes on in the direction of the last pose
         return shapely.LineString(np.vstack([xy, xy[-1] + BEYOND_M * forward / np.linalg.norm(forward)]))
 
     def path_ahead(self, T_world_ego: Float64[np.ndarray, "4 4"]) -> Float64[np.ndarray, "N 2"]:
@@ -124,15 +129,18 @@ class LoggedDrive:
 
         The vehicle stands on the ground plane of the nearest logged pose.
         """
+        # The ground is the plane of the nearest logged pose
         away_m = np.hypot(*(self.poses[:, :2, 3] - [ego.x_m, ego.y_m]).T)
         near = self.poses[int(np.argmin(away_m))]
         up = near[:3, 2]
         aside_m = np.array([ego.x_m, ego.y_m]) - near[:2, 3]
         forward = np.array([np.cos(ego.yaw_rad), np.sin(ego.yaw_rad), 0.0])
+        # Heading within this plane: perpendicular to its normal
         forward[2] = -(forward[:2] @ up[:2]) / up[2]
         forward /= np.linalg.norm(forward)
         T = np.eye(4)
         T[:3, :3] = np.stack([forward, np.cross(up, forward), up], axis=1)
+        # Height of the plane at the vehicle's place
         T[:3, 3] = ego.x_m, ego.y_m, near[2, 3] - (aside_m @ up[:2]) / up[2]
         return T
 

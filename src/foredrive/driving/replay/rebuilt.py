@@ -110,6 +110,7 @@ class RebuiltSimulator:
         self._route = RouteLine(self.drive.route_from(scenario.start_s))
         self._way_m = self.way_m(scenario)
         frames: tuple[KeyFrame, ...] = ()
+        # Key frames before the start are rendered along the log
         for number in range(-scenario.past_frames, 1):
             t_s = number * FRAME_DT_S
             at_s = scenario.start_s + t_s
@@ -167,6 +168,7 @@ class RebuiltSimulator:
         left_m = self.drive.way_left_m(scenario.start_s)
         if scenario.length_s is None:
             return left_m
+        # Way of the log within the test's time
         way_m = left_m - self.drive.way_left_m(min(scenario.start_s + scenario.length_s, self.drive.end_s))
         if way_m < MIN_WAY_M:
             raise InputError(
@@ -196,14 +198,17 @@ class RebuiltSimulator:
         contact = self._scenario.contact
         users = users_at(self._tracks, self._T_world_scene, self._scenario.start_s + t_s)
         users = contact.counted(users)
+        # Actors behind the ego vehicle that touch it have hit it; they are reported but do not count
         box = ego_box(self.drive.on_ground(moved), moved, contact.vehicle)
         behind = comes_from_behind(box, users) & (not contact.struck_counts)
         before = users.without(users.track_id[behind])
         events, met = collide(box, moved, before, state.contacts.users, t_s)
         struck, met = collide(box, moved, users.without(users.track_id[~behind]), met, t_s)
+        # An obstacle in front stops the vehicle where it was
         if blocked(box, before):
             moved = dataclasses.replace(state.ego, speed_mps=0.0, acceleration_mps2=0.0)
         xy = np.array([moved.x_m, moved.y_m])
+        # Progress and ending by the pose after a possible stop
         progress = self._route.advance(state.progress, xy, moved.speed_mps, t_s)
         ended = COLLISION if events and self._scenario.ends_on_collision else self._end_of(progress, t_s)
         events += [dataclasses.replace(event, kind=STRUCK) for event in struck]
@@ -230,6 +235,7 @@ class RebuiltSimulator:
         left_s = self.drive.end_s - self._scenario.start_s
         length_s = left_s if self._scenario.length_s is None else min(left_s, self._scenario.length_s)
         ended = self._route.end_of(progress, t_s, length_s - 0.5 * STEP_S)
+        # At the end of the time, almost all of the way counts as completed
         left_m = self._way_m - progress.done_m
         if ended == "timeout" and left_m < min(ARRIVED_M, 0.5 * self._way_m):
             return "completed"

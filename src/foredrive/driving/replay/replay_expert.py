@@ -94,6 +94,7 @@ class ReplayExpert:
         Raises:
             InputError: the observation has no boxes.
         """
+        # A batch of one: the plan is made in the ego frame of now
         clip = observation[0]
         if not bool(clip.boxes_valid[-1]):
             raise InputError("the expert needs the true boxes of the road users")
@@ -107,6 +108,7 @@ class ReplayExpert:
             )
         path = self.drive.path_ahead(T_world_ego)
         cruise_mps = max(MIN_CRUISE_MPS, self._logged_mps(T_world_ego))
+        # All combinations of accelerations and lateral offsets
         plans = [
             _plan(path, now.speed_mps, cruise_mps, acceleration, aside_m)
             for acceleration, aside_m in itertools.product(ACCELERATIONS_MPS2, ASIDE_M)
@@ -142,6 +144,7 @@ def _best(plans: Sequence[_Plan], now: BicycleState, users: Sequence[RoadUsers])
         users: the road users at each step, in the ego frame of now.
     """
     close, touching = list[_Plan](), list[tuple[float, _Plan]]()
+    # In order of worth: the first plan that keeps its margin is the best one
     for plan in sorted(plans, key=lambda plan: plan.worth, reverse=True):
         driven = _driven(plan.trajectory, now)
         if _impact_mps(driven, users, MARGIN_M) is None:
@@ -157,6 +160,7 @@ def _best(plans: Sequence[_Plan], now: BicycleState, users: Sequence[RoadUsers])
 def _driven(trajectory: Trajectory, now: BicycleState) -> list[BicycleState]:
     """Return the states at `LOOK_TIMES_S` of a vehicle that follows a plan."""
     state, states, every = now, [], round(LOOK_DT_S / STEP_S)
+    # Drive the plan by the same controller and dynamics as in the simulator
     controller = ControllerState(fixed_in_world(trajectory, now, 0.0))
     for number in range(every * len(LOOK_TIMES_S)):
         control, controller = follow(controller, state, number * STEP_S)
@@ -187,14 +191,17 @@ def _plan(
     acceleration_mps2: float,
     aside_m: float,
 ) -> _Plan:
+    # Constant acceleration, between standing and the cruising speed
     highest = max(cruise_mps, speed_mps) if acceleration_mps2 > 0 else speed_mps
     speeds = np.clip(speed_mps + acceleration_mps2 * LOOK_TIMES_S, 0.0, highest)
     before = np.concatenate([[speed_mps], speeds[:-1]])
     way_m = np.cumsum(0.5 * (before + speeds) * LOOK_DT_S)
     arc_m = arc_lengths(path)
+    # Headings of the path half a metre ahead
     ahead = points_at(path, arc_m, way_m + 0.5) - points_at(path, arc_m, way_m)
     headings = np.arctan2(ahead[:, 1], ahead[:, 0])
     starts_m = float(path[0] @ [-math.sin(headings[0]), math.cos(headings[0])])  # path left of the vehicle
+    # Smoothstep from the present offset to that of the plan
     share = np.minimum(way_m / max(SHIFT_M, 1.5 * speed_mps), 1.0)
     smooth = share * share * (3 - 2 * share)
     left_m = -starts_m + smooth * (aside_m + starts_m)
@@ -230,6 +237,7 @@ def _moved_on(users: RoadUsers, after_s: float) -> RoadUsers:
 def _in_ego(users: RoadUsers, T_world_ego: Float64[np.ndarray, "4 4"]) -> RoadUsers:
     """Return road users of the world frame in the ego frame, on one level."""
     R, foot_m = T_world_ego[:2, :2], np.zeros_like(users.foot_m)
+    # Row vectors times the rotation give ego coordinates
     foot_m[:, :2] = (users.foot_m - T_world_ego[:3, 3])[:, :2] @ R
     return users._replace(
         foot_m=foot_m,

@@ -19,6 +19,7 @@ def users_at(tracks: ActorTracks, T_world_scene: Float64[Tensor, "4 4"], t_s: fl
     return RoadUsers(
         track_id=torch.where(states.present, tracks.track_id, -1).numpy(),
         category=tracks.category.numpy(),
+        # Foot: half the height below the box' centre, along its own z axis
         foot_m=(T_world_actor[:, :3, 3] - half_height * T_world_actor[:, :3, 2]).numpy(),
         yaw=yaw_from_matrix(T_world_actor).numpy(),
         half_lw=(0.5 * tracks.size_lwh[:, :2]).double().numpy(),

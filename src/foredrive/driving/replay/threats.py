@@ -46,6 +46,7 @@ def send_threat(threat: Threat, graph: SceneGraph, drive: LoggedDrive, start_s: 
         InputError: the scene has no car, or at the time of impact the log has ended or hardly moves.
     """
     at_s = start_s + AFTER_S
+    # The log must go on beyond the impact, and move at that time
     if at_s > drive.end_s:
         raise InputError(f"the log ends at {drive.end_s:.1f} s, too early for an impact at {at_s:.1f} s")
     if (left_m := drive.way_left_m(at_s)) < ARRIVED_M:
@@ -58,6 +59,7 @@ def send_threat(threat: Threat, graph: SceneGraph, drive: LoggedDrive, start_s: 
     row, tracks = _most_observed_car(graph), graph.tracks
     length_m, _, height_m = tracks.size_lwh[row].tolist()
     bumper_m = EGO.axle_to_centre_m + 0.5 * EGO.length_m
+    # Heading of the other vehicle, and its distance from the rear axle at the impact
     heading_rad, ahead_m = {
         Threat.STATIONARY: (0.0, bumper_m + 0.5 * length_m),
         Threat.FRONTAL: (math.pi, bumper_m + 0.5 * length_m),

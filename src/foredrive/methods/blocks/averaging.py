@@ -52,6 +52,7 @@ class AveragingEncoder(nn.Module):
         self.spec, hidden = spec, config.hidden
         centres = spec.centres_m(torch.get_default_device()).flatten(0, 2)
         self.register_buffer("centres_m", centres, persistent=False)
+        # The gate depends on the place of a voxel only, so it is the same for all clips and cameras
         self.gate: nn.Sequential | None = None
         if config.gate is not None:
             self.register_buffer("place", position_code(centres, PLACE_CHANNELS), persistent=False)
@@ -74,11 +75,15 @@ class AveragingEncoder(nn.Module):
         image_valid: Bool[Tensor, "b C"],
     ) -> Float[Tensor, "b D Z Y X"]:
         """Lift the finest image features. The result is channels-last in memory."""
+        # Sample at the exact projection (zero offset) with weight 1:
+        # the mean over the cameras that see the voxel
         uv, visible = project_to_cameras(self.centres_m, rig, image_valid)
         b, q = len(uv), len(self.centres_m)
         at_projection = uv.new_zeros(b, q, 1, 1, 1, 2)
         read = lift(features[:1], uv, visible, at_projection, uv.new_ones(b, q, 1, 1, 1))
         if self.gate is not None:
+            # The scale is learned as a deviation from 1, so a gate near
+            # zero leaves the features as they are
             scale, shift = self.gate(self.place).chunk(2, dim=-1)
             read = read * (1 + scale) + shift
         volume = read.unflatten(1, self.spec.shape_zyx).permute(0, 4, 1, 2, 3)

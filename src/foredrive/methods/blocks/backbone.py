@@ -77,6 +77,7 @@ class ImageBackbone(nn.Module):
         from transformers import ResNetBackbone, ResNetConfig  # slow to import, and recipes do not need it
 
         super().__init__()
+        # the separate flag for pretrained norms
         self.checkpoint = config.checkpoint
         self.pretrained = False
         self.resnet = ResNetBackbone(
@@ -90,8 +91,10 @@ class ImageBackbone(nn.Module):
         )
         if fetch and config.weights is not None:
             self._load(config.weights, config.stages)
+        # Without the max pooling of the stem, all stages come out at twice the resolution
         if config.stem_stride == 2:
             self.resnet.embedder.pooler = nn.Identity()
+        # Lateral 1x1 convolutions bring every stage to D channels; 3x3 ones smooth after each upsampling
         widths = self.resnet.channels
         self.lateral = nn.ModuleList([nn.Conv2d(width, channels, 1) for width in widths])
         self.smooth = nn.ModuleList([nn.Conv2d(channels, channels, 3, padding=1) for _ in widths])
@@ -133,13 +136,18 @@ class ImageBackbone(nn.Module):
         return self._pyramid(images)
 
     def _pyramid(self, images: UInt8[Tensor, "n 3 H W"]) -> tuple[Float[Tensor, "n _h _w D"], ...]:
+        # Channels-last memory is the faster layout for convolutions on the GPU
         x = normalise_images(images).contiguous(memory_format=torch.channels_last)
         maps = self.resnet(x).feature_maps
+        # Top-down path: start at the coarsest stage and add each upsampled sum to the next finer stage
         merged = self.lateral[-1](maps[-1])
         levels = [merged]
         for lateral, feature in zip(list(self.lateral)[-2::-1], maps[-2::-1], strict=True):
             merged = lateral(feature) + F.interpolate(merged, size=feature.shape[-2:], mode="nearest")
             levels.append(merged)
+        # `levels` runs from coarse to fine: read the last ones in
+        # reverse, paired with smoothing from fine to coarse
         finest = zip(self.smooth[: self.levels], levels[: -self.levels - 1 : -1], strict=True)
         out = [smooth(level) for smooth, level in finest]
+        # Channels last, because the attention reads whole feature vectors at image positions
         return tuple(level.float().permute(0, 2, 3, 1) for level in out)

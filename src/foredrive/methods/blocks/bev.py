@@ -62,15 +62,19 @@ class BevEncoder(nn.Module):
         self.spec, self.checkpoint = spec, config.checkpoint
         width, heads, points, pillars = config.width, config.heads, config.points, config.pillars
         height, ny, nx = spec.shape_zyx
+        # Cell centres in cell units; a plane counts as a grid of height 1, whose centre is at 0.5
         y, x = torch.meshgrid(torch.arange(ny) + 0.5, torch.arange(nx) + 0.5, indexing="ij")
         place = torch.stack([x, y, torch.full_like(x, 0.5)], dim=-1).flatten(0, 1)
         self.register_buffer("place", place, persistent=False)
+        # Heights of the pillar points in cells, at the centres of equal parts of the height range
         up = (torch.arange(pillars) + 0.5) * height / pillars
+        # All heights of a cell lie next to each other: points are ordered [cell, height]
         pillar = torch.cat(
             [place[:, None, :2].expand(-1, pillars, -1), up[None, :, None].expand(len(place), -1, -1)], -1
         )
         pillars_m = torch.tensor(spec.lower_m) + spec.voxel_m * pillar.flatten(0, 1)
         self.register_buffer("pillars_m", pillars_m, persistent=False)
+        # Only the lowest layer of voxels is needed for the code: a plane has no height of its own
         self.query = nn.Parameter(position_code(spec.centres_m(place.device)[0].flatten(0, 1), width))
         self.layers = nn.ModuleList(
             [
@@ -106,5 +110,7 @@ class BevEncoder(nn.Module):
             visible,
             recompute=self.checkpoint,
         )
+        # Unfold W numbers per cell to D features at each height
         volume = self.unfold(plane).view(len(uv), ny, nx, height, -1)
+        # The memory order is [b Z Y X D] (channels last), the logical order [b D Z Y X]
         return volume.permute(0, 3, 1, 2, 4).contiguous().permute(0, 4, 1, 2, 3)

@@ -38,10 +38,12 @@ class InceptionFeatures(nn.Module):
 
     def forward(self, images: UInt8[Tensor, "n 3 H W"]) -> Float[Tensor, "n 2048"]:
         """Return the features of images of any size."""
+        # Pixels 0 to 255 to about -1 to 1, as the TensorFlow network expects
         x = (resized(images.float()) - 128) / 128
         x = self.Conv2d_2b_3x3(self.Conv2d_2a_3x3(self.Conv2d_1a_3x3(x)))
         x = F.max_pool2d(x, 3, 2)
         x = F.max_pool2d(self.Conv2d_4a_3x3(self.Conv2d_3b_1x1(x)), 3, 2)
+        # Mixed blocks in order; 6a and 7a halve the resolution
         for name in ("5b", "5c", "5d", "6a", "6b", "6c", "6d", "6e", "7a", "7b", "7c"):
             x = getattr(self, f"Mixed_{name}")(x)
         return x.mean((2, 3))
@@ -51,6 +53,7 @@ class _Convolution(nn.Module):
     def __init__(self, channels: int, width: int, kernel: Kernel, stride: int, padded: bool = True) -> None:
         super().__init__()
         size = (kernel, kernel) if isinstance(kernel, int) else kernel
+        # The stem convolutions without padding and all strided ones are "valid" in TensorFlow's terms
         padding = (size[0] // 2, size[1] // 2) if padded and stride == 1 else (0, 0)
         self.conv = nn.Conv2d(channels, width, size, stride, padding, bias=False)
         self.bn = nn.BatchNorm2d(width, eps=1e-3)
@@ -67,6 +70,7 @@ class _Block(nn.Module):
         self.pool = pool
         self.branches = [[[name for name, *_ in step] for step in branch] for branch in branches]
         for branch in branches:
+            # Layers of one step share their input; the next step reads their concatenated outputs
             inputs = channels
             for step in branch:
                 for name, width, kernel, stride in step:
@@ -114,6 +118,7 @@ def _block_b(channels: int) -> _Block:
 
 
 def _block_c(channels: int, width: int) -> _Block:
+    # A 7x7 convolution is factorised into 1x7 and 7x1
     wide, tall = (1, 7), (7, 1)
     branches: list[list[Step]] = [
         [(("branch1x1", 192, 1, 1),)],
@@ -153,9 +158,11 @@ def _block_e(channels: int, pool: str) -> _Block:
 def resized(images: Float[Tensor, "n 3 H W"]) -> Float[Tensor, "n 3 299 299"]:
     """Resize as TensorFlow 1 did: bilinear, with the corners of the first pixels on each other."""
     for dim in (2, 3):
+        # Source coordinate of each output pixel, without the half-pixel shift of modern resizing
         position = torch.arange(SIDE_PX, device=images.device) * (images.shape[dim] / SIDE_PX)
         low = position.long()
         high = (low + 1).clamp(max=images.shape[dim] - 1)
+        # The weights broadcast along `dim`: rows need one trailing axis, columns none
         share = (position - low).view(-1, *[1] * (3 - dim))
         images = images.index_select(dim, low) * (1 - share) + images.index_select(dim, high) * share
     return images

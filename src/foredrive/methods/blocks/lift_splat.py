@@ -46,6 +46,7 @@ class LiftSplatEncoder(nn.Module):
         self.spec, self.plane_channels = spec, plane_channels
         depths_m = torch.arange(config.near_m, config.far_m, config.step_m)
         self.register_buffer("depths_m", depths_m, persistent=False)
+        # One linear layer gives depth logits and context features at every image position
         self.depth_and_context = nn.Linear(channels, len(self.depths_m) + plane_channels)
         self.out = nn.Sequential(
             nn.Conv2d(plane_channels, plane_channels, 3, padding=1),
@@ -64,6 +65,7 @@ class LiftSplatEncoder(nn.Module):
         finest = features[0]
         sizes = [len(self.depths_m), self.plane_channels]
         depth, context = self.depth_and_context(finest).float().split(sizes, dim=-1)
+        # The depth distribution of an invalid image is zero everywhere, so it adds nothing to the plane
         depth = depth.softmax(-1) * image_valid[:, :, None, None, None]
         cell, inside = self.cells(rig, (finest.shape[2], finest.shape[3]))
         plane = splat(depth.flatten(1, 3), context.flatten(1, 3), cell, inside, self.spec.shape_zyx[1:])
@@ -78,17 +80,21 @@ class LiftSplatEncoder(nn.Module):
         index = ((points - lower) / self.spec.voxel_m).floor().long()
         shape_xyz = torch.tensor(self.spec.shape_zyx[::-1], device=points.device)
         inside = ((index >= 0) & (index < shape_xyz)).all(-1)
+        # Points of all heights share the cell of their column; the
+        # height only decides whether they are inside
         cell = index[..., 1] * self.spec.shape_zyx[2] + index[..., 0]
         return cell, inside
 
     def points_m(self, rig: CameraRig, feature_hw: tuple[int, int]) -> Float[Tensor, "b P 3"]:
         """Return ego coordinates (m) of each depth of each feature: cameras, rows, columns, depths."""
         h, w = feature_hw
+        # Centres of feature cells in pixels of the full image
         scale = rig.K.new_tensor([rig.size_hw[1] / w, rig.size_hw[0] / h])
         uv = pixel_centres((h, w)).to(rig.K).flatten(0, 1) * scale
         b, c = rig.K.shape[:2]
         rays = pixels_to_rays(uv.expand(b, c, -1, 2), rig.K, rig.dist)
         rays = rays / rays[..., 2:]  # normalised by depth, not by range
+        # One point per depth on each ray, in the camera frame; depth is z of the camera, not the distance
         in_camera = rays[..., None, :] * self.depths_m[:, None]
         return transform_points(rig.T_ego_cam, in_camera.flatten(2, 3)).flatten(1, 2)
 
@@ -107,8 +113,10 @@ def splat(
         cell: index y · X + x of each of the P = N·K points; any value where not `inside`.
     """
     b, count, width = len(share), size_yx[0] * size_yx[1], feature.shape[-1]
+    # Feature of each inside point: K consecutive points belong to one feature
     source = inside.flatten().nonzero()[:, 0] // share.shape[-1]
     values = share.flatten(1)[inside][:, None] * feature.flatten(0, 1)[source]
+    # Offset of each batch element, so that one index_add serves the whole batch
     first = torch.arange(b, device=cell.device)[:, None] * count
     plane = values.new_zeros(b * count, width).index_add(0, (first + cell)[inside], values)
     return plane.view(b, *size_yx, width).permute(0, 3, 1, 2)

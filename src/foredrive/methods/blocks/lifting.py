@@ -23,12 +23,14 @@ def directions_2d(heads: int) -> Float[Tensor, "H 2"]:
     """Return directions on the unit square, one per head (the initialisation of Zhu et al. 2021)."""
     angle = torch.arange(heads) * (2 * math.pi / heads)
     grid = torch.stack([angle.cos(), angle.sin()], dim=-1)
+    # Divided by the largest coordinate: the directions end on the border of the square
     return grid / grid.abs().amax(-1, keepdim=True)
 
 
 def _directions_3d(heads: int) -> Float[Tensor, "H 3"]:
     """Return directions spread over the sphere (golden spiral), one per head, scaled to the unit cube."""
     index = torch.arange(heads) + 0.5
+    # Golden spiral: heights at equal steps, azimuth turned by π(1 + √5), the golden angle up to whole turns
     z = 1 - 2 * index / heads
     angle = math.pi * (1 + math.sqrt(5)) * index
     ring = (1 - z * z).sqrt()
@@ -46,11 +48,15 @@ def position_code(centres_m: Float[Tensor, "Q 3"], channels: int) -> Float[Tenso
     x, y, z = centres_m.unbind(-1)
     distance, azimuth = torch.hypot(x, y), torch.atan2(y, x)
     reach, low, high = distance.max(), z.min(), z.max()
+    # Azimuth at 1 to 3 periods per turn, smooth across ±π
     waves = [k * azimuth for k in range(1, 4)]
+    # Distance and height at octaves from a quarter period over their range
     waves += [0.5 * math.pi * 2**k * distance / reach for k in range(5)]
+    # A grid of one layer has no height range, hence the bound on the divisor
     waves += [0.5 * math.pi * 2**k * (z - low) / (high - low).clamp_min(1.0) for k in range(3)]
     code = [wave for angle in waves for wave in (angle.sin(), angle.cos())]
     code += [(math.pi * 2**k * axis / reach).sin() for k in range(3) for axis in (x, y)]
+    # Small noise breaks the symmetry among the further channels
     rest = 0.02 * torch.randn(len(centres_m), max(channels - len(code), 0), device=centres_m.device)
     return torch.cat([torch.stack(code, dim=-1), rest], dim=-1)[:, :channels].contiguous()
 
@@ -93,6 +99,7 @@ class NeighbourhoodAttention(nn.Module):
         self.weight = nn.Linear(channels, self.heads * points)
         self.out = nn.Linear(channels, channels)
         radius = torch.arange(1, points + 1).view(1, points, 1)
+        # Point p of a head starts p cells away along the head's direction
         _begin_attention(self.offset, self.weight, directions[:, None] * radius)
 
     def forward(
@@ -107,6 +114,7 @@ class NeighbourhoodAttention(nn.Module):
         """
         b, q, _ = query.shape
         offset = self.offset(query).view(b, q, self.heads, self.points, self.dims)
+        # In a plane, offsets have no height
         if self.dims == 2:
             offset = F.pad(offset, (0, 1))
         weight = self.weight(query).view(b, q, self.heads, self.points).softmax(-1)
@@ -160,18 +168,21 @@ class CameraCrossAttention(nn.Module):
         b, q = len(uv), query.shape[1]
         heights, *per_height = self.shape
         offset = self.offset(query).view(-1, q * heights, *per_height, 2)
+        # One softmax per cell and head over all heights, levels and points (as in BEVFormer)
         score = self.weight(query).view(-1, q, *self.shape).transpose(2, 3)  # [b Q H K L P]
         weight = score.flatten(3).softmax(-1).view(score.shape).transpose(2, 3).flatten(1, 2)
         values = [self.value(level) for level in features]
         sampled = lift(
             values, uv, visible, offset.expand(b, *offset.shape[1:]), weight.expand(b, *weight.shape[1:])
         )
+        # The weights of a cell sum to 1 over its heights, so the sum over heights is a weighted mean
         return self.out(sampled if heights == 1 else sampled.unflatten(1, (q, heights)).sum(2))
 
 
 def _begin_attention(offset: nn.Linear, weight: nn.Linear, first_offsets: Float[Tensor, "... _d"]) -> None:
     """Start deformable attention at fixed offsets with equal weights."""
     with torch.no_grad():
+        # Zero weights below make the offsets equal to this bias and the softmax uniform at the start
         offset.bias.copy_(first_offsets.flatten())
     for parameter in (offset.weight, weight.weight, weight.bias):
         nn.init.zeros_(parameter)
@@ -199,6 +210,7 @@ class LiftingLayer(nn.Module):
         hidden = round(feed_forward * channels)
         self.feed_forward = nn.Sequential(nn.Linear(channels, hidden), nn.ReLU(), nn.Linear(hidden, channels))
         norms = [nn.LayerNorm(channels) for _ in range(3)]
+        # An Identity keeps the numbering of the norms, and with it the names of stored weights
         self.norms = nn.ModuleList(norms if self_attention is not None else [nn.Identity(), *norms[1:]])
 
     def forward(
@@ -247,6 +259,7 @@ def project_to_cameras(
 ) -> tuple[Float[Tensor, "b C Q 2"], Bool[Tensor, "b C Q"]]:
     """Project points of the ego frame into every image. Return positions in [0, 1] and visibility."""
     b, c = image_valid.shape
+    # Every camera of every clip sees the same ego-frame points
     in_camera = transform_points(inverse_se3(rig.T_ego_cam), points_m.expand(b, c, -1, -1))
     uv, _, inside = project(in_camera, rig.K, rig.dist, rig.size_hw)
     size_wh = uv.new_tensor(rig.size_hw[::-1])
@@ -259,6 +272,7 @@ def lift_frames(
     """Return the volume or plane of each frame in its own ego frame, and the finest features of the images of
     the last one."""
     b, t, c = frames.image_valid.shape
+    # Frames and clips form one batch for backbone and encoder; cameras are a separate axis for the encoder
     features = [level.unflatten(0, (b * t, c)) for level in backbone(frames.images.flatten(0, 2))]
     rig = frames.rig.map_tensors(lambda tensor: tensor.flatten(0, 1))
     lifted: Tensor = encoder(features, rig, frames.image_valid.flatten(0, 1))
@@ -283,6 +297,7 @@ class LiftingEncoder(nn.Module):
         self.spec, self.checkpoint = spec, config.checkpoint
         centres = spec.centres_m(torch.get_default_device()).flatten(0, 2)
         self.register_buffer("centres_m", centres, persistent=False)
+        # Voxel centres in voxel units: voxel i has its centre at i + 0.5
         place = (centres - torch.tensor(spec.lower_m)) / spec.voxel_m
         self.register_buffer("place", place, persistent=False)
         self.query = nn.Parameter(position_code(centres, channels))

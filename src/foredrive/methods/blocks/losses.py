@@ -27,5 +27,6 @@ def perceptual_loss(
     """Return L1 between network features of the valid images, summed over layers (Johnson et al. 2016)."""
     if not valid.any():
         return predicted.new_zeros(())
+    # Invalid images are left out before the network runs
     pairs = zip(features(predicted[valid]), features(truth[valid]), strict=True)
     return sum((F.l1_loss(a, b) for a, b in pairs), start=predicted.new_zeros(()))

@@ -34,6 +34,7 @@ class Lpips(nn.Module):
             *(nn.Conv2d(d, e, 3, padding=1), nn.ReLU()),
         )
         load_published(self, weights, "AlexNet")
+        # One learned weight per channel turns squared differences into a distance
         heads = [nn.Conv2d(channels, 1, 1, bias=False) for channels in _CHANNELS]
         shipped = resources.files("torchmetrics") / "functional/image/lpips_models/alex.pth"
         with shipped.open("rb") as file:
@@ -47,12 +48,14 @@ class Lpips(nn.Module):
         self, rendered: Float[Tensor, "n 3 H W"], real: Float[Tensor, "n 3 H W"]
     ) -> Float[Tensor, "n"]:
         """Return the distance of each pair of images, RGB in 0 to 1; at least 63 px a side."""
+        # LPIPS scales images to -1..1 and then normalises them
         shift, scale = (rendered.new_tensor(value)[:, None, None] for value in (_SHIFT, _SCALE))
         a, b = ((2 * image - 1 - shift) / scale for image in (rendered, real))
         distance = rendered.new_zeros(len(rendered))
         for index, layer in enumerate(self.features):
             a, b = layer(a), layer(b)
             if index in _TAPS:
+                # Features are compared as unit vectors over the channels
                 difference = (_normalised(a) - _normalised(b)) ** 2
                 distance = distance + self.heads[_TAPS.index(index)](difference).mean((1, 2, 3))
         return distance

@@ -54,11 +54,14 @@ class PlaneContext(nn.Module):
     def forward(self, volume: Float[Tensor, "b D Z Y X"]) -> Float[Tensor, "b D Z Y X"]:
         """Return the volume with context, channels-last in memory."""
         b, d, z, y, x = volume.shape
+        # Heights and channels of a column become the channels of an image, heights outermost
         plane = volume.permute(0, 3, 4, 2, 1).reshape(b, y, x, z * d).permute(0, 3, 1, 2)
         fine = self.fine(self.down(plane))
         coarse = self.lateral(self.coarse(fine))
         merged = self.merged(fine + F.interpolate(coarse, size=fine.shape[-2:], mode="nearest"))
+        # Pixel shuffle turns 4 · Z · D channels at half resolution into Z · D at full resolution
         change = F.pixel_shuffle(self.out(merged), 2)[..., :y, :x]
+        # An odd size was rounded up by the strided convolution: cut to the size of the volume above
         change = change.permute(0, 2, 3, 1).view(b, y, x, z, d).permute(0, 4, 3, 1, 2)
         return (volume + change).permute(0, 2, 3, 4, 1).contiguous().permute(0, 4, 1, 2, 3)
 

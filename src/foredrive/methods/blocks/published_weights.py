@@ -38,6 +38,7 @@ def load_published(module: nn.Module, path: Path, name: str) -> None:
 
 def load_state(module: nn.Module, state: Mapping[str, Tensor], source: str, name: str) -> None:
     """Load a state dict as `load_published` does; `source` stands for the file in messages."""
+    # Scalars such as batch norm's counter are not needed
     wanted = {key: value for key, value in module.state_dict().items() if value.dim()}  # no counters
     for key, value in wanted.items():
         if key not in state:

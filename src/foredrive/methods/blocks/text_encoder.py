@@ -51,11 +51,13 @@ class TextEncoder:
     @torch.no_grad()
     def __call__(self, texts: Sequence[str]) -> Float[Tensor, "N E"]:
         """Encode sentences as vectors of length 1."""
+        # Sentences of similar length form a batch, so little of it is padding
         order = sorted(range(len(texts)), key=lambda n: len(texts[n]))
         parts = [
             self._encode([texts[n] for n in order[start : start + BATCH_SIZE]])
             for start in range(0, len(order), BATCH_SIZE)
         ]
+        # argsort of a permutation is its inverse: back to the order of the caller
         return torch.cat(parts)[torch.tensor(order).argsort()]
 
     def _encode(self, texts: list[str]) -> Float[Tensor, "N E"]:
@@ -65,6 +67,7 @@ class TextEncoder:
             encoded = output if isinstance(output, Tensor) else output.pooler_output
         else:
             hidden, mask = self._encoder(**tokens).last_hidden_state, tokens["attention_mask"][..., None]
+            # Mean over real tokens; padding has mask 0
             encoded = (hidden * mask).sum(dim=1) / mask.sum(dim=1)
         return F.normalize(encoded.float(), dim=-1)
 

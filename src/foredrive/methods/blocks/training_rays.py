@@ -34,6 +34,7 @@ def thinned_rays(clip: Clip, frame: int, stride: int, generator: torch.Generator
         frame: index into T.
         stride: keep one pixel in `stride` along rows and columns.
     """
+    # A central phase makes evaluation deterministic
     if generator is None:
         row, column = stride // 2, stride // 2
     else:
@@ -56,6 +57,7 @@ def averaged_rays(clip: Clip, frame: int, stride: int, generator: torch.Generato
     row, column = torch.randint(stride, (2,), generator=generator).tolist()
     images = clip.images[:, frame, :, :, row:, column:].float()
     means = F.avg_pool2d(images.flatten(0, 1), stride).unflatten(0, images.shape[:2])
+    # Centre of block (i, j) is stride · (j + 0.5, i + 0.5) from the start of the grid
     centres = stride * pixel_centres((means.shape[-2], means.shape[-1]))
     return _rays(clip, frame, centres + torch.tensor([float(column), float(row)]), means)
 

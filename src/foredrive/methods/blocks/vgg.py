@@ -55,6 +55,7 @@ class VggFeatures(nn.Module):
             for _ in range(count):
                 modules += [nn.Conv2d(width, out, 3, padding=1), nn.ReLU()]
                 width = out
+            # Index of the ReLU behind the tapped convolution; two modules per convolution
             self.taps.append(first + 2 * (kind.tap % count) + 1)
             modules.append(nn.MaxPool2d(2))
         self.features = nn.Sequential(*modules[: self.taps[-1] + 1])
@@ -73,6 +74,7 @@ class VggFeatures(nn.Module):
         x = normalise_rgb(rgb) if self.normalised else rgb
         taps = []
         for index, layer in enumerate(self.features):
+            # Another pooling would leave no pixels
             if isinstance(layer, nn.MaxPool2d) and min(x.shape[-2:]) < 2:
                 break
             x = layer(x)

@@ -38,11 +38,15 @@ def actions_between(
     Args:
         T_any_ego: poses in any common frame.
     """
+    # Relative poses are formed in 64 bits, as poses of the world are large
     T_step = compose_se3(inverse_se3(T_any_ego[:, :-1]), T_any_ego[:, 1:]).float()
     way_m = T_step[..., :2, 3].norm(dim=-1)
     dt_s = torch.diff(t_s, dim=1).to(way_m)
+    # An unmeasured speed is the distance to the next pose over time
     speed = torch.where(speed_valid[:, :-1], speed_mps[:, :-1].to(way_m), way_m / dt_s)
+    # Curvature of the arc: turn over distance
     curvature = yaw_from_matrix(T_step) / way_m.clamp_min(1e-3)
+    # Steering angle of the bicycle model: tan(steering) = wheelbase · curvature
     steering = torch.where(way_m > SLOW_MPS * dt_s, torch.atan(WHEELBASE_M * curvature), 0.0)
     done = torch.stack([speed, steering], dim=-1).float()
     return torch.cat([done, torch.zeros_like(done[:, :1])], dim=1)
@@ -55,6 +59,7 @@ def motion_of(action: Float[Tensor, "b 2"], dt_s: float) -> Float[Tensor, "b 4 4
     yaw = way_m * curvature
     cos, sin = yaw.cos(), yaw.sin()
     zero, one = torch.zeros_like(yaw), torch.ones_like(yaw)
+    # Chord of the arc: way · sin(yaw/2) / (yaw/2), finite also for yaw = 0; it points along half the turn
     chord = way_m * torch.sinc(0.5 * yaw / math.pi)
     x, y = chord * (0.5 * yaw).cos(), chord * (0.5 * yaw).sin()
     rows = [[cos, -sin, zero, x], [sin, cos, zero, y], [zero, zero, one, zero], [zero, zero, zero, one]]

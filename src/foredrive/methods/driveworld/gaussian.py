@@ -29,6 +29,7 @@ class DiagonalGaussian(Record):
 
     def sample(self, generator: torch.Generator | None = None) -> Float[Tensor, "*b S"]:
         """Draw a reparametrised sample, so that gradients reach mean and std (Kingma & Welling 2014)."""
+        # The generator decides the device of the noise, so that a CPU seed draws the same on a GPU
         device = self.mean.device if generator is None else generator.device
         noise = torch.randn(self.mean.shape, generator=generator, device=device, dtype=self.mean.dtype)
         return self.mean + self.std * noise.to(self.mean.device)
@@ -50,6 +51,7 @@ def balanced_kl(posterior: DiagonalGaussian, prior: DiagonalGaussian, balance: f
     The value equals KL(q ‖ p). With balance > 1/2 the prior moves faster towards the posterior than the
     posterior towards the prior.
     """
+    # The detached distribution is the target of the other one
     of_prior = kl_divergence(posterior.detach(), prior)
     of_posterior = kl_divergence(posterior, prior.detach())
     return balance * of_prior + (1 - balance) * of_posterior

@@ -86,6 +86,7 @@ class DriveWorldObjective(nn.Module):
         self.agent, self.stage, self.steps, self.tasks = agent, stage, steps, tasks
         weights, world = stage.weights, agent.world_model
         set_planner_trainable(agent.planner, weights.wpts > 0)
+        # The latent dynamics are left out where single frames are trained
         world.states.requires_grad_(stage.temporal)
         world.to_vector.requires_grad_(stage.temporal)
         world.occupancy.requires_grad_(weights.occ > 0)
@@ -95,16 +96,20 @@ class DriveWorldObjective(nn.Module):
         """Return losses by name; "loss" is minimised. `generator` draws states and the frame of statics."""
         clip, stage, world = example.clip, self.stage, self.agent.world_model
         observed = clip.observed()
+        # All frames are lifted once, for the latent dynamics and for planning
         lifted = world.lift_frames(last_frames(observed, world.past_frames))
         losses: dict[str, Float[Tensor, ""]] = {}
         if not stage.temporal:
+            # Baseline: the occupancy of each frame from its own plane
             losses |= self._volume_losses(world.single_frame_beliefs(lifted), example)
         elif stage.weights.occ > 0:
+            # Posteriors over the observed frames, then priors over the imagined ones
             unrolled = world.unroll(lifted, self.steps, generator, stage.statics_of)
             losses |= self._latent_losses(unrolled, clip)
             losses |= self._volume_losses(unrolled.beliefs, example)
         terms: dict[str, Float[Tensor, ""]] = {}
         if stage.weights.wpts > 0 or self.tasks is not None:
+            # The belief of use, not of training: planner and heads read what they get in evaluation
             now = world.belief_about_now(lifted)
             output = None if self.tasks is None else self.agent.perceive(now, clip)
             if stage.weights.wpts > 0:
@@ -113,12 +118,14 @@ class DriveWorldObjective(nn.Module):
                 losses["wpts"] = waypoint_loss(plan, example.clip.future)
             if self.tasks is not None and output is not None:
                 terms |= self.tasks(output, example)
+        # Names of the losses are those of their weights
         weighted = [getattr(stage.weights, name) * value for name, value in losses.items()]
         total = torch.stack(weighted).sum()
         return losses | terms | {"loss": total + terms["tasks"] if "tasks" in terms else total}
 
     def _latent_losses(self, unrolled: Unrolled, clip: Clip) -> dict[str, Float[Tensor, ""]]:
         """Return the divergence of prior and posterior and the errors of the policy and the velocities."""
+        # The posteriors end at now
         first = clip.now + 1 - len(unrolled.posteriors)
         pairs = list(zip(unrolled.posteriors, unrolled.priors, strict=True))
         balance = self.stage.weights.balance
@@ -136,6 +143,7 @@ class DriveWorldObjective(nn.Module):
     def _volume_losses(self, beliefs: Sequence[Belief], example: Example) -> dict[str, Float[Tensor, ""]]:
         """Return the losses of occupancy and flow over all frames."""
         world, weights, occ, flow = self.agent.world_model, self.stage.weights, [], []
+        # Beliefs begin with the first observed frame
         for frame, belief in enumerate(beliefs, start=example.clip.now - world.past_frames):
             decoded = world.decode(belief)
             occ.append(
@@ -149,6 +157,7 @@ class DriveWorldObjective(nn.Module):
                 )
             )
             if decoded.flow is not None and weights.flow > 0:
+                # The squared error of the velocity vector counts only where labels know the flow
                 squared = (decoded.flow - example.flow.values[:, frame]).square().sum(dim=1)
                 flow.append(masked_mean(squared, example.flow.known[:, frame]))
         terms = {"occ": occ, "flow": flow}
@@ -160,8 +169,10 @@ class DriveWorldObjective(nn.Module):
 
     def _action_loss(self, unrolled: Unrolled, clip: Clip, frames: slice) -> Float[Tensor, ""]:
         """Return the L1 error of the policy's actions. The action at the clip's last frame is unknown."""
+        # Actions lead from a frame to the next: the last frame of the clip has none
         driven = actions_of(clip)[:, frames.start : min(frames.stop, clip.t_s.shape[1] - 1)]
         error = (unrolled.actions[:, : driven.shape[1]] - driven).abs()
+        # Divided by the scales of speed and steering, both terms are of order 1
         mean = (error / self.agent.world_model.states.action_scale).mean()
         return self._over_frames(mean, error.shape[1])
 
@@ -170,6 +181,7 @@ class DriveWorldObjective(nn.Module):
         estimated = unrolled.velocities_mps
         boxes = clip.boxes[:, frames]
         truth, exists = nearest_velocities(boxes, estimated.shape[2], self.stage.moving_mps)
+        # Slots are compared in order of distance
         error = (estimated - truth).abs().sum(-1) / self.agent.world_model.states.speed_scale_mps
         mean = masked_mean(error, exists & clip.boxes_valid[:, frames, None])
         return self._over_frames(mean, error.shape[1])
@@ -179,7 +191,9 @@ def nearest_velocities(
     boxes: Boxes, count: int, moving_mps: float
 ) -> tuple[Float[Tensor, "b T K 2"], Bool[Tensor, "b T K"]]:
     """Return the velocities of the `count` nearest moving boxes, nearest first, and which of them exist."""
+    # Unknown velocities are NaN and do not count as moving
     moving = boxes.valid & (boxes.velocity.norm(dim=-1).nan_to_num(0.0) > moving_mps)
+    # Infinite distance sorts what does not move, or is padding, to the end
     distance_m = torch.where(moving, boxes.centre[..., :2].norm(dim=-1), torch.inf)
     missing = max(0, count - distance_m.shape[-1])
     distance_m = F.pad(distance_m, (0, missing), value=torch.inf)

@@ -24,6 +24,7 @@ class AdaptiveNorm(nn.Module):
     ) -> Float[Tensor, "b C Y X"]:
         """Return (1 + scale) ⊙ norm(plane) + shift."""
         scale, shift = self.style(vector)[..., None, None].chunk(2, dim=1)
+        # The scale is learned as a deviation from 1
         return (1 + scale) * self.norm(plane) + shift
 
 
@@ -92,6 +93,7 @@ class VectorToPlane(nn.Module):
         super().__init__()
         widths, self.negative_slope = config.widths, config.negative_slope
         shrunk = 2 ** (len(widths) - 1)
+        # Sizes from coarse to fine, rounded up, each twice the one before; the last is that of the plane
         self.sizes = [tuple(-(-n * 2**k // shrunk) for n in size_yx) for k in range(len(widths))]
         self.constant = nn.Parameter(torch.randn(1, widths[0], *self.sizes[0]))
         before = (widths[0], *widths[:-1])
@@ -102,6 +104,7 @@ class VectorToPlane(nn.Module):
 
     def forward(self, vector: Float[Tensor, "b V"]) -> Float[Tensor, "b C Y X"]:
         """Return the plane."""
+        # The same learned constant for all items: the vector enters by the norms alone
         plane = self.constant.expand(len(vector), -1, -1, -1)
         for size, convolve, style in zip(self.sizes, self.convolve, self.style, strict=True):
             if plane.shape[-2:] != size:
@@ -148,12 +151,16 @@ def warp_plane(
         plane: features over the ground of `spec`, in the frame src.
         T_src_dst: transform of points dst -> src; only its motion over the ground is used.
     """
+    # 32 bits, because coordinates of half precision are off by tenths of a cell
     with full_precision(plane, T_src_dst.float()) as (plane, T):
         size_xy = plane.new_tensor(spec.shape_zyx[:0:-1])
         lower = plane.new_tensor(spec.lower_m[:2])
+        # Centres of the cells of dst, in metres
         y, x = (torch.arange(n).to(plane) + 0.5 for n in spec.shape_zyx[1:])
         cells_m = torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1) * spec.voxel_m + lower
+        # Place of each cell of dst in src: rotation over the ground, then translation
         read_m = torch.einsum("bij,yxj->byxi", T[:, :2, :2], cells_m) + T[:, None, None, :2, 3]
+        # grid_sample has the borders of the image at -1 and 1
         grid = 2 * (read_m - lower) / (spec.voxel_m * size_xy) - 1
         return F.grid_sample(plane, grid, align_corners=False)
 
@@ -190,5 +197,6 @@ class PlanesToVolume(nn.Module):
 
     def forward(self, planes: Float[Tensor, "b C Y X"]) -> Float[Tensor, "b D Z Y X"]:
         """Return the volume."""
+        # Each height gets its own group of channels of the 2-D convolution
         unfolded = self.unfold(planes).unflatten(1, (-1, self.height))
         return self.convolve(unfolded)

@@ -155,4 +155,5 @@ def driveworld_base() -> DriveWorldRecipe:
 
 def _in_time(clips: ClipConfig) -> ClipConfig:
     """Return NeMo's images and voxels with the paper's number of key frames."""
+    # Images of imagined frames are not read: DriveWorld reconstructs no images
     return replace(clips, past_frames=OBSERVED - 1, future_frames=IMAGINED, future_images=False)

@@ -76,6 +76,7 @@ class MotionAwareNorm(nn.Module):
         self.norm = nn.LayerNorm(state, elementwise_affine=False)
         self.reduce = nn.Sequential(nn.Linear(2 * objects + 1, state), nn.ReLU())
         self.gamma, self.beta = nn.Linear(state, state), nn.Linear(state, state)
+        # Zero weights and these biases make γ = 1 and β = 0 at the start
         for layer, bias in ((self.gamma, 1.0), (self.beta, 0.0)):
             nn.init.zeros_(layer.weight)
             nn.init.constant_(layer.bias, bias)
@@ -105,6 +106,7 @@ class MemoryAttention(nn.Module):
     def forward(self, latent: Latent) -> Float[Tensor, "b H"]:
         """Return the refined history."""
         query = latent.history[:, None]
+        # The query is the history of now; places of the memory that are not filled are masked
         attended, _ = self.attention(
             query, latent.memory, latent.memory, key_padding_mask=~latent.memory_valid, need_weights=False
         )
@@ -157,16 +159,19 @@ class StateSpace(nn.Module):
 
     def transition(self, latent: Latent, dt_s: Float[Tensor, "b"]) -> Latent:
         """Return the latent with h_{t+1} = f(h̃_t, s̃_t), added to the memory. The state stays s_t."""
+        # Motion-aware state s̃ and refined history h̃; both are optional in ablations
         state = latent.state
         if self.motion_norm is not None:
             state = self.motion_norm(state, self.velocities_mps(state), dt_s)
         refined = latent.history if self.recall is None else self.recall(latent)
+        # The GRU's input is the state, its hidden state the history
         return _with_history(latent, self.cell(self.into(state), refined))
 
     def posterior(
         self, latent: Latent, last_action: Float[Tensor, "b 2"], x: Float[Tensor, "b X"]
     ) -> DiagonalGaussian:
         """Return q(s_t | o_≤t, a_<t) from (h_t, a_{t-1}, x_t) (eq. 1)."""
+        # Actions enter in units of their scales
         inputs = torch.cat([latent.history, self.action_in(last_action / self.action_scale), x], dim=-1)
         return DiagonalGaussian.from_output(self.posterior_net(inputs), self.min_std)
 
@@ -190,6 +195,7 @@ def _with_history(latent: Latent, history: Float[Tensor, "b H"]) -> Latent:
     return Latent(
         history=history,
         state=latent.state,
+        # First in, first out: the oldest history leaves the memory
         memory=torch.cat([latent.memory[:, 1:], history[:, None].to(latent.memory)], dim=1),
         memory_valid=torch.cat([latent.memory_valid[:, 1:], valid], dim=1),
     )

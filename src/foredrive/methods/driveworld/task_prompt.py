@@ -91,4 +91,5 @@ class TaskPrompt(nn.Module):
         """Return the plane of one prompt, or of the near one that the model knows."""
         prompt_name = prompt if prompt in self.prompts else _STAND_IN[prompt]
         encoding = self.encodings[self.prompts.index(prompt_name)]
+        # The plane depends on the prompt alone, so it is computed once for the batch
         return self.expand(encoding[None]).expand(batch, -1, -1, -1)

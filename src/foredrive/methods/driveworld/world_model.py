@@ -139,6 +139,7 @@ class DriveWorld(nn.Module):
         self.from_vector = VectorToPlane(
             config.from_vector, vector=states.history + states.state, size_yx=size_yx
         )
+        # The volume reads three planes side by side: state, statics, prompt
         planes = config.from_vector.widths[-1]
         planes += 0 if config.statics is None else config.statics.channels
         planes += 0 if config.prompt is None else config.prompt.expand.widths[-1]
@@ -146,11 +147,13 @@ class DriveWorld(nn.Module):
         self.statics = None if config.statics is None else StaticScene(config.statics, channels=plane)
         self.prompt: TaskPrompt | None = None
         if config.prompt is not None:
+            # Zeros stand for encodings that loaded weights replace
             encodings = torch.zeros(len(config.prompt.prompts), config.prompt.encoding)
             encodings = encode_prompts(config.prompt) if fetch else encodings
             self.prompt = TaskPrompt(config.prompt, encodings, size_yx)
         self.occupancy = nn.Linear(channels, 1)
         prior = config.occupied_prior
+        # Log-odds of the prior occupancy
         nn.init.constant_(self.occupancy.bias, math.log(prior / (1 - prior)))
         self.flow = nn.Linear(channels, 3)
         for parameter in self.flow.parameters():
@@ -175,6 +178,7 @@ class DriveWorld(nn.Module):
 
     def belief_about_now(self, lifted: LiftedFrames) -> Belief:
         """Return the belief of `observe` from frames that are already lifted."""
+        # Means of the posteriors make the belief deterministic
         latents, *_ = self._filter(lifted, None)
         return self._belief(latents[-1], self._statics(lifted.planes[:, -1]), "occupancy", None)
 
@@ -201,14 +205,17 @@ class DriveWorld(nn.Module):
             raise InputError(f"DriveWorld imagines one step or more; asked for {steps} with {given} actions")
         latent, statics = self._unpack(belief.state), belief.statics
         T_now_ego = belief.T_now_ego
+        # An observed belief has no pose of its own: it is at now
         if T_now_ego is None:
             T_now_ego = torch.eye(4, device=statics.device).expand(len(statics), 4, 4)
         futures = []
         for k in range(steps):
+            # Without given actions, the model follows its own policy
             action = self.states.action(latent) if actions is None else actions[:, k]
             latent, prior = self._step(latent, action)
             state = prior.mean if generator is None else prior.sample(generator)
             latent = _with_state(latent, state)
+            # The ego pose follows from the action by the bicycle model
             T_now_ego = compose_se3(T_now_ego, motion_of(action, self.dt_s))
             futures.append(self._belief(latent, statics, "forecast", T_now_ego))
         return futures
@@ -233,6 +240,7 @@ class DriveWorld(nn.Module):
             return belief.volume
         if belief.state is None or belief.statics is None:
             raise InputError("DriveWorld reads only beliefs that it made itself")
+        # Statics are stored in the frame of the belief they came from
         statics = self._warped_statics(belief.statics, belief.T_now_ego)
         imagined = task == "occupancy" and belief.T_now_ego is not None
         return self._volume(self._unpack(belief.state), statics, "forecast" if imagined else task)
@@ -253,17 +261,20 @@ class DriveWorld(nn.Module):
         latents, posteriors, priors = self._filter(lifted, generator)
         frames = len(latents)
         batch = len(lifted.planes)
+        # Frame of the statics: now, or one drawn for each item
         source = torch.full((batch,), frames - 1)
         if generator is not None and statics_of == "random":
             source = torch.randint(frames, (batch,), generator=generator)
         chosen = torch.arange(batch), source
         statics = self._statics(lifted.planes[chosen])
+        # Every belief knows its pose in the frame of the statics
         T_source_now = inverse_se3(lifted.T_now_ego[chosen])
         T_source_ego = compose_se3(T_source_now[:, None], lifted.T_now_ego)
         beliefs = [
             self._belief(latent, statics, "occupancy", T_source_ego[:, k]) for k, latent in enumerate(latents)
         ]
         policy = [self.states.action(step_latent) for step_latent in latents]
+        # Imagined frames continue from the last observed latent, under the policy's own actions
         latent, T = latents[-1], T_source_now
         for _ in range(steps):
             T = compose_se3(T, motion_of(policy[-1], self.dt_s))
@@ -283,6 +294,7 @@ class DriveWorld(nn.Module):
 
     def single_frame_beliefs(self, lifted: LiftedFrames) -> list[Belief]:
         """Return a belief about each frame from its own plane only, as in single-frame pre-training."""
+        # The initial latent is the same for every frame, so only the plane tells frames apart
         latent = self.states.initial(len(lifted.planes), lifted.planes.device)
         return [
             self._belief(latent, self._statics(plane), "occupancy", None)
@@ -302,6 +314,7 @@ class DriveWorld(nn.Module):
         prior, last = DiagonalGaussian.standard(latent.state), torch.zeros_like(lifted.actions[:, 0])
         latents, posteriors, priors = [], [], []
         for t in range(frames):
+            # The prior follows the policy's action, the posterior the driven one
             if t > 0:
                 latent, prior = self._step(latent, self.states.action(latent))
                 last = lifted.actions[:, t - 1]
@@ -345,6 +358,7 @@ class DriveWorld(nn.Module):
         self, latent: Latent, statics: Float[Tensor, "b _S Y X"], prompt: Prompt
     ) -> Float[Tensor, "b D Z Y X"]:
         """Apply m_θ and l_θ: decode a state and the statics into a volume of features."""
+        # The decoder reads the refined history h̃
         history = latent.history if self.states.recall is None else self.states.recall(latent)
         planes = [self.from_vector(torch.cat([history, latent.state], dim=-1)), statics]
         if self.prompt is not None:
@@ -356,6 +370,7 @@ class DriveWorld(nn.Module):
         """Undo `_pack`."""
         history, size, memory = self.states.sizes
         parts = state.split([history, size, memory * history, memory], dim=-1)
+        # The flags of the memory were packed as 0 and 1
         return Latent(parts[0], parts[1], parts[2].unflatten(-1, (memory, history)), parts[3] > 0.5)
 
 

@@ -25,6 +25,7 @@ def is_true(stated: Bool[Tensor, "t V"], holds: Bool[Tensor, "i V"]) -> Bool[Ten
         stated: of V facts, those that each text states.
         holds: of V facts, those that hold for each image.
     """
+    # Number of stated facts that do not hold, for every pair; a text is true if there are none
     return (~holds).float() @ stated.float().T == 0
 
 
@@ -37,8 +38,10 @@ def info_nce(
         The mean loss, and the share of rows whose own text comes first.
     """
     own = torch.arange(len(logits), device=logits.device)
+    # A text that is true of another image is no negative: its logit is removed from the softmax
     other_true = true & ~torch.eye(len(logits), dtype=torch.bool, device=logits.device)
     logits = logits.masked_fill(other_true, -torch.inf)
+    # Both directions: images to texts by rows, texts to images by columns
     loss = (F.cross_entropy(logits, own) + F.cross_entropy(logits.T, own)) / 2
     return loss, (logits.argmax(dim=1) == own).float().mean()
 
@@ -85,6 +88,7 @@ class ContrastObjective(nn.Module):
     def __init__(self, tower: ImageTower, config: ContrastConfig) -> None:
         super().__init__()
         self.tower, self.config = tower, config
+        # The logarithm of the inverse temperature is learned, which keeps it positive
         self.log_scale = nn.Parameter(torch.tensor(-math.log(config.initial_temperature)))
 
     def forward(self, batch: CaptionedImages, generator: torch.Generator) -> dict[str, Tensor]:
@@ -95,6 +99,7 @@ class ContrastObjective(nn.Module):
         with torch.autocast(device, torch.bfloat16, enabled=computes_bfloat16(device)):
             embedded = self.tower(_augmented(batch.images, self.config.crop_share, generator))
         embedded = F.normalize(embedded.float(), dim=-1)
+        # Unit vectors: the logits are scaled cosines
         texts = F.normalize(batch.texts[rows, drawn], dim=-1)
         logits = self.log_scale.exp().clamp(max=self.config.max_inverse_temperature) * embedded @ texts.T
         loss, accuracy = info_nce(logits, is_true(batch.stated[rows, drawn], batch.holds))
@@ -116,6 +121,7 @@ class DistillationObjective(nn.Module):
         """Return losses. Half of the sweeps are mirrored and compared with mirrored images."""
         rows = torch.arange(len(batch.targets), device=batch.targets.device)
         mirrored = (torch.rand(len(rows), generator=generator) < 0.5).to(rows.device)
+        # Mirroring a sweep negates y of all of its points
         y = torch.where(mirrored[batch.cloud.item], -1.0, 1.0)
         points = torch.stack([torch.ones_like(y), y, torch.ones_like(y), torch.ones_like(y)], dim=-1)
         embedded = self.encoder(PointCloud(batch.cloud.points * points, batch.cloud.item), len(rows))
@@ -130,6 +136,7 @@ def _augmented(
 ) -> UInt8[Tensor, "n 3 h w"]:
     """Crop all images of the batch equally and mirror each with probability 1/2."""
     height, width = images.shape[-2:]
+    # One crop for the whole batch keeps the images of equal size
     kept_h, kept_w = height - round(crop_share * height), width - round(crop_share * width)
     top = int(torch.randint(height - kept_h + 1, (1,), generator=generator))
     left = int(torch.randint(width - kept_w + 1, (1,), generator=generator))

@@ -33,11 +33,14 @@ class AttentionPool(nn.Module):
     ) -> Float[Tensor, "n D"]:
         """Return one vector per item. `filled` marks the tokens that count; None means all of them."""
         rows = len(tokens)
+        # The learned token comes first and is always filled
         tokens = torch.cat([self.own.expand(rows, 1, -1), tokens], dim=1)
         mask = None if filled is None else F.pad(filled, (1, 0), value=True)
         share = tokens.new_ones(tokens.shape[:2]) if mask is None else mask.to(tokens.dtype)
+        # Shares of a mean over the filled tokens
         share = share / share.sum(1, keepdim=True)
         tokens = self.norm(tokens)
+        # The mean is the query, and is passed on beside what the query attends to
         mean = torch.einsum("nt, ntc -> nc", share, tokens)
         return self.out(torch.cat([mean, self._seen(mean, tokens, mask)], dim=-1))
 
@@ -50,11 +53,14 @@ class AttentionPool(nn.Module):
         of the keys adds the same number to all scores, which the softmax removes. The mean of the values is
         the value of the mean.
         """
+        # The query of each head, in the space of the keys
         query = self.to_query(mean).unflatten(1, (self.heads, -1))
         to_key, to_value = self.to_key_value.weight.unflatten(0, (2, self.heads, -1))
+        # Map the query to token space: q · (W t) = (Wᵀ q) · t
         asked = torch.einsum("nhd, hdc -> nhc", query, to_key) / math.sqrt(query.shape[-1])
         fit = asked @ tokens.mT
         if mask is not None:
             fit = fit.masked_fill(~mask[:, None], -torch.inf)
+        # Attend to the tokens and map the result to values: one map per item instead of one per token
         seen = torch.einsum("nhc, hdc -> nhd", fit.softmax(-1) @ tokens, to_value)
         return seen.flatten(1) + self.to_key_value.bias[mean.shape[1] :]

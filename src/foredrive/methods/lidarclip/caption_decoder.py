@@ -51,17 +51,21 @@ class CaptionDecoder(nn.Module):
 
         Embeddings have length 1.
         """
+        # The embedding becomes the first tokens of the sequence
         before = self.to_prefix(embedding).unflatten(1, (self.prefix, -1))
         tokens = torch.cat([before, self.embed(said)], dim=1)
         length = tokens.shape[1]
         mask = nn.Transformer.generate_square_subsequent_mask(length, tokens.device)
+        # Causal mask: a token attends to itself and to those before it
         seen = self.layers(tokens + self.place[:length], mask=mask, is_causal=True)
+        # The last token of the prefix predicts the first word
         return self.out(seen[:, self.prefix - 1 :])
 
     @torch.no_grad()
     def say(self, embedding: Float[Tensor, "n D"]) -> list[str]:
         """Return a sentence for each embedding of length 1, by greedy decoding."""
         said = torch.zeros(len(embedding), 0, dtype=torch.int64, device=embedding.device)
+        # The sentence grows by its most probable next word
         for _ in range(self.longest):
             said = torch.cat([said, self(embedding, said)[:, -1:].argmax(-1)], dim=1)
         return [self._sentence(row) for row in said.tolist()]

@@ -39,8 +39,10 @@ class CaptionObjective(nn.Module):
         rows = len(batch.words)
         drawn = torch.randint(2, (rows,), generator=generator).to(batch.words.device)
         image = batch.embedding[torch.arange(rows, device=drawn.device), drawn]
+        # Expected length 1 after the division, so NOISE is the length of the noise
         noise = torch.randn(image.shape, generator=generator).to(image.device) / math.sqrt(image.shape[1])
         logits = self.decoder(F.normalize(image + NOISE * noise, dim=-1), batch.words[:, :-1])
+        # Padding has no loss; the end of the sentence has one
         valid = batch.words != PAD
         return {
             "loss": F.cross_entropy(logits[valid], batch.words[valid]),

@@ -29,10 +29,13 @@ class Windows(NamedTuple):
     @classmethod
     def cut(cls, cell_yx: Int[Tensor, "K 2"], item: Int[Tensor, "K"], side: int, shift: int) -> "Windows":
         """Cut the grid into windows of `side` by `side` cells, borders `shift` cells before the grid's."""
+        # A positive shift moves the borders of windows towards the origin
         window_yx = (cell_yx + shift).div(side, rounding_mode="floor")
         inside = cell_yx + shift - window_yx * side
         across = int(window_yx.max()) + 1 if len(window_yx) else 1
+        # One number per window and item; `across` bounds the window numbers along both axes
         window = (item * across + window_yx[:, 0]) * across + window_yx[:, 1]
+        # A stable order groups the pillars of a window; their counts delimit the groups
         order = window.argsort(stable=True)
         _, counts = torch.unique_consecutive(window[order], return_counts=True)
         return cls(order, counts, inside[:, 0] * side + inside[:, 1])
@@ -62,6 +65,7 @@ class WindowLayer(nn.Module):
     def forward(self, features: Float[Tensor, "K D"], windows: Windows) -> Float[Tensor, "K D"]:
         """Return the pillars after attention within their windows."""
         normed = self.norm(features)
+        # The place code tells where in the window a pillar lies; values do not contain it
         query_key = self.to_query_key(normed + self.place[windows.place])
         value = self.to_value(normed)
         features = features + self.merge(
@@ -130,6 +134,7 @@ class LidarEncoder(nn.Module):
         super().__init__()
         width, heads, cells = config.width, config.heads, config.grid.cells
         self.pillars = PillarEncoder(config.grid, (config.point_width, width))
+        # Sines and cosines of the position in the grid, periods falling by √2 from twice the grid
         middle = (torch.arange(cells) + 0.5) / cells
         angle = middle[:, None] * math.pi * 2.0 ** (torch.arange(config.waves) * 0.5)
         self.register_buffer("cell_waves", torch.cat([angle.sin(), angle.cos()], dim=-1), persistent=False)
@@ -156,6 +161,7 @@ def _padded(
 ) -> tuple[Float[Tensor, "n T C"], Bool[Tensor, "n T"]]:
     """Return the tokens grouped by item, padded, and a mask of the real ones."""
     count = torch.bincount(item, minlength=items)
+    # Rank of each pillar within its item: the pillars are sorted by item
     place = torch.arange(len(item), device=item.device) - (count.cumsum(0) - count)[item]
     max_count = int(count.max())
     tokens = features.new_zeros(items, max_count, features.shape[1]).index_put((item, place), features)

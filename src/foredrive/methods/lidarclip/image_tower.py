@@ -51,6 +51,7 @@ class ImageTower(nn.Module):
 
     def forward(self, images: UInt8[Tensor, "n 3 H W"]) -> Float[Tensor, "n D"]:
         """Return one vector per image."""
+        # Channels-last memory is the faster layout for convolutions
         pixels = normalise_images(images).contiguous(memory_format=torch.channels_last)
         (features,) = self.resnet(pixels).feature_maps
         return self.pool(features.flatten(2).mT)

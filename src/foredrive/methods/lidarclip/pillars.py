@@ -73,20 +73,25 @@ class PillarEncoder(nn.Module):
         """Return the pillars of a batch of `items` sweeps. A sweep may have none."""
         grid = self.grid
         lower = cloud.points.new_tensor(grid.lower_m)
+        # Coordinates in pillar units
         place = (cloud.points[:, :3] - lower) / grid.pillar_m
         upper = place.new_tensor([grid.cells, grid.cells, grid.height_m / grid.pillar_m])
         inside = ((place >= 0) & (place < upper)).all(-1)
         place, intensity, item = place[inside], cloud.points[inside, 3:], cloud.item[inside]
         cell_xy = place[:, :2].floor().long()
+        # Number of each point's cell: item, then row, then column
         flat = (item * grid.cells + cell_xy[:, 1]) * grid.cells + cell_xy[:, 0]
         count = torch.bincount(flat, minlength=items * grid.cells**2)
         occupied = count.nonzero()[:, 0]
+        # Rank of the occupied cell: the cumulative count of occupied cells up to it
         pillar = (count > 0).cumsum(0)[flat] - 1
 
         mean = place.new_zeros(len(occupied), 3).index_add_(0, pillar, place) / count[occupied, None]
+        # Offset from the pillar's centre, offset from the mean of its points, and height in 0 to 1
         inputs = torch.cat(
             [place[:, :2] - cell_xy - 0.5, place - mean[pillar], place[:, 2:] / upper[2]], dim=-1
         )
+        # The logarithm of the count is scaled to order 1
         features = self.first(torch.cat([inputs, intensity, count[flat, None].log() / 4], dim=-1))
         features = self._second(features, pillar, len(occupied))
         cell = occupied % grid.cells**2
@@ -103,6 +108,8 @@ class PillarEncoder(nn.Module):
         """
         linear, norm = self.second
         assert isinstance(linear, nn.Linear)
+        # Linear on the concatenation is the sum of two linear maps,
+        # of the point and of its pillar's maximum
         of_point, of_pillar = linear.weight.split(features.shape[1], dim=1)
         shared = F.linear(pillar_max(features, pillar, pillars), of_pillar, linear.bias)
         return pillar_max(norm(F.linear(features, of_point) + shared[pillar]), pillar, pillars).relu()

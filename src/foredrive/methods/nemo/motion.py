@@ -59,6 +59,7 @@ class MotionFlow(nn.Module):
         to_xi = nn.Linear(4 * hidden, 6 * steps)
         for parameter in (*to_flow.parameters(), *to_xi.parameters()):
             nn.init.zeros_(parameter)  # start from no motion
+        # H: flow of every voxel for each step, from all volumes at full resolution
         self.flow = nn.Sequential(
             nn.Conv3d(wide, hidden, 3, padding=1),
             nn.ReLU(),
@@ -66,6 +67,7 @@ class MotionFlow(nn.Module):
             nn.ReLU(),
             to_flow,
         )
+        # G: coarser volumes, pooled to a small plane, flattened and mapped to one twist per step
         self.rigid = nn.Sequential(
             nn.Conv3d(wide, hidden, 3, padding=1, stride=2),
             nn.ReLU(),
@@ -87,14 +89,17 @@ class MotionFlow(nn.Module):
             stacked = stacked.expand(2, -1, -1, -1, -1)
         flow = self.flow(stacked)[:batch].float()
         if self.stride > 1:
+            # Flow in metres needs no rescaling when it is interpolated
             flow = F.interpolate(flow, size=volumes.shape[-3:], mode="trilinear")
         xi = self.rigid(stacked)[:batch].float().unflatten(1, (self.steps, 6))
+        # Twists are scaled down to keep early warps small, then mapped to SE(3)
         return Motion(flow=flow.unflatten(1, (self.steps, 3)), T_prev_next=exp_se3(self.xi_scale * xi))
 
     def _coarser(self, stacked: Float[Tensor, "b W Z Y X"]) -> Float[Tensor, "b W Z _y _x"]:
         """Average the columns of `stride` by `stride`. Layer by layer: pooling in 3-D is much slower."""
         if self.stride == 1:
             return stacked
+        # Heights become items of the batch
         layers = stacked.transpose(1, 2).flatten(0, 1)
         pooled = F.avg_pool2d(layers, self.stride, ceil_mode=True, count_include_pad=False)
         return pooled.unflatten(0, (len(stacked), -1)).transpose(1, 2)

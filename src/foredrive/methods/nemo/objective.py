@@ -98,33 +98,40 @@ class NemoObjective(nn.Module):
         self.image_features, self.tasks = image_features, tasks
         world, weights = agent.world_model, stage.weights
         plans = weights.wpts > 0
+        # The planner learns only if its loss counts
         set_planner_trainable(agent.planner, plans)
         self.sampler = ImaginationSampler(agent, stage.imagined, looks_back=tasks is not None, plans=plans)
         imagines = self.steps > 0 or (plans and agent.planner.imagined_frames > 0)
         for parameter in world.imagination():
             parameter.requires_grad_(imagines)
+        # Occupancy gets gradients from its own loss and, as alpha, from rendering
         world.occupancy.requires_grad_(weights.occ > 0 or weights.recon > 0)
         world.renderer.requires_grad_(weights.recon > 0)
 
     def forward(self, example: Example, generator: torch.Generator) -> dict[str, Float[Tensor, ""]]:
         """Return losses by name; "loss" is minimised. The generator augments and picks rays and samples."""
         frames = 1 if self.tasks is None else self.tasks.config.heads.frames
+        # Augmentation is the same for all frames of an example
         example = augmented(example, self.stage.augment, generator, frames)
         clip, world = example.clip, self.agent.world_model
         now, weights = clip.now, self.weights
         observed = clip.observed()
         needed = self.agent.planner.imagined_frames if weights.wpts > 0 else 0
+        # Imagine at least as far as the planner reads, also in steps that train the present alone
         steps = self.steps if self.sampler.imagines_now() else 0
         beliefs = self.sampler.rollout(observed, max(steps, needed))
         output = None if self.tasks is None else self.agent.perceive(beliefs[0], clip)
         decoded = [world.decode(belief) for belief in beliefs[: steps + 1]]
 
         losses = {name: clip.t_s.new_zeros(()) for name in ("l1", "perc", "occ")}
+        # Relative weight of now and of each imagined frame
         shares = clip.t_s.new_tensor([1.0] + [weights.future] * (len(decoded) - 1))
         shares = shares / shares.sum() if weights.over_frames == "mean" else shares
         for k, (belief, share) in enumerate(zip(decoded, shares, strict=True)):
+            # Imagined beliefs may hold only the first items of the batch
             frame, items = now + k, slice(len(belief.occupancy_logit))
             if weights.occ > 0:
+                # Occupancy of each frame against the labels of the same frame (eq. 10)
                 losses["occ"] = losses["occ"] + share * occupancy_loss(
                     belief.occupancy_logit,
                     example.occupancy.values[items, frame, 0],
@@ -134,12 +141,14 @@ class NemoObjective(nn.Module):
                     occupied_weight=weights.occupied,
                 )
             if weights.recon > 0:
+                # Colour along the rays of each frame against its images (eq. 9)
                 rays = self.rays(clip[items], frame, self.stage.ray_stride, generator)
                 rendered = world.renderer(
                     belief.feature, belief.occupancy_logit, rays.origin, rays.direction, generator
                 )
                 b, c, _, h, w = rays.rgb.shape
                 predicted = rendered.rgb.view(b * c, h, w, 3).permute(0, 3, 1, 2)
+                # Images that are missing are masked in both losses
                 truth, valid = rays.rgb.flatten(0, 1), rays.valid.flatten()
                 losses["l1"] = losses["l1"] + share * l1_loss(predicted, truth, valid)
                 if self.image_features is not None:
@@ -153,6 +162,7 @@ class NemoObjective(nn.Module):
         if weights.ego > 0 and steps > 0:
             losses["ego"] = self._ego_error(clip, beliefs[1 : steps + 1])
             losses["loss"] = losses["loss"] + weights.ego * losses["ego"]
+        # A step without imagination still needs gradients of all trained parameters for DDP
         if len(beliefs) == 1 and self.steps > 0:
             losses["loss"] = losses["loss"] + self.sampler.no_change()
         if weights.wpts > 0:
@@ -168,6 +178,7 @@ class NemoObjective(nn.Module):
         """Return the mean error of the predicted ego motions, m."""
         spec, driven = self.agent.world_model.spec, clip.T_world_ego[:, clip.now :]
         errors = []
+        # Driven poses from now on, in the world
         for k, future in enumerate(futures, start=1):
             assert future.T_now_ego is not None
             items = len(future.T_now_ego)

@@ -41,7 +41,7 @@ def nemo_tiny() -> NemoRecipe:
         clips=ClipConfig(
             past_frames=1,
             future_frames=2,
-            now_stride_s=0.1,  # every frame of a 10 Hz log is a now once
+            now_stride_s=0.1,  # every frame of a 10 Hz log is the present of one clip
             image_hw=(96, 160),
             voxels=VoxelSpec(lower_m=(-24.0, -24.0, -1.5), voxel_m=1.0, shape_zyx=(6, 48, 48)),
         ),

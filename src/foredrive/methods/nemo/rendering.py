@@ -60,11 +60,16 @@ class VolumeRenderer(nn.Module):
         b, rays, _ = origin.shape
         depth = stratified_depths(self.near_m, self.far_m, self.samples, (b, rays), generator)
         depth = depth.to(origin)
+        # Points along each ray in the ego frame, then in cell units
         points = origin[:, :, None] + depth[..., None] * direction[:, :, None]  # [b, R, N, 3]
         place = (points - self.lower_m) / self.spec.voxel_m
+        # Occupancy is the opacity of a sample (eq. 5)
         alpha = sample_volume(occupancy_logit.sigmoid()[..., None], place.flatten(1, 2))
         weights, range_m, through = composite(alpha.view(b, rays, self.samples), depth)
+        # Weighted sum of the features at the samples; the weights are those of compositing
         rendered = attend_volume(feature.permute(0, 2, 3, 4, 1), place[:, :, None], weights[:, :, None])
+        # The transmittance that is left at the far end shows the background
         rendered = rendered + through[..., None] * self.background
         rgb = self.recon(rendered).float().sigmoid()
+        # The light that passes through counts at the far end of the ray
         return RenderedRays(rgb=rgb, range_m=range_m + through * self.far_m, alpha=1 - through)

@@ -62,6 +62,7 @@ class ImaginationSampler(nn.Module):
         """Return whether this step imagines, and count it in training."""
         if self.config.every == 1:
             return True
+        # The first step imagines, then every `every`-th one
         now = int(self.steps_done) % self.config.every == 0
         if self.training:
             self.steps_done += 1
@@ -73,6 +74,7 @@ class ImaginationSampler(nn.Module):
         config, world = self.config, agent.world_model
         if config.items is None and config.past_gradient:
             return agent.rollout(observed, steps)
+        # The past of the items that are not imagined is read only by task heads
         items = slice(None if self.looks_back else config.items)
         # The present of all items has gradients; past frames only where something reads them.
         frames = last_frames(observed, world.past_frames if steps or self.looks_back else 0)
@@ -81,10 +83,13 @@ class ImaginationSampler(nn.Module):
         if steps == 0 and not self.looks_back:
             return [now]
         with torch.set_grad_enabled(config.past_gradient and torch.is_grad_enabled()):
+            # Past frames are encoded apart, without gradients if the motion alone reads them
             past, _ = lift_frames(frames[items, :-1], world.backbone, world.encoder)
+        # History of the imagined items: past volumes, then the present one with its gradients
         history = torch.cat([past, present[items]], dim=1)
         believed = world.believe(frames[items], history)
         imagined = world.imagine(believed, steps) if steps else []
+        # Heads need the history of the belief; the planner and the decoder need the volume of all items
         return [believed if self.looks_back else now, *imagined]
 
     def no_change(self) -> Float[Tensor, ""]:

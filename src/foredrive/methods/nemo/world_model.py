@@ -48,7 +48,7 @@ class NemoConfig:
     would hide what is behind."""
     step_features: bool = False
     """Add a learned feature to all voxels of an imagined volume, one for each step. Warped features are
-    smoother than observed ones; so the decoder knows. Not in the paper."""
+    smoother than observed ones, and the feature tells the decoder the step. Not in the paper."""
     kind: Literal["nemo"] = "nemo"
 
 
@@ -89,6 +89,7 @@ class Nemo(nn.Module):
         self.renderer = VolumeRenderer(config.renderer, spec, channels=channels)
         self.step_features = nn.Parameter(torch.zeros(max_steps, channels)) if config.step_features else None
         to_logit = nn.Linear(config.occupancy_hidden, 1)
+        # The bias starts f_occ at the prior: log-odds of occupied_prior
         nn.init.constant_(to_logit.bias, math.log(config.occupied_prior / (1 - config.occupied_prior)))
         self.occupancy = nn.Sequential(nn.Linear(channels, config.occupancy_hidden), nn.ReLU(), to_logit)
 
@@ -112,6 +113,7 @@ class Nemo(nn.Module):
     def believe(self, frames: Frames, volumes: Float[Tensor, "b T D Z Y X"]) -> Belief:
         """Return the belief about now from the volumes of T_p + 1 frames."""
         measured = continued_motion(frames, self.max_steps) if self.starts_from_measured else None
+        # Pose of now in the ego frame of the last past frame; clips of one frame have none
         T_past_now = inverse_se3(frames.T_now_ego[:, -2]).float() if volumes.shape[1] > 1 else None
         return Belief(volumes[:, -1], history=volumes, T_past_now=T_past_now, T_prev_next=measured)
 
@@ -137,15 +139,20 @@ class Nemo(nn.Module):
             raise InputError("NeMo predicts the ego motion itself and takes no actions")
         if not 0 < steps <= self.max_steps:
             raise InputError(f"this NeMo imagines 1 to {self.max_steps} steps, not {steps}")
+        # Flow on the grid of now and ego motion for every step, from one pass over the history
         motion = self.motion(belief.history)
         T_now_ego = torch.eye(4, device=belief.volume.device).expand(len(belief.volume), 4, 4)
         since_now_m = torch.zeros_like(motion.flow[:, 0])
         futures = []
         for k in range(steps):
+            # With measured motion, the predicted one corrects it: continued step first, then the correction
             if belief.T_prev_next is not None:
                 T_now_ego = compose_se3(T_now_ego, belief.T_prev_next[:, k])
             T_now_ego = compose_se3(T_now_ego, motion.T_prev_next[:, k])
+            # Accumulate the flow from now to step k + 1 on the grid of now
             since_now_m = compose_flows(motion.flow[:, k], since_now_m, self.spec.voxel_m)
+            # Each step gathers from the volume of now once, so that
+            # interpolation does not blur step by step
             volume = self._warped(belief.volume, since_now_m, T_now_ego)
             if self.step_features is not None:
                 volume = volume + self.step_features[k].view(-1, 1, 1, 1)
@@ -170,8 +177,10 @@ class Nemo(nn.Module):
         self, flow_m: Float[Tensor, "b 3 Z Y X"], T_now_ego: Float[Tensor, "b 4 4"]
     ) -> Float[Tensor, "b 3 Z Y X"]:
         """Return the velocity (m/s, axes of the imagined ego frame) of one step's flow on the grid of now."""
+        # Bring the flow to the grid of the imagined ego frame, then turn its vectors to that frame's axes
         at_ego = self._warped(flow_m, torch.zeros_like(flow_m), T_now_ego)
         along_ego = rotate_vectors(inverse_se3(T_now_ego), at_ego.flatten(2).transpose(1, 2))
+        # The flow points from a place to where its content was before: the velocity is the opposite
         return -along_ego.transpose(1, 2).unflatten(2, self.spec.shape_zyx) / self.dt_s
 
     def decode(self, belief: Belief) -> Decoded:

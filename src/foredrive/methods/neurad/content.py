@@ -26,6 +26,7 @@ class FieldParts(NamedTuple):
 
     def same_as(self, other: "FieldParts") -> bool:
         """Return whether both have the same actors: one field, or one that was opened twice."""
+        # Fields that are opened twice from one file have equal tables, which identify them
         own, others = (parts.network.grids.actors.table for parts in (self, other))
         return own is others or (own.shape == others.shape and torch.equal(own, others.to(own)))
 
@@ -73,6 +74,7 @@ class FieldContent(Record):
             raise InputError("an actor that is not part of a field does not fit into a field")
         lender, fields = source.fields[int(source.owner[source_row])], self.fields
         places = [place for place, parts in enumerate(fields) if parts.same_as(lender)]
+        # A field that is in use already is not added a second time
         if not places:
             fields, places = (*fields, _on(lender, self.device)), [len(fields)]
         return FieldContent(

@@ -64,8 +64,10 @@ class PatchDecoder(nn.Module):
                 all patches of a call, of whichever cameras they are.
         """
         code = self.appearance.index_select(0, camera)[:, None, None].expand(*feature.shape[:3], -1)
+        # Features and the camera's appearance code, as channels of an image
         seen = torch.cat([feature, code], dim=-1).permute(0, 3, 1, 2)
         coarse = self.coarse(F.relu(self.first(seen)))
+        # Nine sets of channels per ray become the 3 x 3 pixels for which it stands
         fine = F.pixel_shuffle(self.enlarge(coarse), UPSAMPLING)
         image: Tensor = self.last(self.fine(fine)).sigmoid()
         return image
@@ -101,7 +103,7 @@ class BeamDecoder(nn.Module):
             nn.ReLU(),
             nn.Linear(width, 2),
         )
-        # All beams return until it is learned which do not: for good, where a log does not tell it.
+        # At first every beam is more likely to return than not. Where a log has no lost beams, this stays so.
         with torch.no_grad():
             self.net[-1].weight[1] = 0  # type: ignore[operator]
             self.net[-1].bias[1] = _FIRST_DROP_LOGIT  # type: ignore[operator]

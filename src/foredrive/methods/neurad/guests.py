@@ -88,15 +88,22 @@ def look_with_guests(
         What is seen: distances and opacity with the guests, the feature without them. And what is seen of
         each guest.
     """
+    # Crossings of each guest's box by the rays
     crossings = [guest.parts.network.crossings(rays, guest.tracks) for guest in guests]
+    # In the host's field, nothing stops a ray inside the boxes of guests
     seen = host(rays, own, None, False, torch.stack([_span(one, len(rays.t_s)) for one in crossings]))
     looks = [_look(guest, rays, one) for guest, one in zip(guests, crossings, strict=True)]
+    # All rays that cross any guest; the others need no mixing
     ray = torch.cat([one.ray for one in crossings]).unique()
     behind = _curve(seen.intervals, ray)
     curves = [_widened(look, one.ray, ray) for look, one in zip(looks, crossings, strict=True)]
     looks_of_beams = []
+    # Share of a guest: its weight at each sample, times the
+    # probability that nothing else stopped the ray before
     for look, one, guest in zip(looks, crossings, guests, strict=True):
+        # Rows of this guest's rays among all crossing rays (both ascend)
         place = torch.searchsorted(ray, one.ray.contiguous())
+        # The host and the other guests, each by its curve of what passes
         others = [behind, *(curve for other, curve in zip(looks, curves, strict=True) if other is not look)]
         middle_m = look.intervals.middle_m
         free = torch.ones_like(middle_m)
@@ -120,14 +127,17 @@ def with_guests_in_image(
         guests, seen: the guests, and what the image's rays see of them, row by row.
         camera: index of the camera; a guest whose run had no such camera takes its first.
     """
+    # One ray stands for 3 x 3 pixels
     high, wide = (side // UPSAMPLING for side in rgb.shape[1:])
     rest, mixed = torch.ones_like(rgb[:1]), torch.zeros_like(rgb)
     for guest, part in zip(guests, seen, strict=True):
         if not bool((part.share > _LEAST_SHARE).any()):
             continue
         share = part.share.view(high, wide)
+        # The CNN also sees rays beside the guest, which get the feature of the nearest ray in it
         feature = _filled(part.feature.view(high, wide, -1), share)
         code = camera if camera < len(guest.parts.camera.appearance) else 0
+        # The guest's own decoder renders its patch, which is then mixed in by its share
         own = guest.parts.camera(feature[None], torch.tensor([code], device=feature.device))[0]
         alpha = F.interpolate(share[None, None], scale_factor=UPSAMPLING, mode="bilinear")[0]
         rest, mixed = rest - alpha, mixed + alpha * own
@@ -141,6 +151,7 @@ def with_guests_in_sweep(
     seen: list[SeenOfGuest],
 ) -> tuple[Float[Tensor, "P"], Float[Tensor, "P"]]:
     """Return intensities, and logits of the probability of no return, mixed by the guests' shares."""
+    # Intensities and probabilities of loss mix linearly; logits do not
     rest = torch.ones_like(intensity)
     bright, lost = torch.zeros_like(intensity), torch.zeros_like(intensity)
     for guest, part in zip(guests, seen, strict=True):
@@ -163,11 +174,13 @@ class _Look(NamedTuple):
 def _look(guest: Guest, rays: FieldRays, crossings: Crossings) -> _Look:
     network, ray = guest.parts.network, crossings.ray
     enter_m, length_m = crossings.enter_m[:, None], (crossings.leave_m - crossings.enter_m)[:, None]
+    # A first round of equal intervals within the box, by the last proposal of the guest's field
     border = first_borders(len(ray), _FIRST_SAMPLES, None, rays.origin)
     border_m = enter_m + length_m * border
     proposal = network.proposals[-1]
     assert isinstance(proposal, ProposalDensity)
     opacity = proposal.of_actors(_samples(guest, rays, crossings, border_m), border_m.diff(dim=-1))
+    # A second round where the proposal has weight, evaluated by the field itself
     border = resampled_borders(
         border, composite(opacity, opacity).weights, network.config.samples, generator=None
     )
@@ -175,6 +188,7 @@ def _look(guest: Guest, rays: FieldRays, crossings: Crossings) -> _Look:
     moving = _samples(guest, rays, crossings, border_m)
     opacity, embedding = network.layers.surface(network.grids.of_actors(moving), border_m.diff(dim=-1))
     weight = composite(opacity, opacity).weights
+    # The feature of a ray that ends in the guest: weights of the samples divided by their sum
     whole = weight / weight.sum(-1, keepdim=True).clamp_min(_LEAST_SHARE)
     feature = network.layers.seen(embedding, whole, rays.direction[ray], moving)
     return _Look(Intervals(border, border_m, weight), feature.T)
@@ -185,6 +199,7 @@ def _samples(
 ) -> ActorSamples:
     """Return samples in the middles of intervals, all in the guest's box."""
     middle_m = 0.5 * (border_m[:, 1:] + border_m[:, :-1])
+    # Samples in the frame of the box, along the ray in that frame
     point = crossings.origin_box[:, None] + crossings.direction_box[:, None] * middle_m[..., None]
     count = middle_m.numel()
     return ActorSamples(
@@ -205,6 +220,7 @@ def _span(crossings: Crossings, rays: int) -> Float[Tensor, "R 2"]:
 
 def _curve(intervals: Intervals, ray: Int[Tensor, "Q"]) -> _Curve:
     weight = intervals.weight[ray]
+    # Probability that the ray has not ended before each border
     passed = 1 - torch.cat([torch.zeros_like(weight[:, :1]), weight.cumsum(-1)], dim=-1)
     return _Curve(intervals.border_m[ray], passed)
 
@@ -214,6 +230,7 @@ def _widened(look: _Look, of: Int[Tensor, "P"], ray: Int[Tensor, "Q"]) -> _Curve
     every = torch.arange(len(of), device=of.device)
     curve, place = _curve(look.intervals, every), torch.searchsorted(ray, of.contiguous())
     borders = curve.border_m.shape[1]
+    # Borders of rays that miss the guest are arbitrary, since their curve is 1 everywhere
     border_m = torch.linspace(0, 1, borders).to(curve.border_m).expand(len(ray), -1).clone()
     passed = torch.ones_like(border_m)
     border_m[place], passed[place] = curve.border_m, curve.passed
@@ -222,10 +239,13 @@ def _widened(look: _Look, of: Int[Tensor, "P"], ray: Int[Tensor, "Q"]) -> _Curve
 
 def _together(seen: SeenAlongRays, ray: Int[Tensor, "Q"], curves: list[_Curve]) -> SeenAlongRays:
     """Return distances and opacities of rays that any of several things may stop."""
+    # Borders of all curves together: between two of them, every curve is linear
     border_m = torch.cat([curve.border_m for curve in curves], dim=-1).sort(dim=-1).values
     passed = torch.ones_like(border_m)
+    # The probability to pass several things is the product of their curves
     for curve in curves:
         passed = passed * curve.at(border_m)
+    # What the product loses between two borders ends there
     both = Intervals(border_m, border_m, -passed.diff(dim=-1))
     return seen._replace(
         depth_m=seen.depth_m.index_copy(0, ray, both.depth_m),

@@ -34,9 +34,12 @@ def interlevel_loss(
     """
     with torch.no_grad():
         rest = 1 - weight.sum(-1, keepdim=True)
+        # The last interval also holds what is left of the ray, so the histogram sums to 1
         full = torch.cat([weight[:, :-1], weight[:, -1:] + rest], dim=-1)
+        # Share of the blurred histogram in each of the proposal's intervals: difference of its integral
         knots, passed, slope = _blurred(border, full, pulse)
         share = _quadratic(proposal_border, knots, passed, slope).diff(dim=-1)
+    # A proposal must be at least as large as the field's share; too large costs nothing
     missing = (share - proposal_weight).clamp_min(0)
     return (missing**2 / (proposal_weight + _LEAST_WEIGHT)).sum(-1).mean()
 
@@ -45,11 +48,15 @@ def _blurred(
     border: Float[Tensor, "R S1"], weight: Float[Tensor, "R S"], pulse: float
 ) -> tuple[Float[Tensor, "R K"], Float[Tensor, "R K"], Float[Tensor, "R K"]]:
     """Return knots, integral and density of a histogram that is blurred by a box (Zip-NeRF, supplement)."""
+    # Histogram as a density, and its steps at the borders; it is 0 outside
     density = weight / border.diff(dim=-1).clamp_min(1e-7)
     step = torch.nn.functional.pad(density, (0, 1)) - torch.nn.functional.pad(density, (1, 0))
+    # Blurring by a box turns every step into a ramp from border - pulse to border + pulse
     knots, order = torch.cat([border - pulse, border + pulse], dim=-1).sort(dim=-1)
+    # The slope changes by step / (2 pulse) at the start of a ramp and back at its end
     bend = (torch.cat([step, -step], dim=-1) / (2 * pulse)).gather(1, order)
     gap = knots.diff(dim=-1)
+    # Two sums over the sorted knots: slope to density, density to integral (trapezoids)
     height = torch.nn.functional.pad((gap * bend.cumsum(-1)[:, :-1]).cumsum(-1), (1, 0)).clamp_min(0)
     passed = torch.nn.functional.pad((0.5 * (height[:, 1:] + height[:, :-1]) * gap).cumsum(-1), (1, 0))
     return knots, passed, height
@@ -62,10 +69,12 @@ def _quadratic(
     height: Float[Tensor, "R K"],
 ) -> Float[Tensor, "R P"]:
     """Return the integral at x of a density that is linear between knots, 0 before and 1 after them."""
+    # Knots around each x
     right = torch.searchsorted(knots, x.contiguous()).clamp(1, knots.shape[1] - 1)
     left = right - 1
     x0, x1 = knots.gather(1, left), knots.gather(1, right)
     h0, h1 = height.gather(1, left), height.gather(1, right)
+    # Integral up to x: integral at the left knot plus a trapezoid
     way = torch.minimum(torch.maximum(x, x0), x1) - x0
     part = way / (x1 - x0).clamp_min(1e-7)
     return passed.gather(1, left) + way * (h0 + 0.5 * part * (h1 - h0))
@@ -79,8 +88,10 @@ def distortion_loss(border: Float[Tensor, "R S1"], weight: Float[Tensor, "R S"])
     """
     middle = 0.5 * (border[:, 1:] + border[:, :-1])
     moment = weight * middle
+    # Weight, and weight times middle, of the samples before each one
     before = weight.cumsum(-1) - weight
     moment_before = moment.cumsum(-1) - moment
+    # Each pair is counted once and doubled; |m_i - m_j| = m_i - m_j, as middles ascend
     between = 2 * (moment * before - weight * moment_before).sum(-1)
     within = (weight**2 * border.diff(dim=-1)).sum(-1) / 3
     return (between + within).mean()
@@ -106,6 +117,7 @@ def carving_loss(
         margin_m: samples of returned beams within this distance of the return count as surface.
         free_m: beams that did not return are free up to this distance.
     """
+    # Samples near the return are surface; all others of a returned beam should be empty
     near = (middle_m - range_m[:, None]).abs() < margin_m
     wrong = torch.where(returned[:, None], ~near, middle_m < free_m)
     return (weight**2 * wrong).sum(-1).mean()
@@ -123,6 +135,7 @@ def beam_depth_loss(
 
     A lost beam should end at `free_m` or beyond. The worst errors, above a quantile, are left out.
     """
+    # A lost beam beyond free_m has no error: its target is its own distance
     target = torch.where(returned, range_m, depth_m.detach().clamp_min(free_m))
     error = (depth_m - target).abs() * torch.where(returned, 1.0, lost_weight)
     if quantile < 1 and len(error):
@@ -153,8 +166,10 @@ def hit_loss(
         return weight.new_zeros(())
     low, high = border_m[:, :-1], border_m[:, 1:]
     target = range_m[:, None]
+    # Overlap of each interval with the neighbourhood of the return
     inside = torch.minimum(high, target + near_m) - torch.maximum(low, target - near_m)
     part = inside.clamp_min(0) / (high - low).clamp_min(1e-6)
+    # A share bounded from below keeps the logarithm finite
     share = (weight * part).sum(-1)[returned]
     return -(share + _LEAST_SHARE).log().mean()
 

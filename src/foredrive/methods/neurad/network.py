@@ -32,12 +32,15 @@ def contract(
     Returns:
         Positions in the unit cube, and footprints in sides of the cube.
     """
+    # Inside of the cube of half side 1 (maximum norm) nothing changes
     points = points_m / scale_m
     size = points.abs().amax(-1, keepdim=True).clamp_min(1)
     inverse = 1 / size
     points = points * (2 - inverse) * inverse
     with torch.no_grad():
+        # Cube root of the determinant: radial 1/s², twice tangential (2s - 1)/s²
         shrink = ((2 * size - 1) ** 2)[:, 0].pow(1 / 3) * inverse[:, 0] ** 2
+        # The contracted space spans -2 to 2, so the unit cube is 4 · scale_m wide
         footprint = footprint_m / (4 * scale_m) * shrink
     return 0.25 * points + 0.5, footprint
 
@@ -108,6 +111,7 @@ class Grids(nn.Module):
             footprint_m: side of the volume that each sample stands for.
             moving: samples in boxes.
         """
+        # All samples are read in the static grid; those in boxes are then replaced
         standing = self.static(*contract(points_m, footprint_m, self.scale_m), None)
         if moving is None or len(moving.sample) == 0:
             return standing
@@ -116,6 +120,7 @@ class Grids(nn.Module):
     def of_actors(self, moving: ActorSamples) -> Float[Tensor, "C M"]:
         """Return the features at samples in boxes; those that actors do not have are 0."""
         own = self.actors(*contract(moving.point_m, moving.footprint_m, self.actor_scale_m), moving.slot)
+        # The layers expect the static grid's number of features
         missing = self.features - len(own)
         return torch.cat([own, own.new_zeros(missing, own.shape[1])]) if missing else own
 
@@ -154,6 +159,7 @@ class FieldLayers(nn.Module):
         with torch.no_grad():
             last = self.geometry.linear[-1]
             assert isinstance(last, nn.Linear)
+            # The signed distance starts near a constant
             last.weight[0] *= _FIRST_DISTANCE
             if bias:
                 last.bias[0] = _FIRST_DISTANCE if self.beta is not None else 0.0
@@ -167,6 +173,7 @@ class FieldLayers(nn.Module):
             grid: features of the grids.
             length_m: lengths of the samples' intervals.
         """
+        # Channel 0 is the signed distance or log density, the others are the embedding
         out = self.geometry(grid)
         return self._opacity(out[0].view(length_m.shape), length_m), out[1:].unflatten(1, length_m.shape)
 
@@ -185,6 +192,7 @@ class FieldLayers(nn.Module):
             direction: directions of the rays.
             moving: samples in boxes; their directions are those in the box' frame.
         """
+        # Directions enter linearly, so their part is computed once for each ray
         turned = self.first_direction.weight @ harmonics(direction)  # [D R]
         if self.shading == "samples":
             hidden = affine(self.first, embedding.flatten(1)).unflatten(1, weight.shape) + turned[..., None]
@@ -209,6 +217,7 @@ class FieldLayers(nn.Module):
         if moving is None or len(moving.sample) == 0:
             return hidden
         ray = moving.sample // weight.shape[1]
+        # Actors see the ray in the frame of their box: replace the harmonics of those samples
         along_ray = harmonics(direction.index_select(0, ray))  # see `ops.ray_boxes` on index_select
         change = self.first_direction.weight @ (harmonics(moving.direction) - along_ray)
         if sums:
@@ -219,6 +228,7 @@ class FieldLayers(nn.Module):
         self, geometry: Float[Tensor, "R S"], length_m: Float[Tensor, "R S"]
     ) -> Float[Tensor, "R S"]:
         if self.beta is not None:
+            # The slope stays positive, and above 0
             return torch.sigmoid(-(self.beta.abs() + 1e-4) * geometry)
         return opacity_of_density(geometry, length_m)
 
@@ -227,7 +237,9 @@ def opacity_of_density(
     log_density: Float[Tensor, "R S"], length_m: Float[Tensor, "R S"]
 ) -> Float[Tensor, "R S"]:
     """Return 1 - exp(-σ δ) for log σ - log σ₀ with the initial density σ₀, and lengths δ."""
+    # The bound keeps the exponential finite
     density = (log_density + _FIRST_LOG_DENSITY).clamp_max(_MAX_LOG_DENSITY).exp()
+    # expm1 is exact for small densities
     return -torch.expm1(-density * length_m)
 
 

@@ -45,7 +45,9 @@ def pixel_rays(
         side_px: side of the square of pixels that a ray stands for.
         rolling: if False, all rows are exposed with the middle row.
     """
+    # Time of each row relative to the middle row
     dt_s = (uv[:, 1] / view.size_hw[0] - 0.5) * (view.readout_s if rolling else 0.0)
+    # Pose of the camera when the row is exposed
     T = exposed.T_scene_cam @ exp_se3(dt_s[:, None] * exposed.twist_cam)
     direction = pixels_to_rays(uv, view.K, view.dist)
     focal = view.K[0, 0] * view.K[1, 1]
@@ -63,6 +65,7 @@ def beam_rays(view: SweepView, rolling: bool = True) -> FieldRays:
         rolling: each beam has its own time. If False, all have that of the sweep.
     """
     beams = view.beams
+    # Origins are those of the moving sensor, at the time of each beam
     origin = transform_points(view.T_scene_ego, beams.origin_ego)
     direction = rotate_vectors(view.T_scene_ego, beams.dir_ego)
     wide, high = BEAM_DIVERGENCE_RAD

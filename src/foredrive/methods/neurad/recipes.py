@@ -49,6 +49,7 @@ class FieldRecipe:
         graph = initial_scene(list(views.cameras), list(views.sweeps), tracks, _SHOWN, generator)
         places = [view.T_scene_cam[:3, 3] for view in views.cameras]
         places += [view.T_scene_ego[:3, 3] for view in views.sweeps]
+        # Mean position of all sensors
         middle_m = torch.stack(places).mean(0) if places else torch.zeros(3)
         scale_m = padded_scale_m(views, middle_m) if self.scene.network.scale_m is None else None
         torch.manual_seed(self.schedule.seed)  # the weights
@@ -73,6 +74,7 @@ class FieldRecipe:
             g.levels * g.features * 2**g.log2_rows for pair in grids for g in (pair.static, pair.actors)
         )
         rays = schedule.patches * schedule.patch**2 + schedule.beams
+        # Four proposal samples are counted as one sample of the field
         samples = rays * (sizes.samples + sum(sizes.proposal_samples) / 4)
         of_patches = 9 * schedule.patches * schedule.patch**2 * _OF_A_PIXEL
         return 4 * (entries * _COPIES + samples * _OF_A_SAMPLE + of_patches) / 1024**3
@@ -87,6 +89,7 @@ def padded_scale_m(views: SensorViews, middle_m: Float[Tensor, "3"]) -> float:
     poses = [view.T_scene_ego for view in views.sweeps] or [
         view.T_scene_cam @ AHEAD_LEFT_UP for view in views.cameras
     ]
+    # Points around each pose, in its own axes: ahead, behind, left, right
     around = torch.tensor([[80.0, 0, 0], [-80, 0, 0], [0, 60, 0], [0, -60, 0]])
     places = [transform_points(T, around.to(T)) - middle_m.to(T) for T in poses]
     return max([30.0, *(float(place[:, :2].abs().max()) for place in places)])

@@ -50,6 +50,7 @@ class SeenAlongRays(NamedTuple):
     """What R rays see."""
 
     feature: Float[Tensor, "R D"]
+    # What the ray has left counts for the sky
     depth_m: Float[Tensor, "R"]
     """Expected distance; the sky adds nothing."""
     alpha: Float[Tensor, "R"]
@@ -109,15 +110,19 @@ class NeuralField(nn.Module):
             hidden_m: H spans of each ray, from a distance to another, in which nothing stops it.
         """
         config = self.config
+        # Boxes of actors along the rays, at each ray's own time
         crossings = self.crossings(rays, actors.tracks)
         border = first_borders(len(rays.origin), config.proposal_samples[0], generator, rays.origin)
         proposals: list[Intervals] = []
+        # Rounds of proposals: each places the samples of the next one
         for i, proposal in enumerate(self.proposals):
             border_m = to_distance(border, config.spacing_m, config.sky_m)
+            # Poses get gradients from the field only, not from proposals
             points, footprint, moving = self._samples(rays, border_m, crossings, actors, learn_poses=False)
             with torch.set_grad_enabled(learn_proposals and torch.is_grad_enabled()):
                 opacity = proposal(points, footprint, moving, border_m.diff(dim=-1))
                 opacity = _without_spans(opacity, border_m, hidden_m)
+                # Only the weights are read: the second argument stands in for distances
                 weight = composite(opacity, opacity.detach()).weights
             proposals.append(Intervals(border, border_m, weight))
             last = i + 1 == len(self.proposals)
@@ -162,6 +167,7 @@ class NeuralField(nn.Module):
         """Return the samples' positions and footprints, and which of them lie in boxes."""
         with torch.set_grad_enabled(learn_poses and torch.is_grad_enabled()):
             middle_m = 0.5 * (border_m[:, 1:] + border_m[:, :-1])
+            # The static grid is about the middle of the scene
             origin = rays.origin - self.middle_m
             points = origin[:, None] + rays.direction[:, None] * middle_m[..., None]
             footprint = footprints(rays.area, border_m).flatten()
@@ -181,11 +187,13 @@ def _in_boxes(
     crossings: Crossings, middle_m: Float[Tensor, "R S"], footprint: Float[Tensor, "N"], actors: FieldActors
 ) -> ActorSamples:
     """Return the samples inside boxes. Where boxes overlap, a sample belongs to the one entered last."""
+    # Pairs of a crossing and a sample that lies between its entry and exit
     samples = middle_m.shape[1]
     along = middle_m[crossings.ray]
     inside = (along > crossings.enter_m.detach()[:, None]) & (along < crossings.leave_m.detach()[:, None])
     pair, place = inside.nonzero(as_tuple=True)
     sample = crossings.ray[pair] * samples + place
+    # Of several boxes at one sample, the crossing with the largest index wins
     owner = torch.full((middle_m.numel(),), -1, device=sample.device)
     owner = owner.scatter_reduce(0, sample, pair, "amax")
     mine = owner[sample] == pair
@@ -193,6 +201,7 @@ def _in_boxes(
     box = crossings.box[pair]
     direction = crossings.direction_box.index_select(0, pair)
     point = crossings.origin_box.index_select(0, pair) + direction * along[pair, place][:, None]
+    # Mirroring swaps left and right in the frame of the box: y changes its sign
     if actors.mirror is not None:
         sign = torch.ones_like(point)
         sign[:, 1] = torch.where(actors.mirror[box], -1.0, 1.0)
@@ -214,11 +223,13 @@ def _without_spans(
 @torch.no_grad()
 def median_distance(intervals: Intervals) -> Float[Tensor, "R"]:
     """Return the distance at which half of each ray's weight is reached, linear within an interval."""
+    # The sky is left out: a ray that is mostly sky has no median
     passed = intervals.weight[:, :-1].cumsum(-1)
     index = torch.searchsorted(passed.contiguous(), torch.full_like(passed[:, :1], 0.5))
     reached = index[:, 0] < passed.shape[1]
     index = index.clamp_max(passed.shape[1] - 1)
     weight = intervals.weight.gather(1, index)
+    # Share of the interval before the half is reached
     part = 1 - (passed.gather(1, index) - 0.5) / weight.clamp_min(1e-9)
     low, high = intervals.border_m.gather(1, index), intervals.border_m.gather(1, index + 1)
     return torch.where(reached, (low + part.clamp(0, 1) * (high - low))[:, 0], torch.inf)

@@ -23,6 +23,7 @@ _LEAST_SHARE = 0.01
 
 def to_distance(s: Float[Tensor, "*b"], spacing_m: float, far_m: float) -> Float[Tensor, "*b"]:
     """Return distances of positions; s = 1 is `far_m`."""
+    # s = 1 maps to far_m instead of infinity
     s = s * (far_m / (far_m + spacing_m))
     return spacing_m * s / (1 - s)
 
@@ -46,6 +47,7 @@ def first_borders(
     borders = torch.linspace(0, 1, samples + 1, device=like.device, dtype=like.dtype).expand(rays, -1)
     if generator is None:
         return borders
+    # One shift for all inner borders of a ray keeps the intervals equal
     move = (_random(rays, generator, like) - 0.5) / samples
     inner = borders[:, 1:-1] + move
     return torch.cat([borders[:, :1], inner, borders[:, -1:]], dim=-1)
@@ -68,13 +70,16 @@ def resampled_borders(
     """
     with torch.no_grad():
         padded = how == "padded"
+        # A small share for every interval keeps some samples where the proposal sees nothing
         share = weights + _LEAST_SHARE / (1 if padded else weights.shape[1])
         passed = torch.cumsum(share, dim=-1)
+        # Cumulative distribution from 0 to 1 over the borders
         passed = torch.cat([torch.zeros_like(passed[:, :1]), passed / passed[:, -1:]], dim=-1)
         if padded:
             wanted = _quantiles(len(borders), samples + 1, generator, borders)
         else:
             wanted = first_borders(len(borders), samples, generator, borders)
+        # Inverse of the cumulative distribution at equal quantiles
         return interpolated(wanted.contiguous(), passed, borders)
 
 
@@ -90,6 +95,7 @@ def interpolated(
     x: Float[Tensor, "R M"], query: Float[Tensor, "R N"], value: Float[Tensor, "R N"]
 ) -> Float[Tensor, "R M"]:
     """Return the piecewise linear functions through (at, value) at x, constant beyond their ends."""
+    # Interval of each x; values outside of the ends use the first or last one and are clamped
     right = torch.searchsorted(query, x, right=True).clamp(1, query.shape[1] - 1)
     x0, x1 = query.gather(1, right - 1), query.gather(1, right)
     y0, y1 = value.gather(1, right - 1), value.gather(1, right)

@@ -61,7 +61,7 @@ class FieldScene(RebuiltScene):
         shown: coloured points of the static part and of the actors, for viewers.
         cameras: number of cameras in the rig.
         config: parts of the scene.
-        reach_m: nothing beyond stops a beam.
+        reach_m: range beyond which nothing stops a beam, m.
         middle_m: middle of the part of the scene that is not contracted.
         scale_m: half side of that part; None: that of `config`.
     """
@@ -107,6 +107,7 @@ class FieldScene(RebuiltScene):
             opacity_logit=self.shown_mean_m.new_full((count,), 4.0),
             feature=self.shown_rgb,
         )
+        # Row k of the tracks is at place k of the grid of actors
         slot = torch.arange(len(self.track_id), device=self.device)
         parts = FieldParts(self.field, self.camera_decoder, self.lidar_decoder)
         return FieldContent(slot, torch.zeros_like(slot), GaussianContent(points, self.shown_actor), (parts,))
@@ -152,14 +153,17 @@ class FieldScene(RebuiltScene):
 
     def camera(self, graph: SceneGraph, view: CameraView) -> RenderedImage:
         """Render an image. One ray stands for 3 × 3 pixels; the last ones may reach beyond the image."""
+        # Rays of the last column and row may reach beyond the image, hence rounded up
         high, wide = (-(-side // UPSAMPLING) for side in view.size_hw)
         corner_uv, size = torch.zeros(2, dtype=torch.int64), torch.tensor([wide, high])
         rays = self.rays_of_pixels(view, corner_uv, size)
         seen, guests = self._in_parts(graph, rays)
         feature = seen["feature"].view(1, high, wide, -1)
+        # Features of all rays form one image for the CNN
         rgb = self.camera_decoder(feature, torch.tensor([view.sensor], device=feature.device))[0]
         if guests:
             rgb = with_guests_in_image(rgb, *guests, view.sensor)
+        # Cut what reaches beyond the image
         rgb = rgb[:, : view.size_hw[0], : view.size_hw[1]]
         # The camera's axis is that of the row's own time: it turns during the read-out.
         along = pixels_to_rays(_pixels_of_rays(corner_uv, size).to(view.K), view.K, view.dist)[:, 2]
@@ -183,6 +187,8 @@ class FieldScene(RebuiltScene):
             intensity, drop_logit = with_guests_in_sweep(intensity, drop_logit, *guests)
         range_m = self._ranges(seen)
         median_m = seen["median_m"]
+        # A beam that ends beyond the reach, or nowhere, is lost: a
+        # positive logit, whatever the decoder says
         beyond = torch.where(median_m.isfinite(), median_m, range_m) > self.reach_m
         nothing = seen["alpha"] < _LEAST_ALPHA
         drop_logit = torch.where(beyond | nothing, drop_logit.abs() + 1, drop_logit)
@@ -200,6 +206,7 @@ class FieldScene(RebuiltScene):
         rendered: dict[str, list[Tensor]] = {"feature": [], "depth_m": [], "alpha": [], "median_m": []}
         own, guests = split_guests(graph.tracks, field_of(graph))
         of_guests: list[list[SeenOfGuest]] = []
+        # Rays in parts bound the memory
         for first in range(0, max(len(rays.t_s), 1), RAYS_AT_ONCE):
             part = FieldRays(*(tensor[first : first + RAYS_AT_ONCE] for tensor in rays))
             if guests:
@@ -212,6 +219,7 @@ class FieldScene(RebuiltScene):
         joined = {name: torch.cat(values) for name, values in rendered.items()}
         if not guests:
             return joined, None
+        # Join the parts of each guest
         seen_of = [
             SeenOfGuest(*map(torch.cat, zip(*parts, strict=True))) for parts in zip(*of_guests, strict=True)
         ]
@@ -222,6 +230,7 @@ def _pixels_of_rays(corner_uv: Int[Tensor, "2"], size: Int[Tensor, "2"]) -> Floa
     """Return the middles of the squares of pixels that the rays of a patch stand for, row by row."""
     width, height = size.tolist()
     v, u = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
+    # Middle of the 3 x 3 pixels of each ray
     return corner_uv + UPSAMPLING * (torch.stack([u, v], dim=-1).flatten(0, 1) + 0.5)
 
 

@@ -125,6 +125,7 @@ class FieldTraining:
     """
 
     def __init__(self, scene: FieldScene, views: SensorViews, schedule: FieldSchedule) -> None:
+        # Beams are prepared once for all steps
         beams = [(view, scene.prepare_sweep(view)) for view in views.sweeps]
         self._sweeps = [(view, rays) for view, rays in beams if len(rays.t_s)] if schedule.beams else []
         if not (views.cameras and schedule.patches) and not (self._sweeps and schedule.sweeps):
@@ -144,6 +145,7 @@ class FieldTraining:
         """Return one group per kind of parameter, named as in `FieldRates`."""
         scene, groups = self.scene, []
         tables = tables_of(scene.field)
+        # Three groups: tables of grids, layers and codes, the CNN
         of_table = {id(table) for table in tables}
         layers = [p for p in scene.field.parameters() if id(p) not in of_table]
         by_name = {
@@ -163,10 +165,12 @@ class FieldTraining:
         schedule, scene = self.schedule, self.scene
         propose = step % schedule.proposals_every == 0
         drawn = torch.rand(len(scene.track_id), generator=generator) < schedule.mirror_share
+        # Poses in a step without their gradients need no graph through the tracks
         with torch.set_grad_enabled(step % schedule.poses_every == 0):
             graph, patches = scene.graph, self._patches(generator)
         mirror = drawn.to(scene.device) & graph.tracks.mirrored
         beams = self._some_beams(generator)
+        # Patches first, then beams, in one batch of rays
         rays = [patch.rays for patch in patches] + [beam.rays for beam in beams]
         joined = FieldRays(*(torch.cat(tensors).to(scene.device) for tensors in zip(*rays, strict=True)))
         seen = scene.look(graph, joined, mirror, generator, propose)
@@ -179,9 +183,11 @@ class FieldTraining:
             losses |= self._beam_losses(beams, seen, first)
         if propose:
             losses["interlevel"] = _interlevel(seen)
+        # The sky's interval is huge and would dominate the spread
         losses["distortion"] = distortion_loss(seen.intervals.border[:, :-1], seen.intervals.weight[:, :-1])
         losses["loss"] = torch.stack([self._weight(name) * loss for name, loss in losses.items()]).sum()
         if patches:
+            # The mean squared error gives PSNR directly
             losses["psnr_db"] = -10 * losses["rgb"].detach().log10()
         return StepLosses(f"step {step}", losses)
 
@@ -200,6 +206,7 @@ class FieldTraining:
         for _ in range(self.schedule.patches if self.views.cameras else 0):
             view = self.views.cameras[_draw(len(self.views.cameras), generator)]
             assert view.image is not None
+            # Small images have smaller patches
             high, wide = (min(self.schedule.patch, side // UPSAMPLING) for side in view.size_hw)
             top = _draw(view.size_hw[0] - UPSAMPLING * high + 1, generator)
             left = _draw(view.size_hw[1] - UPSAMPLING * wide + 1, generator)
@@ -232,6 +239,7 @@ class FieldTraining:
     def _image_losses(self, patches: list["_Patch"], feature: Float[Tensor, "R D"]) -> dict[str, Tensor]:
         """Return the mean squared error over all pixels of the patches, and the perceptual loss."""
         parts = feature.split([len(patch.rays.t_s) for patch in patches])
+        # Patches of equal size are decoded in one batch
         groups: dict[tuple[int, int], list[tuple[Tensor, _Patch]]] = defaultdict(list)
         for patch, part in zip(patches, parts, strict=True):
             groups[patch.size_hw].append((part.view(*patch.size_hw, -1), patch))
@@ -246,6 +254,7 @@ class FieldTraining:
             if self._vgg is not None:
                 with torch.no_grad():
                     wanted = self._vgg(real)
+                # Each group counts by its number of patches
                 share = len(alike) / len(patches)
                 likeness = likeness + share * weighted_feature_loss(self._vgg(rgb), wanted)
         losses = {"rgb": squares / count}
@@ -272,8 +281,10 @@ class FieldTraining:
         )
         intensity, drop_logit = self.scene.lidar_decoder(seen.feature[first:])
         losses = {"intensity": intensity_loss(intensity, real_intensity, returned)}
+        # Drop is learned only if all sweeps of the step record lost beams
         if all(part.misses_known for part in beams):
             losses["drop"] = drop_loss(drop_logit, returned)
+        # Proposals that get gradients in this step have the same losses of distance
         proposals = [("proposal_", proposal) for proposal in seen.proposals if proposal.weight.requires_grad]
         for prefix, intervals in (("", seen.intervals), *proposals):
             terms = self._distance_losses(intervals, first, range_m, returned, quantile=not prefix)

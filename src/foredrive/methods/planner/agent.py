@@ -80,8 +80,10 @@ class PlanningAgent(nn.Module, Generic[W]):
         assert self.heads is not None
         steps = None
         if sequences is not None:
+            # Heads that carry agents from frame to frame need the ego motion between the frames
             steps = self.heads.config.steps(sequences.T_world_ego[:, sequences.now])
         read = volumes_of(self.world_model, now, self.heads.config.volumes)
+        # Tasks that read one volume share its cast, so it is converted once
         with full_precision(now.volume):
             cast = {id(volume): volume.map_tensors(Tensor.float) for volume in read.values()}
             volumes = {task: cast[id(volume)] for task, volume in read.items()}

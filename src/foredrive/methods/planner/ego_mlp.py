@@ -21,6 +21,7 @@ def ego_speeds(clip: Clip) -> Float[Tensor, "b T"]:
         return torch.where(clip.ego_speed_valid, clip.ego_speed_mps, 0.0)
     travelled_m = clip.T_world_ego[..., :3, 3].diff(dim=1).norm(dim=-1)
     between = (travelled_m / clip.t_s.diff(dim=1)).to(clip.ego_speed_mps)
+    # The first key frame has no earlier pose and takes the speed of the interval after it
     return torch.where(clip.ego_speed_valid, clip.ego_speed_mps, torch.cat([between[:, :1], between], dim=1))
 
 
@@ -38,7 +39,9 @@ def ego_motion(clip: Clip, past_frames: int) -> tuple[Float[Tensor, "b P 3"], Fl
     if now < past_frames:
         raise InputError(f"the ego status needs {past_frames} frames before now, but the clip has {now}")
     frames = slice(now - past_frames, now + 1)
+    # Poses relative to the ego frame at now, computed in the precision of the world poses (float64)
     T_now_ego = compose_se3(inverse_se3(clip.T_world_ego[:, now : now + 1]), clip.T_world_ego[:, frames])
+    # The last pose is the identity and is left out
     poses = torch.cat([T_now_ego[..., :2, 3], yaw_from_matrix(T_now_ego)[..., None]], dim=-1)[:, :-1]
     return poses.float(), ego_speeds(clip.observed())[:, frames]
 
@@ -71,6 +74,7 @@ def status_vector(
     target: Float[Tensor, "b 3"] | None = None,
 ) -> Float[Tensor, "b S"]:
     """Return the numbers of `ego_status` in order. `route_target` comes last, if given."""
+    # An unknown command is all zeros
     one_hot = nn.functional.one_hot(command.long(), len(Command)) * command_valid[:, None]
     status = torch.cat([poses.flatten(1), speeds, one_hot.to(speeds)], dim=-1)
     return status if target is None else torch.cat([status, target.to(status)], dim=-1)
@@ -131,6 +135,7 @@ class EgoMLP(nn.Module):
 
     def forward(self, status: Float[Tensor, "b S"]) -> Float[Tensor, "b T 3"]:
         """Return x, y (m) and yaw (rad) of each step, in the ego frame at now."""
+        # Inputs and outputs are standardised, so layers work on numbers of order 1
         plan = self.layers(self.standardised(status))
         return (plan * self.plan_std + self.plan_mean).unflatten(1, (self.horizon_steps, 3))
 

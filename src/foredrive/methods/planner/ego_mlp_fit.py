@@ -76,6 +76,7 @@ def fit_ego_mlp(
 ) -> EgoMLP:
     """Fit an ego MLP by L1 on the driven steps. It takes seconds; the same seed gives the same weights."""
     horizon_steps = data.driven.shape[1]
+    # The weights depend on the seed of the fit alone and leave the global generator as it is
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(fit.seed)
         model = EgoMLP(config, past_frames=past_frames, horizon_steps=horizon_steps, dt_s=dt_s, target=target)
@@ -90,6 +91,7 @@ def fit_ego_mlp(
 
 def _standardise(model: EgoMLP, data: StatusDemonstrations) -> None:
     """Set means and spreads of inputs and outputs. Columns that hardly vary keep a spread of 1."""
+    # Means and spreads of plans come from complete futures only
     whole = data.driven[data.valid.all(dim=-1)].flatten(1)
     for name, rows in (("status", data.status), ("plan", whole)):
         if len(rows) < 2:

@@ -35,6 +35,7 @@ class PlannerObjective(nn.Module):
     def forward(self, example: Example, generator: torch.Generator) -> dict[str, Float[Tensor, ""]]:
         """Return losses by name; "loss" is minimised. Nothing is drawn from the generator."""
         observed, agent = example.clip.observed(), self.agent
+        # World model and heads run without gradients: only the planner is trained
         with torch.no_grad():
             beliefs = agent.rollout(observed, agent.planner.imagined_frames)
             output = agent.perceive(beliefs[0], observed)

@@ -99,9 +99,11 @@ class PathCorrection(nn.Module):
             samples: see `sample`.
             status: standardised ego status.
         """
+        # Standardise by statistics of the training demonstrations (see `fit_path`)
         values = (samples.values.float() - self.mean) / self.std
         columns = torch.cat([values, samples.positions_m / self.place_scale_m], dim=-1).flatten(2)
         along = self.together(self.place(columns).flatten(1))
+        # The effect of what is ahead depends on the speed, hence the ego status beside it
         return self.change(torch.cat([along, status], dim=-1)).float()
 
     def sample(self, volume: Float[Tensor, "b D Z Y X"], path_xy: Float[Tensor, "b T 2"]) -> PathSamples:
@@ -109,6 +111,7 @@ class PathCorrection(nn.Module):
         positions_m = self.positions_m(path_xy)
         columns = volume.permute(0, 3, 4, 2, 1).flatten(3).contiguous()
         with full_precision(columns, positions_m) as (values, at_m):
+            # A plane is a volume of one layer, whose centre is at 0.5 in cell units
             cells = F.pad((at_m - self.lower_m) / self.voxel_m, (0, 1), value=0.5)
             samples = sample_volume(values[:, None], cells.flatten(1, 2)).unflatten(1, at_m.shape[1:3])
         return PathSamples(samples, positions_m)
@@ -117,14 +120,19 @@ class PathCorrection(nn.Module):
         """Return the positions to sample: at every distance along the path, at S lateral offsets."""
         steps = torch.diff(path_xy, dim=1, prepend=torch.zeros_like(path_xy[:, :1]))
         lengths = steps.norm(dim=-1)[:, None]  # [b, 1, T]
+        # Path length at the begin of each step
         begins = lengths.cumsum(-1) - lengths
+        # Share of each step that is covered at a given distance: 1 for earlier steps, 0 for later ones
         share = ((self.distances_m[:, None] - begins) / lengths.clamp_min(1e-6)).clamp(0, 1)  # [b, D, T]
         beyond = (self.distances_m - lengths.sum(-1)).clamp_min(0)  # [b, D]
+        # Headings are constant within a step; standing steps keep the heading before them
         yaw = headings(path_xy[:, None])[:, 0]
         forward = torch.stack([yaw.cos(), yaw.sin()], dim=-1)  # [b, T, 2]
+        # Sum of the covered parts of the steps, plus a straight extension beyond the last waypoint
         on_path = share @ steps + beyond[..., None] * forward[:, -1:]
         step = (self.distances_m[:, None] >= begins).sum(-1) - 1  # [b, D]: index of the last step begun
         along = forward.gather(1, step[..., None].expand(-1, -1, 2))
+        # Left normal of the path at each distance
         left = torch.stack([-along[..., 1], along[..., 0]], dim=-1)
         return on_path[:, :, None] + self.lateral_m[:, None] * left[:, :, None]
 
@@ -142,5 +150,6 @@ def headings(xy: Float[Tensor, "b M T 2"]) -> Float[Tensor, "b M T"]:
         along = torch.atan2(step[..., 1], step[..., 0])
         moves = step.norm(dim=-1) > MOVES_M
         count = torch.arange(1, xy.shape[2] + 1, device=xy.device)
+        # Index of the last step that moves, up to each step; 0 selects the prepended heading of 0
         last_move = torch.where(moves, count, 0).cummax(dim=2).values  # 0: has not moved yet
         return torch.cat([torch.zeros_like(along[..., :1]), along], dim=2).gather(2, last_move)

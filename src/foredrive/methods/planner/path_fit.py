@@ -40,6 +40,7 @@ class PathDemonstrations(Record):
 def fit_path(correction: PathCorrection, data: PathDemonstrations, fit: PathFit, seed: int) -> None:
     """Fit the correction by L1 on the waypoints, and store means and spreads that standardise its inputs."""
     data = data.to(correction.mean.device)
+    # One mean and spread per feature, over all demonstrations, distances and offsets
     values = data.values.float()
     correction.mean.copy_(values.mean(dim=(0, 1, 2)))
     correction.std.copy_(values.std(dim=(0, 1, 2)) + 1e-3)

@@ -88,10 +88,13 @@ class FutureAttention(nn.Module):
         self, now: Float[Tensor, "b D Z Y X"], future: Float[Tensor, "b D Z Y X"]
     ) -> Float[Tensor, "b D Z Y X"]:
         """Return V_F = A ⊙ V_t."""
+        # Keys and values are block means, so the attention is V/pool times smaller than over all pairs
         blocks = F.avg_pool3d(future, self.pool).flatten(2).transpose(1, 2)  # [b, blocks, D]
         tokens = future.flatten(2).transpose(1, 2)  # [b, Z·Y·X, D]
         one_head = (x[:, None] for x in (self.query(tokens), self.key(blocks), self.value(blocks)))
+        # The fused attention never stores the matrix of all pairs
         attended = F.scaled_dot_product_attention(*one_head)[:, 0]  # else all pairs would be stored
+        # The attended features scale the present volume elementwise (A ⊙ V_t)
         return attended.transpose(1, 2).unflatten(2, now.shape[2:]) * now
 
 
@@ -143,15 +146,18 @@ class VolumePlanner(nn.Module):
         attends = config.future == "attention"
         self.fuse_future = FutureAttention(channels, config.pool) if attends else None
         volumes = 2 if config.future == "concatenation" else 1
+        # The fold maps a column of Z · D numbers (twice that with both volumes) to C
         self.fold = nn.Sequential(
             nn.Linear(height * channels * volumes, width),
             nn.ReLU(),
             nn.Linear(width, width),
             nn.LayerNorm(width),
         )
+        # Learned place of each row and column, since attention itself knows no positions
         self.row = nn.Parameter(0.02 * torch.randn(ny, 1, width))
         self.column = nn.Parameter(0.02 * torch.randn(1, nx, width))
         self.command = nn.Embedding(len(Command) + 1, width)  # the last entry: unknown command
+        # Speed and its flag, 4 numbers per past frame, and x, y and flag of the target
         inputs = 2 + 4 * config.history + 3 * config.target
         self.speed = nn.Sequential(nn.Linear(inputs, width), nn.ReLU(), nn.Linear(width, width))
         self.plan = nn.Parameter(0.02 * torch.randn(width))
@@ -213,17 +219,21 @@ class VolumePlanner(nn.Module):
         plane, query = self._read(
             now, future, command, command_valid, speed_mps, speed_valid, past, target, tokens
         )
+        # The decoder attends to every cell of the plane, and to the tokens of agents and map elements
         memory = plane.flatten(1, 2)
         if tokens is not None and self.scene is not None:
             memory = torch.cat([memory, tokens.to(memory)], dim=1)
         initial_xy, ego_status = self.initial_plan(command, command_valid, speed_mps, past, target)
+        # The plan has one query; each layer refines it
         query = query[:, None]
         for layer in self.decoder:
             query = layer(query, memory)
+        # Waypoints are regressed as changes of the steps between them, in 32 bits
         change = self.waypoints(self.final_norm(query[:, 0])).float().unflatten(1, (self.horizon_steps, 2))
         change = self.config.step_scale_m * change
         if self.path is not None:
             change = change + self.path(self.path.sample(now, initial_xy), ego_status)
+        # Changes of steps are summed to positions, so a change of one step shifts all later waypoints
         xy = (initial_xy + change.cumsum(dim=1))[:, None]
         return Trajectory(
             xy=xy,
@@ -251,16 +261,21 @@ class VolumePlanner(nn.Module):
         if self.target and target is None:
             raise ValueError("this planner needs the target point of the route")
         fused = self._fuse(now, future)
+        # Fold the heights of each column and add its place
         plane = self.fold(fused.permute(0, 3, 4, 2, 1).flatten(3)) + self.row + self.column
+        # An unknown command has an embedding of its own
         command = torch.where(command_valid, command, len(Command))
         sizes = self.config
+        # An estimated speed is hidden from the query; only the initial plan uses it
         measured_mps = torch.where(speed_valid, speed_mps, 0.0)
         status = torch.stack([measured_mps / sizes.speed_scale_mps, speed_valid.to(speed_mps)], dim=-1)
+        # Scales bring metres, radians and m/s to numbers of order 1; yaw is kept
         past_scale = past.new_tensor((sizes.past_scale_m, sizes.past_scale_m, 1.0, sizes.speed_scale_mps))
         status = torch.cat([status, (past / past_scale).flatten(1)], dim=-1)
         if self.target and target is not None:
             target_scale = target.new_tensor((sizes.target_scale_m, sizes.target_scale_m, 1.0))
             status = torch.cat([status, target / target_scale], dim=-1)
+        # Three embeddings side by side: command, ego status, learned planning query
         query = torch.cat(
             [self.command(command), self.speed(status), self.plan.expand(len(command), -1)], dim=-1
         )
@@ -279,9 +294,11 @@ class VolumePlanner(nn.Module):
         if self.target and target is None:
             raise ValueError("this planner needs the target point of the route")
         if self.ego_mlp is None:
+            # Straight ahead at constant speed: the same step T times
             step = torch.stack([self.dt_s * speed_mps, torch.zeros_like(speed_mps)], dim=-1)
             return step[:, None].expand(-1, self.horizon_steps, 2).cumsum(dim=1), step[:, :0]
         speeds_mps = torch.cat([past[..., 3], speed_mps[:, None]], dim=-1)
+        # 32 bits also under automatic mixed precision: the plan is in metres
         with full_precision(past, speeds_mps) as (poses, speeds):
             target = target if self.target else None
             status = status_vector(poses[..., :3], speeds, command, command_valid, target)

@@ -35,7 +35,7 @@ DELAY_STEPS_S = ((1, 0.02), (1, 0.01))
 The first are tried on a grid, the others climb.
 """
 MAX_ROTATION_RAD, MAX_TRANSLATION_M, MAX_DELAY_S = math.radians(4.0), 0.8, 0.12
-"""Bounds of the searches. An optimum at a bound is none."""
+"""Bounds of the searches. The best offset within them is no optimum if it lies at a bound."""
 _VIEWS, _MIN_VIEWS = 10, 4
 _MIN_EDGES, _MAX_EDGES = 30, 800
 """Minimum number of points in an image (and of each kind by which a sum is divided), and maximum number."""
@@ -119,10 +119,14 @@ def spread_along_path(position_m: Float[Tensor, "F 3"], count: int = _VIEWS) -> 
     frames = len(position_m)
     if frames <= count:
         return list(range(frames))
+    # Path length up to each frame, starting at 0
     path_m = F.pad((position_m[1:] - position_m[:-1]).norm(dim=-1).cumsum(0), (1, 0))
+    # Less than a metre per chosen frame: the vehicle hardly moved, so frames are spread in time
     if float(path_m[-1]) < count:
         return torch.linspace(0, frames - 1, count).round().long().unique().tolist()
     even_m = torch.linspace(0, float(path_m[-1]), count, dtype=path_m.dtype)
+    # First frame at or behind each even path length; a standing
+    # vehicle gives duplicates, which unique drops
     return torch.searchsorted(path_m, even_m).clamp_max(frames - 1).unique().tolist()
 
 
@@ -148,10 +152,14 @@ def calibration_views(cameras: Sequence[CameraView], edges: Sequence[SweepEdges]
         return None
     pairs = []
     for sweep in edges:
+        # The image nearest in time, so that little of the scene has moved between image and sweep
         view = _downsampled(min(cameras, key=lambda other: abs(other.t_s - sweep.t_s)))
         T_cam_ego = inverse_se3(view.T_scene_cam) @ sweep.T_scene_ego
+        # The vehicle's motion between sweep and exposure is part of this transform
         points_cam = transform_points(T_cam_ego, sweep.points_ego)
+        # An image without enough lidar edges in view cannot be scored
         if int(project(points_cam, view.K, view.dist, view.size_hw)[2].sum()) >= _MIN_EDGES:
+            # Keep points that a camera moved within the search bounds can see, thinned to the maximum
             near = _near_view(points_cam, view).nonzero()[:, 0]
             near = near[:: math.ceil(len(near) / _MAX_EDGES)]
             pairs.append((view, T_cam_ego, points_cam[near], sweep.horizontal[near]))
@@ -160,6 +168,7 @@ def calibration_views(cameras: Sequence[CameraView], edges: Sequence[SweepEdges]
     views = [view for view, *_ in pairs]
     counts = torch.tensor([len(points) for _, _, points, _ in pairs])
     pad = torch.nn.utils.rnn.pad_sequence
+    # Point sets of different length are padded to one batch; `points_valid` marks the real ones
     return CalibrationViews(
         K=torch.stack([view.K for view in views]),
         dist=torch.stack([view.dist for view in views]),
@@ -169,6 +178,7 @@ def calibration_views(cameras: Sequence[CameraView], edges: Sequence[SweepEdges]
         strength=_pyramid(_edge_strength(views)),
         points_cam=pad([points for _, _, points, _ in pairs], batch_first=True),
         horizontal=pad([horizontal for *_, horizontal in pairs], batch_first=True),
+        # Row v is True for the first counts[v] points
         points_valid=torch.arange(int(counts.max())) < counts[:, None],
     )
 
@@ -182,6 +192,7 @@ def best_camera_rotation(views: CalibrationViews) -> OffsetFit:
     """Find the rotation of a camera that fits best: up, to its right, clockwise, rad."""
 
     def scores(offset: Tensor, step: float) -> Tensor:
+        # Moving the camera by exp(offset) moves its points by the inverse
         T_moved_cam = inverse_se3(exp_se3(F.pad(offset, (3, 0)))).expand(len(views), 4, 4)
         return _scores(views, T_moved_cam, step)
 
@@ -198,6 +209,7 @@ def mean_shift_rad(views: CalibrationViews, turn: Float[Tensor, "3"]) -> float:
 def best_camera_delay(views: CalibrationViews) -> OffsetFit:
     """Find the time by which a camera was exposed later than its images say, s."""
 
+    # Over the delay, the camera moves along its own velocity and turn rate
     def scores(offset: Tensor, _: float) -> Tensor:
         return _scores(views, inverse_se3(exp_se3(views.twist_cam * offset)), 0.0)
 
@@ -212,8 +224,10 @@ def best_lidar_translation(cameras: Sequence[CalibrationViews]) -> OffsetFit | N
     def scores(offset: Tensor, step: float) -> Tensor:
         scored = []
         for views in cameras:
+            # Moving the lidar by an offset moves its points by the same vector, turned to camera axes
             T_moved_cam = torch.eye(4).repeat(len(views), 1, 1)
             T_moved_cam[:, :3, 3] = views.R_cam_ego @ offset
+            # The step as an angle at a typical range sets the resolution of the images
             scored.append(_scores(views, T_moved_cam, step / _TYPICAL_RANGE_M))
         return torch.cat(scored)
 
@@ -243,10 +257,13 @@ def _search(
     def climbed(offset: Tensor, axes: int, step: float) -> Tensor:
         best = float(scores(offset, step).mean())
         while True:
+            # Neighbours one step away along each searched axis, both ways
             near = [offset + sign * step * axis for axis in torch.eye(dims)[:axes] for sign in (-1.0, 1.0)]
+            # Half of the finest step of tolerance, so that rounding does not exclude the bound itself
             within = [other for other in near if float(other.abs().max()) < bound + 0.5 * fine]
             tried = [(float(scores(other, step).mean()), other) for other in within]
             score, other = max(tried, key=lambda pair: pair[0])
+            # No neighbour is better: a local optimum
             if score <= best:
                 return offset
             best, offset = score, other
@@ -260,12 +277,16 @@ def _search(
         return float(scores(offset, fine).mean())
 
     calibrated = torch.zeros(dims)
+    # Two climbs from the calibration: directly by the finest step, and from coarse to fine
     offset = max(climbed(calibrated, dims, fine), refined(calibrated), key=mean_score)
+    # The nearest optimum is poor: search the whole range on a grid of coarse steps
     if mean_score(offset) < _GOOD_SCORE:
         axes, step = steps[0]
         ticks = torch.arange(-int(bound / step), int(bound / step) + 1) * step
+        # The grid covers the first axes; the others start at 0
         grid = F.pad(torch.cartesian_prod(*[ticks] * axes).reshape(-1, axes), (0, dims - axes))
         far = refined(max(grid, key=lambda other: float(scores(other, step).mean())))
+        # A far optimum replaces the near one only by a clear gain, since repeated structures look alike
         offset = far if mean_score(far) > mean_score(offset) + _FAR_GAIN else offset
     before, after = scores(calibrated, fine), scores(offset, fine)
     return OffsetFit(
@@ -289,14 +310,18 @@ def _scores(
     """
     points_cam = transform_points(T_moved_cam, views.points_cam)
     uv, _, inside = project(points_cam, views.K, views.dist, views.size_hw)
+    # A coarse step reads coarse cells, so that edges are not stepped over between two tries
     step_px = max(step_rad * float(views.K[0, 0, 0]), 1.0)
     level = min(int(math.log2(step_px)), len(views.strength) - 1)
     strength = views.strength[level]
+    # ceil_mode lets the coarse cells cover a little more than the image: normalise by what they cover
     covered_wh = torch.tensor([strength.shape[-1], strength.shape[-2]]) * 2**level
     sampled = F.grid_sample(strength, (2 * uv / covered_wh - 1)[:, None], align_corners=False)[:, :, 0]
     score = torch.zeros(len(views))
+    # Beams side by side meet edges across u (kind 0), beams above each other edges across v (kind 1)
     for kind, belongs in enumerate((~views.horizontal, views.horizontal)):
         weight = (inside & views.points_valid & belongs).float()
+        # The bound on the divisor keeps a few points from a high score
         score += (sampled[:, kind] * weight).sum(-1) / weight.sum(-1).clamp_min(_MIN_EDGES)
     return score
 
@@ -308,20 +333,26 @@ def _downsampled(view: CameraView) -> CameraView:
 def _near_view(points_cam: Float[Tensor, "N 3"], view: CameraView) -> Bool[Tensor, "N"]:
     """Return which points a camera may see that is turned or moved within the bounds of the searches."""
     height, width = view.size_hw
+    # Half the field of view to the corner: horizontal and vertical half angles, combined
     half_rad = torch.atan2(torch.tensor([width, height]), 2 * view.K.diagonal()[:2]).norm()
     off_axis_rad = torch.atan2(points_cam[:, :2].norm(dim=-1), points_cam[:, 2])
+    # The margin covers a turned camera and a moved lidar
     return off_axis_rad < half_rad + 2 * MAX_ROTATION_RAD
 
 
 def _edge_strength(views: Sequence[CameraView]) -> Float[Tensor, "V 2 H W"]:
     """Return the change of brightness along u and v in units of its local mean, less the mean of that."""
     images = [view.image for view in views if view.image is not None]
+    # Grey in 0 to 1, smoothed over 3x3 pixels against noise
     grey = torch.stack([image.float().mean(0, keepdim=True) / 255 for image in images])
     grey = F.avg_pool2d(grey, 3, stride=1, padding=1, count_include_pad=False)
     along_v, along_u = torch.gradient(grey, dim=(-2, -1))
     change = torch.cat([along_u, along_v], dim=1).abs()
+    # Side of the surroundings in pixels at the image centre
     cell_px = max(round(_SURROUNDINGS_RAD * float(views[0].K[0, 0])), 1)
+    # Relative strength: texture raises the mean and so lowers each of its edges; outliers are clipped
     strength = (change / (_local_mean(change, cell_px) + _MIN_CHANGE)).clamp(max=_MAX_STRENGTH)
+    # Less its local mean: a random place scores 0 on average
     return strength - _local_mean(strength, cell_px)
 
 
@@ -336,6 +367,7 @@ def _pyramid(values: Float[Tensor, "V C H W"], levels: int = 4) -> list[Tensor]:
 def _local_mean(values: Float[Tensor, "V C H W"], cell_px: int) -> Float[Tensor, "V C H W"]:
     """Return the means of cells, interpolated between their centres."""
     means = F.avg_pool2d(values, cell_px, ceil_mode=True, count_include_pad=False)
+    # The interpolated means cover whole cells; the last ones are cut at the border of the image
     whole_hw = (means.shape[-2] * cell_px, means.shape[-1] * cell_px)
     grown = F.interpolate(means, whole_hw, mode="bilinear", align_corners=False)
     return grown[..., : values.shape[-2], : values.shape[-1]]
@@ -343,11 +375,14 @@ def _local_mean(values: Float[Tensor, "V C H W"], cell_px: int) -> Float[Tensor,
 
 def _sweep_edges(sweep: SweepView, tracks: ActorTracks) -> SweepEdges:
     beams = sweep.beams[sweep.beams.returned]
+    # Direction of each beam as azimuth and elevation in the ego frame
     azimuth = torch.atan2(beams.dir_ego[:, 1], beams.dir_ego[:, 0])
     elevation = torch.asin(beams.dir_ego[:, 2].clamp(-1, 1))
     column = (azimuth / _COLUMN_RAD).round().long()
+    # Negative row numbers cannot meet real channel numbers, which are at least 0
     elevation_row = (elevation / _ROW_RAD).round().long() - 10_000
     channel = torch.where(beams.beam >= 0, beams.beam.long(), elevation_row)
+    # Pairs of neighbours along a channel (kind 0) and along a column (kind 1)
     pairs = [
         _pairs_before_farther(beams.range_m, channel, azimuth, _BESIDE_RAD),
         _pairs_before_farther(beams.range_m, column, elevation, _ABOVE_RAD),
@@ -356,6 +391,7 @@ def _sweep_edges(sweep: SweepView, tracks: ActorTracks) -> SweepEdges:
         [torch.full((len(pair),), kind, dtype=torch.bool) for kind, pair in enumerate(pairs)]
     )
     near, far = torch.cat(pairs).T
+    # Moving objects are at other places when the image is taken
     static = _static(beams[near], sweep, tracks)
     near, far = near[static], far[static]
     # The edge lies between the two beams; all near beams lie inside of the outlines of what they hit.
@@ -368,11 +404,14 @@ def _pairs_before_farther(
     range_m: Float[Tensor, "N"], line: Tensor, angle_rad: Float[Tensor, "N"], max_apart_rad: float
 ) -> Int64[Tensor, "E 2"]:
     """Return each beam and its neighbour in angle on the same line, where that hit something farther."""
+    # Sort by line, then by angle: lines are whole numbers and angles span less than 10
     order = (line.double() * 10 + angle_rad).argsort()
     line, angle_rad, sorted_m = line[order], angle_rad[order], range_m[order]
+    # Neighbours in the order are neighbours in angle if they share the line and are close
     near = (line[1:] == line[:-1]) & ((angle_rad[1:] - angle_rad[:-1]) < max_apart_rad)
     farther_m = sorted_m[1:] - sorted_m[:-1]
     min_jump_m = _JUMP_M + _JUMP_SHARE * torch.minimum(sorted_m[1:], sorted_m[:-1])
+    # The nearer beam comes first: pairs where the second is farther, then pairs where the first is
     forwards = torch.stack([order[:-1], order[1:]], dim=-1)
     return torch.cat(
         [forwards[near & (farther_m > min_jump_m)], forwards.flip(-1)[near & (-farther_m > min_jump_m)]]
@@ -381,6 +420,7 @@ def _pairs_before_farther(
 
 def _static(beams: LidarSweep, sweep: SweepView, tracks: ActorTracks) -> Bool[Tensor, "N"]:
     """Return which beams hit static surfaces."""
+    # Every actor that moves claims the points in its box; all others count as static
     states = states_at(tracks, sweep.t_s)
     moving = states.present & (states.velocity_mps.norm(dim=-1) > _MAX_STATIC_MPS)
     points_scene = transform_points(sweep.T_scene_ego, beams.points_ego)

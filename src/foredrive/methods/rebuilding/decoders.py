@@ -53,10 +53,12 @@ class CameraDecoder(nn.Module):
 
     def __init__(self, features: int, cameras: int, config: CameraDecoderConfig, appearance: int = 8) -> None:
         """Create a decoder for `features` features besides albedo."""
+        # One learned code per camera takes up its exposure and white balance
         super().__init__()
         self.appearance = nn.Parameter(0.1 * torch.randn(cameras, appearance))
         channels, width = features + appearance + 3, config.width
         last = nn.Conv2d(width, 2 * ALBEDO, 1)
+        # A small last layer makes gain and offset nearly 0 at the start
         with torch.no_grad():
             last.weight *= _LAST_LAYER_GAIN
             last.bias.zero_()  # type: ignore[union-attr]
@@ -79,6 +81,7 @@ class CameraDecoder(nn.Module):
             direction: unit viewing direction in the scene's frame.
             camera: index in the rig.
         """
+        # The batch of one image is in channel-first order
         albedo = feature[..., :ALBEDO].permute(2, 0, 1)
         appearance = self.appearance[camera].expand(*feature.shape[:2], -1)
         seen = torch.cat([feature[..., ALBEDO:], appearance, direction], dim=-1)
@@ -104,6 +107,7 @@ class LidarDecoder(nn.Module):
         self.appearance = nn.Parameter(0.1 * torch.randn(appearance))
         last = nn.Linear(width, 2)
         with torch.no_grad():
+            # The initial bias holds for all beams: faint, and likely to return
             last.bias.add_(torch.tensor([_FAINT, _SENT_BACK]))
         self.net = nn.Sequential(
             nn.Linear(features + appearance + 3, width),
@@ -128,5 +132,6 @@ class LidarDecoder(nn.Module):
         intensity, sent_back = self.net(seen).unbind(-1)
         if not self.drop_from_alpha:
             return intensity.sigmoid(), -sent_back
+        # The bound keeps the logit finite
         returns = (alpha * sent_back.sigmoid()).clamp(_LEAST_CHANCE, 1 - _LEAST_CHANCE)
         return intensity.sigmoid(), -returns.logit()

@@ -128,6 +128,7 @@ def apply_edits(
     T_ego_shifted = torch.eye(4).to(graph.tracks.T_scene_actor)
     for edit in edits:
         if isinstance(edit, ShiftEgo):
+            # Offsets accumulate from the left: each is in the frame that the earlier ones give
             T_ego_shifted = T_ego_shifted @ _offset(edit.offset_m, edit.yaw_rad).to(T_ego_shifted)
         elif isinstance(edit, Remove):
             graph = _without(graph, graph.actor_row(edit.actor))
@@ -154,6 +155,7 @@ def move_between(
     actor: int, T_scene_before: Float[Tensor, "4 4"], T_scene_after: Float[Tensor, "4 4"]
 ) -> Move:
     """Return the edit that moves an actor between two poses of the same time. Only its yaw turns."""
+    # The change in the actor's frame before the move
     change = (inverse_se3(T_scene_before) @ T_scene_after).tolist()
     forward_m, left_m, up_m = (row[3] for row in change[:3])
     return Move(actor, (forward_m, left_m, up_m), math.atan2(change[1][0], change[0][0]))
@@ -171,6 +173,7 @@ def save_edits(edits: Sequence[Edit], path: Path) -> None:
         InputError: the file exists and is not a list of edits; it is not overwritten.
     """
     if path.exists():
+        # Reading the file first refuses to overwrite something that is not a list of edits
         load_edits(path)
     with atomic_path(path) as temporary:
         temporary.write_text(json.dumps([dataclasses.asdict(edit) for edit in edits], indent=1) + "\n")
@@ -203,6 +206,7 @@ def _offset(offset_m: Offset, yaw_rad: float) -> Float[Tensor, "4 4"]:
 
 def _moved(tracks: ActorTracks, row: int, offset_m: Offset, yaw_rad: float) -> ActorTracks:
     poses = tracks.T_scene_actor.clone()
+    # Multiplied from the right: the offset is in the actor's own axes
     poses[row] = poses[row] @ _offset(offset_m, yaw_rad).to(poses)
     return dataclasses.replace(tracks, T_scene_actor=poses)
 
@@ -230,6 +234,7 @@ def _with_copy(
         content = graph.content.with_copy(source.content, row, len(tracks))
     except InputError as error:
         raise InputError(f"actor {actor} cannot be copied here: {error}") from error
+    # Boxes are posed by their centre: half the difference of the heights keeps the copy on the ground
     lift_m = 0.5 * float(source.tracks.size_lwh[row, 2] - tracks.size_lwh[way, 2])
     forward_m, left_m, up_m = offset_m
     pose = tracks.T_scene_actor[way] @ _offset((forward_m, left_m, up_m + lift_m), yaw_rad).to(
@@ -242,6 +247,7 @@ def _with_copy(
             category=torch.cat([tracks.category, source.tracks.category[row : row + 1]]),
             size_lwh=torch.cat([tracks.size_lwh, source.tracks.size_lwh[row : row + 1]]),
             t_s=tracks.t_s,
+            # The copy follows the path at the times when the followed actor is present
             T_scene_actor=torch.cat([tracks.T_scene_actor, pose[None]]),
             present=torch.cat([tracks.present, tracks.present[way : way + 1]]),
         ),
@@ -253,6 +259,7 @@ def _with_sent(graph: SceneGraph, edit: DriveStraight) -> SceneGraph:
     """Add a copy of an actor on a straight path."""
     graph = _with_copy(graph, graph, edit.actor, edit.actor, edit.copy, (0.0, 0.0, 0.0), 0.0)
     tracks, row = graph.tracks, len(graph.tracks) - 1
+    # The straight path passes `at_m` at `at_s` and holds at all times of the scene
     since_s = (tracks.t_s - edit.at_s)[:, None]
     way = tracks.t_s.new_tensor(edit.at_m) + since_s * tracks.t_s.new_tensor(edit.velocity_mps)
     poses, present = tracks.T_scene_actor.clone(), tracks.present.clone()

@@ -45,6 +45,7 @@ def evaluate_cameras(
     scores: dict[str, list[float]] = defaultdict(list)
     graph, took_s, pixels = graph or scene.graph, 0.0, 0
     for number, view in enumerate(views):
+        # The time covers rendering and the copy to the CPU, which waits for the device
         started = time.perf_counter()
         rgb = scene.camera(graph, view.to(scene.device)).rgb.clamp(0, 1)[None].cpu()
         took_s += time.perf_counter() - started
@@ -52,6 +53,7 @@ def evaluate_cameras(
         real = _image(view)
         known = torch.ones_like(real[:, 0], dtype=torch.bool) if where is None else where[number][None]
         same_camera = [other for other in learned if other.sensor == view.sensor]
+        # Baseline: the learned image of the same camera nearest in time
         shown = {"": rgb}
         if same_camera:
             shown["nearest."] = _image(min(same_camera, key=lambda other: abs(other.t_s - view.t_s)))
@@ -59,6 +61,7 @@ def evaluate_cameras(
             figures = {"psnr_db": psnr_db(image, real, known), "ssim": ssim(image, real, known)}
             for name, value in figures.items():
                 scores[prefix + name].append(float(value))
+                # Speed of the camera over ground
                 if float(view.twist_cam[:3].norm()) > MOVING_MPS:
                     scores[f"moving.{prefix}{name}"].append(float(value))
     return {name: fmean(values) for name, values in scores.items()} | {
@@ -106,6 +109,7 @@ def evaluate_sweeps(
             score_sweep(
                 range_m=seen.hit_range_m.cpu()[some],
                 intensity=seen.intensity.cpu()[some],
+                # A beam is lost if the scene says so, and `drop` asks for it
                 dropped=~seen.returned.cpu()[some] & drop,
                 real_range_m=beams.range_m,
                 real_intensity=beams.intensity,

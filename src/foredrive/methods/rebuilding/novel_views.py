@@ -13,7 +13,7 @@ from foredrive.sensors import SpinningLidar
 
 
 def novel_camera_view(rig: CameraRig, camera: int, ego: EgoState, sensor: int | None = None) -> CameraView:
-    """Return a camera whose middle row is exposed at a given ego.
+    """Return a camera whose middle row is exposed at a given state of the ego vehicle.
 
     For the view recorded at a frame, use `vehicle.at(t_s + rig.exposed_dt_s[camera])`.
 
@@ -38,8 +38,9 @@ def novel_camera_view(rig: CameraRig, camera: int, ego: EgoState, sensor: int | 
 
 
 def novel_sweep_view(lidar: SpinningLidar, ego: EgoState) -> SweepView:
-    """Return all beams of the revolution that ends at a ego, without ranges."""
+    """Return all beams of the revolution that ends at a state of the ego vehicle, without ranges."""
     twist = ego.twist_ego.cpu()
+    # Beams of one revolution, each from where the lidar is at its time
     rays = lidar.beams(twist)
     zero = torch.zeros_like(rays.dt_s)
     beams = LidarSweep(
@@ -52,6 +53,7 @@ def novel_sweep_view(lidar: SpinningLidar, ego: EgoState) -> SweepView:
         beam=lidar.channel,
         valid=torch.ones_like(zero, dtype=torch.bool),
     )
+    # The sweep is complete in that it holds lost beams too, here all beams
     return SweepView(beams, True, ego.T_scene_ego.cpu(), twist, ego.t_s)
 
 

@@ -41,7 +41,7 @@ class RebuiltScene(nn.Module, ABC):
     Args:
         tracks: actors.
         cameras: number of cameras in the rig.
-        reach_m: nothing beyond stops a beam.
+        reach_m: range beyond which nothing stops a beam, m.
         frames: number of training images and sweeps, in this order, with velocities of their own.
         frame_velocities: learn corrections of the velocity and turn rate of each training image and sweep.
     """
@@ -63,6 +63,7 @@ class RebuiltScene(nn.Module, ABC):
         for name in PER_TRACK:
             self.register_buffer(name, getattr(tracks, name))
         self.register_buffer("key_t_s", tracks.t_s)
+        # No obstacles at first: buffers of length 0, which are not saved
         self.keep_obstacles(tracks.only(torch.zeros_like(tracks.present[:, 0])))
         self.actor_offset = nn.Parameter(torch.zeros(*tracks.present.shape, 6))
         """Offsets of key poses, in the actors' own axes: m, rad."""
@@ -74,6 +75,7 @@ class RebuiltScene(nn.Module, ABC):
         """Delay of each camera's exposure with respect to its logged time, s."""
         self.frame_velocity = self.frame_turn = None
         if frame_velocities:
+            # Small random values instead of zeros at the start
             self.frame_velocity = nn.Parameter(_FIRST_VELOCITY_MPS * (2 * torch.rand(frames, 3) - 1))
             self.frame_turn = nn.Parameter(_FIRST_TURN_RADPS * (2 * torch.rand(frames, 3) - 1))
 
@@ -138,11 +140,13 @@ class RebuiltScene(nn.Module, ABC):
     def keep_obstacles(self, tracks: ActorTracks) -> None:
         """Take over the tracks of what belongs to the static part. Nothing of it is learned."""
         for name in PER_TRACK:
+            # Empty buffers are not saved, so weights without obstacles have no such entries
             self.register_buffer(OBSTACLE + name, getattr(tracks, name), persistent=len(tracks) > 0)
 
     def restore_obstacles(self, file: Path) -> None:
         """Take over the obstacles in saved weights, which are to be loaded afterwards."""
         with safe_open(file, "pt") as saved:
+            # Weights load only into buffers of their own sizes
             names = [OBSTACLE + name for name in PER_TRACK if OBSTACLE + name in saved.keys()]  # noqa: SIM118
             if names:
                 entries = {name: saved.get_tensor(name) for name in (*names, "key_t_s")}
@@ -174,6 +178,7 @@ class RebuiltScene(nn.Module, ABC):
         late_s, twist = self.camera_late_s[view.sensor], view.twist_cam + self.camera_twist[view.sensor]
         if frame is not None:
             twist = twist + self.frame_twist(frame)
+        # First the mount's offset, then the motion during the delay, both in the camera's own axes
         T_scene_cam = view.T_scene_cam @ exp_se3(self.camera_offset[view.sensor]) @ exp_se3(late_s * twist)
         return SensorMotion(T_scene_cam, twist, view.t_s + late_s)
 

@@ -28,6 +28,7 @@ class RenderedSweep:
     """A rendered sweep, beam by beam."""
 
     range_m: Float[Tensor, "P"]
+    # Lost beams have range 0
     """Expected range of the stopped light, m."""
     median_range_m: Float[Tensor, "P"]
     """Median range, m; infinite where less than half of the light was stopped. Without gradient."""

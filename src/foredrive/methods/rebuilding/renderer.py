@@ -28,6 +28,7 @@ class RebuiltRenderer:
     @property
     def rig(self) -> CameraRig:
         """The log's cameras at their mounts."""
+        # Without exposure offsets, every camera is exposed at the given time
         return dataclasses.replace(self.vehicle.rig, exposed_dt_s=None)
 
     @torch.no_grad()
@@ -35,6 +36,7 @@ class RebuiltRenderer:
         self, T_world_ego: Float64[Tensor, "4 4"], twist_ego: Float[Tensor, "6"], t_s: float
     ) -> Rendered:
         """Render the cameras exposed at a time of the log and the lidar revolution that ends then."""
+        # The scene's frame is near the drive, so 32 bits are enough for its coordinates
         T_scene_ego = (inverse_se3(self.vehicle.T_world_scene) @ T_world_ego).float()
         ego = EgoState(T_scene_ego, twist_ego, t_s)
         device, rig = self.scene.device, self.rig

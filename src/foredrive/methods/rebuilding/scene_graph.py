@@ -1,7 +1,7 @@
 """A scene graph: the tracks of actors, what the static part and each actor look like, and obstacles.
 
-What they look like is the matter of a representation: `rendering.gaussians` keeps Gaussians. Everything else
-(edits, threats, films, drives, evaluation) knows `Content` alone.
+A representation stores what they look like: `rendering.gaussians` keeps Gaussians. Everything else (edits,
+threats, films, drives, evaluation) uses only `Content`.
 """
 
 from dataclasses import dataclass

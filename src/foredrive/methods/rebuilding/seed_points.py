@@ -55,19 +55,24 @@ def lidar_points(
         returned = sweep.beams[sweep.beams.returned]
         xyz = transform_points(sweep.T_scene_ego, returned.points_ego)
         states = states_at(tracks, sweep.t_s)
+        # Actor of each point at the time of its beam; STATIC (-1) selects the appended velocity of zero
         owner = actor_rows(xyz, returned.dt_s, states, tracks)
         velocity = torch.cat([states.velocity_mps, torch.zeros(1, 3)])[owner]
         points = SeedPoints(
             xyz,
             torch.full_like(xyz, GREY),
             torch.zeros(len(xyz), dtype=torch.bool),
+            # The beam's width grows with range and bounds the size of its Gaussian
             BEAM_WIDTH_RAD * returned.range_m,
         )
         for view in _nearest_views(cameras, exposed_s, sweep.t_s):
+            # Move points of actors from the time of their beam to the time of the image
             at_exposure = xyz + velocity * (view.t_s - sweep.t_s - returned.dt_s)[:, None]
             inside, colour = _colours(at_exposure, view)
+            # Where several images show a point, the one farthest in time sets its colour
             points.rgb[inside], points.seen[inside] = colour, True
         standing.append(points[owner == STATIC])
+        # Points of actors at the time of the sweep, to express them in the box at that time
         at_sweep = xyz - velocity * returned.dt_s[:, None]
         for row in owner[owner != STATIC].unique().tolist():
             T_actor_scene, mine = inverse_se3(states.T_scene_actor[row]), owner == row
@@ -100,24 +105,32 @@ def points_along_pixels(
     """
     parts = [empty_points()]
     moments_s = torch.tensor([sweep.t_s for sweep in sweeps])
+    # Every image gets nearly the same number of pixels; the shares add up to `count`
     for view, share in zip(cameras, _shares(count, len(cameras)), strict=True):
         uv, direction = _random_pixels(view, share, generator)
         sweep = sweeps[int((moments_s - view.t_s).abs().argmin())]
         beams = sweep.beams[sweep.beams.returned]
         xyz = transform_points(sweep.T_scene_ego, beams.points_ego)
+        # Only points of the static part give ranges: actors have their own points
         standing = actor_rows(xyz, beams.dt_s, states_at(tracks, sweep.t_s), tracks) == STATIC
         T_cam_scene = inverse_se3(view.T_scene_cam)
         uv_beam, _, inside = project(transform_points(T_cam_scene, xyz), view.K, view.dist, view.size_hw)
+        # Ranges for pixels without a beam near: uniform in inverse range, as disparity is
         away_m = even_in_inverse(share, far_m, generator)
         if not bool(inside.any()):
             range_m, kept = away_m, torch.ones(share, dtype=torch.bool)
         else:
+            # Nearest projected beam of each pixel in the image
             apart_px, index = cKDTree(uv_beam[inside].numpy()).query(uv.numpy())
             nearest = torch.from_numpy(np.asarray(index))
             beside = torch.from_numpy(np.asarray(apart_px)) < NEAR_IN_IMAGE * view.size_hw[0]
             met = beside | (direction[:, 2] < 0)  # the ground just in front of the vehicle is below all beams
+            # Range from the camera, not from the lidar
             beam_m = (xyz[inside] - view.T_scene_cam[:3, 3]).norm(dim=-1)[nearest]
+            # Pixels at an actor's beam are dropped; pixels without a near
+            # beam are kept at their random range
             range_m, kept = torch.where(met, beam_m, away_m), standing[inside][nearest] | ~met
+        # All pixels drawn for this camera over its images: together they cover the scene
         drawn = count * sum(other.sensor == view.sensor for other in cameras) / len(cameras)
         scale_m = scale * range_m * _pixels_apart_rad(view, drawn)
         parts.append(_at(view, uv, direction, range_m, scale_m)[kept])
@@ -149,6 +162,7 @@ def subsample_static(
     Beams hit near surfaces over and over. Where no camera looks, one point is enough per cube. The side of a
     cube is about `UNSEEN_RAD` times the smallest range from which the place was measured.
     """
+    # A random order, so that a cut at the end takes points evenly
     order = torch.randperm(len(points.seen), generator=generator)
     seen, unseen = order[points.seen[order]][:most], order[~points.seen[order]]
     return points[torch.cat([seen, unseen[_one_a_cube(points[unseen])][:most_unseen]])]
@@ -156,13 +170,18 @@ def subsample_static(
 
 def _one_a_cube(points: SeedPoints) -> Int[Tensor, "K"]:
     """Return the index of the first point of each cube, in order."""
+    # `scale_m` is the beam's width, proportional to range: it gives the range back
     xyz_m, range_m = points.xyz_m.double().numpy(), points.scale_m.double().numpy() / BEAM_WIDTH_RAD
     _, block = np.unique(np.floor(xyz_m / UNSEEN_M[1]), axis=0, return_inverse=True)
+    # Smallest range from which each block of 1 m was measured
     closest_m = np.full(block.max(initial=-1) + 1, np.inf)
     np.minimum.at(closest_m, block, range_m)
+    # Halve the block until its side is at most UNSEEN_RAD times that range, within the bounds
     halvings = np.ceil(np.log2(UNSEEN_M[1] / (UNSEEN_RAD * closest_m).clip(*UNSEEN_M)))
     side_m = (UNSEEN_M[1] / 2**halvings)[block]
+    # Side and index together name a cube, so cubes of different blocks do not mix
     cubes = np.column_stack([np.floor(xyz_m / side_m[:, None]), side_m])
+    # The index of the first point of each cube; sorting keeps the random order of the caller
     return torch.from_numpy(np.sort(np.unique(cubes, axis=0, return_index=True)[1]))
 
 
@@ -170,6 +189,7 @@ def subsample(points: SeedPoints, most: int, generator: torch.Generator) -> Seed
     """Choose at most `most` points, `SEEN_SHARE` of them seen by a camera if there are enough."""
     order = torch.randperm(len(points.seen), generator=generator)
     seen, unseen = order[points.seen[order]], order[~points.seen[order]]
+    # If unseen points are too few for their share, seen ones fill it
     of_seen = max(round(SEEN_SHARE * most), most - len(unseen))
     picked = torch.cat([seen[:of_seen], unseen[: most - min(of_seen, len(seen))]])
     return points[picked]
@@ -193,6 +213,7 @@ def neighbour_distance_m(xyz_m: Float[Tensor, "N 3"]) -> Float[Tensor, "N"]:
     if len(xyz_m) <= _NEIGHBOURS:
         return torch.full((len(xyz_m),), 0.1)
     points = xyz_m.numpy()
+    # The nearest neighbour of each point is the point itself, hence one more and column 0 left out
     distance, _ = cKDTree(points).query(points, k=_NEIGHBOURS + 1)
     return torch.from_numpy(np.asarray(distance, dtype=np.float32)[:, 1:].mean(-1))
 
@@ -215,8 +236,11 @@ def actor_rows(
     owner = torch.full((len(xyz),), STATIC)
     for row in states.present.nonzero()[:, 0].tolist():
         T, half_m = states.T_scene_actor[row], 0.5 * tracks.size_lwh[row] + _BOX_MARGIN_M
+        # Half diagonal of the box, plus its motion over a tenth of a second, the time of a revolution
         reach_m = half_m.norm() + states.velocity_mps[row].norm() * 0.1
+        # A cheap test first: the box test below runs on few points only
         near = ((xyz - T[:3, 3]).abs() < reach_m).all(-1).nonzero()[:, 0]
+        # Move the points to the time of the sweep, at which the box is posed
         at_sweep = xyz[near] - states.velocity_mps[row] * dt_s[near, None]
         inside = (transform_points(inverse_se3(T), at_sweep).abs() <= half_m).all(-1)
         owner[near[inside]] = row
@@ -225,6 +249,7 @@ def actor_rows(
 
 def _nearest_views(cameras: list[CameraView], exposed_s: Float[Tensor, "V"], t_s: float) -> list[CameraView]:
     """Return the view of each camera that is nearest in time."""
+    # Views in order of time distance: the first of each sensor is its nearest
     order = (exposed_s - t_s).abs().argsort(stable=True).tolist()
     nearest: dict[int, CameraView] = {}
     for index in order:
@@ -245,6 +270,7 @@ def _colours(xyz: Float[Tensor, "N 3"], view: CameraView) -> tuple[Bool[Tensor, 
 def _pixels_apart_rad(view: CameraView, drawn: int | float) -> float:
     """Return the mean angular spacing (rad) of `drawn` random pixels of an image."""
     height, width = view.size_hw
+    # Square root of the image area per drawn pixel, divided by the focal length
     return (height * width / max(drawn, 1.0)) ** 0.5 / float(view.K[0, 0])
 
 
@@ -265,6 +291,7 @@ def even_in_inverse(
     count: int, range_m: tuple[float, float], generator: torch.Generator
 ) -> Float[Tensor, "N"]:
     """Return random ranges between two bounds, uniform in 1/m."""
+    # 1/range is drawn uniformly between the inverse bounds
     near, far = 1 / range_m[0], 1 / range_m[1]
     return 1 / (torch.rand(count, generator=generator) * (near - far) + far)
 

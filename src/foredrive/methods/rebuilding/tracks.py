@@ -31,7 +31,7 @@ PER_TRACK = ("track_id", "category", "size_lwh", "T_scene_actor", "present")
 NONRIGID_CATEGORIES = (Category.PEDESTRIAN, Category.ANIMAL)
 """Categories that change their shape while they move."""
 MOVES_M = 0.5
-"""Standard deviation of the position of what moves, m: that of NeuRAD's reference implementation."""
+"""Least standard deviation of the position of a moving object, m, as in NeuRAD's reference implementation."""
 MAX_HOLD_S = 0.5
 """Time before and after its key time for which an actor with a single key time is present, s."""
 
@@ -77,6 +77,7 @@ class ActorTracks(Record):
 
     def moved(self, offset: Float[Tensor, "A K 6"]) -> "ActorTracks":
         """Return tracks with every key pose changed in the actor's frame by exp(offset): m, then rad."""
+        # Multiplied from the right: offsets are in the actor's own axes
         return dataclasses.replace(self, T_scene_actor=self.T_scene_actor @ exp_se3(offset))
 
 
@@ -102,10 +103,12 @@ def states_at(tracks: ActorTracks, t_s: float | Tensor) -> ActorStates:
     now_s = float(t_s.detach()) if isinstance(t_s, Tensor) else t_s
     T, velocity_mps, turn_radps = poses_at(tracks.t_s, tracks.T_scene_actor, t_s)
     if len(tracks.t_s) == 1:
+        # There is no motion to continue from a single key time, so the time alone decides
         present = tracks.present[:, 0] & (abs(float(tracks.t_s[0]) - now_s) <= MAX_HOLD_S)
     else:
         after = _key_after(tracks.t_s, now_s)
         step_s = float(tracks.t_s[after] - tracks.t_s[after - 1])
+        # At most one step before the first or after the last key time
         near = -1.0 <= (now_s - float(tracks.t_s[after - 1])) / step_s <= 2.0
         present = tracks.present[:, after - 1] & tracks.present[:, after] & near
     return ActorStates(T, velocity_mps, turn_radps, present)
@@ -125,17 +128,22 @@ def poses_at(
         return T[:, 0], still, still
     after = _key_after(key_t_s, float(t_s.detach()) if isinstance(t_s, Tensor) else t_s)
     step_s = float(key_t_s[after] - key_t_s[after - 1])
+    # Share of the step that has passed; below 0 or above 1 outside of the key times
     share = (t_s - float(key_t_s[after - 1])) / step_s
     T0, T1 = T[:, after - 1], T[:, after]
     turn = log_so3(T0[:, :3, :3].transpose(-1, -2) @ T1[:, :3, :3])  # in the actor's own axes
+    # Rotate by a share of the turn, about the axis from the first to the second pose
     now = T0 @ exp_se3(torch.cat([torch.zeros_like(turn), share * turn], dim=-1))
+    # The translation column is interpolated apart from the rotation, in the scene's axes
     now = torch.cat([now[..., :3], now[..., 3:] + share * (T1 - T0)[..., 3:]], dim=-1)
     way = T1[:, :3, 3] - T0[:, :3, 3]
+    # The turn is in the actor's own axes: rotate it to the axes of the frame
     return now, way / step_s, (T0[:, :3, :3] @ turn[..., None])[..., 0] / step_s
 
 
 def _key_after(key_t_s: Float[Tensor, "K"], now_s: float) -> int:
     """Return the index of the later of the two key times around, or nearest to, a time."""
+    # searchsorted gives the first key time that is not before now; the ends use their only interval
     after = int(torch.searchsorted(key_t_s.contiguous(), now_s))
     return min(max(after, 1), len(key_t_s) - 1)
 
@@ -170,14 +178,18 @@ def joined_tracks(tracks: ActorTracks, others: ActorTracks) -> ActorTracks:
 def move_at_least(tracks: ActorTracks, std_m: float) -> Bool[Tensor, "A"]:
     """Return which tracks move: in some direction the standard deviation of their position is greater.
 
-    NeuRAD's reference implementation finds the moving objects of nuScenes so, along the axes of the map. It
-    takes PandaSet's own marks of what stands; the cuboids that are marked keep their place exactly.
+    NeuRAD's reference implementation finds the moving objects of nuScenes in this way, along the axes of the
+    map. For PandaSet it uses the dataset's own marks of standing objects; cuboids with that mark keep their
+    place exactly.
     """
+    # Absent frames are zeros and count nothing
     present = tracks.present[..., None]
     xy_m = tracks.T_scene_actor[..., :2, 3].detach().double() * present
     count = present.sum(1)
+    # Deviations from the mean position; masked again, since the mean was subtracted from absent frames too
     spread_m = (xy_m - (xy_m.sum(1) / count.clamp_min(1))[:, None]) * present
     covariance = spread_m.mT @ spread_m / (count - 1).clamp_min(1)[..., None]
+    # The largest eigenvalue is the variance along the direction of most motion
     return torch.linalg.eigvalsh(covariance)[:, -1] > std_m**2
 
 
@@ -205,6 +217,7 @@ def read_tracks(clip: Clip, T_world_scene: Float64[Tensor, "4 4"]) -> ActorTrack
     """
     boxes = clip.boxes
     T_scene_ego = (inverse_se3(T_world_scene) @ clip.T_world_ego).float()
+    # Boxes turn about the z axis of the ego frame of their time
     T_scene_box = T_scene_ego[:, None] @ matrix_from_yaw(boxes.yaw, boxes.centre)
     seen = boxes.valid & clip.boxes_valid[:, None]
     ids = boxes.track_id[seen].unique()
@@ -213,8 +226,10 @@ def read_tracks(clip: Clip, T_world_scene: Float64[Tensor, "4 4"]) -> ActorTrack
     present = torch.zeros(len(ids), frames, dtype=torch.bool)
     size, category = torch.zeros(len(ids), 3), torch.zeros(len(ids), dtype=torch.int64)
     for a, track_id in enumerate(ids):
+        # Frames and slots of this track; a track has at most one box per frame
         t, m = (seen & (boxes.track_id == track_id)).nonzero(as_tuple=True)
         poses[a, t], present[a, t] = T_scene_box[t, m], True
+        # Median size and most frequent category over all detections
         size[a] = boxes.size_lwh[t, m].median(0).values
         category[a] = boxes.category[t, m].mode().values
     return _filled(ActorTracks(ids, category, size, clip.t_s, poses, present))
@@ -234,8 +249,10 @@ def _filled(tracks: ActorTracks) -> ActorTracks:
             tracks.T_scene_actor[one, keys],
             tracks.present[one, keys],
         )
+        # From one frame before the first detection to one after the last
         for k in range(max(int(keys[0]) - 1, 0), min(int(keys[-1]) + 2, len(tracks.t_s))):
             if not tracks.present[a, k]:
+                # Interpolated or continued from the detections alone, not from other filled poses
                 poses[a, k] = states_at(sightings, float(tracks.t_s[k])).T_scene_actor[0]
                 present[a, k] = True
     return dataclasses.replace(tracks, T_scene_actor=poses, present=present)

@@ -105,6 +105,7 @@ def rebuild(training: SceneTraining, folder: Path) -> None:
     scene, steps = training.scene, training.steps
     checkpoint, done = latest_checkpoint(folder / CHECKPOINTS), 0
     if checkpoint is not None:
+        # Training may change the number of parameters: the sizes must be right before weights are loaded
         scene.resize(checkpoint / "model.safetensors")
     optimizer = make_optimizer(training)
     if checkpoint is not None:
@@ -116,12 +117,14 @@ def rebuild(training: SceneTraining, folder: Path) -> None:
     with step_counter(folder, scene, optimizer, done, steps, training.checkpoint_every) as end_step:
         for step in range(done, steps):
             before_s = time.process_time()
+            # The rate follows from the step alone, so a resumed run continues it
             for group in optimizer.param_groups:
                 group["lr"] = rates[group["name"]].at(step, steps)
             losses = _one_step(training, optimizer, step)
             losses["computing_s"] = torch.tensor(time.process_time() - before_s)
             if "psnr_db" in losses:
                 now_db = float(losses["psnr_db"])
+                # Exponential mean over images; the first one starts it
                 shown_db = now_db if math.isnan(shown_db) else shown_db + _SMOOTHING * (now_db - shown_db)
             note = "" if math.isnan(shown_db) else f"  PSNR {shown_db:.1f} dB"
             if end_step(losses, scene.described + note):
@@ -145,6 +148,7 @@ def make_optimizer(training: SceneTraining) -> Adam:
 
 
 def _one_step(training: SceneTraining, optimizer: Optimizer, step: int) -> dict[str, Tensor]:
+    # One generator per step, seeded by run and step, makes a resumed run equal to an uninterrupted one
     generator = torch.Generator().manual_seed((training.seed * 1_000_003 + step) * 1009)
     source, losses = training.losses(step, generator)
     descended = {name: value for name, value in losses.items() if name != "psnr_db"}  # may be infinite
@@ -177,11 +181,14 @@ class ViewOrder:
     def at(self, step: int) -> tuple[Literal["image", "sweep"], int]:
         """Return the kind of a step's view, and its index."""
         turn = self.images_per_sweep + 1
+        # The last step of each turn shows a sweep
         if not self.images or (self.sweeps and step % turn == turn - 1):
+            # Number of sweeps, respectively images, shown before this step
             return "sweep", self._shuffled(step // turn if self.images else step, self.sweeps, 1)
         return "image", self._shuffled(step - step // turn if self.sweeps else step, self.images, 0)
 
     def _shuffled(self, number: int, items: int, kind: int) -> int:
+        # Every epoch and kind has an order of its own
         seed = ((self.seed * 1_000_003 + number // items) * 2 + kind) * 7919
         order = torch.randperm(items, generator=torch.Generator().manual_seed(seed))
         return int(order[number % items])

@@ -63,7 +63,7 @@ class LoggedVehicle(Record):
     reach_m: float
     """Range of the lidar, m; infinite without one."""
     other_names: tuple[tuple[str, ...], ...] = ()
-    """Further names of each camera, such as 123D's; empty: none are known."""
+    """Further names of each camera, such as those in 123D; empty if none are known."""
 
     def check_time(self, t_s: float) -> None:
         """Check that a time lies within the drive.
@@ -78,6 +78,7 @@ class LoggedVehicle(Record):
     def at(self, t_s: float) -> EgoState:
         """Return the vehicle at a time. Before its first and after its last pose the motion continues."""
         T, velocity_mps, turn_radps = poses_at(self.t_s, self.T_scene_ego[None], t_s)
+        # Velocities to the vehicle's own axes
         R_ego_scene = T[0, :3, :3].T
         twist = torch.cat([R_ego_scene @ velocity_mps[0], R_ego_scene @ turn_radps[0]])
         return EgoState(T[0], twist, t_s)
@@ -112,17 +113,22 @@ def read_vehicle(
     """
     T_scene_ego = (inverse_se3(T_world_scene) @ drive.T_world_ego).float()
     rig, cameras = drive.rig, len(drive.rig.names)
+    # Without logged delays, images are taken at the time of their frame
     late_s = torch.zeros_like(rig.readout_s) if rig.exposed_dt_s is None else rig.exposed_dt_s
     mounted = torch.eye(4).repeat(cameras, 1, 1)
     dt_s, some = torch.zeros(cameras), [0] * cameras
     for c in range(cameras):
         frames = drive.image_valid[:, c].nonzero()[:, 0].tolist() or [0]
+        # Pose of the vehicle when each image was exposed
         exposed = [
             poses_at(drive.t_s, T_scene_ego[None], float(drive.t_s[f] + late_s[f, c]))[0][0] for f in frames
         ]
         mounted[c] = _mean_pose(
+            # Mount seen from the vehicle at exposure: `T_ego_cam` of a
+            # frame contains the motion until exposure
             inverse_se3(torch.stack(exposed)) @ T_scene_ego[frames] @ rig.T_ego_cam[frames, c]
         )
+        # Intrinsics are those of the first valid frame
         dt_s[c], some[c] = late_s[frames, c].median(), frames[0]
     one = torch.arange(cameras)
     return LoggedVehicle(
@@ -146,6 +152,7 @@ def read_vehicle(
 
 def save_vehicle(vehicle: LoggedVehicle, path: Path) -> None:
     """Write a vehicle as JSON."""
+    # JSON has no infinity
     reach_m = vehicle.reach_m if math.isfinite(vehicle.reach_m) else None
     with atomic_path(path) as temporary:
         temporary.write_text(json.dumps({**_plain(vehicle), "reach_m": reach_m}))
@@ -204,6 +211,7 @@ def _plain(value: Any) -> Any:
 
 def _mean_pose(T: Float[Tensor, "N 4 4"]) -> Float[Tensor, "4 4"]:
     """Return the mean of nearly equal poses. Its rotation is the one nearest to the mean of the matrices."""
+    # The mean of rotations is not a rotation: project it onto the nearest one by SVD
     mean = T.mean(0)
     u, _, vh = torch.linalg.svd(mean[:3, :3])
     mean[:3, :3] = u @ vh

@@ -35,9 +35,11 @@ class CameraView(Record):
     def shrunk(self, factor: int) -> "CameraView":
         """Return the view at a lower resolution, with the image averaged."""
         height, width = self.size_hw
+        # Rows and columns that do not fill a whole block scale with the rest
         size_hw = (max(height // factor, 1), max(width // factor, 1))
         if factor == 1:
             return self
+        # Image coordinates start at the corner of the first pixel, so K scales without an offset
         scale = torch.tensor([size_hw[1] / width, size_hw[0] / height, 1.0]).to(self.K)
         image = self.image
         if image is not None:
@@ -74,6 +76,7 @@ def camera_views(
     views: list[list[CameraView]] = [[] for _ in rig.names]
     for frame, camera in clip.image_valid.nonzero().tolist():
         T_ego_cam = rig.T_ego_cam[frame, camera]
+        # Pose at exposure: the camera's T_ego_cam refers to the ego frame of the key frame
         late_s = 0.0 if rig.exposed_dt_s is None else float(rig.exposed_dt_s[frame, camera])
         views[camera].append(
             CameraView(
@@ -112,9 +115,11 @@ def ego_twists(t_s: Float[Tensor, "T"], T_world_ego: Float64[Tensor, "T 4 4"]) -
     frames = len(t_s)
     if frames == 1:
         return torch.zeros(1, 6)
+    # The first and last frame use one-sided differences
     before = (torch.arange(frames) - 1).clamp_min(0)
     after = (torch.arange(frames) + 1).clamp_max(frames - 1)
     span_s = (t_s[after] - t_s[before]).double()[:, None]
+    # The velocity is expressed in the ego axes of the frame itself
     R_ego_world = T_world_ego[:, :3, :3].transpose(-1, -2)
     way = T_world_ego[after, :3, 3] - T_world_ego[before, :3, 3]
     velocity = (R_ego_world @ way[..., None])[..., 0]

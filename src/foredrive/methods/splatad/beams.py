@@ -47,17 +47,21 @@ def prepared_sweep(view: SweepView, rolling: bool = True) -> PreparedSweep:
     rays = TimedRays(beams.origin_ego, beams.dir_ego, beams.dt_s)
     T_ego_lidar = torch.eye(4).to(beams.origin_ego)
     if len(beams.dt_s):
+        # The mount is where the beam fired nearest to the sweep's time starts: ego motion is zero there
         T_ego_lidar[:3, 3] = beams.origin_ego[beams.dt_s.abs().argmin()]
     twist, middle_s = view.twist_ego, 0.0
     if not rolling:
+        # Simultaneous beams: no motion of the sensor and no times of firing
         twist, rays = torch.zeros_like(twist), dataclasses.replace(rays, dt_s=torch.zeros_like(rays.dt_s))
     elif len(rays.dt_s):
+        # Times relative to the middle of the sweep halve the largest time that motion is extrapolated over
         middle_s = float(rays.dt_s.min() + rays.dt_s.max()) / 2
     tiles = tiled_lidar_beams(rays, T_ego_lidar, twist, middle_s)
     return PreparedSweep(
         tiles=tiles,
         scan_s=scan_times(tiles) if bool(tiles.time_s.any()) else None,
         dir_scene=rotate_vectors(view.T_scene_ego, beams.dir_ego),
+        # Pose of the lidar at the middle: ego pose of the sweep, moved on by its own motion, then the mount
         T_scene_lidar=view.T_scene_ego @ exp_se3(middle_s * twist) @ T_ego_lidar,
         twist_lidar=sensor_twist(T_ego_lidar, view.twist_ego),
         middle_s=middle_s,
@@ -82,6 +86,7 @@ def tiled_lidar_beams(
             splats is the pose at that time.
     """
     T_then_ego = exp_se3(-rays.dt_s[:, None] * twist_ego)  # ego at reference time -> ego at firing time
+    # Row vectors times the matrix rotate to the lidar's axes (the inverse of lidar -> ego)
     fired = rotate_vectors(T_then_ego, rays.dir_ego[:, None])[:, 0] @ T_ego_lidar[:3, :3]
     azimuth = torch.atan2(fired[:, 1], fired[:, 0])
     elevation = torch.atan2(fired[:, 2], fired[:, :2].norm(dim=-1))
@@ -90,6 +95,7 @@ def tiled_lidar_beams(
 
 def scan_times(points: TiledPoints) -> Float[Tensor, "S"]:
     """Return the mean firing time of the beams in each of `SECTORS` sectors of azimuth, s; 0 without."""
+    # Index -1 marks empty places of the tiles
     hits = points.index >= 0
     sector, time_s = sector_of(points.position[..., 0][hits]), points.time_s[hits]
     total = time_s.new_zeros(SECTORS).index_add(0, sector, time_s)
@@ -98,5 +104,6 @@ def scan_times(points: TiledPoints) -> Float[Tensor, "S"]:
 
 def sector_of(azimuth_rad: Float[Tensor, "*n"]) -> Int[Tensor, "*n"]:
     """Return the index of the sector that contains an azimuth; the first one begins at -π."""
+    # Turns since -π; the fraction wraps azimuths outside of ±π
     turns = azimuth_rad / (2 * math.pi) + 0.5
     return ((turns - turns.floor()) * SECTORS).long().clamp(max=SECTORS - 1)

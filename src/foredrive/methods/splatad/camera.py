@@ -54,10 +54,12 @@ def project_camera(
         x, y, z = position
         seen = z > near_m
         for across, low, high in ((x, lower[0], upper[0]), (y, lower[1], upper[1])):
+            # Signed distance to the left and right (top and bottom) plane of the view, inside positive
             seen &= (across - low * z) / (1 + low * low).sqrt() > -reach_m
             seen &= (high * z - across) / (1 + high * high).sqrt() > -reach_m
         chosen = seen.nonzero()[:, 0]
     them = in_sensor(gaussians, position, chosen, T_cam_scene, velocity_mps, twist_cam)
+    # Linear images of the covariances at the centres: Σ' = J M (J M)ᵀ + ε I
     uv, jacobian = _project(them.position_m, K, dist, lower, upper)
     spread = footprint(through(jacobian, them.factor_m), SPREAD_PX2)
     return Splats(
@@ -66,6 +68,7 @@ def project_camera(
         opacity=them.opacity * spread.compensation if compensate else them.opacity,
         range_m=them.position_m[2],
         range_slope=torch.zeros_like(uv),
+        # Velocity on the image (px/s) and along the axis, for rolling shutter
         velocity=(jacobian * them.velocity_mps).sum(1).T,
         range_rate_mps=them.velocity_mps[2],
         feature=them.feature,
@@ -77,6 +80,7 @@ def _limits(
 ) -> tuple[Float[Tensor, "2"], Float[Tensor, "2"]]:
     """Return bounds of x/z and y/z for the image with its margin."""
     height, width = size_hw
+    # The borders' corners and middles bound x/z and y/z, also for a bent image
     border = [(u, v) for u in (0.0, width / 2, width) for v in (0.0, height / 2, height)]
     rays = pixels_to_rays(K.new_tensor(border), K, dist)
     xy = rays[:, :2] / rays[:, 2:]
@@ -94,9 +98,11 @@ def _project(
 ) -> tuple[Float[Tensor, "N 2"], Float[Tensor, "2 3 N"]]:
     """Return pixels of points and the Jacobian with respect to the points, px/m."""
     near = 1 / position_m[2]
+    # Normalised coordinates x/z, y/z, and the same clamped to the image with its margin
     xy = (position_m[:2] * near).T
     within = torch.minimum(torch.maximum(xy, lower), upper)
     if dist.any():
+        # Outside of the margin, the distortion is continued linearly: the polynomial may fold back there
         xx, xy_, yy = distortion_jacobian(within, dist).unbind(-1)
         dx, dy = (xy - within).unbind(-1)
         bent = distort(within, dist) + torch.stack([xx * dx + xy_ * dy, xy_ * dx + yy * dy], -1)
@@ -104,6 +110,7 @@ def _project(
         xx, xy_, yy = torch.ones_like(near), torch.zeros_like(near), torch.ones_like(near)
         bent = xy
     (fx, fy), centre = (K[0, 0], K[1, 1]), K[:2, 2]
+    # Chain rule: distortion Jacobian times that of (x/z, y/z), where -x/z² is -x·near in these units
     x, y = within.unbind(-1)
     across = torch.stack([fx * xx, fx * xy_, -fx * (xx * x + xy_ * y)])
     down = torch.stack([fy * xy_, fy * yy, -fy * (xy_ * x + yy * y)])

@@ -38,6 +38,7 @@ class GaussianContent(Record):
         """Return the content without the Gaussians of an actor."""
         kept = self.actor != row
         actor = self.actor[kept]
+        # Rows behind the removed actor move up by one
         return GaussianContent(self.gaussians[kept], actor - (actor > row).to(actor))
 
     def with_copy(self, source: Content, source_row: int, row: int) -> "GaussianContent":
@@ -48,6 +49,7 @@ class GaussianContent(Record):
         """
         if not isinstance(source, GaussianContent):
             raise InputError("an actor that is not made of Gaussians does not fit into a scene of Gaussians")
+        # Actors have frames of their own, so their Gaussians can be copied as they are
         own = source.preview(source_row).to(self.device)
         features, others = own.feature.shape[1], self.gaussians.feature.shape[1]
         if features != others:

@@ -52,6 +52,7 @@ def in_sensor(
     twist_sensor: Float[Tensor, "6"] | None,
 ) -> InSensor:
     """Transform the chosen Gaussians to a sensor's frame. The arguments are those of `project_camera`."""
+    # Gather the visible Gaussians first, so that what follows works on few
     if len(chosen) < len(gaussians.mean_m):
         gaussians = gaussians.map_tensors(lambda tensor: tensor.index_select(0, chosen))
         position_m = position_m.index_select(1, chosen)
@@ -59,6 +60,7 @@ def in_sensor(
     R = T_sensor_scene[:3, :3]
     velocity = torch.zeros_like(position_m) if velocity_mps is None else R @ velocity_mps.T
     if twist_sensor is not None:
+        # Velocity relative to the moving and turning sensor: v - v_s - ω × p
         velocity = velocity - twist_sensor[:3, None] - hat(twist_sensor[3:]) @ position_m
     return InSensor(
         position_m,
@@ -72,6 +74,7 @@ def in_sensor(
 def through(jacobian: Float[Tensor, "K 3 N"], factor: Float[Tensor, "3 3 N"]) -> Float[Tensor, "K 3 N"]:
     """Return J M for every Gaussian."""
     columns = [column.unbind() for column in factor.unbind(1)]
+    # J row (j, k, m) times M column (x, y, z), by fused multiply-add on long vectors
     products = [
         torch.addcmul(torch.addcmul(j * x, k, y), m, z) for j, k, m in jacobian for x, y, z in columns
     ]
@@ -83,8 +86,11 @@ def footprint(spread: Float[Tensor, "2 3 N"], epsilon: float) -> Footprint:
     u, v = spread
     xx, xy, yy = (u * u).sum(0), (u * v).sum(0), (v * v).sum(0)
     (a, b, c), (d, e, f) = u, v
+    # Cauchy-Binet: det U Uᵀ is the sum of the squared 2x2 minors of U
     minors = a * e - b * d, a * f - c * d, b * f - c * e
     area = minors[0].square() + minors[1].square() + minors[2].square()  # det U Uᵀ, without cancellation
+    # det(Σ + ε I) = det Σ + ε tr Σ + ε²
     widened = area + epsilon * (xx + yy) + epsilon * epsilon
+    # Inverse of a symmetric 2x2 matrix
     inverse = torch.stack([yy + epsilon, -xy, xx + epsilon], -1) / widened[:, None]
     return Footprint(inverse, (area / widened).clamp(min=MIN_RATIO).sqrt())

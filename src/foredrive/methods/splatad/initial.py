@@ -53,8 +53,10 @@ def drive_bounds(T_scene_sensor: Float[Tensor, "V 4 4"]) -> DriveBounds:
         T_scene_sensor: poses with x ahead and y to the left.
     """
     padding = [(0.0, 0.0, 0.0), *((x, y, 0.0) for x in (-AHEAD_M, AHEAD_M) for y in (-ASIDE_M, ASIDE_M))]
+    # The padded corners of every pose, in the scene's axes
     corners = torch.stack([transform_points(T, T.new_tensor(padding)) for T in T_scene_sensor])
     centre_m = T_scene_sensor[:, :3, 3].mean(0)
+    # Twice the largest distance from the centre, so that the box is symmetric about it
     size_m = 2 * (corners - centre_m).abs().amax((0, 1))
     size_m[2] = HEIGHT_M
     return DriveBounds(centre_m, size_m)
@@ -72,7 +74,9 @@ def random_points(
         scale: standard deviation in units of the mean distance to the nearest of these points.
     """
     direction = torch.rand(far, 3, generator=generator) - 0.5
+    # Directions of the upper half
     direction[:, 2].abs_()
+    # Far points begin at half the shorter side of the bounds
     range_m = even_in_inverse(far, (0.5 * float(bounds.size_m[:2].min()), FAR_M), generator)
     away_m = torch.nn.functional.normalize(direction, dim=-1) * range_m[:, None]
     beside_m = (torch.rand(near, 3, generator=generator) - 0.5) * bounds.size_m
@@ -158,12 +162,14 @@ def initial_scene(
     standing = colour_from_neighbours(
         subsample_static(standing, size.lidar_points, size.unseen_points, generator)
     )
+    # Inverse ranges are uniform, so far points fill a thin shell as seen from the vehicle
     near, far = (size.near_m, size.far_m), (size.far_from_m, size.far_m)
     along, anywhere = empty_points(), size.near_points
     if sweeps:
         count, scale = size.pixel_points, size.pixel_scale
         along = points_along_pixels(cameras, sweeps, tracks, count, scale, far, generator)
     else:
+        # Without lidar, the same number of points goes to random ranges along pixels
         anywhere += size.lidar_points + size.unseen_points + size.pixel_points
     beside = points_at_random_ranges(cameras, anywhere, size.scale, near, generator)
     parts = [
@@ -173,6 +179,7 @@ def initial_scene(
         _gaussians(beside, size, size.near_opacity if sweeps else size.opacity, generator),
     ]
     if size.random_far_points or size.random_near_points:
+        # Poses with x ahead and y left: those of the vehicle, or cameras turned to these axes
         poses = [view.T_scene_ego for view in sweeps] or [
             view.T_scene_cam @ AHEAD_LEFT_UP for view in cameras
         ]
@@ -180,6 +187,7 @@ def initial_scene(
         around = random_points(bounds, *counts, size.scale, generator)
         parts.append(_gaussians(around, size, size.opacity, generator))
     actor = [torch.full((len(part.opacity_logit),), STATIC) for part in parts]
+    # Points of an actor are in the frame of its box
     for row, points in enumerate(of_actors):
         part = _actor(points, tracks.size_lwh[row], bool(tracks.mirrored[row]), size, generator)
         parts.append(part)
@@ -197,12 +205,14 @@ def _actor(
     """Build an actor from its lidar points (on both sides if symmetric) and random points in its box."""
     points = colour_from_neighbours(subsample(points, size.max_actor_points, generator))
     part = _gaussians(points, size, size.opacity, generator, by_neighbours=True)
+    # Both sides of a symmetric actor share what lidar saw of either
     if both_sides:
         part = joined([part, mirrored(part)])
     missing = max(size.actor_points - len(part.opacity_logit), 0)
     if missing == 0:
         return part
     rgb = points.rgb.mean(0) if len(points.rgb) else torch.full((3,), GREY)
+    # Mean spacing of actor_points random points in the box
     apart_m = float(size_lwh.prod() / size.actor_points) ** (1 / 3)
     inside = SeedPoints(
         (torch.rand(missing, 3, generator=generator) - 0.5) * size_lwh,
@@ -230,6 +240,7 @@ def _gaussians(
     scale_m = points.scale_m
     if by_neighbours:
         apart_m = neighbour_distance_m(points.xyz_m).clamp(_LEAST_SCALE_M, _GREATEST_SCALE_M)
+        # No wider than the beam's bound, nor than half the distance to the neighbours
         scale_m = scale_m.minimum(size.scale * apart_m)
     return Gaussians(
         mean_m=points.xyz_m.float(),
@@ -247,9 +258,11 @@ def _patches(points: SeedPoints, size: InitialGaussians, generator: torch.Genera
         return gaussians
     xyz = points.xyz_m.numpy().astype(np.float64)
     _, near = cKDTree(xyz).query(xyz, k=_PATCH + 1)
+    # Covariance of the nearest points; the first neighbour is the point itself
     spread = xyz[near] - xyz[near].mean(1, keepdims=True)
     variance, axes = np.linalg.eigh(spread.transpose(0, 2, 1) @ spread / (_PATCH + 1))
     axes *= np.sign(np.linalg.det(axes))[:, None, None]  # make it a rotation
+    # The smallest axis keeps a thickness, so that the Gaussian stays visible edge-on
     scale_m = np.sqrt(variance.clip(0)).clip(_FLATTEST_M, 0.5 * _GREATEST_SCALE_M)
     quaternion, log_scale = quaternion_from_matrix(torch.from_numpy(axes)), torch.from_numpy(scale_m).log()
     return dataclasses.replace(gaussians, quaternion=quaternion.float(), log_scale=log_scale.float())

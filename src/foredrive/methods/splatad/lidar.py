@@ -52,17 +52,21 @@ def project_lidar(
         x, y, z = position
         level2 = x * x + y * y
         range2 = level2 + z * z
+        # Within reach, and not straight above or below, where the azimuth has no derivative
         seen = (range2 > NEAR_M**2) & (range2 <= reach_m**2) & (level2 > UPRIGHT**2 * range2)
         chosen = seen.nonzero()[:, 0]
     them = in_sensor(gaussians, position, chosen, T_lidar_scene, velocity_mps, twist_lidar)
+    # Motion of the centre over the angles and the range: tangent at time 0, or a line through two places
     if scan_s is None:
         angles, range_m, jacobian = _project(them.position_m)
         centre = _Centre(angles, range_m, (jacobian * them.velocity_mps).sum(1))
     else:
         twist = them.position_m.new_zeros(6) if twist_lidar is None else twist_lidar
         centre, jacobian = _scanned(them, twist, scan_s)
+    # J M for azimuth, elevation and range; the first two rows give the footprint
     spread = through(jacobian, them.factor_m)
     shape = footprint(spread[:2], SPREAD_RAD2)
+    # Covariance of the range with both angles
     with_azimuth, with_elevation = (spread[:2] * spread[2]).sum(1)
     xx, xy, yy = shape.inverse.unbind(-1)
     return Splats(
@@ -70,6 +74,8 @@ def project_lidar(
         inverse_covariance=shape.inverse,
         opacity=them.opacity * shape.compensation if compensate else them.opacity,
         range_m=centre.range_m,
+        # Slope of the conditional mean of range over the angles:
+        # Σ'_range,angles times the inverse footprint
         range_slope=torch.stack(
             [xx * with_azimuth + xy * with_elevation, xy * with_azimuth + yy * with_elevation], -1
         ),
@@ -100,18 +106,22 @@ def _scanned(
     near Gaussians astray within a turn. The Jacobian takes vectors in the axes of the lidar at time 0.
     """
     with torch.no_grad():
+        # First guess of the scan time from the azimuth at time 0, refined once after moving there
         time_s = scan_s[sector_of(torch.atan2(them.position_m[1], them.position_m[0]))]
         x, y, _ = _moved(them.position_m, them.velocity_mps, twist_lidar, time_s)
         time_s = scan_s[sector_of(torch.atan2(y, x))]
         turn_s = scan_s.max() - scan_s.min()
+        # The same azimuth a turn earlier or later, at the other side of the seam
         other_s = torch.where(time_s > 0, time_s - turn_s, time_s + turn_s)
     here, beyond = (
         _project(_moved(them.position_m, them.velocity_mps, twist_lidar, when_s))
         for when_s in (time_s, other_s)
     )
     azimuth, elevation = (beyond[0] - here[0]).T
+    # Difference of azimuths across ±π
     azimuth = torch.remainder(azimuth + math.pi, 2 * math.pi) - math.pi
     velocity = torch.stack([azimuth, elevation, beyond[1] - here[1]]) / (other_s - time_s)
+    # The line through (time_s, here) at time 0
     centre = _Centre(here[0] - (time_s * velocity[:2]).T, here[1] - time_s * velocity[2], velocity)
     # Until then the axes turn by time · ω, and J (1 - time [ω]×) takes vectors in the axes at time 0.
     turned = torch.linalg.cross(here[2], twist_lidar[None, 3:, None].expand_as(here[2]), dim=1)
@@ -131,6 +141,7 @@ def _moved(
     linear, turn = twist_lidar[:3, None], twist_lidar[3:, None].expand_as(position_m)
     inner = 2 * velocity_mps + linear + torch.linalg.cross(turn, position_m, dim=0)
     change = -torch.linalg.cross(turn, inner, dim=0)
+    # Taylor expansion to second order: p + t v + t²/2 p''
     return position_m + time_s * (velocity_mps + 0.5 * time_s * change)
 
 
@@ -144,6 +155,7 @@ def _project(
     range_m = range2.sqrt()
     zero = torch.zeros_like(x)
     angles = torch.stack([torch.atan2(y, x), torch.atan2(z, level)], -1)
+    # Rows are the gradients of azimuth, elevation and range
     jacobian = [
         torch.stack([-y / level2, x / level2, zero]),
         torch.stack([-x * z / level, -y * z / level, level]) / range2,

@@ -22,12 +22,16 @@ def photometric_loss(
 def _mean_ssim(a: Float[Tensor, "1 3 H W"], b: Float[Tensor, "1 3 H W"]) -> Float[Tensor, ""]:
     """Return structural similarity (Wang et al., 2004) with a separable window, borders mirrored."""
     offset = torch.arange(_SSIM_WINDOW_PX, device=a.device) - _SSIM_WINDOW_PX // 2
+    # Normalised Gaussian weights: a softmax of -x²/2σ² sums to 1
     window = torch.softmax(-0.5 * (offset / _SSIM_SIGMA_PX) ** 2, dim=0).to(a)
+    # All five local moments go through one convolution
     stack = torch.cat([a, b, a * a, b * b, a * b], dim=1)  # [1 15 H W]
     stack = F.pad(stack, (_SSIM_WINDOW_PX // 2,) * 4, mode="reflect")
+    # Separable window: rows, then columns, each channel on its own
     for kernel in (window[None], window[:, None]):
         stack = F.conv2d(stack, kernel.expand(15, 1, -1, -1), groups=15)
     mean_a, mean_b, aa, bb, ab = stack[0].unflatten(0, (5, 3)).unbind(0)
+    # Variance and covariance from the moments
     var_a, var_b, cov = aa - mean_a**2, bb - mean_b**2, ab - mean_a * mean_b
     similarity = (2 * mean_a * mean_b + _SSIM_C1) * (2 * cov + _SSIM_C2)
     return (similarity / ((mean_a**2 + mean_b**2 + _SSIM_C1) * (var_a + var_b + _SSIM_C2))).mean()
@@ -43,6 +47,7 @@ def range_loss(
     error = (rendered_m - real_m).abs()[returned]
     if not len(error):
         return rendered_m.new_zeros(())
+    # The limit is the quantile of the error itself, so the worst beams drop out
     limit = error.detach().kthvalue(max(int(quantile * len(error)), 1)).values
     return error[error <= limit].mean()
 
@@ -89,6 +94,7 @@ def published_lidar_losses(
     if not len(error):
         nothing = weighted_range_m.new_zeros(())
         return {"depth": nothing, "intensity": nothing, "line_of_sight": nothing}
+    # Beams above the quantile count 0, but stay in the mean
     counts = error < torch.quantile(error.detach(), quantile)
     return {
         "depth": (error * counts).mean(),

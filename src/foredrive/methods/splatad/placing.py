@@ -43,6 +43,7 @@ def place_gaussians(
     """
     content, states = gaussians_of(graph), states_at(graph.tracks, t_s)
     shown = torch.cat([states.present, states.present.new_ones(1)])[content.actor]  # STATIC, -1: last entry
+    # Gaussians of present actors; the static ones always count
     moving = (shown & (content.actor >= 0)).nonzero()[:, 0]
     still = (content.actor < 0).nonzero()[:, 0]
     standing = content.gaussians[still]
@@ -57,12 +58,14 @@ def place_gaussians(
         return values.index_select(0, owner)  # indexing would add up gradients in the order of threads
 
     R = states.T_scene_actor[:, :3, :3]
+    # Offset of the Gaussian from the actor's origin, in the scene's axes
     arm = (of_owner(R) @ own.mean_m[..., None])[..., 0]
     moved = dataclasses.replace(
         own,
         mean_m=of_owner(states.T_scene_actor[:, :3, 3]) + arm,
         quaternion=multiply_quaternions(of_owner(quaternion_from_matrix(R)), own.quaternion),
     )
+    # Velocity of a point of a rigid body: v + ω × r
     velocity = of_owner(states.velocity_mps) + torch.linalg.cross(of_owner(states.turn_radps), arm)
     return PlacedGaussians(
         gaussians=joined([standing, moved]),
@@ -77,6 +80,7 @@ def mirrored(gaussians: Gaussians) -> Gaussians:
 
 
 def _mirrored(gaussians: Gaussians, which: Bool[Tensor, "M"]) -> Gaussians:
+    # Signs of the components are flipped only for mirrored actors
     xyz = torch.where(which[:, None], gaussians.mean_m.new_tensor(_MIRROR_XYZ), 1.0)
     wxyz = torch.where(which[:, None], gaussians.mean_m.new_tensor(_MIRROR_WXYZ), 1.0)
     return dataclasses.replace(

@@ -35,6 +35,7 @@ def write_ply(gaussians: Gaussians, path: Path) -> None:
     columns = [
         gaussians.mean_m,
         torch.zeros_like(gaussians.mean_m),
+        # PLY stores the coefficient of the constant spherical harmonic in place of albedo
         (gaussians.feature[:, :3] - 0.5) / SH_DEGREE_0,
         gaussians.mean_m.new_zeros(len(gaussians.mean_m), _HIGHER),
         gaussians.opacity_logit[:, None],

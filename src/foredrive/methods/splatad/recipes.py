@@ -58,6 +58,7 @@ class GaussianRecipe:
 
     def learning_gib(self, pixels: int) -> float:
         """Estimate the memory that training takes besides its data, GiB, with images of so many pixels."""
+        # Numbers of one Gaussian: mean, quaternion, scale, opacity, albedo, features
         of_one = 3 + 4 + 3 + 1 + 3 + self.initial.features
         return 4 * (self.schedule.max_gaussians * of_one * _COPIES + pixels * _OF_A_PIXEL) / 1024**3
 

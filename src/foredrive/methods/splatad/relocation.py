@@ -35,6 +35,7 @@ def split_evenly(
     for i in range(1, MAX_COPIES + 1):
         for k in range(i):
             weight[i, k] = math.comb(i - 1, k) * (-1) ** k / math.sqrt(k + 1)
+    # Row n of the table holds the coefficients of o'^(k+1), k = 0, 1, …, for n copies
     total = weight.cumsum(0).to(opacity.device)  # sum over i, up to n
     powers = shared[:, None] ** torch.arange(1, MAX_COPIES + 1, device=opacity.device)
     integral = (total[copies] * powers).sum(-1)
@@ -53,7 +54,9 @@ def random_walk_m(gaussians: Gaussians, step_m: float, generator: torch.Generato
     walking = (opacity < _STAYS).nonzero()[:, 0]
     them = gaussians[walking]
     noise = torch.randn(len(walking), 3, generator=generator).to(them.mean_m)
+    # The walk fades for opaque Gaussians: a steep sigmoid about the limit of dead ones
     free = torch.sigmoid(-_STEEPNESS * (opacity[walking] - MIN_OPACITY))
+    # Σ · noise with Σ = R S² Rᵀ: turn to the Gaussian's axes, scale, turn back
     scaled = them.log_scale.exp() ** 2 * _turned(them.quaternion, noise, inverse=True)
     way = torch.zeros_like(gaussians.mean_m)
     way[walking] = step_m * free[:, None] * _turned(them.quaternion, scaled)

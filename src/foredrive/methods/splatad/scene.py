@@ -104,6 +104,7 @@ class GaussianScene(RebuiltScene):
                 count = saved.get_slice("actor").get_shape()[0]
         except (OSError, SafetensorError) as error:
             raise InputError(f"{file}: weights of a scene cannot be read: {error}") from error
+        # Parameters get the size of the saved ones; their values are loaded later
         self.actor = self.actor.new_zeros(count)
         for name in GAUSSIAN_PARAMETERS:
             old = getattr(self, name)
@@ -116,6 +117,7 @@ class GaussianScene(RebuiltScene):
         }
         added |= {"albedo": gaussians.feature[:, :ALBEDO], "feature": gaussians.feature[:, ALBEDO:]}
         for name in GAUSSIAN_PARAMETERS:
+            # Parameters cannot grow in place: they are replaced
             setattr(self, name, nn.Parameter(torch.cat([getattr(self, name).detach(), added[name].detach()])))
         none = self.actor.new_full((len(gaussians.opacity_logit),), STATIC)
         self.actor = torch.cat([self.actor, none])
@@ -140,6 +142,7 @@ class GaussianScene(RebuiltScene):
         exposed = self.corrected_camera(view, frame)
         placed = place_gaussians(graph, exposed.t_s, mirror)
         splats = project_camera(
+            # Gaussians at the time of exposure, with velocities for the time of each row
             placed.gaussians,
             inverse_se3(exposed.T_scene_cam),
             view.K,
@@ -151,9 +154,11 @@ class GaussianScene(RebuiltScene):
         )
         seen = composite_splats(splats, _pixels(view.size_hw, view.readout_s if self.config.rolling else 0.0))
         feature = seen.feature
+        # Where light passes through, grey albedo fills up the rest before decoding
         if self.config.background == "albedo":
             grey = BACKGROUND * (1 - seen.alpha)[:, None]
             feature = torch.cat([feature[:, :ALBEDO] + grey, feature[:, ALBEDO:]], dim=-1)
+        # Viewing direction of each pixel, which the decoder reads
         rays = pixels_to_rays(pixel_centres(view.size_hw).to(view.K).flatten(0, 1), view.K, view.dist)
         direction = rotate_vectors(view.T_scene_cam, rays)
         alpha = seen.alpha.unflatten(0, view.size_hw)
@@ -165,6 +170,7 @@ class GaussianScene(RebuiltScene):
             rgb = rgb + (1 - alpha) * colour[:, None, None]
         return RenderedImage(
             rgb=rgb,
+            # The expected depth is a weighted sum: dividing by alpha gives the mean over the stopped light
             range_m=seen.expected_range_m.unflatten(0, view.size_hw) / alpha.clamp_min(_LEAST_ALPHA),
             alpha=alpha,
         )
@@ -193,11 +199,13 @@ class GaussianScene(RebuiltScene):
             mirror: see `place_gaussians`.
             frame: index of a training sweep, counted after the images, for `frame_twist`.
         """
+        # The Gaussians are placed at the middle of the sweep, the time 0 of its beams
         placed = place_gaussians(graph, t_s + points.middle_s, mirror)
         T_scene_lidar = points.T_scene_lidar.to(placed.velocity_mps)
         twist = points.twist_lidar.to(placed.velocity_mps)
         if frame is not None:
             more = self.frame_twist(frame)
+            # The correction also moves the lidar between the sweep's time and its middle
             T_scene_lidar, twist = T_scene_lidar @ exp_se3(points.middle_s * more), twist + more
         splats = project_lidar(
             placed.gaussians,

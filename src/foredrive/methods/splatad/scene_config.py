@@ -22,7 +22,7 @@ class GaussianSceneConfig:
     camera_near_m: float = NEAR_M
     """Minimum depth of the Gaussians that a camera sees, m."""
     lidar_reach_m: float | None = None
-    """Nothing beyond stops a beam, m. None: the reach of the log's lidar."""
+    """Range beyond which nothing stops a beam, m. None: the reach of the log's lidar."""
     frame_velocities: bool = False
     """Learn corrections of the velocity and turn rate of each training image and sweep. They are not used for
     other views."""

@@ -39,11 +39,14 @@ def relocate(scene: GaussianScene, optimizer: Optimizer, generator: torch.Genera
     alive = (opacity > MIN_OPACITY).nonzero()[:, 0]
     if len(dead) == 0 or len(alive) == 0:
         return 0
+    # Live Gaussians are drawn in proportion to opacity, as samples of the scene
     chosen = alive[_drawn(opacity[alive], len(dead), generator)]
+    # Opacity and scale are shared before copying, so the copies are equal to the original
     _share(scene, chosen)
     for name in GAUSSIAN_PARAMETERS:
         parameter = getattr(scene, name)
         parameter[dead] = parameter[chosen]
+        # Moments of Adam belong to the old place: both start without momentum
         _forget(optimizer, parameter, torch.cat([dead, chosen]))
     scene.actor[dead] = scene.actor[chosen]
     return len(dead)
@@ -65,6 +68,7 @@ def grow(
     for name in GAUSSIAN_PARAMETERS:
         old = getattr(scene, name)
         new = nn.Parameter(torch.cat([old, old[chosen]]))
+        # The originals changed by sharing, so their momentum is void too
         _forget(optimizer, old, chosen)
         _replace(optimizer, old, new)
         setattr(scene, name, new)
@@ -81,6 +85,7 @@ def _drawn(weight: Float[Tensor, "N"], count: int, generator: torch.Generator) -
 
 def _share(scene: GaussianScene, chosen: Int[Tensor, "count"]) -> None:
     """Lower opacity and scale of the chosen Gaussians, so that with their copies they render as before."""
+    # A Gaussian drawn k times splits into k + 1, itself included
     rows, copies = chosen.unique(return_counts=True)
     opacity, scale = split_evenly(scene.opacity_logit[rows].sigmoid(), (copies + 1).clamp_max(MAX_COPIES))
     scene.opacity_logit[rows] = opacity.clamp(MIN_OPACITY, 1 - 1e-6).logit()
@@ -96,6 +101,7 @@ def _forget(optimizer: Optimizer, parameter: nn.Parameter, rows: Int[Tensor, "_"
 def _replace(optimizer: Optimizer, old: nn.Parameter, new: nn.Parameter) -> None:
     """Continue the optimizer with a longer parameter."""
     state = optimizer.state.pop(old, {})
+    # Moments of new rows start at 0; the step counter has no rows and stays
     optimizer.state[new] = {
         name: torch.cat([value, value.new_zeros(len(new) - len(old), *value.shape[1:])])
         if value.shape == old.shape
@@ -188,6 +194,7 @@ class GaussianTraining:
         self._order = ViewOrder(
             len(views.cameras), len(views.sweeps), schedule.images_per_sweep, schedule.seed
         )
+        # Sweeps are thinned and prepared once
         self._sweeps: dict[int, tuple[SweepView, PreparedSweep]] = {}
 
     def parameter_groups(self) -> list[ParameterGroup]:
@@ -206,10 +213,12 @@ class GaussianTraining:
     def losses(self, step: int, generator: torch.Generator) -> StepLosses:
         """Return the losses of an image or a sweep, some actors mirrored, and of the regularisers."""
         kind, number = self._order.at(step)
+        # Each symmetric actor is mirrored at random, so that both of its sides are learned from either
         drawn = torch.rand(len(self.scene.track_id), generator=generator) < self.schedule.mirror_share
         mirror = drawn.to(self.scene.device) & self.scene.tracks.mirrored
         if kind == "image":
             random = self.scene.config.background == "after_decoder"
+            # A random background cannot be imitated, so the scene has to cover what is opaque
             background_rgb = torch.rand(3, generator=generator) if random else None
             losses = self._image(number, self.schedule.shrink_at(step), mirror, background_rgb)
         else:
@@ -221,9 +230,11 @@ class GaussianTraining:
     def evolve(self, step: int, optimizer: Optimizer, generator: torch.Generator) -> None:
         """Relocate, grow and walk."""
         schedule, scene = self.schedule, self.scene
+        # Relocation and growth at intervals within a window of steps
         if schedule.grow_from < step + 1 <= schedule.grow_until and (step + 1) % schedule.grow_every == 0:
             relocate(scene, optimizer, generator)
             grow(scene, optimizer, schedule.max_gaussians, schedule.growth, generator)
+        # The noise shrinks with the learning rate of the centres
         rate = schedule.rates.mean_m.at(step, schedule.steps)
         scene.mean_m.add_(random_walk_m(scene.gaussians, schedule.walk * rate, generator))
 
@@ -235,6 +246,7 @@ class GaussianTraining:
         real = view.image.float() / 255
         rgb = self.scene.camera(self.scene.graph, view, mirror, number, background_rgb).rgb
         loss = photometric_loss(rgb, real, self.schedule.weights.ssim)
+        # PSNR in dB for values up to 1
         psnr = -10 * ((rgb.detach().clamp(0, 1) - real) ** 2).mean().log10()
         return {"loss": loss, "photometric": loss, "psnr_db": psnr}
 
@@ -242,10 +254,12 @@ class GaussianTraining:
         if number not in self._sweeps:
             stride = self.schedule.beam_stride
             view = self.views.sweeps[number]
+            # Another offset for each sweep, so that all beams of the pattern are used over the drive
             view = dataclasses.replace(view, beams=view.beams[number % stride :: stride])
             self._sweeps[number] = (view, self.scene.prepare_sweep(view))
         view, points = self._sweeps[number]
         beams = view.beams.to(self.scene.device)
+        # Light stopped well before the return is penalised; lost beams have no such limit
         hit_m = torch.where(beams.returned, beams.range_m - self.schedule.before_hit_m, torch.inf)
         published = self.schedule.lidar_losses == "published"
         rendered = self.scene.sweep(
@@ -258,6 +272,7 @@ class GaussianTraining:
             len(self.views.cameras) + number,
         )
         losses = self._published_losses(rendered, beams) if published else self._our_losses(rendered, beams)
+        # The drop is learned only where the log records lost beams
         if view.misses_known:
             losses["drop"] = drop_loss(rendered.drop_logit, beams.returned)
         loss = torch.stack([getattr(self.schedule.weights, name) * value for name, value in losses.items()])
@@ -286,6 +301,7 @@ class GaussianTraining:
 
     def _regularisers(self) -> Tensor:
         weights = self.schedule.weights
+        # Small scales and low opacities keep Gaussians from covering what others explain
         small = self.scene.log_scale.exp().mean()
         loss = weights.scale * small + weights.opacity * self.scene.opacity_logit.sigmoid().mean()
         for name in ("frame_velocity", "frame_turn"):

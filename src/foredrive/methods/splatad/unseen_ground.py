@@ -56,6 +56,7 @@ def add_unseen_ground(
     graph = scene.graph
     ground = extrapolated_ground(scene.content.preview(STATIC), T_scene_ego)
     seen = torch.zeros_like(ground.opacity_logit, dtype=torch.bool)
+    # Ground that a camera would have seen would hide what it saw, so it is left out
     for view in _some_views(views):
         seen |= _seen(scene, graph, view.to(seen.device), ground.mean_m)
     scene.add_static(ground[~seen])
@@ -78,17 +79,21 @@ def extrapolated_ground(
         return ground[:0]
     way = cKDTree(T_scene_ego[:, :2, 3].double().cpu().numpy())
     places = _grid(T_scene_ego[:, :2, 3].double().cpu().numpy(), step_m)
+    # Places near the path, near known ground, and with no Gaussian of the ground close by
     near = way.query(places)[0] <= WITHIN_M
     near &= cKDTree(level[:, :2]).query(places)[0] <= _FROM_KNOWN_M
     near &= cKDTree(xyz[:, :2]).query(places)[0] > step_m
     places = places[near]
     if not len(places):
         return ground[:0]
+    # Height by inverse-square weights of the nearest known cells
     apart, beside = cKDTree(level[:, :2]).query(places, k=range(1, min(_LEVELS, len(level)) + 1))
     share = 1 / (np.asarray(apart) + _CELL_M) ** 2
     z = (share * level[beside, 2]).sum(1) / share.sum(1)
+    # Features by the median of the nearest ground Gaussians
     alike = cKDTree(xyz[:, :2]).query(places, k=range(1, min(_ALIKE, len(xyz)) + 1))[1]
     feature = ground.feature[torch.from_numpy(np.asarray(alike)).to(ground.feature.device)].median(1).values
+    # Discs that overlap their neighbours at the spacing of the grid
     flat = torch.tensor([0.6 * step_m, 0.6 * step_m, 0.01]).log()
     upright = torch.tensor([1.0, 0.0, 0.0, 0.0])
     return Gaussians(
@@ -105,6 +110,7 @@ def _some_views(views: Sequence[CameraView]) -> list[CameraView]:
     chosen: list[CameraView] = []
     for sensor in sorted({view.sensor for view in views}):
         own = [view for view in views if view.sensor == sensor]
+        # Every n-th view, rounded up, so that there are at most `_VIEWS`
         chosen += own[:: -(-len(own) // _VIEWS)]
     return chosen
 
@@ -119,6 +125,7 @@ def _seen(
     u, v = uv[inside].long().unbind(-1)
     seen = inside.clone()
     picture = scene.camera(graph, view)
+    # Depth at which the rendered view is stopped; see-through pixels hide nothing
     stopped_m = torch.where(picture.alpha > 0.5, picture.range_m, torch.inf)[v, u]
     seen[inside] = depth_m[inside] < (1 + _BEHIND) * stopped_m + _BEHIND_M
     return seen
@@ -128,11 +135,14 @@ def _ground(standing: Gaussians, T_scene_ego: Float[Tensor, "K 4 4"]) -> Gaussia
     """Return the Gaussians that show the ground near the path, at about the height of the wheels."""
     mean_m = standing.mean_m
     way = cKDTree(T_scene_ego[:, :2, 3].double().cpu().numpy())
+    # Nearest pose of the path to each Gaussian, over the ground
     apart_m, pose = way.query(mean_m[:, :2].double().cpu().numpy())
     T_ego_scene = inverse_se3(T_scene_ego)[torch.from_numpy(pose)].to(mean_m)
+    # Height above the wheels of that pose: the z row of the transform
     height_m = (T_ego_scene[:, 2, :3] * mean_m).sum(-1) + T_ego_scene[:, 2, 3]
     aside_m = torch.from_numpy(apart_m).to(mean_m)
     shown = (standing.opacity_logit.sigmoid() > _OPAQUE) & (standing.log_scale.exp().amax(-1) < _MOST_M)
+    # The tolerance grows aside of the path, as roads are cambered
     return standing[shown & (aside_m <= WITHIN_M) & (height_m.abs() <= _HEIGHT_M + _SLOPE * aside_m)]
 
 
@@ -141,6 +151,7 @@ def _levels(xyz_m: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "C 3"]:
     cells, member, count = np.unique(
         np.floor(xyz_m[:, :2] / _CELL_M), axis=0, return_inverse=True, return_counts=True
     )
+    # Sort by cell, then by height: the median is in the middle of each cell's block
     order = np.lexsort((xyz_m[:, 2], member.reshape(-1)))
     first = np.cumsum(count) - count
     median = xyz_m[order[first + count // 2], 2] if len(cells) else np.zeros(0)

@@ -42,11 +42,14 @@ def centre_target(
         classes: K.
     """
     target = xy.new_zeros(classes, *middle_m.shape[:2])
+    # Gaussian bump of every object at every cell
     away_m = (middle_m[None] - xy[:, None, None]).square().sum(-1)
     bump = (-0.5 * away_m / spread_m[:, None, None].square()).exp()
+    # The cell of the centre is exactly 1, even if the middle of the cell is off the centre
     cell = ((xy - middle_m[0, 0]) / cell_m + 0.5).floor().long()
     bump[torch.arange(len(xy)), cell[:, 1], cell[:, 0]] = 1.0
     index = label.long()[:, None, None].expand_as(bump)
+    # Where bumps of a class overlap, the larger value counts
     return target.scatter_reduce(0, index, bump, "amax")
 
 
@@ -58,6 +61,7 @@ def centre_loss(
 ) -> Float[Tensor, ""]:
     """Return the focal loss, lower near centres, per centre (CornerNet, Law and Deng 2018, eq. 1)."""
     p = logits.sigmoid()
+    # Cells at centres are positive; the others are negative, weighted less near centres
     centre = target == 1.0
     present = (1 - p) ** alpha * F.logsigmoid(logits)
     empty = (1 - target) ** beta * p**alpha * F.logsigmoid(-logits)
@@ -103,7 +107,7 @@ def agent_losses(
         centres: the dense map of b items.
         layers: agents after each layer.
         boxes: at now.
-        boxes_valid: whether an item is annotated at now. Others train nothing.
+        boxes_valid: whether an item is annotated at now. The others have no losses.
         truth: of b items.
         spec: grid of the volumes.
         weights: weights of the terms.
@@ -116,9 +120,11 @@ def agent_losses(
         name: [] for name in ("centres", "cells", "queries", "velocity", "attribute", "motion")
     }
     count = last.velocity.shape[1]
+    # Object that each query was matched to in the frame before
     nobody = torch.full((count,), NOBODY, device=boxes_valid.device)
     owner = nobody
     for item, annotated in enumerate(boxes_valid.tolist()):
+        # A sequence's first item, or one after a frame without annotation, has no matches to keep
         owner = nobody if item % frames == 0 or not annotated else owner
         if not annotated:
             continue
@@ -126,21 +132,26 @@ def agent_losses(
         targets = agent_targets(boxes[item], futures, spec, steps)
         for name, value in _cell_losses(centres[item], targets, spec).items():
             terms[name].append(value)
+        # Slot of the frame before that each query was carried from
         source = nobody if lineage is None else lineage.source[item]
         away_m = torch.cdist(
             last.boxes.mean[item, :, :2].detach(), targets.boxes.state[:, :2].to(last.boxes.mean)
         )
+        # Carried queries stay with their object; the rest is matched anew below
         held = held_objects(source, owner, targets.track_id, away_m)
         for number, layer in enumerate(layers):
             predicted = layer[item]
+            # Optimal matching of the free queries and objects, beside the held pairs
             query, match = matching_beside(predicted.boxes, targets.boxes, held, weights.boxes)
             terms["queries"].append(matched_loss(predicted.boxes, targets.boxes, query, match, weights.boxes))
+            # Velocity, attribute and motion are trained at the last layer only
             if number == len(layers) - 1:
                 for name, value in _matched_terms(predicted, targets, query, match).items():
                     terms[name].append(value)
                 owner = owners(query, match, targets.track_id, count)
     if last.future_xy is None:
         del terms["motion"]
+    # Zero with a gradient, for batches without annotation
     zero = last.velocity.sum() * 0 + centres.logits.sum() * 0
     return {
         name: getattr(weights, name) * torch.stack(values).mean() if values else zero
@@ -155,10 +166,12 @@ def _cell_losses(centres: CentreMap, targets: AgentTargets, spec: VoxelSpec) -> 
     cell_m = spec.voxel_m
     state, label = targets.boxes.state.to(centres.z), targets.boxes.label
     middle = cell_middles(spec.lower_m[:2], cell_m, (rows, columns)).view(rows, columns, 2).to(lower)
+    # The bump scales with the box, and covers the neighbouring cells at least
     spread = (SPREAD * state[:, 3:5].exp().mean(-1)).clamp_min(0.7 * cell_m)
     target = centre_target(state[:, :2], label, spread, middle, cell_m, len(AGENT_CLASSES))
     # Each box trains the cell of its centre and the eight around it.
     around = torch.tensor([[i, j] for j in (-1, 0, 1) for i in (-1, 0, 1)], device=lower.device)
+    # Cells around the centre, without those off the grid
     cell = ((state[:, :2] - lower) / cell_m).floor().long()[:, None] + around
     inside = ((cell >= 0) & (cell < cell.new_tensor([columns, rows]))).all(-1)
     box, _ = inside.nonzero(as_tuple=True)
@@ -168,9 +181,11 @@ def _cell_losses(centres: CentreMap, targets: AgentTargets, spec: VoxelSpec) -> 
     )
     assert targets.boxes.yaw is not None
     yaw = targets.boxes.yaw.to(state)[box]
+    # The heading as sine and cosine has no jump at ±π
     arrow = torch.stack([yaw.sin(), yaw.cos()], dim=-1)
     off = (logits - state[box]).abs().sum(-1) + (centres.heading[row, column] - arrow).abs().sum(-1)
     velocity = targets.velocity[box]
+    # Unknown velocities are NaN: replace them before they meet a gradient
     known = velocity.isfinite().all(-1)
     slip = centres.velocity[row, column] - torch.where(known[:, None], velocity, 0.0)
     off = off + torch.where(known, slip.abs().sum(-1) / VELOCITY_SCALE_MPS, 0.0)
@@ -185,12 +200,14 @@ def _matched_terms(
     known = true_velocity.isfinite().all(-1)
     off = (predicted.velocity[query] - torch.where(known[:, None], true_velocity, 0.0)).abs().sum(-1)
     true_attribute = targets.attribute[match]
+    # Label -1 is an unknown attribute and is left out
     entropy = F.cross_entropy(
         predicted.attribute[query], true_attribute.long(), ignore_index=-1, reduction="none"
     )
     terms = {"velocity": masked_mean(off, known), "attribute": masked_mean(entropy, true_attribute >= 0)}
     if predicted.future_xy is None or predicted.log_prob is None:
         return terms
+    # Forecasts: distance of the nearest mode, and cross-entropy of the modes
     motion = motion_losses(
         predicted.future_xy[query],
         predicted.log_prob[query],

@@ -41,7 +41,7 @@ class CarriedConfig:
     """Carrying of agents from frame to frame (`tasks.tracking.carried`)."""
 
     agents: int = 30
-    """Number of queries that are carried on; as many fewer begin at proposals then."""
+    """Number of queries that are carried on. That many fewer queries begin at proposals."""
     decay: float = 0.6
     """Share of its rank that a carried query keeps at least from frame to frame."""
     reach_m: float = 2.0
@@ -91,6 +91,7 @@ class AgentSet(Record):
             dt_s: time between the steps of the futures.
         """
         mean, heading = self.boxes.mean, self.boxes.heading
+        # The last logit stands for "no object" and is no class
         score, label = self.boxes.logits.softmax(dim=-1)[..., :-1].max(dim=-1)
         categories = torch.tensor([int(kind) for kind in AGENT_CLASSES], device=label.device)
         return Agents(
@@ -100,6 +101,7 @@ class AgentSet(Record):
             velocity=self.velocity,
             category=categories[label],
             score=score,
+            # Only attributes of the category's group can be chosen
             attribute=_possible(self.attribute, categories[label]).argmax(dim=-1),
             track_id=torch.full_like(label, -1),
             future_xy=self.future_xy,
@@ -159,16 +161,20 @@ class AgentHead(nn.Module):
         cells, fine = planes.coarse.cells, planes.fine
         cell_place = self.place(planes.coarse.share(planes.coarse.middle_m))[None]
         centres = self.centres(fine)
+        # The most probable centres of the map start the queries
         first = best_proposals(centres, self.queries)
         queries, before = self.kind(first.label), _first_agents(first)
+        # Carried agents take the place of the least probable proposals
         if carried is not None:
             queries, before = self._with_carried(queries, before, carried)
         layers: list[AgentSet] = []
         for layer in self.layers:
             at_m = before.boxes.mean[..., :2]
+            # Each query reads the plane at its own box
             queries = queries + self.read(fine.at(at_m))
             queries = layer(queries, self.place(fine.share(at_m)), cells, cell_place)
             layers.append(_changed(before, self.change(queries)))
+            # Each layer refines a fixed box: gradients do not run back through the boxes of earlier layers
             before = layers[-1].map_tensors(torch.Tensor.detach)
         layers[-1] = replace(layers[-1], query=queries)
         if self.motion is not None and motion_planes is not None:
@@ -190,6 +196,7 @@ class AgentHead(nn.Module):
         assert self.renew is not None
         assert carried.query is not None
         expected_m, proposed_m = carried.boxes.mean[..., :2], first.boxes.mean[..., :2]
+        # Which proposal each carried agent takes, and which proposals are left
         taken, rest = take_proposals(expected_m, proposed_m, self.carried.reach_m)
         sees = taken >= 0
         place = taken.clamp_min(0)
@@ -198,7 +205,9 @@ class AgentHead(nn.Module):
             return torch.where(sees.view(*sees.shape, *[1] * (seen.dim() - 2)), seen, expected)
 
         item = torch.arange(len(place), device=place.device)[:, None]
+        # Features are carried on through a layer, plus those of the proposal that the agent takes
         renewed = self.renew(carried.query) + sees[..., None] * queries[item, place]
+        # The box is the proposal's where there is one, else the carried one moved to now
         old = _merged(go_on, _chosen(first, place), carried)
         return torch.cat([renewed, queries[item, rest]], dim=1), _merged(_join, old, _chosen(first, rest))
 
@@ -222,6 +231,7 @@ def check_carried(config: CarriedConfig, queries: int) -> None:
 
 
 def _first_agents(first: Proposals) -> AgentSet:
+    # Zero log standard deviations; each layer replaces them
     """Return proposals as agents. The logit of "no object" is 0, so each class keeps its own probability."""
     nothing = torch.zeros_like(first.z)
     heading = nn.functional.normalize(first.heading, dim=-1, eps=1e-3)
@@ -259,6 +269,7 @@ def _changed(before: AgentSet, change: Float[Tensor, "b Q _N"]) -> AgentSet:
     boxes = before.boxes
     return AgentSet(
         boxes=BoxSet(
+            # The logit of "no object" stays 0
             logits=boxes.logits + nn.functional.pad(logits, (0, 1)),
             mean=boxes.mean + torch.cat([shift, size], dim=-1),
             log_std=log_std[..., :6],
@@ -272,6 +283,7 @@ def _changed(before: AgentSet, change: Float[Tensor, "b Q _N"]) -> AgentSet:
 
 def _possible(logits: Float[Tensor, "*n A"], category: Int[Tensor, "*n"]) -> Float[Tensor, "*n A"]:
     """Leave out the attributes that a category cannot have."""
+    # Attributes come in three groups: vehicles, cycles, pedestrians
     of_vehicles, of_cycles = Attribute.CYCLE_WITH_RIDER, Attribute.PEDESTRIAN_MOVING
     kind = torch.arange(logits.shape[-1], device=logits.device)
     group = (kind >= of_vehicles).long() + (kind >= of_cycles).long()

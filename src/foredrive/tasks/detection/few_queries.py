@@ -25,10 +25,13 @@ def attend_few(
     heads, width = attention.num_heads, channels // attention.num_heads
     to_query, to_key, to_value = attention.in_proj_weight.chunk(3)
     bias_query, _, bias_value = attention.in_proj_bias.chunk(3)
+    # Scaled query of each head, then its projection into the space of the memory (Wᵀ q)
     asked = F.linear(query, to_query, bias_query).view(b, count, heads, width) * width**-0.5
     asked = torch.einsum("bqhw,hwc->bqhc", asked, to_key.view(heads, width, channels))
+    # Scores and weights over the memory, all heads and queries in one product
     weight = (asked.flatten(1, 2) @ memory.transpose(1, 2)).softmax(-1)  # [b, Q·H, N]
     weight = F.dropout(weight, attention.dropout, attention.training)
+    # Weighted mean of the memory, then the value projection of each head
     seen = (weight @ memory).view(b, count, heads, channels)
     value = torch.einsum("bqhc,hwc->bqhw", seen, to_value.view(heads, width, channels))
     # Dropped weights must drop their share of the bias too.

@@ -58,6 +58,7 @@ def read_coco(
     classes = [str(category.get("name", category["id"])) for category in categories]
     if len(set(classes)) < len(classes):
         raise InputError(f"{truth_path}: two categories have the same name")
+    # Records by image, with their numbers for messages
     predicted: dict[Any, list[tuple[int, Record]]] = defaultdict(list)
     true: dict[Any, list[tuple[int, Record]]] = defaultdict(list)
     crowds = 0
@@ -70,9 +71,11 @@ def read_coco(
     for n, record in enumerate(results):
         category = _key(record, "category_id")
         others += category is not None and category not in label_of
+        # Records of other categories are left out, as pycocotools does
         if category is None or category in label_of:
             predicted[_key(record, "image_id")].append((n, record))
     image_ids = {image["id"] for image in images}
+    # A wrong image or category is an error, not a record to leave out
     for records, where in ((predicted, path), (true, truth_path)):
         for image_id, members in records.items():
             if image_id not in image_ids:
@@ -94,6 +97,7 @@ def read_coco(
         "crowds_left_out": crowds,
         "boxes_of_other_classes_left_out": others,
         "boxes_without_size_left_out": sizeless,
+        # Frames come in the order of the images, also those without records
         "true_boxes_without_size_left_out": true_sizeless,
     }
     frames = [
@@ -139,6 +143,7 @@ def _frame(
         str(image.get("sequence", image["id"])),
         make_detections(names, score, share, corners, covariance, family=family),
         make_objects(true_names, true_label, true_corners),
+        # Objects that no detection explains lie in the image
         *enclosing_region(np.zeros(4), np.array([width, height, width, height]), true_corners),
         relevance=read_relevance([record for _, record in true], true_names),
         stated=StatedDetections(np.array(label, dtype=np.int64), score, np.ones(len(label), bool)),
@@ -177,7 +182,9 @@ def _corners(records: Sequence[tuple[int, Record]], path: Path) -> Float[ndarray
 
 
 def _defaults(corners: Float[ndarray, "n 4"]) -> Float[ndarray, "n 4 4"]:
+    # Standard deviations of x1, x2 scale with the width, those of y1, y2 with the height
     side = np.tile(corners[:, 2:] - corners[:, :2], 2)
+    # Two independent parts, added in quadrature
     return np.eye(4) * ((STD_OF_SIDE * side) ** 2 + STD_PX**2)[:, None, :]
 
 

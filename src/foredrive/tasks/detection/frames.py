@@ -16,7 +16,7 @@ from foredrive.sets import BoxDensity, Family, LabelledBoxes, MultiBernoulli
 
 _log = logging.getLogger(__name__)
 MIN_PROBABILITY = 1e-6
-"""Probabilities in files are kept this far from 0 and 1, which are mostly rounded from such."""
+"""Distance that probabilities of files are kept from 0 and 1: an exact 0 or 1 is mostly due to rounding."""
 STD_M = (0.5, 0.5, 0.3)
 """Standard deviations of a box centre where a detector states none."""
 STD_LOG_SIZE = 0.15
@@ -93,6 +93,7 @@ def make_detections(
     Raises:
         InputError: a detection is wrong. The message begins with the name of the first.
     """
+    # Checks name the first wrong record, so they come before any conversion
     chol, definite = _cholesky(covariance)
     checks = {
         "a score outside [0, 1]": (score >= 0) & (score <= 1),
@@ -108,12 +109,14 @@ def make_detections(
     for fault, valid in checks.items():
         if not valid.all():
             raise InputError(f"{names[int(np.flatnonzero(~valid)[0])]} has {fault}")
+    # Probabilities of 0 and 1 would give infinite likelihoods
     r = torch.as_tensor(np.clip(score, MIN_PROBABILITY, 1 - MIN_PROBABILITY))
     share = np.clip(class_probability, MIN_PROBABILITY, None)
     boxes = BoxDensity(
         mean=torch.as_tensor(mean),
         chol=torch.as_tensor(chol),
         yaw=None if yaw is None else torch.as_tensor(yaw),
+        # A von Mises density with concentration 1/σ² is close to a normal one of σ
         concentration=None if yaw_std is None else torch.as_tensor(1.0 / yaw_std**2),
         family=family,
     )
@@ -143,6 +146,7 @@ def _cholesky(
     covariance: Float[ndarray, "M D D"],
 ) -> tuple[Float[ndarray, "M D D"], Bool[ndarray, "M"]]:
     """Return the lower factors, and whether each covariance has one. The factors are zeros unless all do."""
+    # The factor of all matrices at once; only after a failure are the wrong ones looked for
     finite = np.isfinite(covariance).all((1, 2))
     try:
         if finite.all():
@@ -180,9 +184,11 @@ def _covariance_matrices(
         if len(values) == 1:
             raise InputError(f"{names[0]}: its covariance is not made of numbers") from error
         array = np.zeros(0)
+    # Variances become diagonal matrices
     if array.shape == (len(values), dims):
         return array[:, :, None] * np.eye(dims)
     if array.shape == (len(values), dims, dims):
+        # Symmetric up to rounding in the file
         slack = 1e-6 * np.abs(array).max((1, 2), keepdims=True)
         if not (np.abs(array - array.swapaxes(1, 2)) > slack).any():  # NaN passes: `make_detections` checks
             return array
@@ -190,6 +196,7 @@ def _covariance_matrices(
         raise InputError(
             f"{names[0]}: its covariance is neither {dims} variances nor a symmetric matrix of them"
         )
+    # Forms differ between records: convert each one alone
     single = [_covariance_matrices([value], dims, names[n : n + 1]) for n, value in enumerate(values)]
     return np.concatenate(single)
 
@@ -275,6 +282,7 @@ def read_number_rows(
 ) -> Float[ndarray, "n count"]:
     """Return `read_numbers` of every record."""
     try:
+        # Fast path: all rows at once. Any fault is found again below, with the record's name
         values = np.array([record[key] for record in records], dtype=np.float64)
         shape = (len(records), count) if count > 1 else (len(records),)
         if values.shape == shape and (np.abs(values) <= MAX_NUMBER).all():

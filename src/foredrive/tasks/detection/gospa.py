@@ -53,11 +53,15 @@ def gospa(
         raise InputError(f"existence ({np.flatnonzero(~((r >= 0) & (r <= 1)))[0]},) is not in [0, 1]")
     if not (cutoff > 0 and p >= 1):
         raise InputError("GOSPA needs a cutoff above 0 and a power of at least 1")
+    # Half of c^p: the cost of a missed or of a false object
     half = 0.5 * cutoff**p
     near = distance < cutoff
     powers = np.where(near, np.minimum(distance, cutoff), 0.0) ** p
+    # Cost of a pair relative to leaving the object missed; too distant pairs are impossible
     gain = np.where(near, r[:, None] * powers + (1.0 - r[:, None]) * half - half, np.inf)
+    # A detection without an object costs r · c^p / 2
     column = best_assignment(gain, r * half).column
+    # The four parts of the sum, from the best assignment
     paired = np.flatnonzero(column >= 0)
     detection = np.full(distance.shape[1], -1)
     detection[column[paired]] = paired
@@ -75,6 +79,7 @@ def wasserstein_distance(boxes: BoxDensity, objects: LabelledBoxes, dims: int = 
     √(|mean - y|² + tr Σ), the root of the expected squared distance, over the first `dims` coordinates.
     """
     with torch.no_grad():
+        # Squared distance of the means, plus the trace of the covariance (the object has none)
         offset = boxes.mean[:, None, :dims].double() - objects.state[:, :dims].double()
         spread = boxes.chol[:, :dims].double().square().sum((-2, -1))
         return (offset.square().sum(-1) + spread[:, None]).sqrt().cpu().numpy()

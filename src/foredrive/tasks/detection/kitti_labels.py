@@ -128,6 +128,7 @@ def read_frames(
     for lines_of, where in ((true, truth), (predicted, folder)):
         given = sum(len(lines) for lines in lines_of.values())
         for name, lines in lines_of.items():
+            # Log sizes need positive lengths, so boxes without size are left out
             lines_of[name] = [line for line in lines if (line.values[7:10] > 0).all()]
         sized = sum(len(lines) for lines in lines_of.values())
         tell_left_out(where, {"boxes without size": given - sized}, given)
@@ -179,6 +180,7 @@ def box_states(lines: Sequence[KittiLine]) -> tuple[Float[ndarray, "n 6"], Float
     values = np.array([line.values[:14] for line in lines]).reshape(-1, 14)
     height, width, length, x, y, z, rotation = values[:, 7:14].T
     size = np.stack([length, width, height], axis=1)
+    # Camera axes (right, down, forward) to forward, left, up; from the bottom's middle to the centre
     centre = np.stack([z, -x, -(y - height / 2)], axis=1)
     # The heading is (cos, 0, -sin) of the rotation in x, y, z of the camera.
     yaw = np.arctan2(-np.cos(rotation), -np.sin(rotation))

@@ -67,16 +67,20 @@ def matched_loss(
     assert truth.yaw is not None
     objects = max(len(truth.label), 1)
     classes = predicted.logits.shape[-1] - 1
+    # Queries without an object have the last class, "no object"
     target = torch.full(predicted.logits.shape[:1], classes, device=predicted.logits.device)
     target[query] = truth.label[match].long()
+    # Most queries have no object, so these weigh less
     weight = torch.where(target == classes, config.no_object_weight, 1.0)
     entropy = (F.cross_entropy(predicted.logits, target, reduction="none") * weight).sum()
     state, scale = truth.state[match].to(predicted.mean), predicted.mean.new_tensor(STATE_SCALE)
     mean, log_std, log_std_yaw = predicted.mean[query], predicted.log_std[query], predicted.log_std_yaw[query]
     yaw = truth.yaw[match].to(predicted.mean)
     arrow = torch.stack([yaw.sin(), yaw.cos()], dim=-1)
+    # Heading by L1 of sine and cosine
     turn = (predicted.heading[query] - arrow).abs().sum()
     cos = (predicted.heading[query].detach() * arrow).sum(-1)
+    # Negative log-likelihood of the heading near a von Mises density: log σ + (1 - cos) / σ²
     spread = (log_std_yaw + (1 - cos) * (-2 * log_std_yaw).exp()).sum()
     if config.box_score == "energy":
         score = energy_score(
@@ -84,6 +88,7 @@ def matched_loss(
         )
         box = score.sum()
     else:
+        # Fixed means: the likelihood trains the standard deviations alone
         box = ((mean - state).abs() / scale).sum()
         spread = _negative_log_likelihood(mean.detach(), log_std, state, predicted.family).sum() + spread
     return (
@@ -96,6 +101,7 @@ def _negative_log_likelihood(
 ) -> Float[Tensor, "n D"]:
     """Return the negative log-likelihood of each coordinate, without its constant."""
     z = (mean - state) / log_std.exp()
+    # Standard deviation σ: Gaussian exponent z²/2, Laplace exponent √2 |z|
     return (0.5 * z.square() if family == "gaussian" else math.sqrt(2) * z.abs()) + log_std
 
 
@@ -118,6 +124,7 @@ def energy_score(
         else torch.distributions.Laplace(zero, one / math.sqrt(2))
     )
     draws = mean + std * unit.sample(torch.Size((samples + 1, *mean.shape)))
+    # E|X - y| over the draws, and E|X - X'| over successive draws
     to_truth = (draws[:-1] - state).norm(dim=-1).mean(0)
     between = (draws[1:] - draws[:-1]).norm(dim=-1).mean(0)
     return to_truth - 0.5 * between
@@ -131,6 +138,7 @@ def best_matching(
         class_cost = -predicted.logits.softmax(-1)[:, truth.label.long()]
         scale = predicted.mean.new_tensor(STATE_SCALE)
         error = (predicted.mean[:, None] - truth.state.to(predicted.mean)) / scale
+        # Rows are objects, columns are queries
         cost = (class_cost + config.box_weight * error.abs().sum(-1)).T.double().cpu().numpy()
     unmatched = np.full(len(cost), 1.0 + 2.0 * np.abs(cost).sum())  # dearer than all pairs
     column = torch.as_tensor(best_assignment(cost, unmatched).column)

@@ -14,11 +14,13 @@ COCO_OVERLAPS = tuple(np.round(np.arange(0.5, 1.0, 0.05), 2).tolist())
 
 def overlaps(boxes: Float[ndarray, "M 4"], others: Float[ndarray, "N 4"]) -> Float[ndarray, "M N"]:
     """Return the intersection over union of image boxes (x1, y1, x2, y2)."""
+    # Corners of the intersection
     low = np.maximum(boxes[:, None, :2], others[:, :2])
     high = np.minimum(boxes[:, None, 2:], others[:, 2:])
     shared = np.clip(high - low, 0.0, None).prod(-1)
     area, other_area = (np.clip(b[:, 2:] - b[:, :2], 0.0, None).prod(-1) for b in (boxes, others))
     either = area[:, None] + other_area - shared
+    # Two empty boxes have overlap 0
     return np.divide(shared, either, out=np.zeros_like(shared), where=either > 0)
 
 
@@ -52,6 +54,7 @@ def _match_greedily(order, closeness, min_closeness):
     taken = np.zeros(closeness.shape[1], np.bool_)
     for i in order:
         closest, best = -1, min_closeness
+        # The closest object that is left; at the limit itself a pair counts
         for j in range(len(taken)):
             close = closeness[i, j]
             if not taken[j] and (close > best or (closest < 0 and close == best)):
@@ -75,13 +78,16 @@ def match_centres(
     Returns:
         The true row of each detection at each distance; -1: none is nearer than the distance.
     """
+    # Sort detections and objects by frame, so that each frame is a range of rows
     turn = np.argsort(found_frame, kind="stable")
     place = np.argsort(true_frame, kind="stable")
     frames, first = np.unique(found_frame[turn], return_index=True)
     bounds = (np.searchsorted(true_frame[place], frames, side=side) for side in ("left", "right"))
+    # A distance equal to the limit is no hit: the next number towards 0 excludes it
     nearness = np.nextafter(-np.array(distances_m), 0.0)
     matched = _match_centres(np.append(first, len(turn)), *bounds, found_xy[turn], true_xy[place], nearness)
     partner = np.empty_like(matched)
+    # Back to the callers' rows; -1 selects the appended -1
     partner[:, turn] = np.append(place, -1)[matched]
     return partner
 
@@ -89,6 +95,7 @@ def match_centres(
 @numba.njit(cache=True, nogil=True)
 @no_type_check
 def _match_centres(start, true_start, true_stop, found_xy, true_xy, nearness):
+    # Arguments: ranges of rows by frame (start; true_start, true_stop), positions in m, least -distances
     matched = np.full((len(nearness), len(found_xy)), -1)
     for f in range(len(start) - 1):
         rows, true_here = np.arange(start[f + 1] - start[f]), true_xy[true_start[f] : true_stop[f]]
@@ -124,7 +131,9 @@ def average_precision_coco(score: Float[ndarray, "n"], hit: Bool[ndarray, "n"], 
     if objects == 0:
         return float("nan")
     precision, recall = precision_recall(hit[descending(score)], objects)
+    # Index of the first detection that reaches each recall; unreached ones select the appended 0
     index = np.searchsorted(recall, np.linspace(0, 1, 101), side="left")
+    # Running maximum from the end: the largest precision at this recall or beyond
     return float(np.append(np.maximum.accumulate(precision[::-1])[::-1], 0.0)[index].mean())
 
 
@@ -143,7 +152,9 @@ def ranked_precision_nuscenes(hit: Bool[ndarray, "n"], objects: int) -> float:
     if not hit.any():
         return 0.0
     precision, recall = precision_recall(hit, objects)
+    # Precision at 101 recalls, 0 beyond the largest recall that is reached
     resampled = np.interp(np.linspace(0, 1, 101), recall, precision, right=0.0)
+    # Recalls up to 0.10 and precisions up to 0.1 do not count
     return float(np.clip(resampled[11:] - 0.1, 0.0, None).mean() / 0.9)
 
 

@@ -25,7 +25,7 @@ class DetectionMetric:
     """Keys: `nuscenes.map`, `nuscenes.nds`, `nuscenes.ate_m`, `vad.map`, `car_ap_2m_30m`, `frames_counted`.
 
     Frames without annotation do not count. Boxes are compared in the world frame, as in files of results.
-    Figures that need what no true box has, such as an attribute, are None.
+    Figures that need a value that no true box has, such as an attribute, are None.
     """
 
     name = "detection"
@@ -41,6 +41,7 @@ class DetectionMetric:
         clip = truth.clip
         for item in clip.boxes_valid[:, clip.now].nonzero()[:, 0].tolist():
             frame = len(self._true)
+            # World coordinates, as in files of results
             pose = clip.T_world_ego[item, clip.now].cpu().numpy()
             self._found.append(agent_rows(likely(prediction.agents[item]), pose, frame, CLASSES))
             self._true.append(box_rows(clip.boxes[item, clip.now], pose, frame, CLASSES))
@@ -50,12 +51,14 @@ class DetectionMetric:
         if not self._true:
             return {"frames_counted": 0}
         predicted, true = stacked(self._found), stacked(self._true)
+        # Baseline: no detections at all
         none = np.zeros(0, dtype=np.int64)
         nothing, racks, lacks = predicted[none], true[none], lacking(true)
         out = detection_figures(predicted, true, racks, lacks)
         empty = detection_figures(nothing, true, racks, lacks)
         for key in ("map", "nds"):
             out |= {f"{name}.{key}.nothing_detected": empty[f"{name}.{key}"] for name in DETECTION_PROTOCOLS}
+        # Label 0 is the first class, cars
         cars = [rows[rows.label == 0] for rows in (predicted, true)]
         figures = evaluate_detections(cars[0], cars[1], racks, CAR_30M).by_class["car"]
         out |= {"car_ap_2m_30m": figures.ap[2.0] if figures.true else float("nan")}

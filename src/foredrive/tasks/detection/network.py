@@ -52,7 +52,9 @@ class BoxSet(Record):
         Sine and cosine get the variance of the angle.
         """
         log_prob = self.logits.double().log_softmax(-1)
+        # Probability that the query is any object
         log_existence = log_prob[..., :-1].logsumexp(-1)
+        # Sine and cosine both take the spread of the angle
         std_yaw = self.log_std_yaw[..., None].expand(*self.log_std_yaw.shape, 2)
         std = torch.cat([self.log_std, std_yaw], dim=-1).exp()
         return Detections(
@@ -119,7 +121,9 @@ class DetectionHead(nn.Module):
         logits, shift, size, heading, log_std = self.out(queries).split(
             [self.classes + 1, 3, 3, 2, 7], dim=-1
         )
+        # Positions relative to the cell in units of its edge; height relative to the ego frame
         ground = self.middle_m + plane.cell_m * shift[..., :2]
+        # Sizes relative to a typical object
         log_lwh = size + size.new_tensor(TYPICAL_LOG_LWH)
         log_std = log_std.clamp(*LOG_STD_RANGE)
         return BoxSet(

@@ -60,6 +60,7 @@ def read_nuscenes(
     Raises:
         InputError: a record is wrong. The message names the first.
     """
+    # Frames are matched by sample token; results may lack frames, but not have others
     found_boxes, true = _by_frame(results, path), _by_frame(truth, truth_path)
     unknown = sorted(set(found_boxes) - set(true))
     if unknown:
@@ -67,6 +68,7 @@ def read_nuscenes(
     true_names, names = (
         {box["detection_name"] for boxes in side.values() for box in boxes} for side in (true, found_boxes)
     )
+    # Bicycle racks are no objects: they only exclude detections near them
     classes, true_classes = order_classes(true_names - {BICYCLE_RACK}, names)
     frames = []
     sizeless, true_sizeless = 0, 0
@@ -92,7 +94,7 @@ def read_nuscenes(
 
 @dataclass(frozen=True)
 class _Boxes:
-    """Boxes of one frame that have a size, with the ego vehicle's place if they tell it."""
+    """Boxes of one frame that have a size, with the ego vehicle's place if the file has it."""
 
     records: Sequence[Box]
     names: Sequence[str]
@@ -105,8 +107,10 @@ class _Boxes:
     def of(cls, records: Sequence[Box], where: str) -> "_Boxes":
         names = [f"{where}, box {n}" for n in range(len(records))]
         centre, size_lwh, yaw = read_geometry(records, names)
+        # Log sizes need positive sizes, so boxes without them are left out
         sized = np.min(size_lwh, axis=1) > 0
         state = np.concatenate([centre[sized], np.log(size_lwh[sized])], axis=1)
+        # All boxes serve to find the ego vehicle, also those without size
         ego = _ego(records, centre, names)
         return cls(list(compress(records, sized)), list(compress(names, sized)), state, yaw[sized], ego)
 
@@ -118,7 +122,7 @@ class _Boxes:
         return [classes.index(box["detection_name"]) for box in self.records]
 
     def count_in_precision(self, ego: Float[ndarray, "3"] | None, racks: "_Boxes") -> Bool[ndarray, "n"]:
-        """Return whether nuScenes' protocol counts each box. Where the ego vehicle is unknown, ranges are."""
+        """Return whether nuScenes' protocol counts each box. Without the ego vehicle, ranges are unknown."""
         protocol = DETECTION_PROTOCOLS["nuscenes"]
         return counted(
             self.rows(protocol.classes, ego), racks.rows((), ego), protocol.region, protocol.classes
@@ -129,6 +133,7 @@ class _Boxes:
         number = {name: n for n, name in enumerate(classes)}
         label = np.array([number.get(box["detection_name"], -1) for box in self.records], dtype=np.int64)
         points = np.array([box.get("num_pts", UNKNOWN) for box in self.records], dtype=np.int64)
+        # An unknown ego vehicle makes all ranges NaN
         place = np.full(3, np.nan) if ego is None else ego
         return make_rows(
             np.zeros(len(label), np.int64),
@@ -148,8 +153,10 @@ def _frame(
     is_rack = np.array([box["detection_name"] == BICYCLE_RACK for box in true.records], bool)
     racks, true = true[is_rack], true[~is_rack]
     ego = predicted.ego if true.ego is None else true.ego
+    # Without an ego vehicle, the region lies about the middle of all boxes
     every = np.concatenate([true.state, predicted.state])[:, :3]
     origin = ego if ego is not None else every.mean(0) if len(every) else np.zeros(3)
+    # Move the boxes to the region's origin: only positions shift, not log sizes
     shift = np.concatenate([origin, np.zeros(3)])
     true_state = true.state - shift
     seen = [
@@ -226,15 +233,17 @@ def read_geometry(
     wrong = np.flatnonzero(~(np.linalg.norm(rotation, axis=1) > 0))
     if len(wrong):
         raise InputError(f"{names[wrong[0]]} has the rotation {rotation[wrong[0]].tolist()}")
+    # Yaw of a unit quaternion w x y z
     w, x, y, z = (rotation / np.linalg.norm(rotation, axis=1, keepdims=True)).T
     yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y**2 + z**2))
+    # nuScenes writes width, length, height
     return centre, size[:, [1, 0, 2]], yaw
 
 
 def _ego(
     boxes: Sequence[Box], centre: Float[ndarray, "n 3"], names: Sequence[str]
 ) -> Float[ndarray, "3"] | None:
-    """Return the ego vehicle's place if the first box tells it. The devkit writes zeros if it is unknown."""
+    """Return the ego vehicle's place if the first box has it. The devkit writes zeros if it is unknown."""
     if not boxes or "ego_translation" not in boxes[0]:
         return None
     offset = read_numbers(boxes[0], "ego_translation", 3, names[0])

@@ -22,9 +22,13 @@ def error_over_recall(
     """
     if not hit.any():
         return 1.0
+    # Recall after each prediction
     recall = np.cumsum(hit) / objects
+    # Score at which each of 101 recalls is reached; 0 beyond the largest one
     at_recall = np.interp(np.linspace(0, 1, 101), recall, score, right=0.0)
+    # Running mean error as a function of the score; np.interp needs ascending scores, hence the reversals
     curve = np.interp(at_recall[::-1], score[hit][::-1], running_mean(error)[::-1])[::-1]
+    # Steps from recall 0.11 to the largest recall that is reached
     reached = np.flatnonzero(at_recall)
     last = int(reached[-1]) if len(reached) else 0
     return float(curve[FIRST : last + 1].mean()) if last >= FIRST else 1.0
@@ -32,6 +36,7 @@ def error_over_recall(
 
 def running_mean(values: Float[ndarray, "n"]) -> Float[ndarray, "n"]:
     """Return the mean of the known values so far: 0 before the first, 1 everywhere if none is known."""
+    # Unknown errors count neither in the sum nor in the number
     valid: Bool[ndarray, n] = ~np.isnan(values)
     if not valid.any():
         return np.ones(len(values))

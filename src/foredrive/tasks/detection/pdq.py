@@ -37,6 +37,7 @@ def pixel_quality(
     above y2; edges are independent and normal. Pairs of boxes that do not meet have quality 0.
     """
     quality = np.zeros((len(mean), len(boxes)))
+    # Most pairs of boxes do not meet, and need no image
     meets = ((mean[:, None, :2] < boxes[:, 2:]) & (boxes[:, :2] < mean[:, None, 2:])).all(-1)
     for i, j in np.argwhere(meets):
         spatial = _spatial_quality(mean[i], std[i], boxes[j])
@@ -46,6 +47,7 @@ def pixel_quality(
 
 def count_pdq(quality: Float[ndarray, "M N"]) -> PdqCounts:
     """Count the pairs of the assignment of the largest total quality."""
+    # Assignment of the largest total quality; pairs without quality are no pairs
     i, j = linear_sum_assignment(-quality)
     paired = quality[i, j][quality[i, j] > 0]
     pairs = len(paired)
@@ -62,11 +64,13 @@ def _spatial_quality(mean: Float[ndarray, "4"], std: Float[ndarray, "4"], box: F
     """Return exp(-(loss of foreground + loss of background)), each a mean over the object's pixels."""
     along, inside_x = _along(mean[[0, 2]], std[[0, 2]], box[[0, 2]])
     down, inside_y = _along(mean[[1, 3]], std[[1, 3]], box[[1, 3]])
+    # Pixels of the object, and probability of each pixel to be in the detection: a product over both axes
     inside = inside_y[:, None] & inside_x
     pixels = inside.sum()
     if pixels == 0:
         return 0.0
     covered = np.clip(down[:, None] * along, MIN_PROBABILITY, 1 - MIN_PROBABILITY)
+    # Log-likelihood of the object's pixels as foreground and of the others as background
     loss = np.log(covered[inside]).sum() + np.log1p(-covered[~inside]).sum()
     return float(np.exp(loss / pixels))
 
@@ -75,8 +79,10 @@ def _along(
     edges: Float[ndarray, "2"], std: Float[ndarray, "2"], box: Float[ndarray, "2"]
 ) -> tuple[Float[ndarray, "n"], ndarray]:
     """Return which pixels of a row lie between the edges, as a probability, and which are the object's."""
+    # Pixels that either the object or the uncertain detection can reach
     low = np.floor(min(edges[0] - OUTSIDE_STD * std[0], box[0]))
     high = np.ceil(max(edges[1] + OUTSIDE_STD * std[1], box[1]))
     middle = np.arange(low, high) + 0.5
+    # The middle lies right of the first edge and left of the second
     probability = ndtr((middle - edges[0]) / std[0]) * ndtr((edges[1] - middle) / std[1])
     return probability, (middle >= box[0]) & (middle <= box[1])

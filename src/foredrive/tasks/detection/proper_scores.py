@@ -24,7 +24,9 @@ def object_brier(
     error of Park, Sobolewski and Azizan (arXiv 2412.01782), at one threshold of nearness.
     """
     count = near.sum(0)
+    # Mean class probabilities over the detections near each object
     mean = near.T.astype(float) @ probability / np.maximum(count, 1)[:, None]
+    # Minus the one-hot truth; the squared sum is the Brier score
     mean[np.arange(len(label)), label] -= 1.0
     return np.where(count > 0, (mean**2).sum(1), 1.0)
 
@@ -36,6 +38,7 @@ def crps_gaussian(
 
     Gneiting and Raftery (2007), eq. 21.
     """
+    # Closed form for a normal distribution
     z = (value - mean) / std
     density = np.exp(-0.5 * z**2) / math.sqrt(2 * math.pi)
     return std * (z * (2 * ndtr(z) - 1) + 2 * density - 1 / math.sqrt(math.pi))
@@ -44,6 +47,7 @@ def crps_gaussian(
 def crps_laplace(
     mean: Float[ndarray, "..."], std: Float[ndarray, "..."], value: Float[ndarray, "..."]
 ) -> Float[ndarray, "..."]:
+    # Closed form for a Laplace distribution
     """Return that of Laplace predictions, which have scale σ/√2."""
     scale = std / math.sqrt(2)
     z = np.abs(value - mean) / scale
@@ -57,9 +61,11 @@ def energy_score(
 
     E|X - y| - ½ E|X - X'| over `samples` draws of either; unbiased. Headings are left out.
     """
+    # Two independent sets of draws of every box
     repeated = boxes[np.repeat(np.arange(len(boxes.mean)), 2 * samples)]
     shape = (len(boxes.mean), 2, samples, boxes.mean.shape[-1])
     one, other = np.moveaxis(repeated.sample(rng)[0].numpy().reshape(shape), 1, 0)
     truth = objects.state.double().cpu().numpy()[:, None]
+    # Both sets estimate E|X - y|, pairs of them E|X - X'|
     to_truth = 0.5 * (np.linalg.norm(one - truth, axis=-1) + np.linalg.norm(other - truth, axis=-1))
     return (to_truth - 0.5 * np.linalg.norm(one - other, axis=-1)).mean(-1)

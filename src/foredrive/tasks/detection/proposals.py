@@ -69,6 +69,7 @@ class CentreHead(nn.Module):
         out = self.out(self.shared(plane.features))
         logits, boxes = out[:, : self.classes], out[:, self.classes :].permute(0, 2, 3, 1)
         shift, z, size, heading, velocity = boxes.split(BOX_NUMBERS, dim=-1)
+        # Boxes relative to the middle of their cell, in units of its edge
         middle = cell_middles(plane.lower_m, plane.cell_m, (out.shape[2], out.shape[3])).to(out)
         return CentreMap(
             logits=logits,
@@ -87,8 +88,10 @@ def best_proposals(centres: CentreMap, count: int) -> Proposals:
     As in TransFusion (Bai et al. 2022, §3.3). Nothing passes a gradient.
     """
     logits = centres.logits
+    # A cell is a peak if no neighbour has a larger logit of the same class
     peak = F.max_pool2d(logits, 3, stride=1, padding=1) == logits
     cells = logits[0, 0].numel()
+    # Rank classes and cells together; flattened index = class · cells + cell
     ranked = torch.where(peak, logits, -torch.inf).flatten(1)
     best = ranked.topk(min(count, ranked.shape[1]), dim=1).indices
     label, cell = best // cells, best % cells

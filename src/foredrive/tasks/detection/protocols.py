@@ -123,6 +123,7 @@ def evaluate_detections(
         true, predicted: labels are indices into the protocol's classes; -1 is left out.
         racks: bicycle racks; labels do not matter.
     """
+    # Boxes that the protocol counts: in range, with points, not at a bicycle rack
     predicted, true = (
         boxes[(boxes.label >= 0) & counted(boxes, racks, protocol.region, protocol.classes)]
         for boxes in (predicted, true)
@@ -131,8 +132,10 @@ def evaluate_detections(
         name: _class_figures(predicted[predicted.label == n], true[true.label == n], name, protocol)
         for n, name in enumerate(protocol.classes)
     }
+    # Classes without true boxes count with 0; NaN errors of undefined classes do not count
     mean_ap = float(np.mean([np.mean([*figures.ap.values()]) for figures in by_class.values()]))
     errors = {key: mean_of_valid([figures.errors[key] for figures in by_class.values()]) for key in ERRORS}
+    # NDS: weighted mean of mAP and of 1 - error of each kind
     score = protocol.map_weight * mean_ap + sum(max(0.0, 1.0 - error) for error in errors.values())
     return DetectionFigures(by_class, mean_ap, errors, score / (protocol.map_weight + len(ERRORS)))
 
@@ -140,6 +143,7 @@ def evaluate_detections(
 def _class_figures(
     predicted: ObjectRows, true: ObjectRows, name: str, protocol: DetectionProtocol
 ) -> ClassFigures:
+    # The devkit's order: descending score, equal scores from the end of the file
     predicted = predicted[descending(predicted.score, ties_reversed=True)]
     partners = match_centres(
         predicted.frame,
@@ -153,6 +157,7 @@ def _class_figures(
         distance: ranked_precision_nuscenes(partner >= 0, len(true)) if len(true) else 0.0
         for distance, partner in zip(protocol.distances_m, partners, strict=True)
     }
+    # Errors are those of the hits at one distance
     partner = partners[protocol.distances_m.index(protocol.error_distance_m)]
     errors = _mean_errors(predicted, true, partner, name, protocol)
     undefined = dict.fromkeys(protocol.without.get(name, ()), math.nan)
@@ -176,10 +181,12 @@ def hit_errors(
     predicted: ObjectRows, true: ObjectRows, *, half_turn: bool = False
 ) -> dict[str, Float[ndarray, "n"]]:
     """Return `ERRORS` of pairs. NaN: the velocity is unknown, or the true box has no attribute."""
+    # Overlap of aligned boxes: the smaller of each dimension
     smaller, a, b = (
         size.prod(axis=1)
         for size in (np.minimum(predicted.size_lwh, true.size_lwh), predicted.size_lwh, true.size_lwh)
     )
+    # Difference of headings to half a period; fronts and backs of barriers look alike
     period = math.pi if half_turn else 2 * math.pi
     turn = np.abs((true.yaw - predicted.yaw + period / 2) % period - period / 2)
     wrong = np.where(predicted.attribute == true.attribute, 0.0, 1.0)
@@ -188,5 +195,6 @@ def hit_errors(
         "ase": 1.0 - smaller / (a + b - smaller),
         "aoe_rad": turn,
         "ave_mps": np.linalg.norm(predicted.velocity - true.velocity, axis=1),
+        # A box without a known attribute has no attribute error
         "aae": np.where(true.attribute == UNKNOWN, np.nan, wrong),
     }

@@ -36,8 +36,10 @@ def reliability(
     confidence: Float[ndarray, "n"], outcome: Shaped[ndarray, "n"], bins: int = 25
 ) -> Reliability:
     """Bin confidences in [0, 1] and their outcomes; a bin holds its upper edge."""
+    # ceil - 1 puts an upper edge into its own bin; 0 goes into the first one
     which = np.clip(np.ceil(confidence * bins).astype(int) - 1, 0, bins - 1)
     count = np.bincount(which, minlength=bins)
+    # Empty bins give 0 / 0 = NaN
     with np.errstate(invalid="ignore"):
         mean_confidence = np.bincount(which, confidence, bins) / count
         mean_outcome = np.bincount(which, outcome.astype(float), bins) / count

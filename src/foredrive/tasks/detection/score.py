@@ -131,6 +131,7 @@ def predicted_set(
     """
     if config.background_rate == 0:
         return PoissonMultiBernoulli.from_detections(frame.detected, config.low_confidence)
+    # The background rate is shared evenly by the classes of the truth
     rate = torch.zeros(classes, dtype=torch.float64)
     rate[:true_classes] = config.background_rate / true_classes
     uniform = UniformPoisson(
@@ -146,6 +147,7 @@ def _score_frame(frame: DetectionFrame, detection_set: DetectionSet, config: Sco
     is_3d = detection_set.is_3d
     pmb = predicted_set(frame, len(detection_set.classes), detection_set.true_classes, config)
     result = set_nll(pmb, frame.objects, k=config.k)
+    # The other detections are background, and have no association
     bernoulli = np.flatnonzero(frame.detected.log_existence.numpy() > np.log(config.low_confidence))
     closeness = _closeness(frame, is_3d)
     detections = _detections(frame, result, bernoulli, closeness, is_3d)
@@ -154,6 +156,7 @@ def _score_frame(frame: DetectionFrame, detection_set: DetectionSet, config: Sco
         frame.name,
         frame.sequence,
         float(result.nll),
+        # Upper minus lower bound of the NLL if not all associations are summed
         float(result.nll) - result.lower if result.nll.isfinite() else 0.0,
         {part: float(getattr(result, part)) for part in PARTS},
         *_gospas(frame, detections, is_3d),
@@ -167,6 +170,7 @@ def _score_frame(frame: DetectionFrame, detection_set: DetectionSet, config: Sco
 def _pdq(frame: DetectionFrame, detections: DetectionScores) -> PdqCounts:
     """Count pairs for PDQ. Label quality is existence times class probability."""
     boxes = frame.detected.boxes
+    # Standard deviation of each edge: root of the diagonal of L Lᵀ
     std = boxes.chol.square().sum(-1).sqrt().numpy()
     share = detections.existence[:, None] * frame.detected.log_class.exp().numpy()
     true = frame.objects
@@ -180,9 +184,11 @@ def _objects(
     brier: Float[ndarray, "N"],
 ) -> ObjectScores:
     associations, count = result.associations, len(result.associations.background)
+    # Expected cost over associations: probability of each pair times its negative log-likelihood
     box = -associations.probability * result.pair_log_box.numpy()
     label = -associations.probability * result.pair_log_label.numpy()
     log_background = result.log_background.numpy()
+    # 0 · -inf is NaN: an object that is never missed has no cost
     with np.errstate(invalid="ignore"):
         missed = np.where(associations.background > 0, -associations.background * log_background, 0.0)
     return ObjectScores(
@@ -191,6 +197,7 @@ def _objects(
         np.bincount(associations.object, label, count).astype(float),
         missed,
         associations.background,
+        # Index among all detections; -1 stays background
         np.where(associations.best < 0, -1, np.append(bernoulli, -1)[associations.best]),
         brier,
     )
@@ -200,7 +207,9 @@ def _object_brier(
     frame: DetectionFrame, bernoulli: Int[ndarray, "_"], closeness: Float[ndarray, "M N"], is_3d: bool
 ) -> Float[ndarray, "N"]:
     detected, label = frame.detected, frame.objects.label.numpy()
+    # Probability of existence with each class
     probability = (detected.log_existence[:, None] + detected.log_class).exp().numpy()[bernoulli]
+    # Closeness is minus the distance, or the overlap
     thresholds = [-distance for distance in NEAR_M] if is_3d else NEAR_OVERLAP
     briers = [object_brier(probability, closeness[bernoulli] >= nearness, label) for nearness in thresholds]
     return np.mean(briers, axis=0)
@@ -217,10 +226,13 @@ def _detections(
     label = detected.log_class.argmax(-1).numpy()
     score = (detected.log_existence + detected.log_class.amax(-1)).exp().numpy()
     has_object = np.full(len(label), np.nan)
+    # The posterior probability that no object belongs to a detection
     has_object[bernoulli] = 1.0 - result.associations.absent
     true, overlap = objects.label.numpy(), np.full(len(label), np.nan if is_3d else 0.0)
+    # Only objects of the same class can be hit
     near = np.where(label[:, None] == true, closeness, -np.inf)
     if not is_3d:
+        # Any overlap above 0 is a match here
         taken = match_greedily(descending(score), near, np.nextafter(0.0, 1.0))
         which = np.flatnonzero(taken >= 0)
         overlap[which] = near[which, taken[which]]
@@ -234,6 +246,7 @@ def _precision(
     """Match the detections and objects that average precision counts, by the file's labels and scores."""
     label, score, true = detections.label, detections.score, frame.objects.label.numpy()
     counts = frame.object_counts
+    # Average precision reads the file's own labels and scores, and only what the protocol counts
     if frame.stated is not None:
         which = np.flatnonzero(frame.stated.counts)
         label, score, closeness = frame.stated.label[which], frame.stated.score[which], closeness[which]
@@ -246,6 +259,7 @@ def _precision(
 def _hits(score: Float[ndarray, "m"], near: Float[ndarray, "m n"], is_3d: bool) -> Bool[ndarray, "T m"]:
     """Return whether each detection hits an object, at each distance (nuScenes) or overlap (COCO)."""
     order = descending(score, ties_reversed=is_3d)
+    # nuScenes asks for a distance below the threshold, COCO for an overlap of at least the threshold
     thresholds = [np.nextafter(-d, 0.0) for d in NUSCENES_DISTANCES_M] if is_3d else COCO_OVERLAPS
     return np.array([match_greedily(order, near, threshold) >= 0 for threshold in thresholds])
 
@@ -262,8 +276,10 @@ def _gospas(frame: DetectionFrame, detections: DetectionScores, is_3d: bool) -> 
     """Return GOSPA of detections above a half, and P-GOSPA of all. Likeliest classes must agree."""
     dims, cutoff = (3, GOSPA_CUTOFF_M) if is_3d else (4, GOSPA_CUTOFF_PX)
     boxes, objects = frame.detected.boxes, frame.objects
+    # Pairs of different classes are impossible
     same = detections.label[:, None] == objects.label.numpy()
     apart = np.linalg.norm(boxes.mean.numpy()[:, None, :dims] - objects.state.numpy()[:, :dims], axis=-1)
+    # GOSPA knows no probabilities: unlikely detections are left out
     likely = detections.score >= GOSPA_CONFIDENCE
     spread = wasserstein_distance(boxes, objects, dims)
     return (

@@ -66,11 +66,13 @@ def compare_scores(
     if [score.name for score in scores] != [other.name for other in others]:
         raise InputError("two files of detections can be compared on the same frames only")
     ours, theirs = (np.array([score.nll for score in scored]) for scored in (scores, others))
+    # An infinite likelihood has no difference
     both = np.isfinite(ours) & np.isfinite(theirs)
     if not both.any():
         raise InputError("there is no frame in which both likelihoods are finite")
     sequences = np.array([score.sequence for score in scores])[both].tolist()
     compared = bootstrap_mean((ours - theirs)[both], sequences, np.random.default_rng(seed))
+    # Whole sequences are resampled, as frames of one sequence resemble each other
     return compared, int((~both).sum())
 
 
@@ -94,6 +96,7 @@ def _likelihood(
 ) -> Figures:
     """Average the likelihood and its parts over frames where it is finite."""
     nll = np.array([score.nll for score in scores])
+    # Parts are averaged over the same frames as the whole
     finite = np.isfinite(nll)
     if not finite.any():
         return {}
@@ -130,6 +133,7 @@ def _precision(
     hit, true = _joined(scores, "precision", "hit"), _joined(scores, "precision", "true_label")
     thresholds = NUSCENES_DISTANCES_M if detection_set.is_3d else COCO_OVERLAPS
     average = average_precision_nuscenes if detection_set.is_3d else average_precision_coco
+    # Average precision by class and threshold
     table = np.array(
         [
             [average(score[label == c], row[label == c], int((true == c).sum())) for row in hit]
@@ -167,6 +171,7 @@ def _diagrams(detection_set: DetectionSet, scores: Sequence[FrameScore]) -> dict
     diagrams = {"d_ece": reliability(score, hit[radius])}
     existence = _joined(scores, "detections", "existence")
     has_object = _joined(scores, "detections", "has_object")
+    # Background detections have no association
     bernoulli = ~np.isnan(has_object)
     diagrams["existence"] = reliability(existence[bernoulli], has_object[bernoulli])
     return diagrams
@@ -184,6 +189,7 @@ def _calibration(
         "brier.hit": float(brier(score, hit[radius]).mean()) if len(score) else None,
         "calibration.object_level": float(of_objects.mean()) if len(of_objects) else None,
     }
+    # LaECE: overlap of hits; LaECE₀: any overlap
     outcomes = (
         {} if detection_set.is_3d else {"la_ece": np.where(hit[radius], overlap, 0.0), "la_ece_0": overlap}
     )
@@ -208,6 +214,7 @@ def _pairs(detection_set: DetectionSet, scores: Sequence[FrameScore], rng: np.ra
     """Return proper scores, scale of σ and coverage of boxes and objects in the likeliest associations."""
     boxes, objects = [], []
     for frame, score in zip(detection_set.frames, scores, strict=True):
+        # Objects whose likeliest association is a detection
         has = np.flatnonzero(score.objects.best >= 0)
         if len(has):
             boxes.append(frame.detected.boxes[score.objects.best[has]])
@@ -222,9 +229,11 @@ def _pairs(detection_set: DetectionSet, scores: Sequence[FrameScore], rng: np.ra
     figures: Figures = {
         f"crps.{axis}": float(crps(mean[:, d], std[:, d], state[:, d]).mean()) for d, axis in enumerate(axes)
     }
+    # At most 2000 boxes, since the energy score draws samples
     some = rng.permutation(len(mean))[:2000]
     figures["energy_score"] = float(energy_score(density[some], truth[some], rng).mean())
     figures["std.best_factor"] = fit_scale(density, truth)
+    # Conformal factor from one half of the boxes, its coverage on the other half
     half, rest = np.split(rng.permutation(len(mean)), [len(mean) // 2])
     factor = conformal_factor(density[half], truth[half], COVERAGE)
     figures["conformal.factor_90"] = factor
@@ -244,6 +253,7 @@ def _slices(detection_set: DetectionSet, scores: Sequence[FrameScore], rng: np.r
     ]
     if not pairs:
         return {}
+    # Frames with an infinite likelihood have no costs of single objects
     frames, scores = [frame for frame, _ in pairs], [score for _, score in pairs]
     label = _joined(scores, "objects", "label")
     figures: Figures = _relevance(frames, scores)
@@ -264,6 +274,7 @@ def _slices(detection_set: DetectionSet, scores: Sequence[FrameScore], rng: np.r
     seen = [frame.visibility for frame in frames if frame.visibility is not None]
     if len(seen) == len(frames) and not np.isnan(np.concatenate(seen)).any():
         visibility = np.concatenate(seen)
+        # Thirds of the visibility; equal values give fewer classes
         edges = np.unique(np.quantile(visibility, [0.0, 1 / 3, 2 / 3])) if len(visibility) else visibility
         for low, high in pairwise([*edges.tolist(), np.inf]):
             inside = np.flatnonzero((visibility >= low) & (visibility < high))

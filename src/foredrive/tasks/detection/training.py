@@ -37,6 +37,7 @@ def fit_head(
         raise InputError(f"{len(samples)} samples are fewer than a batch of {batch}")
     head = copy.deepcopy(head).train()
     rng = np.random.default_rng(seed)
+    # Weight decay acts on some parameters only (see `parameter_groups`)
     optimizer = torch.optim.AdamW(parameter_groups(head, weight_decay=1e-2), learning_rate)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, learning_rate, total_steps=steps)
     with torch.random.fork_rng(devices=[]):
@@ -47,6 +48,7 @@ def fit_head(
             predicted = head(torch.stack([samples[n][0] for n in chosen]))
             losses = [loss(predicted[place], samples[n][1]) for place, n in enumerate(chosen)]
             _check_finite(losses, chosen, samples, queries=len(head.middle_m))
+            # A frame without a finite loss stops the training with its cause
             torch.stack(losses).mean().backward()
             torch.nn.utils.clip_grad_norm_(head.parameters(), 10.0)
             optimizer.step()

@@ -35,6 +35,7 @@ def log_frames(folder: Path, wanted: Collection[str], path: Path) -> Iterator[Lo
     """
     frames = []
     for drive, log_path in enumerate(find_logs(folder)):
+        # Logs without wanted frames are not opened
         if not any(name.startswith(f"{log_path.name}@") for name in wanted):
             continue
         log = Log(log_path)

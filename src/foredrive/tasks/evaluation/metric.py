@@ -60,6 +60,7 @@ def labels_from_now(labels: VoxelGrid, clip: Clip, frames: int) -> VoxelGrid:
     Raises:
         InputError: if the clip ends before.
     """
+    # Labels begin with past frames; now comes after them
     now = clip.now
     if now + frames > clip.t_s.shape[1]:
         raise InputError(

@@ -52,7 +52,6 @@ class Prediction(Record):
     """Index of the class of each voxel, in the classes and on the grid of the truth."""
     instances: Int[Tensor, "b S _Y _X"] | None = None
     """Number + 1 of the vehicle at each cell now and later, the same over time, on the grid of the truth."""
-    """The next light, the lead vehicle and people who will cross."""
     image_stride: int = 1
     """One pixel in `image_stride` along rows and columns is rendered, the first at `image_stride // 2`."""
 

@@ -66,8 +66,7 @@ Record = dict[str, Any]
 class ResultsFiles:
     """Collects the predictions of an evaluation batch by batch, and writes them.
 
-    Frames that the log does not annotate are left out, unless it annotates none: they can be scored nowhere
-    else then.
+    Frames that the log does not annotate are left out, unless it annotates none: then all frames are written.
 
     Args:
         folder: an empty folder for the files. Voxels are written to it at once.
@@ -86,6 +85,7 @@ class ResultsFiles:
         The files of an earlier evaluation are removed then: scored with the new ones, they would count as
         predictions. Other files in the folder stay.
         """
+        # The files appear together at the end of the block, in place of those before
         with atomic_path(folder) as scratch:
             scratch.mkdir()
             files = cls(scratch)
@@ -93,6 +93,7 @@ class ResultsFiles:
             files._write()
             earlier = {folder / f"{task}.json" for task in TASKS} | {folder / OCCUPANCY / GRID_FILE}
             earlier |= set((folder / OCCUPANCY).rglob("*@*.npz"))
+            # Files of others in the folder are kept
             for other in (path for path in folder.rglob("*") if path.is_file() and path not in earlier):
                 kept = scratch / other.relative_to(folder)
                 kept.parent.mkdir(parents=True, exist_ok=True)
@@ -107,12 +108,14 @@ class ResultsFiles:
                 agents = likely(prediction.agents[item].to("cpu"))
                 pose = clip.T_world_ego[item, clip.now].cpu().numpy()
                 for task, records in _agent_records(token, agents, pose).items():
+                    # The first item of the pair tells whether the frame can be judged
                     self._frames.setdefault(task, {})[token] = (annotated, records)
             if prediction.map_lines is not None:
                 elements = None if truth.truth is None else truth.truth.elements
                 known = elements is not None and bool(elements.known[item])
                 vectors = _vectors(prediction.map_lines[item].to("cpu"))
                 self._frames.setdefault("map", {})[token] = (known, vectors)
+            # Voxels are written at once, as they are large
             semantics = None if truth.truth is None else truth.truth.semantics
             if prediction.semantics is not None and semantics is not None:
                 flow = None if prediction.flow_mps is None else prediction.flow_mps[item, 0, :2]
@@ -150,6 +153,7 @@ class ResultsFiles:
                 ]
                 content = {"meta": meta | {"area_m": area_m}, "results": vectors}
             write_json(self.folder / f"{task}.json", content, indent=None)
+        # Voxels of unlabelled frames are removed if others have labels
         if any(self._voxels.values()):
             for path in (path for path, written in self._voxels.items() if not written):
                 path.unlink()
@@ -178,6 +182,7 @@ def _agent_records(token: str, agents: Agents, T_world_ego: Pose) -> dict[str, l
         if track >= 0 and name in TRACKED
     ]
     if agents.future_xy is not None and agents.log_prob is not None:
+        # Futures are offsets of centres in the ego frame: move them to the world
         centre = agents.centre.double().numpy()
         futures = futures_in_world(agents.future_xy.double().numpy(), centre, T_world_ego)
         probabilities = agents.log_prob.double().exp().numpy()
@@ -198,8 +203,10 @@ def _agent_records(token: str, agents: Agents, T_world_ego: Pose) -> dict[str, l
 def _box_records(token: str, agents: Agents, T_world_ego: Pose) -> list[Record]:
     """Return what detections and tracks share: places, sizes, rotations and velocities in the world frame."""
     centre = places_in_world(agents.centre.double().numpy(), T_world_ego)
+    # Half angles for a quaternion about the vertical axis
     half_yaw = 0.5 * (agents.yaw.double().numpy() + ego_yaw(T_world_ego))
     velocity = velocities_in_world(agents.velocity.double().numpy(), T_world_ego)
+    # nuScenes writes width, length, height
     size_wlh = agents.size_lwh.double().numpy()[:, [1, 0, 2]]
     rotation = _rotations(half_yaw)
     columns = {"translation": centre, "size": size_wlh, "rotation": rotation, "velocity": velocity}
@@ -209,6 +216,7 @@ def _box_records(token: str, agents: Agents, T_world_ego: Pose) -> list[Record]:
     ]
 
 
+# Quaternion w x y z
 def _rotations(half_yaw: Float[ndarray, "n"]) -> Float[ndarray, "n 4"]:
     zero = np.zeros_like(half_yaw)
     return np.stack([np.cos(half_yaw), zero, zero, np.sin(half_yaw)], axis=1)

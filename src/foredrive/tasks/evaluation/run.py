@@ -168,6 +168,7 @@ def judge(
     """
     started = time.perf_counter()
     context = EvaluationContext(frame_dt_s, prior, task_priors)
+    # The model and each baseline accumulate figures of their own
     model = _JudgedMethod(metrics, context)
     planners = {
         name: (PlannerPredictor(planner), _JudgedMethod(metrics, context, only=frozenset({"plan"})))
@@ -176,6 +177,7 @@ def judge(
     with torch.inference_mode():
         for batch in batches:
             model.add(batch, on_prediction)
+            # Baselines see the same items, also those that the model failed on
             if batch.truth is not None:
                 for predictor, method in planners.values():
                     method.add(_predicted(predictor, batch.truth.to(device), frozenset({"plan"})))
@@ -187,6 +189,7 @@ def judge(
     summary = model.figures()
     for name, (_, method) in planners.items():
         summary |= method.figures(f"{name}.") | {f"planning.{name}.failed": len(method.failures)}
+    # Commands that come from the driven future leak it, so their source is part of the summary
     summary |= _command_figures(command_source or {})
     summary |= {"items": model.items + failed, "failed": failed}
     summary |= {"peak_rss_gib": peak_rss_gib(), "wall_s": time.perf_counter() - started}
@@ -207,6 +210,7 @@ class _JudgedMethod:
         only: frozenset[Part] | None = None,
     ) -> None:
         started = [start(context) for start in metrics]
+        # A baseline of plans gets the metrics that need nothing but a plan
         self._metrics = [metric for metric in started if only is None or metric.needs <= only]
         self._has_figures = [only is not None for _ in self._metrics]
         """Metrics that give figures: those that were updated, and all of them where `only` is given."""
@@ -224,6 +228,7 @@ class _JudgedMethod:
             truth = _select(batch.truth, chosen)
             self.items += len(chosen)
             for number, metric in enumerate(self._metrics):
+                # A metric counts only where the model gives all parts that it reads
                 if all(getattr(prediction, part) is not None for part in metric.needs):
                     metric.update(prediction, truth)
                     self._has_figures[number] = True
@@ -243,8 +248,10 @@ def _predicted(predictor: Predictor, example: Example, asked: frozenset[Part]) -
     """Predict one batch; if it fails, item by item."""
     batches, parts, failures = [torch.arange(len(example.key))], [], []
     while batches:
+        # The queue holds index sets: first the whole batch, after an error its single items
         chosen = batches.pop(0)
         try:
+            # The model sees the clip up to now only
             part = _select(example, chosen)
             observed = part.clip.observed()
             if isinstance(predictor, DriveFollowing):
@@ -257,6 +264,7 @@ def _predicted(predictor: Predictor, example: Example, asked: frozenset[Part]) -
                 failures.append(Failure(example.key[int(chosen)], _line(error)))
             continue
         good = _is_complete(prediction).cpu()
+        # Items with values that are not finite fail; the rest of the batch is kept
         bad = chosen[~good].tolist()
         failures.extend(Failure(example.key[i], "not finite or incomplete") for i in bad)
         if good.all():

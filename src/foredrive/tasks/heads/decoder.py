@@ -46,6 +46,7 @@ class QueryDecoderLayer(nn.Module):
     ) -> Float[Tensor, "b Q W"]:
         """Return the queries after one layer. `place` and `cell_place` are embeddings of positions."""
         normed = self.norms[0](queries)
+        # Positions are part of queries and keys, values are features alone
         asked = normed + place
         queries = queries + self.among(asked, asked, normed, need_weights=False)[0]
         asked = self.norms[1](queries) + place

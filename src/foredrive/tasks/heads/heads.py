@@ -41,7 +41,6 @@ class TaskHeadsConfig:
     voxels: VoxelHeadConfig | None = field(default_factory=VoxelHeadConfig)
     instances: InstanceHeadConfig | None = None
     """Needs agents, and beliefs that the world model imagines."""
-    """Reads the image features of now, which only heads within an agent have."""
     volume_of: Task | None = None
     """Task whose volume all heads read. None: each head reads that of its own task. A frozen world model has
     learned no prompt but that of occupancy for the present, so probes read this one."""
@@ -120,12 +119,14 @@ def volumes_of(
         tasks: tasks of the heads.
         later: number of key frames to imagine, or as many as the world model can.
     """
+    # Imagining is costly and runs only for heads that read it
     imagined, T_now_later = imagined_volumes(world, belief, later) if later else (None, None)
     past = None if belief.T_past_now is None or belief.history is None else belief.history[:, -2]
     made: dict[int, TaskVolume] = {}
     by_task: dict[Task, TaskVolume] = {}
     for task in tasks:
         volume = world.volume_for(belief, task)
+        # Tasks with the same volume share one record, and with it the planes made of it
         by_task[task] = made.setdefault(
             id(volume),
             TaskVolume(volume, past, belief.T_past_now, imagined, T_now_later),
@@ -223,6 +224,7 @@ class TaskHeads(nn.Module):
 
         def planes_of(task: Task) -> Planes:
             volume = volume_of(task)
+            # Planes are made once for each distinct volume
             if id(volume) not in made:
                 made[id(volume)] = self.planes(volume.now, volume.past, volume.T_past_now)
             return made[id(volume)]
@@ -240,6 +242,7 @@ class TaskHeads(nn.Module):
             voxels = self.voxels(volume_of("occupancy").now, planes_of("occupancy"))
         instances = None
         if self.instances is not None and agents is not None and volume_of(of_agents).later is not None:
+            # Imagined volumes are read for the last frame of a sequence only
             last = _last_frames(steps)
             instances = self._imagined(
                 self.instances,
@@ -257,6 +260,7 @@ class TaskHeads(nn.Module):
         later, before = [], volume.now
         T_now_before = torch.eye(4, device=before.device).expand(len(before), 4, 4)
         for imagined, T_now in zip(volume.later.unbind(1), volume.T_now_later.unbind(1), strict=True):
+            # Motion from the imagined frame to the frame before it
             T_before_now = torch.linalg.inv(T_now_before.to(T_now)) @ T_now
             later.append(self.planes(imagined, before, T_before_now).fine)
             before, T_now_before = imagined, T_now

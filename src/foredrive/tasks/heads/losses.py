@@ -46,8 +46,8 @@ def task_losses(
     Args:
         output: of the heads for b items. A head that was left out has no loss.
         boxes: at now.
-        boxes_valid: whether an item is annotated at now. Others do not train the agents.
-        truth: of b items. What it lacks trains nothing.
+        boxes_valid: whether an item is annotated at now. The others have no losses of agents.
+        truth: of b items. A task without truth has no loss.
         spec: grid of the volumes.
         class_weight: weight of each class of semantic voxels.
         weights: weights of the losses.
@@ -76,6 +76,7 @@ def task_losses(
     if output.voxels is not None and truth.semantics is not None:
         losses["voxels"] = weights.voxels * _voxel_loss(output.voxels, truth.semantics, class_weight)
     if output.instances is not None and output.agents is not None and truth.instances is not None:
+        # Rows of the last frames
         last = slice(frames - 1, None, frames)  # the heads leave out the other frames of a sequence
         losses["instances"] = weights.instances * instance_loss(
             output.instances,
@@ -91,6 +92,7 @@ def task_losses(
 
 def _map_loss(layers: list[MapSet], elements: MapElements, weights: MapLossWeights) -> Float[Tensor, ""]:
     """Return the mean over layers and over items with a map."""
+    # Every layer has a loss (deep supervision); items without a map have none
     values = []
     for item in elements.known.nonzero()[:, 0].tolist():
         kinds, points = layers[0].logits.shape[-1], layers[0].points.shape[-2]
@@ -104,6 +106,7 @@ def _map_loss(layers: list[MapSet], elements: MapElements, weights: MapLossWeigh
                 + weights.points * losses.points
                 + weights.direction * losses.direction
             )
+    # Zero with a gradient, for batches without a map
     return torch.stack(values).mean() if values else layers[0].logits.sum() * 0
 
 

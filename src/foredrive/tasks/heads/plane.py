@@ -40,6 +40,7 @@ class Plane(Record):
 
     def at(self, points_m: Float[Tensor, "b *n 2"]) -> Float[Tensor, "b *n W"]:
         """Return the features at points of the ego frame, bilinear; they fall to 0 outside of the plane."""
+        # grid_sample has the borders of the plane at -1 and 1; one row of N points
         where = (2 * self.share(points_m) - 1).flatten(1, -2)[:, None]
         sampled = F.grid_sample(self.features, where.to(self.features), align_corners=False)
         return sampled[:, :, 0].mT.unflatten(1, points_m.shape[1:-1])
@@ -68,6 +69,7 @@ class PlaneFeatures(nn.Module):
     def __init__(self, spec: VoxelSpec, *, channels: int, width: int, shrink: int) -> None:
         super().__init__()
         depth = spec.shape_zyx[0]
+        # Heights and channels of a column become the channels of an image
         convolutions: list[nn.Module] = [nn.Conv2d(depth * channels, width, 3, padding=1), nn.ReLU()]
         for _ in range(shrink):
             convolutions += [
@@ -134,15 +136,19 @@ class PlanePyramid(nn.Module):
             T_past_now: the ego frame at now -> the ego frame of the past volume.
         """
         plane = self.columns(volume.flatten(1, 2))
+        # Without a past volume the second half of the channels is 0
         if self.past:
             before = torch.zeros_like(plane)
             if past is not None and T_past_now is not None:
                 before = self._moved(self.columns(past.flatten(1, 2)), T_past_now)
             plane = torch.cat([plane, before], dim=1)
+        # Channels-last memory is the faster layout for convolutions
         levels = [self.join(plane.contiguous(memory_format=torch.channels_last))]
+        # Down to one level below the coarse plane
         for down in self.down:
             levels.append(down(levels[-1]))
         refined = levels.pop()
+        # Up again: coarse features added to each finer level; the level of the coarse plane is kept
         for n in reversed(range(len(levels))):
             narrowed = self.narrow[n](refined)
             refined = self.up[n](
@@ -157,6 +163,7 @@ class PlanePyramid(nn.Module):
     def _moved(self, past: Float[Tensor, "b W y x"], T_past_now: Float[Tensor, "b 4 4"]) -> Tensor:
         """Read the plane of the past at the places of now's cells, 0 outside."""
         middle = cell_middles(self.lower_m, self.cell_m, self.shape_yx).to(past)
+        # Places of now's cells in the past ego frame, rotated and shifted over the ground
         moved = middle @ T_past_now[:, :2, :2].mT.to(past) + T_past_now[:, None, :2, 3].to(past)
         return Plane(past, self.lower_m, self.cell_m).at(moved).mT.unflatten(-1, self.shape_yx)
 
@@ -181,6 +188,7 @@ def spread_points(
 ) -> Float[Tensor, "count 2"]:
     """Return points at about equal distances over a plane, m."""
     rows, columns = shape_yx
+    # Rows and columns in the proportion of the plane, so that distances along both are equal
     per_row = math.ceil(math.sqrt(count * columns / rows))
     n_rows = math.ceil(count / per_row)
     index = torch.arange(count)
@@ -190,4 +198,5 @@ def spread_points(
 
 def halvings(spec: VoxelSpec, max_cells: int) -> int:
     """Return how many times a plane is halved until neither side has more than `max_cells` cells."""
+    # Number of halvings until the longer side fits
     return max(0, math.ceil(math.log2(max(spec.shape_zyx[1:]) / max_cells)))

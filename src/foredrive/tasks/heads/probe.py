@@ -59,6 +59,7 @@ def task_volumes(world: WorldModel, belief: Belief, tasks: tuple[Task, ...], lat
 
     Arguments and errors are those of `volumes_of`.
     """
+    # Equal volumes are kept once; `index` says which one each task reads
     read = volumes_of(world, belief, tasks, later)
     distinct = list({id(volume): volume for volume in read.values()}.values())
     index = tuple(next(n for n, other in enumerate(distinct) if other is read[task]) for task in tasks)
@@ -98,6 +99,7 @@ def mirrored_item(example: TaskExample, chosen: Bool[Tensor, "b"]) -> TaskExampl
     )
 
 
+# Mirroring in the x-z plane reverses the order of the cells along y
 def _flipped(volume: Float[Tensor, "b *n Y X"], chosen: Bool[Tensor, "b"]) -> Tensor:
     flipped = volume.clone()
     flipped[chosen] = volume[chosen].flip(-2)
@@ -132,6 +134,7 @@ class ProbeObjective(nn.Module):
         """Return losses by name; "loss" is minimised. The generator draws the items to mirror."""
         frames = self.heads.config.frames
         if self.mirror > 0:
+            # One draw for each sequence
             drawn = torch.rand(len(example.boxes_valid) // frames, generator=generator) < self.mirror
             chosen = drawn.repeat_interleave(frames)  # all frames of a sequence, or none
             example = mirrored_item(example, chosen.to(example.boxes_valid.device))

@@ -86,9 +86,11 @@ class SceneTokens(nn.Module):
             agents.velocity / SPEED_SCALE_MPS,
         ]
         if agents.future_xy is not None and agents.log_prob is not None:
+            # Path of the most probable mode, relative to the agent
             best = agents.log_prob.argmax(dim=-1)[..., None, None, None]
             path = agents.future_xy.take_along_dim(best, dim=2)[:, :, 0]
             attributes.append(((path - centre[:, :, None]) / FUTURE_SCALE_M).flatten(2))
+        # What heads predict enters without gradient; only the features of queries pass one
         features = torch.cat([agents.query, torch.cat(attributes, dim=-1).detach()], dim=-1)
         tokens: Tensor = mlp(features) + self.place(self._share(centre.detach()))
         return tokens

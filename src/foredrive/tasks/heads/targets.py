@@ -50,10 +50,12 @@ def agent_targets(boxes: Boxes, futures: AgentFutures | None, spec: VoxelSpec, s
     These are the boxes of the detected classes above the grid, except those without a lidar point, which
     nuScenes counts neither in training nor in evaluation. Without futures, no step is valid.
     """
+    # Road users above the grid, of a detected class, with at least one lidar point or an unknown number
     lower, upper = (boxes.centre.new_tensor(corner[:2]) for corner in (spec.lower_m, spec.upper_m))
     inside = ((boxes.centre[:, :2] >= lower) & (boxes.centre[:, :2] < upper)).all(-1)
     label = _LABELS.to(boxes.category.device)[boxes.category]
     kept = boxes.valid & inside & (label >= 0) & (boxes.num_points != 0)
+    # Log sizes need positive sizes
     state = torch.cat([boxes.centre, boxes.size_lwh.clamp_min(1e-2).log()], dim=-1)
     count = int(kept.sum())
     xy, valid = boxes.centre.new_zeros(count, steps, 2), kept.new_zeros(count, steps)
@@ -75,6 +77,7 @@ def agent_targets(boxes: Boxes, futures: AgentFutures | None, spec: VoxelSpec, s
 def map_targets(elements: MapElements, kinds: int, points: int) -> MapTargets:
     """Return the elements of the first `kinds` kinds of an unbatched frame, with `points` points each."""
     wanted = ((elements.kind >= 0) & (elements.kind < kinds)).nonzero()[:, 0].tolist()
+    # All orders of points that describe the same element: reversals, and starts of a closed line
     orders = elements.vertices.new_zeros(len(wanted), 2 * (points - 1), points, 2)
     for row, element in enumerate(wanted):
         line = elements.vertices[element, elements.valid[element]].double().cpu().numpy()
@@ -87,6 +90,7 @@ def even_points(line: Float[np.ndarray, "V 2"], points: int) -> Float[np.ndarray
     """Return points at equal distances along a polyline, its ends included. A closed one stays closed."""
     arc_m = arc_lengths(line)
     resampled = points_at(line, arc_m, np.linspace(0.0, arc_m[-1], points))
+    # Ends that meet in the line also meet exactly in the samples
     if math.isclose(0.0, float(np.abs(line[0] - line[-1]).max()), abs_tol=1e-9):
         resampled[-1] = resampled[0]
     return resampled

@@ -108,6 +108,7 @@ def read_maps(results: Path, truth: Path) -> MapFiles:
 def area_of(lines: LineSet) -> Area:
     """Return the area whose sides lines keep to: 60 × 30 m, or else 100 × 50 m."""
     reach_m = max((float(np.abs(line).max()) for line in lines.lines), default=0.0)
+    # The tolerance of 1 m allows for points just outside
     return "60x30" if reach_m <= max(HALF_XY_M["60x30"]) + 1.0 else "100x50"
 
 
@@ -116,6 +117,7 @@ def _against_logs(predicted: dict[str, _Frame], results: Path, truth: Path, stat
     frames = list(log_frames(truth, predicted, results))
     lines, short = _line_set([predicted[frame.name] for frame in frames])
     area = stated or area_of(lines)
+    # The truth is cut to the area in which the predictions are
     half_xy_m = HALF_XY_M[area]
     kinds, predicted_lines, number = [], [], []
     for n, frame in enumerate(frames):
@@ -135,7 +137,7 @@ def _against_logs(predicted: dict[str, _Frame], results: Path, truth: Path, stat
 
 
 def _in_order(frames: Mapping[str, _Frame]) -> list[str]:
-    """Return tokens by drive and time if the file tells them, else in its order."""
+    """Return tokens by drive and time if the file has both, else in its order."""
     if any(frame.drive is None or frame.index is None for frame in frames.values()):
         return list(frames)
     return sorted(frames, key=lambda token: (str(frames[token].drive), frames[token].index or 0))
@@ -146,6 +148,7 @@ def _line_set(frames: Sequence[_Frame | None]) -> tuple[LineSet, int]:
     rows = [(n, e) for n, frame in enumerate(frames) if frame is not None for e in frame.elements]
     kept = [(n, e) for n, e in rows if len(e.points) >= 2]
     identities = [e.identity for _, e in kept]
+    # Identities count only if every element has one
     tracked = bool(kept) and all(identity is not None for identity in identities)
     return (
         LineSet(
@@ -167,6 +170,7 @@ def _read(path: Path, *, predicted: bool) -> tuple[dict[str, _Frame], Area | Non
     try:
         if isinstance(content, dict):
             area = _stated_area(content.get("meta"))
+            # MapTR's truth lists its frames under "GTs"
             content = content.get("results", content.get("GTs", content))
         if isinstance(content, list):
             frame_lines: Iterator[tuple[str, _Frame]] = _of_maptr(content, predicted)
@@ -215,6 +219,7 @@ def _of_maptr(content: Sequence[Any], predicted: bool) -> Iterator[tuple[str, _F
         yield token, _Frame(elements, *_place(record))
 
 
+# StreamMapNet's records have parallel lists instead of vectors
 def _of_streammapnet(content: Mapping[str, Any], predicted: bool) -> Iterator[tuple[str, _Frame]]:
     for token, record in content.items():
         lists = ["vectors", "labels", *(["scores"] if predicted else [])]
@@ -241,7 +246,7 @@ def _of_streammapnet(content: Mapping[str, Any], predicted: bool) -> Iterator[tu
 
 
 def _place(record: Mapping[str, Any]) -> tuple[str | None, int | None]:
-    """Return drive and index of a frame, where the file tells them."""
+    """Return drive and index of a frame, where the file has them."""
     drive, index = record.get("scene_name"), record.get("local_idx")
     return (
         drive if isinstance(drive, str) else None,
@@ -255,6 +260,7 @@ def _points(value: Any, where: str) -> Float[ndarray, "V 2"]:
         points = np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError, OverflowError) as error:
         raise InputError(f"{where}: its points are not numbers") from error
+    # Flat lists hold x and y by turns
     if points.ndim == 1 and len(points) % 2 == 0:
         points = points.reshape(-1, 2)
     if points.ndim != 2 or points.shape[1] not in (2, 3):

@@ -60,6 +60,7 @@ class MapHead(nn.Module):
         self.step_m = planes.coarse_m
         self.element = nn.Parameter(torch.randn(config.elements, 1, width))
         self.point = nn.Parameter(torch.randn(config.points, width))
+        # Elements start as short lines, spread evenly over the plane
         middle = spread_points(planes.lower_m, planes.cell_m, planes.shape_yx, config.elements)[:, None]
         line = torch.linspace(-1, 1, config.points)[:, None] * torch.tensor([2 * planes.coarse_m, 0.0])
         self.start_m = nn.Parameter(middle + line)
@@ -85,12 +86,16 @@ class MapHead(nn.Module):
         at_m = self.start_m.expand(batch, -1, -1, -1)
         layers = []
         for layer in self.layers:
+            # Each point reads the plane at its own position
             queries = queries + self.read(fine.at(at_m))
             place = self.place(fine.share(at_m)).flatten(1, 2)
+            # All points of all elements attend to each other as one sequence
             queries = layer(queries.flatten(1, 2), place, cells, cell_place).view_as(queries)
             points = at_m + self.step_m * self.shift(queries)
+            # The kind and features of an element come from the mean of its points
             features = queries.mean(dim=2)
             layers.append(MapSet(self.kind(features), points, features))
+            # Each layer moves fixed points: gradients do not run through earlier layers
             at_m = points.detach()
         return layers
 
@@ -152,11 +157,14 @@ class RasterHead(nn.Module):
 
     def forward(self, planes: Planes) -> Float[Tensor, "b L Y X"]:
         """Return the logits."""
+        # Beyond the plane, convolutions of growing reach continue what leads out of it
         far = self.continued(_on_canvas(planes.coarse, self.coarse_m, self.coarse_shape))
         far = F.interpolate(far, size=self.fine_shape, mode="bilinear")
         near = self.narrow(_on_canvas(planes.fine, self.fine_m, self.fine_shape))
+        # Each cell gives 2 x 2 finer cells
         logits = F.pixel_shuffle(self.out(self.refine(F.relu(far + near))), 2)
         plane = Plane(logits, self.spec.lower_m, self.cell_m / 2)
+        # Read at the middles of the truth's cells, whose size may differ
         at_middles = plane.at(self.middle_m.expand(len(logits), -1, -1))
         return at_middles.mT.unflatten(-1, self.spec.shape_yx)
 

@@ -71,9 +71,11 @@ def chamfer_distances(
 @numba.njit(cache=True, nogil=True)
 @no_type_check
 def _chamfer(lines, others, at_most_m):
+    # Arguments: lines [m P 2] and [n P 2] in m; pairs out of reach stay at infinity
     distance_m = np.full((len(lines), len(others)), np.inf)
     for i in range(len(lines)):
         for j in range(len(others)):
+            # Distances to bounding boxes are lower bounds, and much cheaper than those to lines
             if _to_box(lines[i], others[j]) + _to_box(others[j], lines[i]) <= 2 * at_most_m + 1e-9:
                 distance_m[i, j] = 0.5 * (_one_way(lines[i], others[j]) + _one_way(others[j], lines[i]))
     return distance_m
@@ -86,6 +88,7 @@ def _one_way(line, other):
     for p in range(len(line)):
         nearest = np.inf
         for q in range(len(other)):
+            # Squared distances inside of the loop, one root at the end
             x, y = line[p, 0] - other[q, 0], line[p, 1] - other[q, 1]
             nearest = min(nearest, x * x + y * y)
         total += np.sqrt(nearest)
@@ -100,6 +103,7 @@ def _to_box(line, other):
     y0, y1 = other[:, 1].min(), other[:, 1].max()
     total = 0.0
     for p in range(len(line)):
+        # 0 between the sides of the box, else the distance to the nearer one
         x = max(x0 - line[p, 0], 0.0, line[p, 0] - x1)
         y = max(y0 - line[p, 1], 0.0, line[p, 1] - y1)
         total += np.sqrt(x * x + y * y)

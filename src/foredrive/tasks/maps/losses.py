@@ -46,11 +46,14 @@ def map_element_losses(
         orders: the same true points in every order that describes the same element (`equivalent_orders`).
         weights: weights of the matching's terms.
     """
+    # The optimal assignment, and the order of true points that it found nearest
     element, match, order = _best_matching(logits, points, kind, orders, weights)
     target = torch.zeros_like(logits)
     target[element, kind[match]] = 1.0
+    # Frames without elements divide by 1
     objects = max(len(kind), 1)
     true, predicted = orders[match, order], points[element]
+    # Directions of edges between successive points
     edges, true_edges = (line[:, 1:] - line[:, :-1] for line in (predicted, true))
     turn = 1 - F.cosine_similarity(edges, true_edges, dim=-1, eps=1e-6)
     return MapLosses(
@@ -67,9 +70,12 @@ def equivalent_orders(points: Float[Tensor, "P 2"]) -> Float[Tensor, "O P 2"]:
     The two orders of an open line are repeated, so that O is the same for all elements.
     """
     count = len(points) - 1
+    # Both directions of the line
     ways = torch.stack([points, points.flip(0)])
+    # An open line has no other start; the two orders are repeated to the common number
     if not torch.equal(points[0], points[-1]):
         return ways.repeat(count, 1, 1)
+    # Every start of a closed line: cyclic shifts, closed again by index modulo count
     start = torch.arange(count)[:, None]
     index = (start + torch.arange(count + 1)) % count
     return ways[:, index].flatten(0, 1)
@@ -81,6 +87,7 @@ def sigmoid_focal_loss(
     """Return the focal loss of independent probabilities (Lin et al. 2017, eq. 5)."""
     entropy = F.binary_cross_entropy_with_logits(logits, target, reduction="none")
     p = logits.sigmoid()
+    # Probability of the wrong answer: well classified entries weigh little
     missed = torch.where(target > 0, 1 - p, p)
     return torch.where(target > 0, alpha, 1 - alpha) * missed**gamma * entropy
 
@@ -97,7 +104,9 @@ def _best_matching(
 
     The cost of a kind is the focal loss of the kind less that of its absence, as in Deformable DETR.
     """
+    # Cost of claiming a kind less the cost of denying it, for every element and kind
     yes, no = (sigmoid_focal_loss(logits, torch.full_like(logits, value)) for value in (1.0, 0.0))
+    # Distance to a true element in its best order
     distance, order = (points[:, None, None] - orders).abs().sum(-1).mean(-1).min(dim=-1)  # [E N]
     cost = weights.kind * (yes - no)[:, kind] + weights.points * distance
     element, match = (

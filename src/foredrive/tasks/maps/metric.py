@@ -56,6 +56,7 @@ def raster_figures(counts: RasterCounts) -> dict[str, float]:
 
 
 def _figure_masks(masks: Bool[ndarray, "F 4 H W"]) -> tuple[Bool[ndarray, "F H W"], ...]:
+    # The layers in the order of their numbers
     divider, crossing, boundary, drivable = (masks[:, layer] for layer in sorted(RasterLayer))
     return divider | crossing | boundary, drivable, divider, crossing, boundary
 
@@ -99,6 +100,7 @@ class MapLinesMetric:
         """Return the average precisions over all frames with a map."""
         if not self._frames:
             return {}
+        # Frames are numbered over all batches
         predicted, true = _line_set(self._found), _line_set(self._true)
         out: Figures = {}
         for name, protocol in PROTOCOLS.items():
@@ -143,14 +145,17 @@ class MapRasterMetric:
         layers, raster = prediction.map_layers, None if truth.truth is None else truth.truth.raster
         if layers is None or raster is None or not bool(raster.known.any()):
             return
+        # Only frames with a map
         true = raster.layers[raster.known].cpu().numpy()
         shown = {"": (layers[raster.known] > 0.5).cpu().numpy()}
         if self._prior is not None:
             shown[PRIOR] = self._prior.cpu().expand(len(true), -1, -1, -1).numpy()
+        # All cells, and those above the voxels, which a model with a small grid can see
         areas = {"uniad": np.array(True), "uniad_covered": _covered(raster.spec, truth.occupancy.spec)}
         for suffix, mask in shown.items():
             for area, cells in areas.items():
                 counts, key = count_raster(mask & cells, true & cells), (area, suffix)
+                # Sums over all frames: IoU is the ratio of sums, not a mean of ratios
                 self._counts[key] = self._counts[key] + counts if key in self._counts else counts
 
     def result(self) -> Figures:
@@ -168,4 +173,5 @@ def _covered(raster: PlaneSpec, voxels: VoxelSpec) -> Bool[ndarray, "H W"]:
     for axis, (lower_m, size) in enumerate(zip(raster.lower_m, raster.shape_yx[::-1], strict=True)):
         middle_m = lower_m + (np.arange(size) + 0.5) * raster.cell_m
         inside.append((middle_m >= voxels.lower_m[axis]) & (middle_m < voxels.upper_m[axis]))
+    # Rows are y, columns x
     return inside[1][:, None] & inside[0]

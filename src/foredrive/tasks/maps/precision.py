@@ -66,7 +66,9 @@ def average_precision_area(score: Float[ndarray, "n"], hit: Bool[ndarray, "n"], 
     if objects == 0 or not hit.any():
         return 0.0
     precision, recall = precision_recall(hit[descending(score)], objects)
+    # Largest precision at each recall or beyond, by a running maximum from the end
     envelope = np.maximum.accumulate(precision[::-1])[::-1]
+    # Area: steps of recall times precision
     return float((np.diff(recall, prepend=0.0) * envelope).sum())
 
 
@@ -74,6 +76,7 @@ def check_identities(elements: LineSet, what: str) -> None:
     """Raise an InputError unless elements have identities, each of a class once a frame at most."""
     if elements.identity is None:
         raise InputError(f"{what} map elements have no identities, which C-mAP needs")
+    # One row for each element; a repeated row is an identity that is there twice
     key = np.stack([elements.frame, elements.kind, elements.identity], axis=1)
     unique, count = np.unique(key, axis=0, return_counts=True)
     if (count > 1).any():
@@ -93,6 +96,7 @@ def _score_class(
     ours, theirs = (np.flatnonzero(elements.kind == kind) for elements in (predicted, true))
     predicted, true = predicted[ours], true[theirs]
     objects = len(true.lines)
+    # C-mAP as released drops predictions of a class in frames without truth of it
     if protocol.frames_without_truth == "dropped":
         predicted = predicted[np.flatnonzero(np.isin(predicted.frame, true.frame))]
     distances_m = protocol.distances_m[area]
@@ -108,15 +112,18 @@ def _match(
 ) -> Int[ndarray, "D M"]:
     """Return the true element that each prediction finds at each distance; -1: none."""
     matched = np.full((len(distances_m), len(predicted.lines)), -1)
+    # All lines have the same number of points at equal distances
     lines = predicted.resampled(protocol.points)
     others = _resampled_truth(true, protocol)
     rows, columns = rows_by_frame(predicted.frame), rows_by_frame(true.frame)
     for frame in rows.keys() & columns.keys():
         ours, theirs = rows[frame], columns[frame]
         distance_m = _distances(lines[ours], others[theirs], protocol, max(distances_m))
+        # Each prediction is compared with its nearest true element only
         nearest = distance_m.argmin(1)
         nearest_m = distance_m.min(1)
         order = descending(predicted.score[ours])
+        # For each limit, the best scored of the predictions that share a true element is the hit
         for row, limit_m in enumerate(distances_m):
             near = order[nearest_m[order] <= limit_m]
             element, first = np.unique(nearest[near], return_index=True)
@@ -127,6 +134,7 @@ def _match(
 def _resampled_truth(true: LineSet, protocol: VectorProtocol) -> Float[ndarray, "N P 2"]:
     if protocol.true_points_first is None:
         return true.resampled(protocol.points)
+    # MapTracker resamples the truth twice: a coarse line first
     coarse = true.resampled(protocol.true_points_first)
     return np.array([resample(line, protocol.points) for line in coarse]).reshape(-1, protocol.points, 2)
 
@@ -140,6 +148,7 @@ def _distances(
     distance_m = chamfer_distances(lines, others, at_most_m=at_most_m)
     if protocol.buffer_m is None:
         return distance_m
+    # Only pairs in reach need the costly test of buffers
     i, j = np.nonzero(distance_m <= at_most_m)
     near, other = (
         shapely.buffer(shapely.linestrings(points), protocol.buffer_m, cap_style="flat", join_style="mitre")
@@ -160,11 +169,14 @@ def _claimed(
     assert predicted.identity is not None
     assert true.identity is not None
     hits = np.flatnonzero(row >= 0)
+    # Predictions in order of time
     hits = hits[np.argsort(predicted.frame[hits], kind="stable")]
     frame = predicted.frame[hits]
+    # A true element is identified by drive and identity
     key = np.stack([np.zeros_like(frame) if drive is None else drive[frame], true.identity[row[hits]]])
     _, first, element = np.unique(key, axis=1, return_index=True, return_inverse=True)
     identity = predicted.identity[hits]
     kept = row.copy()
+    # Later predictions of another identity are false
     kept[hits[identity != identity[first[element.ravel()]]]] = -1
     return kept

@@ -24,6 +24,7 @@ def score_map_files(files: MapFiles) -> Figures:
     Centrelines count where the results have any, and C-mAP if both files state identities.
     """
     area = files.area
+    # Centrelines are judged only if the results have them
     classes = [*CLASSES]
     if (files.predicted.kind == ElementKind.CENTRELINE).any():
         classes.append(ElementKind.CENTRELINE)

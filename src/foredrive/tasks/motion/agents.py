@@ -55,6 +55,7 @@ class TrueAgents:
 
     def steps_known(self, horizon: int) -> Int[ndarray, "N"]:
         """Return the number of steps before the first gap, at most `horizon`."""
+        # The product is 0 from the first gap on
         return np.cumprod(self.future_valid[:, :horizon], axis=1).sum(axis=1)
 
 
@@ -94,10 +95,12 @@ def _errors(future_xy, true_xy, steps):
     errors = np.zeros((3, pairs, modes))
     for i in range(pairs):
         for k in range(modes):
+            # Only the known steps count
             for t in range(steps[i]):
                 x = future_xy[i, k, t, 0] - true_xy[i, t, 0]
                 y = future_xy[i, k, t, 1] - true_xy[i, t, 1]
                 distance_m = np.sqrt(x * x + y * y)
+                # Mean, last and largest distance, step by step
                 errors[0, i, k] += distance_m / steps[i]
                 errors[1, i, k] = distance_m
                 errors[2, i, k] = max(errors[2, i, k], distance_m)

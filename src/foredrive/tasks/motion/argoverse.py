@@ -83,11 +83,13 @@ def forecast_errors(
 
     Probabilities of all K futures are divided by their sum.
     """
+    # Probabilities are normalised before the best k are chosen
     share = probability / probability.sum(1, keepdims=True)
     likely = np.argsort(-share, axis=1, kind="stable")[:, :k]
     row = np.arange(len(future_xy))
     steps = np.full(len(future_xy), true_xy.shape[1])
     errors = displacement_errors(future_xy[row[:, None], likely], true_xy, steps)
+    # The best future is the one that ends nearest
     best = errors.last.argmin(1)
     fde_m = errors.last[row, best]
     return ForecastErrors(
@@ -117,11 +119,14 @@ def forecast_precision(
         true: agents with at least one known step count.
         classes: names of the categories, keys of `MEAN_SPEED_MPS`.
     """
+    # Agents in range with at least one known step
     true = true[(true.steps_known(STEPS) > 0) & (np.linalg.norm(true.xy, axis=1) < RANGE_M)]
     predicted = predicted[np.linalg.norm(predicted.xy, axis=1) < RANGE_M]
     speed_mps = np.array([MEAN_SPEED_MPS[name] for name in classes])
     steps = true.steps_known(STEPS)
+    # The threshold grows with the class's mean speed and the length of the known future
     threshold_m = 1.0 + steps / STEPS * speed_mps[true.category]
+    # Agents by the simplest motion that explains their future
     kind = kind_of_motion(true.xy, true.future_xy, steps, threshold_m)
     likely = predicted.probability.argmax(1)
     # The released code takes the number of futures here, not that of their steps.
@@ -136,6 +141,7 @@ def forecast_precision(
     for label, name in enumerate(classes):
         of_class, true_of_class = predicted.category == label, true.category == label
         for motion, motion_name in enumerate(MOTION_NAMES):
+            # A class is judged for each kind of motion on its own
             table[name, motion_name] = _precision_of_motion(
                 predicted[of_class],
                 guess[of_class] == motion,
@@ -155,6 +161,7 @@ def kind_of_motion(
 
     Right is nearer than `threshold_m`. The velocity is that of the first step.
     """
+    # Position at the last known step, and the one that constant velocity leads to
     last = future_xy[np.arange(len(xy)), steps - 1]
     velocity_mps = (future_xy[:, 0] - xy) / STEP_S
     linear = xy + velocity_mps * (steps * STEP_S)[:, None]
@@ -189,21 +196,26 @@ def precision_at(
     """
     if len(true.frame) == 0:
         return ForecastPrecision(float("nan"), float("nan"), float("nan"))
+    # Detections take the nearest agent in order of their scores
     order, partner = match_by_score(predicted, true, within_m=distance_m)
     pairs = order[partner[order] >= 0]
     agent = partner[pairs]
     steps = true.steps_known(STEPS)[agent]
     errors = displacement_errors(predicted.future_xy[pairs, :FUTURES], true.future_xy[agent], steps)
+    # The best future by ADE decides, also about FDE
     best = errors.mean.argmin(1)
     row = np.arange(len(pairs))
     ade_m, fde_m = errors.mean[row, best], errors.last[row, best]
     right = np.zeros(len(order), dtype=bool)
+    # A forecast is right if it ends within a distance that grows with the horizon
     right[pairs] = fde_m < distance_m + steps / STEPS * speed_mps
     if not right.any():
         return ForecastPrecision(0.0, MAX_ERROR_M, MAX_ERROR_M)
+    # Detections without an agent are false only if they are predicted to move in this way
     hit = right[order][(partner[order] >= 0) | guessed[order]]
     hits = np.cumsum(hit)
     precision, recall = hits / np.arange(1, len(hit) + 1), hits / len(true.frame)
+    # Precision at 101 recalls, 0 beyond the largest one
     ap = np.interp(np.linspace(0, 1, 101), recall, precision, right=0.0).mean()
     return ForecastPrecision(
         float(ap), min(float(ade_m.mean()), MAX_ERROR_M), min(float(fde_m.mean()), MAX_ERROR_M)
@@ -212,6 +224,7 @@ def precision_at(
 
 def _averaged(table: dict[tuple[str, str], ForecastPrecision], classes: Sequence[str]) -> dict[str, float]:
     """Return means over the entries that have agents, under flat keys."""
+    # Means over everything, by kind of motion, by class, and single entries
     groups = {"": list(table.values())}
     groups |= {f"{m}.": [table[name, m] for name in classes] for m in MOTION_NAMES}
     groups |= {f"{name}.": [table[name, m] for m in MOTION_NAMES] for name in classes}

@@ -58,6 +58,7 @@ def read_end_to_end(results: Path, truth: Path) -> SensorForecasts:
     if not isinstance(content, dict) or not all(isinstance(frames, dict) for frames in content.values()):
         raise InputError(f"{results}: there must be frames by time (ns), by log")
     files = {path.parent.name: path for path in _annotations(truth)}
+    # Frames of all logs are numbered in one sequence
     predicted, true, offset = [], [], 0
     for log, frames in content.items():
         if log not in files:
@@ -97,6 +98,7 @@ def _agents(
             names.append(where)
             frame.append(number)
     number_of = np.array(frame, dtype=np.int64)
+    # Positions relative to the ego vehicle, along the axes of the city
     place = read_number_rows(records, "current_translation_m", 2, names) - ego_xy[number_of]
     score = read_number_rows(records, "detection_score", 1, names)[:, 0]
     wrong = np.flatnonzero((score < 0) | (score > 1))
@@ -132,11 +134,13 @@ class _Log:
         path = annotations.parent / "city_SE3_egovehicle.feather"
         poses = read_table(path, ("timestamp_ns", *_POSE))
         t_ns, pose_t_ns = boxes["timestamp_ns"].to_numpy(), poses["timestamp_ns"].to_numpy()
+        # Every annotation needs the pose at exactly its time
         row = np.searchsorted(pose_t_ns, t_ns).clip(0, len(pose_t_ns) - 1)
         if (pose_t_ns[row] != t_ns).any():
             raise InputError(f"{path}: has no pose at {t_ns[pose_t_ns[row] != t_ns][0]} ns")
         pose = np.stack([poses[name].to_numpy() for name in _POSE], axis=-1)
         centre = np.stack([boxes[name].to_numpy() for name in _POSE[:3]], axis=-1)
+        # Boxes are stored in the ego frame of their time: move them to the city frame
         in_city = Rotation.from_quat(pose[row, 3:], scalar_first=True).apply(centre) + pose[row, :3]
         label = {name: n for n, name in enumerate(CLASSES)}
         return cls(
@@ -154,6 +158,7 @@ class _Log:
     def agents(self, times: Int64[ndarray, "F"], ego_xy: Float[ndarray, "F 2"], offset: int) -> TrueAgents:
         """Return the boxes at some times, and where they are every 0.5 s after."""
         annotated = np.unique(self.t_ns)
+        # Position of each track at each annotated time
         place = {(t, track): xy for t, track, xy in zip(self.t_ns.tolist(), self.track, self.xy, strict=True)}
         number = {t: n for n, t in enumerate(times.tolist())}
         rows = np.flatnonzero(np.isin(self.t_ns, times) & (self.category >= 0))
@@ -162,9 +167,11 @@ class _Log:
         valid = np.zeros((len(rows), STEPS), dtype=bool)
         for step in range(STEPS):
             wanted = self.t_ns[rows] + round((step + 1) * STEP_S * 1e9)
+            # First annotated time that is not before the tolerance, and the one after it
             after = np.searchsorted(annotated, wanted - SLACK_NS).clip(0, len(annotated) - 2)
             pair = annotated[after[:, None] + np.arange(2)]
             nearest = np.take_along_axis(pair, np.abs(pair - wanted[:, None]).argmin(1)[:, None], 1)[:, 0]
+            # A step without annotation within the tolerance stays unknown
             for n in np.flatnonzero(np.abs(nearest - wanted) <= SLACK_NS):
                 xy = place.get((int(nearest[n]), self.track[rows[n]]))
                 if xy is not None:

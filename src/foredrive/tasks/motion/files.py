@@ -7,8 +7,8 @@ them, their probabilities (`predict_traj_score` or `traj_prob`).
 
 In the truth, `traj` [T, 2] is the future up to the first step without annotation, and `num_pts` the number
 of sensor points. Regions need the place of the ego vehicle: `ego_poses` by token (`translation`, `rotation`
-as w x y z) beside `results`, or `ego_translation` of the boxes, as the devkit writes it. The latter does not
-tell the heading, without which VAD's rectangle cannot be placed.
+as w x y z) beside `results`, or `ego_translation` of the boxes, as the devkit writes it. The latter has no
+heading, without which VAD's rectangle cannot be placed.
 
 Futures are in the global frame; or, as UniAD's, in the lidar's in both files. They can be compared then, but
 not with places, so that what needs both (moving vehicles) is left out.
@@ -64,7 +64,7 @@ class AgentFiles:
     frames: int
     frames_without_results: int
     heading_known: bool
-    """False if the truth tells where the ego vehicle was, but not its heading."""
+    """False if the truth has the place of the ego vehicle but not its heading."""
     futures_placed: bool
     """False if futures are in another frame than boxes."""
 
@@ -99,6 +99,7 @@ def read_agents(results: Path, truth: Path) -> AgentFiles:
     rows, true_rows = _rows(boxes, tokens, results), _rows(true_boxes, tokens, truth)
     ego = _ego(true_content, true_rows, rows, tokens, truth)
     future_xy, valid = _true_futures(true_rows)
+    # A box without a number of points counts as seen
     seen = np.array([box.get("num_pts", -1) != 0 for box in true_rows.records], dtype=bool)
     true = TrueAgents(true_rows.frame, true_rows.category, true_rows.xy, future_xy, valid, seen)
     missing = len(set(true_boxes) - set(boxes))
@@ -109,6 +110,7 @@ def _in_ego_frame(
     rows: _Rows, true: TrueAgents, true_names: Sequence[str], ego: "_Ego", frames_without_results: int
 ) -> AgentFiles:
     """Bring both sides, global so far, into the ego frames."""
+    # Futures that begin near their boxes are in the global frame; others are in a frame of their own
     futures = _predicted_futures(rows)
     placed = _placed(rows, futures[:, :, 0], true, true_names)
     future_xy = ego.frame_of(futures, rows.frame) if placed else futures
@@ -125,6 +127,7 @@ def _in_ego_frame(
         true=dataclasses.replace(
             true,
             xy=ego.frame_of(true.xy, true.frame),
+            # Unknown steps are set to 0
             future_xy=true_future_xy * true.future_valid[..., None],
         ),
         frames=len(ego.xy),
@@ -138,6 +141,7 @@ def _against_logs(boxes: Mapping[str, Sequence[Box]], results: Path, truth: Path
     """Return predictions and the agents of logs at their frames."""
     frames = list(log_frames(truth, boxes, results))
     agents, names, ego_xy, headings = [], [], [], []
+    # Frames of logs have truth in the world frame of their log
     for number, frame in enumerate(frames):
         logged = read_boxes(frame.log, frame.frame)
         if logged is None:
@@ -173,18 +177,20 @@ def _agents_of_log(
 
 @dataclass(frozen=True)
 class _Ego:
-    """Place (global, m) and heading of the ego vehicle in each frame; NaN for a heading that is not told."""
+    """Place (global, m) and heading of the ego vehicle in each frame; NaN where the heading is unknown."""
 
     xy: Float[ndarray, "F 2"]
     yaw: Float[ndarray, "F"]
 
     def frame_of(self, xy: Float[ndarray, "n *s 2"], frame: Int[ndarray, "n"]) -> Float[ndarray, "n *s 2"]:
         """Return global places in the ego frames, or along global axes if there are no headings."""
+        # The ego pose broadcasts over steps and modes
         extra = (slice(None), *[None] * (xy.ndim - 2))
         offset = xy - self.xy[frame][extra]
         yaw = np.nan_to_num(self.yaw)[frame][extra]
         cos, sin = np.cos(yaw), np.sin(yaw)
         x, y = offset[..., 0], offset[..., 1]
+        # Rotation by -yaw; without a heading, yaw counts as 0
         return np.stack([cos * x + sin * y, cos * y - sin * x], axis=-1)
 
 
@@ -262,6 +268,7 @@ def _predicted_futures(rows: _Rows) -> Float[ndarray, "n K T 2"]:
 
 
 def _probabilities(rows: _Rows, futures: int) -> Float[ndarray, "n K"]:
+    # Without probabilities, all futures are equally likely
     probabilities = np.full((len(rows.records), futures), 1.0 / futures)
     for n, (where, box) in enumerate(zip(rows.names, rows.records, strict=True)):
         stated = _first(box, PROBABILITIES)
@@ -302,6 +309,7 @@ def _placed(
     rows: _Rows, first_steps: Float[ndarray, "n K 2"], true: TrueAgents, true_names: Sequence[str]
 ) -> bool:
     """Return whether futures are in the frame of the boxes. Both files must agree on it."""
+    # Agents with a known first step decide about the truth's frame
     rows_with_future = np.flatnonzero(true.future_valid[:, 0])
     near = np.linalg.norm(first_steps - rows.xy[:, None], axis=-1).min(axis=1) < FAR_M
     true_near = (
@@ -322,8 +330,9 @@ def _placed(
 def _ego(
     content: Mapping[str, Any], true: _Rows, predicted: _Rows, tokens: Sequence[str], path: Path
 ) -> _Ego:
-    """Return place and heading of the ego vehicle as the files tell them."""
+    """Return place and heading of the ego vehicle as the files state them."""
     xy, yaw = np.full((len(tokens), 2), np.nan), np.full(len(tokens), np.nan)
+    # Place and heading from the poses, if there are any
     poses = content.get("ego_poses", {})
     for number, token in enumerate(tokens):
         pose = poses.get(token) if isinstance(poses, dict) else None
@@ -332,6 +341,7 @@ def _ego(
             xy[number] = read_numbers(pose, "translation", 3, where)[:2]
             w, x, y, z = read_numbers(pose, "rotation", 4, where)
             yaw[number] = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y**2 + z**2))
+    # Otherwise the place follows from a box: its position minus its position relative to the ego vehicle
     for rows in (true, predicted):
         for n, (frame, box) in enumerate(zip(rows.frame, rows.records, strict=True)):
             if np.isnan(xy[frame, 0]) and "ego_translation" in box:

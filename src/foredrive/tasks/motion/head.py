@@ -76,23 +76,29 @@ class MotionModes(nn.Module):
             place: embedding of positions.
         """
         config, plane = self.config, planes.coarse
+        # Boxes and motion are trained apart
         xy, heading, velocity = xy.detach(), heading.detach(), velocity.detach()
         speed = velocity.norm(dim=-1, keepdim=True)
+        # Speed and velocity in units of 10 m/s are part of the query
         queries = queries + self.speed(torch.cat([velocity, speed], dim=-1) / 10.0)
+        # One query for each agent and mode
         modes = (queries[:, :, None] + self.mode).flatten(1, 2)
         anchors = place(plane.share(xy)).repeat_interleave(config.modes, dim=1)
         cell_place = place(plane.share(plane.middle_m))[None]
         for layer in self.layers:
             modes = layer(modes, anchors, plane.cells, cell_place)
         out = self.out(modes).unflatten(1, (queries.shape[1], config.modes))
+        # Corrections of velocity, summed to corrections of position
         change = config.dt_s * out[..., :-1].unflatten(-1, (config.steps, 2)).cumsum(dim=-2)
         sin, cos = heading[:, :, None, None, 0], heading[:, :, None, None, 1]
         along, across = change.unbind(-1)
+        # Along and across the heading to x and y
         corrected = torch.stack([cos * along - sin * across, sin * along + cos * across], dim=-1)
         moved = kinematic_motion(
             velocity, heading, self.acceleration_mps2, self.yaw_rate_rps, config.steps, config.dt_s
         )
         future_xy = xy[:, :, None, None] + moved + corrected
+        # The last number of each mode is its logit
         return future_xy, out[..., -1].log_softmax(dim=-1)
 
 
@@ -106,8 +112,8 @@ def kinematic_motion(
 ) -> Float[Tensor, "*n M S 2"]:
     """Return how far agents have moved at each step at constant acceleration and yaw rate, m.
 
-    Nobody drives backwards: a braking agent stands once its speed is 0. Speed and direction are those in the
-    middle of each step.
+    Agents do not drive backwards: a braking agent stands once its speed is 0. Speed and direction are those
+    in the middle of each step.
 
     Args:
         velocity: at the start, m/s.
@@ -119,11 +125,15 @@ def kinematic_motion(
     """
     speed = velocity.norm(dim=-1, keepdim=True)
     slow = speed < SLOW_MPS
+    # Direction of motion: the velocity if there is enough of it, else the heading (cosine first)
     direction = torch.where(slow, heading.flip(-1), velocity / speed.clamp_min(SLOW_MPS))
+    # Middle of each step, so that the sum is exact for linear speed
     t_s = dt_s * (torch.arange(steps, device=velocity.device) + 0.5)
+    # Braking stops at speed 0
     at_mps = (speed[..., None] + acceleration_mps2[:, None] * t_s).clamp_min(0.0)  # [*n, M, S]
     turn = yaw_rate_rps[:, None] * t_s
     sin, cos = turn.sin(), turn.cos()
     x, y = direction[..., None, None, 0], direction[..., None, None, 1]
+    # The direction turns at constant yaw rate
     step = torch.stack([cos * x - sin * y, sin * x + cos * y], dim=-1) * at_mps[..., None]
     return dt_s * step.cumsum(dim=-2)

@@ -31,11 +31,13 @@ def motion_losses(
     known = valid.any(dim=-1)
     steps = valid.sum(dim=-1).clamp_min(1)
     with torch.no_grad():
+        # The mode with the least mean distance over known steps wins, without gradient
         distance = (future_xy - true_xy[:, None]).norm(dim=-1) * valid[:, None]
         best = (distance.sum(-1) / steps[:, None]).argmin(dim=-1)
     won = future_xy[torch.arange(len(best), device=best.device), best]
     error = F.smooth_l1_loss(won, true_xy, reduction="none").sum(-1)
     per_agent = torch.where(valid, error, 0.0).sum(-1) / steps
+    # Agents without a known step have no loss
     return MotionLosses(
         distance=masked_mean(per_agent, known),
         mode=masked_mean(F.nll_loss(log_prob, best, reduction="none"), known),

@@ -35,6 +35,7 @@ def match_by_score(
         prediction; -1: none.
     """
     order = descending(predicted.score, ties_reversed=True)
+    # Agents sorted by frame: those of a frame are a range of rows
     by_frame = np.argsort(true.frame, kind="stable")
     frames = int(max(predicted.frame.max(initial=-1), true.frame.max(initial=-1))) + 1
     start = np.searchsorted(true.frame[by_frame], np.arange(frames + 1))
@@ -51,6 +52,7 @@ def match_by_score(
         steps,
         end_within_m,
     )
+    # Rows of the kernel back to the caller's; without agents nothing is found
     return order, np.where(partner >= 0, by_frame[partner], -1) if len(by_frame) else partner
 
 
@@ -66,8 +68,10 @@ def match_by_distance(predicted: PredictedAgents, true: TrueAgents, *, within_m:
         if column is None:
             continue
         distance_m = cdist(predicted.xy[row], true.xy[column])
+        # Only rows and columns with a partner enter the assignment
         near = distance_m <= within_m
         row, column = row[near.any(1)], column[near.any(0)]
+        # Pairs out of reach are dearer than all others together, so as many pairs as possible are made
         cost = np.where(near, distance_m, _APART)[np.ix_(near.any(1), near.any(0))]
         i, j = linear_sum_assignment(cost)
         hit = cost[i, j] < _APART
@@ -80,9 +84,11 @@ def match_by_distance(predicted: PredictedAgents, true: TrueAgents, *, within_m:
 def _match_by_score(
     order, frame, xy, start, true_xy, within_m, future_xy, true_future_xy, steps, end_within_m
 ):
+    # Positions in m; start delimits the agents of each frame; steps counts known steps
     partner = np.full(len(order), -1)
     taken = np.zeros(len(true_xy), np.bool_)
     for i in order:
+        # Nearest agent that is left; no other one is tried
         nearest, nearest_m = -1, np.inf
         for j in range(start[frame[i]], start[frame[i] + 1]):
             x, y = xy[i, 0] - true_xy[j, 0], xy[i, 1] - true_xy[j, 1]
@@ -92,6 +98,7 @@ def _match_by_score(
         if nearest < 0 or nearest_m >= within_m:
             continue
         if end_within_m < np.inf:
+            # The nearest end of all futures, at the last known step of the agent
             last, end_m = steps[nearest] - 1, np.inf
             if last >= 0:
                 for k in range(future_xy.shape[1]):

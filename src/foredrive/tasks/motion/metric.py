@@ -49,6 +49,7 @@ class MotionMetric:
             assert predicted.future_xy is not None
             assert predicted.log_prob is not None
             t_s = STEP_S * torch.arange(1, predicted.future_xy.shape[-2] + 1)
+            # Baseline: the same detections moved by their predicted velocities
             steady = predicted.centre[:, None, :2] + predicted.velocity[:, None] * t_s[:, None]
             pose = clip.T_world_ego[item, clip.now].cpu().numpy()
             self._steady.append(_placed(steady[:, None], predicted.centre, pose))
@@ -63,6 +64,7 @@ class MotionMetric:
                 }
             )
             boxes, futures = clip.boxes[item, clip.now].to("cpu"), truth.truth.futures[item].to("cpu")
+            # A batch may pad boxes and futures to different lengths
             rows = min(len(boxes.valid), len(futures.valid))
             valid = boxes.valid[:rows]
             boxes, futures = boxes[:rows][valid], futures[:rows][valid]
@@ -88,6 +90,7 @@ class MotionMetric:
             future_xy=np.concatenate(self._steady),
             probability=np.ones((len(predicted.frame), 1)),
         )
+        # Protocols that judge more steps than are known are left out
         horizon = min(predicted.future_xy.shape[2], true.future_xy.shape[1])
         out: Figures = {"frames_counted": len(self._true)}
         for name, protocol in PROTOCOLS.items():

@@ -42,6 +42,7 @@ class MovingScores:
 
 def is_moving(true: TrueAgents) -> Bool[ndarray, "N"]:
     """Return which agents have a whole future of 6 s and end at least 2 m from where they are."""
+    # Distance at the end of 6 s
     travelled_m = np.linalg.norm(true.future_xy[:, STEPS - 1] - true.xy, axis=1)
     return (true.steps_known(STEPS) == STEPS) & (travelled_m >= MOVES_M)
 
@@ -51,6 +52,7 @@ def score_moving(predicted: PredictedAgents, true: TrueAgents) -> dict[str, Movi
     predicted = predicted[np.isin(predicted.category, list(CLASSES.values()))]
     true = true[np.isin(true.category, ANY_VEHICLE)]
     moving = is_moving(true)
+    # Predictions on vehicles that do not move are left out
     beside = match_by_distance(predicted, true, within_m=MATCH_M)
     predicted = _likeliest(predicted[(beside < 0) | moving[beside] if len(moving) else beside < 0])
     true = true[moving]
@@ -59,11 +61,13 @@ def score_moving(predicted: PredictedAgents, true: TrueAgents) -> dict[str, Movi
         of_class = predicted[predicted.category == category]
         true_of_class = true[true.category == category]
         ap, min_score = _precision(of_class, true_of_class)
+        # Errors are those of predictions from the score of the best F1 on
         confident = of_class[of_class.score >= min_score]
         error = _pair_errors(confident, true_of_class)
         errors.append(error)
         scores[name] = _scores(ap, error, len(true_of_class.frame))
     mean_ap = float(np.mean([score.map_f for score in scores.values()]))
+    # The mean over classes, and the errors of all pairs together
     scores["all"] = _scores(mean_ap, np.concatenate(errors, axis=1), len(true.frame))
     return scores
 
@@ -82,6 +86,7 @@ def _precision(predicted: PredictedAgents, true: TrueAgents) -> tuple[float, flo
     if objects == 0 or len(predicted.frame) == 0:
         return 0.0, 0.0
     order, partner = match_by_score(predicted, true, within_m=MATCH_M, end_within_m=MISS_M, horizon=STEPS)
+    # F1 at every number of predictions, best scored first
     precision, recall = precision_recall(partner[order] >= 0, objects)
     f1 = 2 * precision * recall / (precision + recall + 1e-5)
     ap = average_precision_nuscenes(predicted.score, partner >= 0, objects)

@@ -51,17 +51,20 @@ def read_challenge(results: Path, truth: Path) -> ChallengeForecasts:
     files = {path.stem.removeprefix("scenario_"): path for path in sorted(truth.rglob("scenario_*.parquet"))}
     if not files:
         raise InputError(f"{truth}: holds no scenario_*.parquet")
+    # Rows of each track: one for each of its futures
     rows: dict[tuple[str, str], list[int]] = {}
     for n, key in enumerate(zip(scenario, map(str, track), strict=True)):
         rows.setdefault(key, []).append(n)
     truths: dict[str, dict[str, Float[ndarray, "T 2"]]] = {}
     futures, shares, true = [], [], []
+    # All tracks have the same number of futures
     count = max((len(row) for row in rows.values()), default=1)
     for (name, track_id), row in rows.items():
         where = f"{results}: scenario {name}, track {track_id}"
         if name not in files:
             raise InputError(f"{where} is not in {truth}: of another split?")
         if name not in truths:
+            # A scenario is read once for all of its tracks
             truths[name] = _scenario(files[name])
         if track_id not in truths[name]:
             raise InputError(f"{where} has no whole future in {files[name]}")
@@ -94,11 +97,13 @@ def _scenario(path: Path) -> dict[str, Float[ndarray, "T 2"]]:
     """Return the futures of the tracks that are known at every step."""
     table = read_table(path, _SCENARIO)
     track, step, x, y = (table[name].to_numpy() for name in _SCENARIO)
+    # Only what follows the observed steps is forecast
     later = step >= OBSERVED
     scenario = {}
     for name in np.unique(track[later]):
         rows = np.flatnonzero(later & (track == name))
         rows = rows[np.argsort(step[rows], kind="stable")]
+        # Tracks that are known at every step; others cannot be judged
         if len(rows) == PREDICTED:
             scenario[str(name)] = np.stack([x[rows], y[rows]], axis=-1).astype(np.float64)
     return scenario
@@ -127,15 +132,17 @@ def score_motion_results(results: Path, truth: Path) -> Figures:
 def score_agent_files(files: AgentFiles) -> Figures:
     """Return `motion.uniad.car.min_ade_m`, … and, of moving vehicles alone, `motion.moving.car.map_f`, …
 
-    A protocol that the files do not tell enough for has no figures.
+    A protocol has no figures if the files lack an entry that it needs.
     """
     figures: Figures = {"motion.frames_counted": files.frames}
     figures["frames_without_results"] = files.frames_without_results
     for name, protocol in PROTOCOLS.items():
+        # VAD's rectangle needs the heading of the ego vehicle
         if isinstance(protocol.region, Rectangle) and not files.heading_known:
             continue
         scores = score_motion(files.predicted, files.true, protocol)
         figures |= {f"motion.{name}.{key}": value for key, value in motion_figures(scores).items()}
+    # Moving vehicles need futures in the frame of the boxes
     if files.futures_placed:
         for name, moving in score_moving(files.predicted, files.true).items():
             figures |= {f"motion.moving.{name}.{key}": value for key, value in vars(moving).items()}

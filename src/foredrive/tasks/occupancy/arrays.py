@@ -41,6 +41,7 @@ def read_labels(
     if labels.min() < 0 or labels.max() >= len(classes):
         wrong = labels.min() if labels.min() < 0 else labels.max()
         raise InputError(f"{file}: {name}: unknown class {wrong}; there are 0 to {len(classes) - 1}")
+    # X Y Z in the file, Z Y X in memory
     return np.ascontiguousarray(labels.reshape(spec.shape_zyx[::-1]).T.astype(np.uint8))
 
 
@@ -60,12 +61,14 @@ def _read(file: Path, name: str, kinds: str, spec: VoxelSpec, per_voxel: int = 1
     with _opened(file) as archive:
         if f"{name}.npy" not in archive.namelist():
             raise InputError(f"{file}: has no array {name!r}")
+        # The header tells shape and type before any data is read or unpacked
         with archive.open(f"{name}.npy") as stream:
             version = npy.read_magic(stream)
             header = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
             shape, _, dtype = header(stream)
         shape_xyz, last = spec.shape_zyx[::-1], () if per_voxel == 1 else (per_voxel,)
         voxels = int(np.prod(shape_xyz))
+        # Leading dimensions of 1 are those of a batch
         trimmed = shape
         while len(trimmed) > 1 and trimmed[0] == 1:
             trimmed = trimmed[1:]

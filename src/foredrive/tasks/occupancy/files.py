@@ -69,6 +69,7 @@ def _from_infos(content: Any, file: Path) -> dict[str, FramePose]:
 def _pose_of_info(frame: Mapping[str, Any]) -> FramePose:
     """Return the pose of a frame: quaternions before mmdetection3d 1.1, matrices since."""
     time = float(frame["timestamp"])
+    # mmdetection3d 1.1 and later store matrices
     if "ego2global" in frame:
         return FramePose(time, _matrix(frame["ego2global"]), _matrix(frame["lidar_points"]["lidar2ego"]))
     ego, lidar = (
@@ -99,6 +100,7 @@ def _annotated_pose(frame: Mapping[str, Any]) -> FramePose:
     path = str(next(iter(frame["camera_sensor"].values()))["img_path"])
     vehicle = next((name for name in LIDAR_POSITION_M if name in path), None)
     if vehicle is None:
+        # The name of an image file begins with the vehicle's name
         raise ValueError(f"the name of image {path} begins with none of {', '.join(LIDAR_POSITION_M)}")
     T_ego_lidar = np.eye(4)
     T_ego_lidar[:3, 3] = LIDAR_POSITION_M[vehicle]
@@ -183,6 +185,7 @@ def find_voxels(results: Path, truth: Path, poses: Path | None = None) -> VoxelF
     if not true:
         raise InputError(f"{truth}: holds no SCENE/TOKEN/labels.npz")
     predicted = _results_by_token(results)
+    # The frames to be scored, in the order of their list
     frames, listed = list(true if places is None else places), poses or truth
     if places is not None:
         absent = [token for token in frames if token not in true]
@@ -218,6 +221,7 @@ def read_frame(files: VoxelFiles, token: str) -> VoxelFrame:
     truth, result = files.truth[token], files.results[token]
     true = read_labels(truth, "semantics", files.classes)
     names = array_names(result)
+    # The name of the array differs between public scripts
     name = next((name for name in PREDICTED_NAMES if name in names), None)
     if name is None:
         raise InputError(f"{result}: has no array named {', '.join(PREDICTED_NAMES[:-1])}")
@@ -225,6 +229,7 @@ def read_frame(files: VoxelFiles, token: str) -> VoxelFrame:
     if files.data_set == "occ3d":
         camera, lidar = (read_mask(truth, mask) for mask in MASKS)
         return VoxelFrame(predicted, true, camera, lidar, None, None, states_velocity=False)
+    # OpenOcc has no masks: all voxels count
     true_mps, seen = read_velocities(truth, "flow"), np.ones(true.shape, np.bool_)
     stated = "flow" in names
     predicted_mps = read_velocities(result, "flow") if stated else np.zeros_like(true_mps)
@@ -264,6 +269,7 @@ def _data_set(file: Path) -> str:
 def _origins(poses: Mapping[str, FramePose], truth: Mapping[str, Path]) -> dict[str, Float64[ndarray, "O 3"]]:
     """Return the lidar's places of each frame; frames of one scene folder are a drive."""
     drives: dict[str, list[str]] = {}
+    # Frames in order of time, grouped by drive
     for token in sorted(poses, key=lambda token: poses[token].time):
         drives.setdefault(truth[token].parent.parent.name, []).append(token)
     origins: dict[str, Float64[ndarray, "O 3"]] = {}

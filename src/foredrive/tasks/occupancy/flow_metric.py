@@ -23,6 +23,7 @@ class FlowMetric:
             InputError: if the clips end before the predicted flow.
         """
         assert prediction.flow_mps is not None
+        # Labels from now on, as many frames as are predicted
         labels = labels_from_now(truth.flow, truth.clip, prediction.flow_mps.shape[1])
         errors = flow_errors(prediction.flow_mps, labels)
         self._errors = errors if self._errors is None else self._errors + errors

@@ -26,11 +26,14 @@ def ego_compensated(
         T_src_dst: points of the frame dst, in which the result is, -> src.
         spec: of both grids.
     """
+    # Centres of all voxels of dst, in the frame of src
     centres = spec.centres_m(occupied.device).flatten(0, 2).double()
     place = transform_points(T_src_dst, centres.expand(len(occupied), -1, -1))
+    # Nearest voxel of each; those outside of the grid are free
     index = ((place - place.new_tensor(spec.lower_m)) / spec.voxel_m).floor().long()
     nz, ny, nx = spec.shape_zyx
     inside = ((index >= 0) & (index < index.new_tensor([nx, ny, nz]))).all(-1)
+    # The index of outside voxels is 0 and is masked below
     flat = ((index[..., 2] * ny + index[..., 1]) * nx + index[..., 0]).where(inside, 0)
     return (occupied.flatten(1).gather(1, flat) & inside).view(occupied.shape)
 
@@ -61,6 +64,7 @@ def count_futures(
 ) -> FuturesCounts:
     """Compare K sampled futures of each item with labels [b F 1 Z Y X], as `count_occupancy` does."""
     best, mean, spread = [], [], torch.zeros(futures.shape[2], dtype=torch.float64)
+    # Every item has K futures; the best is chosen by IoU over all of its frames
     for item, drawn in enumerate(futures):
         label = labels[item : item + 1]
         counts = [count_occupancy(future[None], label, region) for future in drawn]
@@ -86,6 +90,7 @@ def _disagreement(drawn: Bool[Tensor, "K F Z Y X"]) -> Float64[Tensor, "F"]:
     """Return 1 - IoU per frame, averaged over pairs of futures; two empty frames agree."""
     pairs = list(itertools.combinations(drawn.flatten(2).unbind(), 2))
     apart = torch.zeros(drawn.shape[1], dtype=torch.float64)
+    # 1 - IoU is the symmetric difference over the union
     for one, other in pairs:
         either = (one | other).sum(-1)
         apart += ((one ^ other).sum(-1) / either.clamp_min(1)).double().cpu()

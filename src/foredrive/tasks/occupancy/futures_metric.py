@@ -29,6 +29,7 @@ class FuturesMetric:
         """
         assert prediction.futures is not None
         self._drawn, frames = prediction.futures.shape[1:3]
+        # The futures begin after now
         labels = labels_from_now(truth.occupancy, truth.clip, frames + 1)[:, 1:]
         for scope, region in {"": None, "above_ground.": above_ground(labels.spec)}.items():
             counts = count_futures(prediction.futures, labels, region)

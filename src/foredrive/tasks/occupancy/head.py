@@ -40,6 +40,7 @@ class VoxelHead(nn.Module):
 
     def forward(self, volume: Float[Tensor, "b D Z Y X"], planes: Planes) -> Float[Tensor, "b C Z Y X"]:
         """Return the logits in the order of `VOXEL_CLASSES`."""
+        # One vector of the column for each height, added to the features of each voxel
         around = self.column(planes.fine.features).unflatten(1, (-1, self.height))
         logits: Tensor = self.out((self.own(volume) + around).relu())
         return logits

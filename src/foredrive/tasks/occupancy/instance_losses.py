@@ -35,10 +35,12 @@ def instance_loss(
     annotates. Cells outside of the volume's plane do not count. Of the others each item takes those of one
     row and one column in `STRIDE`, starting at another one than its neighbours in the batch.
     """
+    # Cells whose middle is above the volume
     grid, wanted = truth.spec, _inside(truth.spec, spec)
     middle = cell_middles(grid.lower_m, grid.cell_m, grid.shape_yx).unflatten(0, grid.shape_yx)
     middles = middle[wanted[0]][:, wanted[1]].to(instances.embedding)
     losses = []
+    # Vehicles among the matched boxes, at steps that are annotated
     for item in boxes_valid.nonzero()[:, 0].tolist():
         targets = agent_targets(boxes[item], None, spec, 0)
         query, match = best_matching(agents[item].boxes, targets.boxes, matching)
@@ -47,14 +49,17 @@ def instance_loss(
         query, track_id = query[vehicle], targets.track_id[match[vehicle]]
         if not len(query) or not bool(steps.any()):
             continue
+        # Another start for each item, so that a batch covers all rows and columns
         rows, columns = slice(item // STRIDE % STRIDE, None, STRIDE), slice(item % STRIDE, None, STRIDE)
         points = middles[rows, columns]
         logits = instance_logits(instances[item], agents[item], query, points.flatten(0, 1))
         cells = truth.track_id[item][:, wanted[0]][:, :, wanted[1]][:, rows, columns]
+        # Track ids are stored plus 1, as 0 is no vehicle
         masks = cells == (track_id + 1)[:, None, None, None]
         whole = logits.unflatten(-1, points.shape[:2])[:, steps]
         known = torch.ones(len(query), dtype=torch.bool, device=whole.device)
         losses.append(raster_loss(whole, masks[:, steps], known, OCCUPIED_WEIGHT))
+    # Zero with a gradient, for batches without matched vehicles
     return torch.stack(losses).mean() if losses else instances.embedding.sum() * 0
 
 

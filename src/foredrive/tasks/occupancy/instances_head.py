@@ -102,9 +102,11 @@ class InstanceHead(nn.Module):
         T_later_now = torch.linalg.inv(T_now_later.to(now.features))
         for step, plane in enumerate(later):
             T = T_later_now[:, step]
+            # Places of now's cells in the ego frame of the imagined step
             carried_xy = middle @ T[:, :2, :2].mT + T[:, None, :2, 3]
             moved = Plane(self.pixels(plane.features), plane.lower_m, plane.cell_m).at(carried_xy)
             seen.append(moved.mT.unflatten(-1, self.shape_yx))
+        # Zeros leave the box at constant velocity as the only prior of steps that are not imagined
         seen += [torch.zeros_like(seen[0])] * (self.config.steps - len(later))
         return InstanceSet(
             embedding=out[..., :-1],
@@ -133,16 +135,20 @@ def instance_logits(
     mean, heading, velocity = (
         part[rows].detach() for part in (agents.boxes.mean, agents.boxes.heading, agents.velocity)
     )
+    # Boxes at constant velocity
     t_s = instances.dt_s * torch.arange(count, device=mean.device)
     place = mean[:, None, :2] + velocity[:, None] * t_s[:, None]
     offset = points_m - place[:, :, None]
+    # Offset from the box along and across its heading, in half boxes
     sin, cos = heading[:, None, None, 0], heading[:, None, None, 1]
     half = 0.5 * mean[:, 3:5].exp() + MARGIN_M
     along = (cos * offset[..., 0] + sin * offset[..., 1]).abs() / half[:, None, None, 0]
     across = (cos * offset[..., 1] - sin * offset[..., 0]).abs() / half[:, None, None, 1]
+    # 1 at the centre, 0 at the border of the box, negative beyond, bounded far away
     inside = 1.0 - torch.maximum(along, across).clamp_max(FARTHEST)
     plane = Plane(instances.pixels, instances.lower_m, instances.cell_m)
     pixels = plane.at(points_m.expand(count, -1, -1))
+    # Scaled dot product of the agent's feature and the features of the pixels
     product = torch.einsum("nsw,spw->nsp", embedding, pixels) / embedding.shape[-1] ** 0.5
     return instances.sharpness[rows][..., None] * inside + product
 
@@ -159,11 +165,13 @@ def instance_raster(instances: InstanceSet, agents: AgentSet, spec: PlaneSpec) -
     raster = torch.zeros(len(instances.embedding), count, len(points), dtype=torch.long, device=points.device)
     is_vehicle = _IS_VEHICLE.to(points.device)
     for item in range(len(raster)):
+        # The last logit stands for "no object"
         score, label = agents.boxes.logits[item].softmax(dim=-1)[..., :-1].max(dim=-1)
         rows = ((score >= MIN_SCORE) & is_vehicle[label]).nonzero()[:, 0]
         if len(rows):
             probability = instance_logits(instances[item], agents[item], rows, points).sigmoid()
             inside = probability >= MIN_PROBABILITY
+            # Of several vehicles at a cell, the product of probability and score decides
             which = (probability * inside * score[rows, None, None]).argmax(dim=0)
             raster[item] = torch.where(inside.any(dim=0), rows[which] + 1, 0)
     return raster.unflatten(-1, spec.shape_yx)

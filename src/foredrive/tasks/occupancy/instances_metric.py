@@ -101,8 +101,10 @@ def count_rasters(
             f"the truth has {truth.spec.cell_m} m and {truth.dt_s} s"
         )
     total: dict[str, InstanceCounts] = {}
+    # Samples at the start of a drive do not count
     if past_frames < protocol.past_frames:
         return total
+    # All future steps must be annotated
     for item in truth.valid.all(dim=1).nonzero().flatten().tolist():
         predicted_id, true = (part[item].cpu().numpy() for part in (predicted, truth.track_id))
         for name, counts in count_instances(predicted_id, true, protocol).items():
@@ -121,18 +123,22 @@ def _count_range(
     pairs, iou_sum, false, missed = 0, 0.0, 0, 0
     partner: dict[int, int] = {}
     for predicted_frame, true_frame in zip(predicted, true, strict=True):
+        # Pairs with an IoU above 0.5 are unique in rows and columns
         predicted_id, true_id, iou = _ious(predicted_frame, true_frame)
         rows, columns = np.nonzero(iou > min_iou)
         false += len(predicted_id) - len(columns)
         missed += len(true_id) - len(rows)
         for row, column in zip(rows, columns, strict=True):
             instance, candidate = int(true_id[row]), int(predicted_id[column])
+            # The first partner of an instance is remembered; a later
+            # partner with another number is an error
             if partner.setdefault(instance, candidate) == candidate:
                 pairs += 1
                 iou_sum += float(iou[row, column])
             else:
                 false, missed = false + 1, missed + 1
                 partner[instance] = candidate
+    # Cells count over all frames, whatever their instance
     return InstanceCounts(
         cells_hit=int(((predicted > 0) & (true > 0)).sum()),
         cells_false=int(((predicted > 0) & (true == 0)).sum()),
@@ -148,10 +154,13 @@ def _ious(
     predicted: Int[ndarray, "R C"], true: Int[ndarray, "R C"]
 ) -> tuple[Int[ndarray, "P"], Int[ndarray, "N"], Float64[ndarray, "N P"]]:
     """Return the numbers of predicted and of true instances, and their IoU."""
+    # Numbers of instances, and the index of each cell's number
     predicted_id, predicted_at = np.unique(predicted, return_inverse=True)
     true_id, true_at = np.unique(true, return_inverse=True)
+    # Joint histogram: cells of each pair of numbers
     pair = true_at.ravel() * len(predicted_id) + predicted_at.ravel()
     shared = np.bincount(pair, minlength=len(true_id) * len(predicted_id)).reshape(len(true_id), -1)
+    # Union of a pair: both areas less the intersection
     either = shared.sum(axis=1, keepdims=True) + shared.sum(axis=0) - shared
     return (
         predicted_id[predicted_id > 0],
@@ -186,6 +195,7 @@ class InstanceMetric:
             return
         true, agents = true.to("cpu"), prediction.agents.to("cpu")
         shown = {"": prediction.instances.cpu()}
+        # Baselines: the same detections, moved or left where they are
         for suffix, moves in ((STEADY, 1.0), (PERSISTENCE, 0.0)):
             drawn = [drawn_boxes(agents[item], true, moves) for item in range(len(true.valid))]
             shown[suffix] = torch.from_numpy(np.stack(drawn))
@@ -217,8 +227,10 @@ def drawn_boxes(agents: Agents, like: InstanceRaster, moves: float) -> Int[ndarr
     drawn = np.zeros((steps, *like.spec.shape_yx), dtype=np.int32)
     kinds = torch.tensor(sorted(int(kind) for kind in VEHICLES))
     kept = (torch.isin(agents.category, kinds) & (agents.score >= MIN_SCORE)).nonzero()[:, 0]
+    # Draw the best scored last, on top
     order = kept[agents.score[kept].argsort()]
     corners = box_corners(agents.centre, agents.size_lwh, agents.yaw)[:, :4, :2].double()
+    # The footprint of each box moves by its velocity
     for step in range(steps):
         shift = moves * step * like.dt_s * agents.velocity.double()
         for row in order.tolist():

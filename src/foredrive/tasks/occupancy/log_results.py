@@ -55,12 +55,14 @@ def write_voxels(
     flow_mps: Float[ndarray, "2 Z Y X"] | None,
     taxonomy: Taxonomy,
 ) -> None:
+    # Labels Z Y X in memory, X Y Z in the file
     """Write the voxels of one frame. Free voxels stand still, as in figures."""
     semantics = np.ascontiguousarray(labels.T)
     with atomic_path(path) as temporary, temporary.open("wb") as file:
         if flow_mps is None:
             np.savez_compressed(file, semantics=semantics)
             return
+        # The last class is free space
         occupied = labels != len(VOXEL_CLASSES[taxonomy]) - 1
         flow = np.where(occupied, flow_mps, 0.0).astype(np.float32).T
         np.savez_compressed(file, semantics=semantics, flow=np.ascontiguousarray(flow))
@@ -77,6 +79,7 @@ def score_against_logs(results: Path, truth: Path, on_frame: Callable[[], None] 
     Raises:
         InputError: a frame is not in the logs or has no recorded voxels, or a file is wrong.
     """
+    # Names of frames are paths relative to the folder, as names of logs may hold folders
     files = {path.relative_to(results).as_posix()[: -len(".npz")]: path for path in results.rglob("*.npz")}
     if not files:
         raise InputError(f"{results}: holds no LOG@T_US.npz")
@@ -85,6 +88,7 @@ def score_against_logs(results: Path, truth: Path, on_frame: Callable[[], None] 
     without_velocity = 0
     for frame in log_frames(truth, files, results):
         labels, flow_mps = _read(files[frame.name], grid)
+        # The camera mask depends on which cameras the model saw
         cameras = pinhole_cameras(frame.log)
         named = (
             cameras if grid.cameras is None else {name: find_camera(cameras, name) for name in grid.cameras}
@@ -107,6 +111,7 @@ def read_grid(folder: Path) -> VoxelGridOfResults:
     Raises:
         InputError: an entry is wrong. The message names it.
     """
+    # Without a description, the grid is Occ3D's
     path = folder / GRID_FILE
     if not path.is_file():
         return VoxelGridOfResults("occ3d", GRID, None)

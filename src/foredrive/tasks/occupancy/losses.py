@@ -20,6 +20,7 @@ def occupancy_bce(
 
     `occupied_weight` multiplies the terms of occupied voxels; eq. 10 has 1.
     """
+    # pos_weight multiplies the terms of occupied voxels
     weight = logit.new_tensor([occupied_weight])
     per_voxel = F.binary_cross_entropy_with_logits(logit, occupied, reduction="none", pos_weight=weight)
     return masked_mean(per_voxel, known)
@@ -36,11 +37,14 @@ def scene_class_affinity(
     """
     p = logit.sigmoid()
     y, free = occupied * known, (1 - occupied) * known
+    # Sums over the known voxels of the whole batch
     hit, count, count_free = (p * y).sum(), y.sum(), free.sum()
     terms = [(hit, (p * known).sum()), (hit, count), (((1 - p) * free).sum(), count_free)]
     has_occupied, has_free = count > 0, count_free > 0
     loss = logit.new_zeros(())
+    # Terms of precision and recall need an occupied voxel, that of specificity a free one
     for (numerator, denominator), present in zip(terms, (has_occupied, has_occupied, has_free), strict=True):
+        # EPS keeps ratio and logarithm finite
         ratio = (numerator + EPS) / (denominator + EPS)
         loss = loss - torch.where(present, ratio.log(), torch.zeros_like(ratio))
     return loss

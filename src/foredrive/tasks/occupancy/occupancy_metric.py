@@ -15,7 +15,7 @@ from foredrive.tasks.occupancy.scores import OccupancyCounts, above_ground, coun
 
 PERSISTENCE, EGO_COMPENSATED, CONTINUED = ".copy", ".carried_copy", ".continued_copy"
 """Suffixes of persistence: the predicted present in place of the future, the same moved along the driven
-path, and the same moved as if the vehicle went on as measured. A model is told no more than the last."""
+path, and the same moved as if the vehicle went on as measured. The last uses all that a model knows."""
 PERSISTENT = (PERSISTENCE, EGO_COMPENSATED, CONTINUED)
 PRIOR = ".best_constant"
 
@@ -42,6 +42,7 @@ class OccupancyMetric:
             InputError: if the clips or the occupancy prior have other frames than the prediction.
         """
         assert prediction.occupancy_logit is not None
+        # A positive logit is a probability above 1/2
         predicted, clip = prediction.occupancy_logit > 0, truth.clip
         frames = predicted.shape[1]
         labels = labels_from_now(truth.occupancy, clip, frames)
@@ -49,13 +50,16 @@ class OccupancyMetric:
             self._begin(labels.spec, frames)
         shown = {"": predicted}
         if frames > 1:
+            # Driven poses relative to now
             T_world_ego = clip.T_world_ego[:, clip.now : clip.now + frames]
             T_now_ego = inverse_se3(T_world_ego[:, :1]) @ T_world_ego
             shown[PERSISTENCE] = predicted[:, :1].expand_as(predicted)
             shown[EGO_COMPENSATED] = _moved(predicted[:, 0], T_now_ego, labels.spec)
+            # A clip without past frames has no measured motion to continue
             if clip.now > 0:
                 T_now_ego = _continued_path(clip, frames - 1)
                 shown[CONTINUED] = _moved(predicted[:, 0], T_now_ego, labels.spec)
+        # All voxels, and those above the ground
         for scope, region in self._regions.items():
             if scope in self._priors:
                 shown[PRIOR] = self._priors[scope][0].to(predicted.device).expand_as(predicted)
@@ -80,6 +84,7 @@ class OccupancyMetric:
         out: Figures = {}
         for (scope, suffix), counts in self._counts.items():
             names = self._context.frame_names(len(counts.iou))
+            # Persistence at now is the prediction itself and is left out
             persists = suffix in PERSISTENT
             for kind in ("iou",) if persists else ("iou", "precision", "recall"):
                 for name, value in zip(names, getattr(counts, kind).tolist(), strict=True):
@@ -102,6 +107,7 @@ def _moved(
 
 def _continued_path(clip: Clip, steps: int) -> Float64[Tensor, "b F 4 4"]:
     """Return the poses now and at the next key frames if the vehicle goes on as measured, F = steps + 1."""
+    # Poses accumulate step by step
     T = [torch.eye(4, dtype=torch.float64, device=clip.t_s.device).expand(len(clip.t_s), 4, 4)]
     for T_prev_next in continued_motion(last_frames(clip.observed(), 1), steps).double().unbind(dim=1):
         T.append(T[-1] @ T_prev_next)

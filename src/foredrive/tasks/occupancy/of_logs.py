@@ -45,6 +45,7 @@ class LogVoxelCounts:
         frame = _frame(predicted, velocity_mps, truth, rays)
         origins_m = None if rays is None else rays.origin_m[rays.origin_valid].double().numpy()
         self._own.add(frame, origins_m)
+        # The same frame also in OpenOcc's classes
         if self._openocc is not None:
             self._openocc.add(_as_openocc(frame), origins_m)
 
@@ -64,6 +65,7 @@ def _frame(
     rays: RayTruth | None,
 ) -> VoxelFrame:
     true_mps = None if rays is None else _last(rays.velocity_mps)
+    # Free voxels stand still
     predicted_mps = None
     if true_mps is not None:
         occupied = predicted[..., None] != len(VOXEL_CLASSES[truth.taxonomy]) - 1
@@ -83,6 +85,7 @@ def _frame(
 
 def _as_openocc(frame: VoxelFrame) -> VoxelFrame:
     """Return a frame of Occ3D's classes in those of OpenOcc. Where the truth has none, nothing is known."""
+    # "others" has no class in OpenOcc: unknown in the truth, free in a prediction
     assert frame.known is not None
     known: Bool[ndarray, "Z Y X"] = frame.known & (frame.true != _OCC3D_OTHERS)
     return VoxelFrame(

@@ -34,6 +34,7 @@ def lidar_rays() -> Float32[ndarray, "14040 3"]:
     Ten elevations meet the ground at 1, 2 … 10 sensor heights; the last step between them is repeated
     until the first elevation above 0.21 rad, about the upper end of nuScenes' lidar.
     """
+    # Elevations at which a ray meets the ground at k sensor heights: -45° for k = 1, flatter for larger k
     elevation = [np.arctan(k) - np.pi / 2 for k in range(1, 11)]
     while elevation[-1] < MAX_ELEVATION_RAD:
         elevation.append(elevation[-1] + (elevation[-1] - elevation[-2]))
@@ -70,6 +71,7 @@ def cast_rays(
     """
     origin, direction = _in_voxels(origins_m, spec)
     ends: RayEnds = first_hits(origin, direction, labels != free)
+    # A ray that hits nothing reads the voxel 0
     voxel = np.maximum(ends.voxel, 0)
     return Seen(
         labels.reshape(-1)[voxel],
@@ -88,8 +90,10 @@ def _in_voxels(
         )
     lower_m, voxel_m = np.array(spec.lower_m), np.float64(np.float32(spec.voxel_m))
     rays = lidar_rays()
+    # Single precision where the public code has it, so that rays end in the same voxels
     end = ((rays + origins_m[:, None] - lower_m) / voxel_m).astype(np.float32).reshape(-1, 3)
     origin = ((origins_m - lower_m) / voxel_m).astype(np.float32)
+    # The direction is that between the rounded ends, computed in double precision
     origin = np.repeat(origin, len(rays), axis=0).astype(np.float64)
     step = end.astype(np.float64) - origin
     x, y, z = step.T
@@ -117,11 +121,14 @@ def count_rays(predicted: Seen, true: Seen, protocol: RayProtocol) -> RayCounts:
     Without velocities in either, no velocity errors are summed.
     """
     classes = len(protocol.classes)
+    # Rays whose truth is free are dropped first
     valid = true.label != classes - 1
     label, true_label = predicted.label[valid], true.label[valid]
     precision = np.float16 if protocol.stored == "half" else np.float32
+    # The server stores ranges in half precision
     ranges_m = (seen.range_m[valid].astype(precision).astype(np.float32) for seen in (predicted, true))
     error_m = np.abs(np.subtract(*ranges_m))
+    # A hit has the true class and nearly the true range
     same = label == true_label
 
     def by_class(rays: ndarray) -> Int64[ndarray, "C"]:
@@ -148,10 +155,12 @@ def _velocity_errors(
 ) -> tuple[Float64[ndarray, "C"], Int64[ndarray, "C"]]:
     """Return sums of errors, and numbers of rays, of the classes that move."""
     classes = len(protocol.classes)
+    # Rays of each class that hit
     number = np.bincount(true_label[hit], minlength=classes).astype(np.int64)
     if protocol.velocity_rays == "hits":
         total = np.bincount(true_label[hit], weights=error_mps[hit], minlength=classes)
     else:
+        # The server averages over all rays of a frame that has a hit of the class
         total = np.where(number > 0, error_mps.sum(), 0.0)
         number = np.where(number > 0, len(error_mps), 0)
     moving = np.array([name in protocol.moving for name in protocol.classes])
@@ -174,11 +183,13 @@ class RayScores:
 
 def score_rays(counts: RayCounts, protocol: RayProtocol) -> RayScores:
     """Return RayIoU, velocity errors and OccScore of the summed counts."""
+    # Union: true and predicted rays, less those counted twice
     either = counts.true + counts.predicted - counts.hits
     iou = np.divide(counts.hits, either, out=np.full(either.shape, np.nan), where=either > 0)
     rays = counts.velocity_rays
     ave = np.divide(counts.velocity_error_mps, rays, out=np.full(len(rays), np.nan), where=rays > 0)
     rayiou, mave = mean_iou(iou), mean_of_valid(ave.tolist())
+    # OccScore: RayIoU and the velocity score, weighted
     still = protocol.range_weight * rayiou
     score = still + (1.0 - protocol.range_weight) * float(np.maximum(1.0 - mave, 0.0))
     return RayScores(iou, ave, rayiou, mave, score)
@@ -195,12 +206,14 @@ class VoxelCounts:
     def __init__(self, data_set: str, spec: VoxelSpec = GRID) -> None:
         self.data_set, self._spec = data_set, spec
         self._classes = VOXEL_PROTOCOLS[data_set].classes
+        # Voxels by camera mask, lidar mask, true class, predicted class
         self._voxels = np.zeros((2, 2, len(self._classes), len(self._classes)), np.int64)
         self._rays: dict[str, RayCounts] = {}
         self._frames = self._ray_frames = 0
 
     def add(self, frame: VoxelFrame, origins_m: Float64[ndarray, "O 3"] | None) -> None:
         """Add a frame. Without places of the lidar it has no rays."""
+        # A mask turns the grid into a list of known voxels
         judged = slice(None) if frame.known is None else frame.known
         self._voxels += count_voxels(
             _as_grid(frame.predicted[judged]),
@@ -217,6 +230,7 @@ class VoxelCounts:
     def _add_rays(self, frame: VoxelFrame, origins_m: Float64[ndarray, "O 3"]) -> None:
         """Cast the rays of one frame once, and count them under each protocol. Unknown voxels are free."""
         free = len(self._classes) - 1
+        # Rays pass through what has no truth
         voxels = frame.predicted if frame.known is None else np.where(frame.known, frame.predicted, free)
         predicted = cast_rays(origins_m, voxels.astype(np.uint8), free, frame.predicted_mps, spec=self._spec)
         true = cast_rays(origins_m, frame.true, free, frame.true_mps, spec=self._spec)
@@ -246,6 +260,7 @@ def score_voxels(files: VoxelFiles, on_frame: Callable[[], None] = lambda: None)
     """
     counts, without_velocity = VoxelCounts(files.data_set), 0
     frames = (read_frame(files, token) for token in files.truth)
+    # Frames are read ahead while earlier ones are counted
     for token, frame in zip(files.truth, prefetched(frames), strict=True):
         counts.add(frame, None if files.origins_m is None else files.origins_m[token])
         without_velocity += not frame.states_velocity

@@ -43,6 +43,7 @@ class OccupancyCounts(Record):
     @property
     def iou(self) -> Float[Tensor, "F"]:
         """Intersection over union; NaN where neither truth nor prediction has an occupied voxel."""
+        # 0 / 0 is NaN: nothing to find
         return self.true_positive / (self.true_positive + self.false_positive + self.false_negative)
 
     @property
@@ -61,6 +62,7 @@ def count_occupancy(
 ) -> OccupancyCounts:
     """Compare predicted occupancy with labels [b F 1 Z Y X] on known voxels, of `region` only if given."""
     occupied = labels.values[:, :, 0] > 0.5
+    # Unknown voxels count nowhere
     known = labels.known if region is None else labels.known & region.to(labels.known.device)
 
     def count(where: Tensor) -> Int[Tensor, "F"]:
@@ -90,6 +92,7 @@ class OccupancyPrior:
                 f"labels of {labels.values.shape[1]} frames on {labels.spec} do not fit a prior of "
                 f"{len(self.occupied)} frames on {self.spec}"
             )
+        # Frequencies count over the frames in which a voxel was known
         self.occupied += ((labels.values[:, :, 0] > 0.5) & labels.known).sum(dim=0).to(self.occupied)
         self.known += labels.known.sum(dim=0).to(self.known)
 
@@ -110,13 +113,16 @@ class OccupancyPrior:
         probability = self.probability
         where = self.known > 0 if region is None else (self.known > 0) & region
         thresholds = torch.full((len(probability),), torch.inf)
+        # One threshold for each frame; voxels that were never known are left out
         for frame, (p, inside) in enumerate(zip(probability, where, strict=True)):
             hits = self.occupied[frame][inside].double()
             false_alarms = self.known[frame][inside].double() - hits
             if hits.sum() == 0:
                 continue
             p_sorted, order = p[inside].sort(descending=True)
+            # IoU of the k most probable voxels: their hits over all occupied ones plus their false alarms
             iou = hits[order].cumsum(0) / (hits.sum() + false_alarms[order].cumsum(0))
+            # A threshold cuts between different probabilities only: at the end of each run of equal ones
             ends_tie = torch.cat([p_sorted[1:] < p_sorted[:-1], p_sorted.new_ones(1, dtype=torch.bool)])
             thresholds[frame] = p_sorted[torch.where(ends_tie, iou, -1.0).argmax()]
         return where & (probability >= thresholds[:, None, None, None]), thresholds
@@ -139,6 +145,7 @@ class FlowErrors(Record):
 
 def flow_errors(predicted_mps: Float[Tensor, "b F 3 Z Y X"], labels: VoxelGrid) -> FlowErrors:
     """Sum the end-point errors |predicted − true velocity| over known voxels faster than 0.5 m/s."""
+    # Speed of the labels; voxels that stand are not counted
     speed = labels.values.norm(dim=2)
     moving = labels.known & (speed > MOVING_MPS)
     error = (predicted_mps - labels.values).norm(dim=2)

@@ -22,6 +22,7 @@ def voxel_cross_entropy(
     weight: Float[Tensor, "C"],
 ) -> Float[Tensor, ""]:
     """Return the cross-entropy over known voxels, each weighted by its true class; 0 if none is known."""
+    # The class weight multiplies each voxel's loss; the sum is divided by the weights of the known ones
     per_voxel = F.cross_entropy(logits, index.long(), weight, reduction="none")
     weights = torch.where(known, weight[index.long()], 0.0)
     return torch.where(known, per_voxel, 0.0).sum() / weights.sum().clamp_min(1e-6)
@@ -36,8 +37,10 @@ def semantic_affinity(
     the mean over the classes that the truth has. Without known voxels it is 0.
     """
     classes = logits.shape[1]
+    # Known voxels as one list
     p = logits.movedim(1, -1)[known].softmax(dim=-1)
     y = F.one_hot(index[known].long(), classes).to(p)
+    # Expected hits, occupied voxels and predicted voxels of each class
     hit, true, total = (p * y).sum(0), y.sum(0), len(y)
     predicted = p.sum(0)
     free = ((1 - p) * (1 - y)).sum(0)
@@ -45,6 +48,7 @@ def semantic_affinity(
         [
             (hit + EPS) / (predicted + EPS),
             (hit + EPS) / (true + EPS),
+            # A class that fills everything has no specificity
             torch.where(true < total, (free + EPS) / (total - true + EPS), 1.0),
         ]
     )
@@ -64,10 +68,12 @@ def raster_loss(
     """
     y = layers.to(logits)
     weight = logits.new_tensor(occupied_weight)
+    # Mean over the cells of a layer
     entropy = F.binary_cross_entropy_with_logits(logits, y, reduction="none", pos_weight=weight).mean(
         (-2, -1)
     )
     p = logits.sigmoid()
     both, either = (p * y).sum((-2, -1)), (p.square() + y).sum((-2, -1))
+    # The ones keep the ratio finite for empty layers, and make it 0 for a good empty prediction
     dice = 1 - (2 * both + 1) / (either + 1)
     return masked_mean(entropy + dice, known[:, None].expand_as(entropy))

@@ -21,6 +21,7 @@ def count_voxels(
 
     The counts of frames add up, and every protocol sums those of its masks.
     """
+    # One number for each combination of masks and classes
     cell = (seen_by_camera.astype(np.int64) * 2 + seen_by_lidar) * classes + true
     counts = np.bincount((cell * classes + predicted).ravel(), minlength=4 * classes * classes)
     return counts.astype(np.int64).reshape(2, 2, classes, classes)
@@ -37,9 +38,11 @@ def count_semantics(predicted: UInt8[Tensor, "*b Z Y X"], truth: SemanticVoxels)
 
 def voxel_ious(counts: Int64[ndarray, "2 2 C C"], protocol: VoxelProtocol) -> Float64[ndarray, "C"]:
     """Return the IoU of each class, free among them; NaN for classes that the protocol leaves out."""
+    # A protocol without a mask sums over both values of it
     by_camera = counts[1:] if "camera" in protocol.masks else counts
     counted = by_camera[:, 1:] if "lidar" in protocol.masks else by_camera
     table = counted.sum(axis=(0, 1))
+    # Diagonal: right voxels; rows: truth; columns: prediction
     hits, true, predicted = np.diag(table), table.sum(axis=1), table.sum(axis=0)
     either = true + predicted - hits
     known = true > 0 if protocol.absent == "in truth" else either > 0

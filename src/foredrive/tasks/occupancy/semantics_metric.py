@@ -31,11 +31,13 @@ class SemanticVoxelMetric:
         predicted, semantics = prediction.semantics, None if truth.truth is None else truth.truth.semantics
         if predicted is None or semantics is None or truth.truth is None:
             return
+        # Frames with any known voxel
         for item in semantics.known.flatten(1).any(dim=1).nonzero()[:, 0].tolist():
             true = semantics[item].to("cpu")
             rays = None if truth.truth.rays is None else truth.truth.rays[item].to("cpu")
             flow = None if prediction.flow_mps is None else prediction.flow_mps[item, 0, :2].cpu().numpy()
             shown = {"": (predicted[item].cpu().numpy(), flow)}
+            # The prior stands still
             if self._prior is not None:
                 shown[PRIOR] = (self._prior, None)
             for suffix, (voxels, velocity_mps) in shown.items():

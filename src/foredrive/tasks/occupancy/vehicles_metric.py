@@ -28,12 +28,15 @@ def car_columns(boxes: Boxes, labels: VoxelGrid, range_m: float) -> Bool[Tensor,
         range_m: maximum distance of the column's centre from the ego frame's origin.
     """
     spec = labels.spec
+    # Columns that were observed as occupied above the ground
     observed = (labels.values[:, 0] > 0.5) & labels.known & above_ground(spec).to(labels.known.device)
     centre = spec.centres_m()[0, ..., :2].to(boxes.centre)  # [Y, X, 2]
+    # Offset of each column from each box, turned to the box's axes
     offset = centre[:, :, None] - boxes.centre[:, None, None, :, :2]  # [b, Y, X, M, 2]
     cos, sin = boxes.yaw.cos()[:, None, None], boxes.yaw.sin()[:, None, None]
     along = cos * offset[..., 0] + sin * offset[..., 1]
     across = cos * offset[..., 1] - sin * offset[..., 0]
+    # Half a voxel of margin on each side, so that returns from a car's side lie inside
     half = 0.5 * (boxes.size_lwh[:, None, None, :, :2] + spec.voxel_m)
     is_car = boxes.valid & torch.isin(boxes.category, torch.tensor(CARS).to(boxes.category))
     inside = (along.abs() <= half[..., 0]) & (across.abs() <= half[..., 1]) & is_car[:, None, None]
@@ -75,6 +78,7 @@ def count_found_columns(
         range_m: maximum distances of the columns' centres.
     """
     spec = labels.spec
+    # Unobserved voxels count as not predicted
     predicted_columns = found_columns(predicted & labels.known, spec)
     true = found_columns((labels.values[:, 0] > 0.5) & labels.known, spec)
     near = spec.centres_m()[0, ..., :2].norm(dim=-1)[None] <= range_m[:, None, None]  # [R, Y, X]

@@ -39,7 +39,9 @@ def ego_motion_loss(
         T_world_now, T_world_ego: measured poses now and then.
         spec: grid.
     """
+    # Corners of the volume
     corners_m = T_now_ego.new_tensor(list(product(*zip(spec.lower_m, spec.upper_m, strict=True))))
+    # Driven motion from now to the later frame
     driven = (inverse_se3(T_world_now) @ T_world_ego).to(T_now_ego)
     corners_m = corners_m.expand(len(driven), -1, -1)
     error_m = transform_points(T_now_ego, corners_m) - transform_points(driven, corners_m)

@@ -36,10 +36,12 @@ class PlanningMetric:
         """Score the plans of b clips."""
         assert prediction.plan is not None
         driven = truth.clip.future
+        # Boxes of the future, in the ego frame at now
         obstacles = future_obstacles(truth.clip, STEPS, STEP_S)
         invalid = 0
         for name, protocol in PROTOCOLS.items():
             scores = score_plan(prediction.plan, driven, obstacles, protocol)
+            # Sums over frames; means are taken at the end
             self._l2_m[name] += scores.l2_m.sum(dim=0).cpu()
             kinds = [getattr(scores, kind).sum(dim=0) for kind in COLLISIONS]
             self._collisions[name] += torch.stack(kinds).cpu()
@@ -50,6 +52,7 @@ class PlanningMetric:
             )  # the same under every protocol
         self._frames_invalid += invalid
 
+    # Frames with boxes are fewer than frames with a driven path
     def result(self) -> Figures:
         """Return the means over counted frames."""
         out: Figures = {}

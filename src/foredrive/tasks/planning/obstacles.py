@@ -35,6 +35,7 @@ class Obstacles(Record):
 def boxes_at_now(clip: Clip) -> Boxes:
     """Return the boxes of every frame of a clip [b T M] in the ego frame at now, velocities too."""
     now = clip.now
+    # Motion from each frame to now; headings and velocities turn with it, positions move as well
     T_now_ego = inverse_se3(clip.T_world_ego[:, now : now + 1]) @ clip.T_world_ego  # [b, T, 4, 4]
     boxes = clip.boxes
     heading = torch.stack([boxes.yaw.cos(), boxes.yaw.sin(), torch.zeros_like(boxes.yaw)], dim=-1)
@@ -58,11 +59,14 @@ def future_obstacles(clip: Clip, steps: int, step_s: float) -> Obstacles:
         raise InputError(f"expected a batch of clips, got t_s of shape {tuple(clip.t_s.shape)}")
     now = clip.now
     wanted_s = step_s * torch.arange(1, steps + 1, device=clip.t_s.device, dtype=clip.t_s.dtype)
+    # Key frame nearest to each step
     distance_s, frame = (clip.t_s[:, None, :] - wanted_s[:, None]).abs().min(dim=-1)  # [b, steps]
     item = torch.arange(len(frame), device=frame.device)[:, None]
+    # A step counts as annotated only if a key frame is near and has boxes
     annotated = (distance_s <= FRAME_TOLERANCE_S) & clip.boxes_valid[item, frame]
     boxes = boxes_at_now(clip)[item, frame]
 
+    # Key frames of the last second up to now
     lately = (clip.t_s >= -OBSERVED_S - FRAME_TOLERANCE_S) & clip.boxes_valid
     lately[:, now + 1 :] = False
     past_valid = clip.boxes.valid & lately[..., None]  # [b, T, M]
@@ -78,5 +82,6 @@ def future_obstacles(clip: Clip, steps: int, step_s: float) -> Obstacles:
 
 def _tracked(boxes: Boxes, track_id: Tensor, valid: Tensor) -> Bool[Tensor, "b T M"]:
     """Return whether each box's track is among the valid ones of `track_id` [b, frames, M]."""
+    # Compare the track of each box with all tracks of these frames
     same = boxes.track_id[..., None] == track_id.flatten(1)[:, None, None, :]  # [b, T, M, frames * M]
     return (same & valid.flatten(1)[:, None, None, :]).any(dim=-1) & boxes.valid

@@ -16,6 +16,7 @@ def psnr_db(
     """
     from torchmetrics.functional.image import peak_signal_noise_ratio  # takes seconds
 
+    # PSNR over the known pixels only
     scores = [
         peak_signal_noise_ratio(a[:, k], b[:, k], data_range=1.0) if k.any() else a.new_tensor(torch.nan)
         for a, b, k in zip(rendered, real, known, strict=True)
@@ -35,6 +36,7 @@ def ssim(
 
     if not len(rendered):
         return rendered.new_zeros(0)
+    # Unknown pixels equal the real image, so the window around known ones sees no difference there
     filled = torch.where(known[:, None], rendered, real)
     _, similarity = structural_similarity_index_measure(filled, real, data_range=1.0, return_full_image=True)
     known_pixels = known[:, None].expand_as(similarity)

@@ -48,6 +48,7 @@ def score_sweep(
     missing = float("nan")
     error = (range_m - real_range_m)[returned]
     wrong = (intensity - real_intensity)[returned]
+    # Dropped beams are left out of the cloud below
     cloud = origin + direction * torch.where(dropped, 0.0, range_m)[:, None]
     real = origin + direction * real_range_m[:, None]
     return SweepScores(
@@ -65,5 +66,6 @@ def chamfer_m2(cloud_m: Float[Tensor, "N 3"], real_m: Float[Tensor, "M 3"]) -> f
     if not len(cloud_m):
         return NO_POINTS_M**2
     a, b = cloud_m.numpy(), real_m.numpy()
+    # Nearest neighbours both ways
     forth, back = cKDTree(b).query(a)[0], cKDTree(a).query(b)[0]
     return float((np.square(forth).sum() + np.square(back).sum()) / len(b))

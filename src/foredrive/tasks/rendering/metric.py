@@ -25,11 +25,13 @@ class ImageMetric:
         assert prediction.images is not None
         rendered, stride, clip = prediction.images, prediction.image_stride, truth.clip
         frames = slice(clip.now, clip.now + rendered.shape[1])
+        # Real pixels at the positions that were rendered
         real = clip.images[:, frames, :, :, stride // 2 :: stride, stride // 2 :: stride].float() / 255
         known = clip.image_valid[:, frames, :, None, None].expand_as(real[:, :, :, 0])
         sums = torch.zeros(rendered.shape[1], 2, dtype=torch.float64)
         images = torch.zeros(rendered.shape[1], 1, dtype=torch.int64)
         for k in range(rendered.shape[1]):
+            # Only views with an image are compared
             seen = known[:, k].flatten(2).any(dim=-1)  # [b, C]
             views = (rendered[:, k][seen], real[:, k][seen], known[:, k][seen])
             scores = torch.stack([psnr_db(*views), ssim(*views)], dim=-1)

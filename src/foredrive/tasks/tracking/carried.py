@@ -58,6 +58,7 @@ def frame_steps(T_world_ego: Float64[Tensor, "b 4 4"], frames: int, dt_s: float)
         dt_s: time between them.
     """
     poses = T_world_ego.unflatten(0, (-1, frames))
+    # The first frame of a sequence is its own predecessor
     before = torch.cat([poses[:, :1], poses[:, :-1]], dim=1)
     return FrameSteps(compose_se3(inverse_se3(poses), before).float(), dt_s)
 
@@ -68,11 +69,13 @@ def lineage_of(predicted: AgentSet, carried: CarriedAgents | None, decay: float)
     The rank is the score. Carried queries keep at least `decay` times their rank, so that an agent that is
     hidden for a moment is not lost (SparseDrive, Sun et al. 2024: its instance bank).
     """
+    # Score without "no object"
     score = predicted.boxes.logits.detach().softmax(dim=-1)[..., :-1].amax(dim=-1)
     source = torch.full_like(score, NEW, dtype=torch.long)
     if carried is None:
         return Lineage(source, score)
     old = carried.lineage.rank.shape[-1]
+    # Carried queries come first: their rank decays slowly, new ones have their score
     rank = torch.cat([torch.maximum(score[:, :old], decay * carried.lineage.rank), score[:, old:]], dim=-1)
     return Lineage(torch.cat([carried.lineage.source, source[:, old:]], dim=-1), rank)
 
@@ -93,6 +96,7 @@ def carry(
     """
     rank, best = lineage.rank.topk(count, dim=-1)
     item = torch.arange(len(best), device=best.device)[:, None]
+    # Forecasts are not carried
     bare = dataclasses.replace(predicted, future_xy=None, log_prob=None)
     chosen = bare.map_tensors(lambda tensor: tensor[item, best])
     query = chosen.query
@@ -106,8 +110,10 @@ def moved(agents: AgentSet, T_now_before: Float[Tensor, "b 4 4"], dt_s: float) -
     with full_precision(boxes.mean, T_now_before) as (mean, T):
         level = torch.zeros_like(mean[..., :1])
         velocity = torch.cat([agents.velocity.to(mean), level], dim=-1)
+        # Position after dt at constant velocity, in the new ego frame
         centre = transform_points(T, mean[..., :3] + dt_s * velocity)
         sin, cos = boxes.heading.to(mean).unbind(-1)
+        # The heading is stored as sine and cosine; as a vector it is (cos, sin)
         heading = rotate_vectors(T, torch.stack([cos, sin, level[..., 0]], dim=-1))
         turned = torch.nn.functional.normalize(heading[..., [1, 0]], dim=-1, eps=1e-3)
         moved_boxes = dataclasses.replace(
@@ -131,6 +137,7 @@ def follow(
     carried: CarriedAgents | None = None
     every: list[tuple[CentreMap, list[AgentSet], Lineage]] = []
     for k in range(frames):
+        # Frame k of all sequences: items are sequence by sequence
         now, motion = (
             None if part is None else part.map_tensors(lambda tensor, k=k: tensor[k::frames])  # type: ignore[misc]
             for part in (planes, motion_planes)
@@ -139,6 +146,7 @@ def follow(
         centres, layers = head(now, motion, None if carried is None else carried.agents)
         lineage = lineage_of(layers[-1], carried, config.decay)
         every.append((centres, layers, lineage))
+        # The agents of the last frame go nowhere
         if k + 1 < frames:
             carried = carry(layers[-1], lineage, config.agents, steps.T_now_before[:, k + 1], steps.dt_s)
     layers = [interleaved([step[1][n] for step in every]) for n in range(len(every[0][1]))]
@@ -150,6 +158,7 @@ def interleaved(records: Sequence[R]) -> R:
 
     def join(values: list[Any]) -> Any:
         if isinstance(values[0], Tensor):
+            # Stack the frames of each sequence beside each other again
             return torch.stack(values, dim=1).flatten(0, 1)
         return interleaved(values) if isinstance(values[0], Record) else values[0]
 

@@ -141,6 +141,7 @@ def clear_mot(
 def _check_rows(rows: TrackRows, name: str) -> None:
     if (np.diff(rows.frame) < 0).any():
         raise InputError(f"the {name} boxes are not in the order of frames")
+    # Sorted by frame and track, a repeated pair is a neighbour of itself
     order = np.lexsort((rows.track, rows.frame))
     again = (np.diff(rows.frame[order]) == 0) & (np.diff(rows.track[order]) == 0)
     if again.any():
@@ -165,10 +166,12 @@ class Layout:
 
 def lay_out(true: TrackRows, predicted: TrackRows, candidates: Candidates) -> Layout:
     """Return the rows of each frame and the candidates of each true row."""
+    # Frames with any box of either side
     frames = np.union1d(true.frame, predicted.frame)
     return Layout(
         _starts(true.frame, frames),
         _starts(predicted.frame, frames),
+        # Tracks numbered from 0, so that the kernel indexes arrays by them
         np.unique(true.track, return_inverse=True)[1],
         np.unique(predicted.track, return_inverse=True)[1],
         np.searchsorted(candidates.true_row, np.arange(len(true) + 1)),
@@ -200,9 +203,12 @@ def follow(
 @_kernel
 @no_type_check
 def _follow(true_start, found_start, true_track, found_track, start, found_row, distance, active):
+    # Arguments: row ranges by frame, tracks by row, candidate
+    # ranges by true row, their found rows and distances
     kind, partner = np.zeros(len(true_track), np.int64), np.full(len(true_track), -1)
     apart = np.zeros(len(true_track))
     last = np.full(true_track.max() + 1 if len(true_track) else 0, -1)  # found track by true track
+    # Inactive detections are taken from the start
     taken = ~active
     for f in range(len(true_start) - 1):
         rows = range(true_start[f], true_start[f + 1])
@@ -214,9 +220,11 @@ def _follow(true_start, found_start, true_track, found_track, start, found_row, 
                         kind[row], partner[row], apart[row] = MATCH, present, distance[p]
                         taken[present] = True
                         break
+        # The remaining boxes of the frame are matched anew
         _match_rest(rows, start, found_row, distance, taken, partner, apart)
         for row in rows:
             if partner[row] >= 0 and kind[row] == MISS:
+                # Another found track than the last one is a switch, after any gap
                 track, now = true_track[row], found_track[partner[row]]
                 kind[row] = SWITCH if last[track] >= 0 and last[track] != now else MATCH
                 last[track] = now
@@ -239,6 +247,7 @@ def _match_rest(rows, start, found_row, distance, taken, partner, apart):
                 left.append(row)
     if len(left) == 1:
         return
+    # Rows and columns of the assignment: true rows without a partner, and what they can take
     row_of, column_of = np.array(left[1:]), np.unique(np.array(columns[1:]))
     cost = np.full((len(row_of), len(column_of)), np.inf)
     largest = 1.0
@@ -251,6 +260,7 @@ def _match_rest(rows, start, found_row, distance, taken, partner, apart):
     free = np.full(len(row_of), 2.0 * (len(row_of) + 1) * largest)
     column, _, _ = solve(cost, free)
     for i, row in enumerate(row_of):
+        # A column beyond the last one stands for no partner
         if column[i] < len(column_of):
             partner[row], apart[row] = column_of[column[i]], cost[i, column[i]]
             taken[partner[row]] = True
@@ -260,8 +270,10 @@ def count_events(layout: Layout, events: ClearEvents, active: Bool[ndarray, "m"]
     """Return the counts of `follow`'s events."""
     matches, switches = ((events.kind == kind).sum() for kind in (MATCH, SWITCH))
     true = len(events.kind)
+    # Active detections before each frame: their differences tell whether a frame has any
     seen = np.concatenate([[0], np.cumsum(active)])[layout.found_start]
     nonempty = (np.diff(layout.true_start) > 0) | (np.diff(seen) > 0)
+    # Frames count only if they have a box, so empty ones do not lengthen gaps
     lives = _lives(layout.true_start, layout.true_track, np.cumsum(nonempty), events.kind)
     boxes, hits, fragments, first, gap = lives
     share = hits / np.maximum(boxes, 1)
@@ -289,6 +301,7 @@ def count_events(layout: Layout, events: ClearEvents, active: Bool[ndarray, "m"]
 def _lives(true_start, true_track, frame_number, kind):
     """Return, for each true track, its boxes, hits, fragments, frames before the first hit, longest gap."""
     tracks = true_track.max() + 1 if len(true_track) else 0
+    # One entry for each true track
     boxes, hits, fragments = np.zeros(tracks), np.zeros(tracks), np.zeros(tracks)
     start, before, now, longest = np.zeros(tracks), np.zeros(tracks), np.zeros(tracks), np.zeros(tracks)
     last, missed = np.zeros(tracks), np.zeros(tracks, np.bool_)  # last frame; a miss since the last hit
@@ -296,6 +309,7 @@ def _lives(true_start, true_track, frame_number, kind):
         for row in range(true_start[f], true_start[f + 1]):
             t, number = true_track[row], frame_number[f]
             if boxes[t] == 0:
+                # First box of the track
                 start[t] = number
             else:
                 now[t] += number - last[t] - 1  # the track had no box meanwhile
@@ -303,6 +317,7 @@ def _lives(true_start, true_track, frame_number, kind):
             last[t] = number
             if kind[row] == MISS:
                 now[t] += 1
+                # A miss after a hit starts a gap; a hit after it makes it a fragment
                 missed[t] = hits[t] > 0
             else:
                 if hits[t] == 0:
@@ -310,6 +325,7 @@ def _lives(true_start, true_track, frame_number, kind):
                 fragments[t] += missed[t]
                 longest[t] = max(longest[t], now[t])
                 hits[t], now[t], missed[t] = hits[t] + 1, 0, False
+    # A gap at the end of the life counts as well
     return boxes, hits, fragments, before, np.maximum(longest, now)
 
 
@@ -321,6 +337,7 @@ def near_pairs(
     max_distance: float,
 ) -> Candidates:
     """Return the pairs of one frame whose centres are nearer than a distance. Rows are in order of frames."""
+    # Range of found rows in the frame of each true row
     first, last = (np.searchsorted(found_frame, true_frame, side=side) for side in ("left", "right"))
     arrays = (np.ascontiguousarray(xy, np.float64) for xy in (true_xy, found_xy))
     return Candidates(*_near_pairs(first, last, *arrays, max_distance))
@@ -329,6 +346,7 @@ def near_pairs(
 @_kernel
 @no_type_check
 def _near_pairs(first, last, true_xy, found_xy, max_distance):
+    # Two passes: count the pairs, then fill arrays of that size
     count = 0
     for fill in range(2):
         if fill == 1:

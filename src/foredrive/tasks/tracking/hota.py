@@ -71,13 +71,20 @@ def hota(true: TrackRows, predicted: TrackRows, similar: Candidates) -> Hota:
     true_boxes, true_track = _counts(true.track)
     found_boxes, found_track = _counts(predicted.track)
     both = np.stack([true_track[similar.true_row], found_track[similar.found_row]], axis=1)
+    # Distinct pairs of tracks, and the pair of each candidate
     pairs, pair = np.unique(both, axis=0, return_inverse=True)
+    # Boxes of both tracks together
     pair, lengths = pair.reshape(-1), true_boxes[pairs[:, 0]] + found_boxes[pairs[:, 1]]
+    # Number of frames that two tracks share, weighted by similarity among the alternatives
     shared = np.bincount(pair, _share(similar, len(true), len(predicted)), len(pairs))
+    # Alignment: shared frames over the union of both tracks; matching maximises alignment times similarity
     matched = _match(true, similar, (shared / (lengths - shared))[pair] * similar.value)
+    # A match counts at all thresholds up to its similarity
     hit = (matched >= 0) & (similar.value >= ALPHAS[:, None] - _EPS)
+    # Matches of each pair of tracks, by threshold
     joint = np.stack([np.bincount(pair[row], minlength=len(pairs)) for row in hit])
     hits = hit.sum(1)
+    # Each match weighs the overlap of its tracks: joint² sums it over the joint matches
     ass_a, ass_re, ass_pr = (
         (joint * joint / np.maximum(1, whole)).sum(1) / np.maximum(1, hits)
         for whole in (lengths - joint, true_boxes[pairs[:, 0]], found_boxes[pairs[:, 1]])
@@ -102,6 +109,7 @@ def _counts(track: Int[ndarray, "n"]) -> tuple[Int[ndarray, "T"], Int[ndarray, "
 def _share(similar: Candidates, true: int, predicted: int) -> Float[ndarray, "P"]:
     """Return the similarity of each pair as a share of that of all pairs that its two boxes have."""
     value = similar.value
+    # Similarity of all pairs of the true box and of the found box, the pair itself counted once
     whole = np.bincount(similar.true_row, value, true)[similar.true_row] - value
     whole += np.bincount(similar.found_row, value, predicted)[similar.found_row]
     return np.divide(value, whole, out=np.zeros_like(value), where=whole > _EPS)
@@ -112,11 +120,14 @@ def _match(true: TrackRows, similar: Candidates, score: Float[ndarray, "P"]) -> 
     matched = np.full(len(score), -1)
     frame = true.frame[similar.true_row]
     starts = np.flatnonzero(np.diff(frame, prepend=-1))
+    # Candidates are in order of frames: each run is one frame
     for start, stop in itertools.pairwise([*starts, len(frame)]):
         rows, row = np.unique(similar.true_row[start:stop], return_inverse=True)
         columns, column = np.unique(similar.found_row[start:stop], return_inverse=True)
+        # Table of scores; pairs that are no candidates have score 0 and no index
         table, place = np.zeros((len(rows), len(columns))), np.full((len(rows), len(columns)), -1)
         table[row, column], place[row, column] = score[start:stop], np.arange(start, stop)
+        # The largest sum of scores; chosen pairs that are no candidates are dropped
         pairs = place[linear_sum_assignment(table, maximize=True)]
         matched[pairs[pairs >= 0]] = pairs[pairs >= 0]
     return matched

@@ -25,6 +25,7 @@ def futures_in_world(
     future_xy: Float[ndarray, "n *s 2"], centre: Float[ndarray, "n 3"], T_world_ego: Pose
 ) -> Float64[ndarray, "n *s 2"]:
     """Return x and y in the world frame of futures of the ego frame, at the heights of their boxes, m."""
+    # Futures keep the height of their box
     height = centre[:, 2].reshape(-1, *[1] * (future_xy.ndim - 1))
     xyz = np.concatenate([future_xy, np.broadcast_to(height, (*future_xy.shape[:-1], 1))], axis=-1)
     return places_in_world(xyz, T_world_ego)[..., :2]
@@ -35,6 +36,7 @@ def levelled(xy_world: Float64[ndarray, "*n 2"], T_world_ego: Pose) -> Float64[n
 
     Pitch and roll of the vehicle are left out, as in files, which state places over ground.
     """
+    # Rotation by -yaw of the offset from the vehicle
     x, y = np.moveaxis(xy_world - T_world_ego[:2, 3], -1, 0)
     yaw = ego_yaw(T_world_ego)
     cos, sin = np.cos(yaw), np.sin(yaw)
@@ -48,6 +50,7 @@ def ego_yaw(T_world_ego: Pose) -> float:
 
 def velocities_in_world(velocity: Float[ndarray, "n 2"], T_world_ego: Pose) -> Float64[ndarray, "n 2"]:
     """Return velocities over ground along the axes of the world frame, m/s. NaN stays NaN."""
+    # Vertical velocity is 0
     level = np.concatenate([velocity, np.zeros((len(velocity), 1))], axis=1)
     return (level @ T_world_ego[:3, :3].T)[:, :2]
 
@@ -88,6 +91,7 @@ def likely(agents: Agents) -> Agents:
     return agents[agents.score >= MIN_SCORE]
 
 
+# Frames in order, concatenated column by column
 def stacked(rows: Sequence[ObjectRows]) -> ObjectRows:
     """Return the rows of all frames in order."""
     if not rows:
@@ -99,6 +103,7 @@ def stacked(rows: Sequence[ObjectRows]) -> ObjectRows:
 def _columns(
     objects: Agents | Boxes, T_world_ego: Pose, frame: int, classes: Sequence[str]
 ) -> tuple[Int64[ndarray, "n"], Int64[ndarray, "n"], ndarray, ndarray, Float64[ndarray, "n"]]:
+    # Labels of the protocol's classes; others get -1
     label_of = {Category[name.upper()]: label for label, name in enumerate(classes)}
     label = [label_of.get(Category(kind), -1) for kind in objects.category.tolist()]
     return (

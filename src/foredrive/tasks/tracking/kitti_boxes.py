@@ -16,7 +16,7 @@ from foredrive.tasks.detection.protocols import DETECTION_PROTOCOLS, evaluate_de
 from foredrive.tasks.tracking.object_rows import ObjectRows, Region, make_rows
 
 _UNKNOWN = frozenset({"ave_mps", "aae"})
-"""Errors of what KITTI's text does not tell."""
+"""Errors that need values which KITTI's text does not have."""
 
 
 def score_kitti_boxes(folder: Path, truth: Path) -> Figures:
@@ -29,12 +29,14 @@ def score_kitti_boxes(folder: Path, truth: Path) -> Figures:
     for lines in true.values():
         for line in lines:
             check_type(line.kind, line.name)
+    # Detections of classes that the truth lacks cannot be judged
     others = _drop_other_classes(predicted, classes[:true_classes])
     tell_left_out(folder, {"boxes of other classes": others}, others + sum(map(len, predicted.values())))
     protocol = dataclasses.replace(
         DETECTION_PROTOCOLS["nuscenes"],
         title="KITTI, by distance",
         classes=tuple(classes[:true_classes]),
+        # No ranges: KITTI has none
         region=Region("circle", {}),
         without=dict.fromkeys(classes, _UNKNOWN),
     )

@@ -71,6 +71,7 @@ def score_kitti_tracks(folder: Path, truth: Path) -> Figures:
     given = sum(len(predicted) for _, predicted in pairs)
     judged = [name for name in CLASSES if any((true.kind == name).any() for true, _ in pairs)]
     unjudged = [name for name in CLASSES if name not in judged]
+    # Types that KITTI does not know are left out
     pairs = [(true, predicted[np.isin(predicted.kind, KITTI_TYPES)]) for true, predicted in pairs]
     others = given - sum(len(predicted) for _, predicted in pairs)
     absent = sum(int(np.isin(predicted.kind, unjudged).sum()) for _, predicted in pairs)
@@ -106,12 +107,14 @@ def read_sequence(path: Path, fields: int) -> KittiBoxes:
         if len(words) < fields:
             raise InputError(f"{path}: line {n} has {len(words)} fields, not {fields}")
         try:
+            # The type is the only word that is no number
             values = [float(word) for word in (*words[:2], *words[3:fields])]
         except ValueError as error:
             raise InputError(f"{path}: line {n} has something that is not a number") from error
         if not all(abs(value) <= MAX_NUMBER for value in values):
             raise InputError(f"{path}: line {n} has a number that is not finite, or beyond {MAX_NUMBER:g}")
         kind = words[2].lower()
+        # A track has one box in a frame; `DontCare` regions may repeat their number
         if kind != "dontcare" and (kind, *values[:2]) in seen:
             raise InputError(f"{path}: line {n} has the track {words[1]} a second time in frame {words[0]}")
         seen.add((kind, *values[:2]))
@@ -131,16 +134,20 @@ def counted_boxes(true: KittiBoxes, predicted: KittiBoxes, name: str) -> tuple[K
     """
     ignored = true[true.kind == "dontcare"]
     true, predicted = true[np.isin(true.kind, (name, CLASSES[name]))], predicted[predicted.kind == name]
+    # Boxes that must be found: of the class, not truncated, visible enough
     must = (true.kind == name) & (true.occlusion <= MAX_OCCLUSION) & (true.truncation <= MAX_TRUNCATION)
     kept = np.ones(len(predicted), bool)
     for frame in np.unique(predicted.frame):
         columns, rows = np.flatnonzero(predicted.frame == frame), np.flatnonzero(true.frame == frame)
+        # The largest total overlap, of pairs that overlap enough
         overlap = overlaps(true.corners[rows], predicted.corners[columns])
         overlap[overlap < MIN_OVERLAP - _EPS] = 0.0
         row, column = linear_sum_assignment(overlap, maximize=True)
         hit = overlap[row, column] > 0
         row, column = row[hit], column[hit]
+        # What is matched with a box that need not be found does not count
         kept[columns[column]] = must[rows[row]]
+        # Unmatched detections that are low, or mostly in an ignored region, do not count either
         alone = np.delete(columns, column)
         corners, regions = predicted.corners[alone], ignored.corners[ignored.frame == frame]
         low = corners[:, 3] - corners[:, 1] <= MIN_HEIGHT_PX + _EPS
@@ -150,6 +157,7 @@ def counted_boxes(true: KittiBoxes, predicted: KittiBoxes, name: str) -> tuple[K
 
 def _mostly_inside(corners: Float[ndarray, "n 4"], regions: Float[ndarray, "m 4"]) -> Bool[ndarray, "n"]:
     """Return whether more than half of each box lies in one of the regions."""
+    # Intersection with each region over the area of the box, as a region may be much larger
     upper = np.minimum(corners[:, None, 2:], regions[:, 2:])
     shared = np.clip(upper - np.maximum(corners[:, None, :2], regions[:, :2]), 0.0, None).prod(-1)
     area = (corners[:, 2:] - corners[:, :2]).prod(-1)
@@ -161,12 +169,14 @@ def _score_class(pairs: Sequence[tuple[KittiBoxes, KittiBoxes]], name: str) -> d
     for pair in pairs:
         for side, boxes in zip(sides, counted_boxes(*pair, name), strict=True):
             side.append(boxes)
+    # Frames and tracks of a sequence are shifted, so that those of two sequences differ
     frames = 1 + max(int(boxes.frame.max(initial=0)) for side in sides for boxes in side)
     (true, a), (predicted, b) = (_joined(side, frames) for side in sides)
     rows, columns, values = [], [], []
     for frame in np.unique(true.frame):
         row, column = (np.flatnonzero(side.frame == frame) for side in (true, predicted))
         overlap = overlaps(a[row], b[column])
+        # Pairs that overlap at all are HOTA's candidates
         i, j = np.nonzero(overlap)
         rows.append(row[i])
         columns.append(column[j])
@@ -175,6 +185,7 @@ def _score_class(pairs: Sequence[tuple[KittiBoxes, KittiBoxes]], name: str) -> d
     row, column = (np.concatenate([zero, *pair]) for pair in (rows, columns))
     similar = Candidates(row, column, np.concatenate([np.zeros(0), *values]))
     near = similar.value >= MIN_OVERLAP - _EPS
+    # CLEAR MOT needs an overlap of a half; the distance is one less the overlap
     close = Candidates(similar.true_row[near], similar.found_row[near], 1 - similar.value[near])
     counts = clear_mot(true, predicted, close)[1]
     clear = {"mota": counts.mota, "motp_overlap": 1 - counts.motp, "recall": counts.recall}

@@ -43,8 +43,11 @@ def held_objects(
         track_id: identity of each object at now.
         away_m: distance of each query from each object, m.
     """
+    # Object that the query carried on, if any
     mine = torch.where(source >= 0, owner[source.clamp_min(0)], NOBODY)
+    # Its row among the objects at now
     same = (mine[:, None] == track_id) & (mine[:, None] != NOBODY)
+    # A query that is far from its object is free, and the object is free as well
     lost = (same & (away_m >= RELEASED_M)).any(dim=1)
     same = same & ~lost[:, None]
     query, match = same.nonzero(as_tuple=True)
@@ -55,6 +58,7 @@ def matching_beside(
     predicted: BoxSet, truth: LabelledBoxes, held: Held, config: MatchingLossConfig
 ) -> tuple[Int[Tensor, "n"], Int[Tensor, "n"]]:
     """Return queries and their objects: the held ones, and the best matching of all others."""
+    # Queries and objects without a partner are matched optimally
     free_query = (~held.bound).nonzero()[:, 0]
     free = torch.ones(len(truth.label), dtype=torch.bool, device=held.match.device)
     free[held.match] = False

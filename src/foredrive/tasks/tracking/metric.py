@@ -57,17 +57,22 @@ def greedy_tracks(predicted: ObjectRows, frames: Frames, classes: Sequence[str])
         frames: in the order of time within each scene.
         classes: names of the labels. Detections of other classes are left out.
     """
+    # Classes without a limit are not tracked
     limit_m = np.array([MAX_DISTANCE_M.get(name, np.nan) for name in classes])
     predicted = predicted[(predicted.label >= 0) & np.isfinite(limit_m)[predicted.label]]
     number = np.full(len(predicted), -1, dtype=np.int64)
     tracks, begun = _nothing(), 0
+    # Every scene begins anew
     for frame, dt_s in _steps(frames):
         tracks = _nothing() if dt_s is None else tracks
         rows = np.flatnonzero(predicted.frame == frame)
+        # Detections of high scores choose first
         rows = rows[np.argsort(-predicted.score[rows], kind="stable")]
         here = predicted[rows]
         dt_s = dt_s or FRAME_S
+        # Limits are for steps of 0.5 s and scale with the time step
         partner = _partners(here, tracks, limit_m * dt_s / FRAME_S, dt_s)
+        # Detections without a track begin one
         new = partner < 0
         number[rows[~new]] = tracks.number[partner[~new]]
         number[rows[new]] = begun + np.arange(new.sum())
@@ -90,13 +95,16 @@ def _partners(
     partner = np.full(len(here), -1, dtype=np.int64)
     if len(tracks.number) == 0:
         return partner
+    # Move each detection back to the time of the frame before
     before = here.centre[:, :2] - np.nan_to_num(here.velocity) * dt_s
     away_m = np.linalg.norm(before[:, None] - tracks.xy, axis=-1)
+    # Other classes, and tracks beyond the limit of the class
     away_m[(here.label[:, None] != tracks.label) | (away_m > limit_m[here.label][:, None])] = np.inf
     for row in range(len(here)):
         nearest = int(away_m[row].argmin())
         if np.isfinite(away_m[row, nearest]):
             partner[row] = nearest
+            # A track is taken once
             away_m[:, nearest] = np.inf
     return partner
 
@@ -108,6 +116,7 @@ def _next_tracks(
     partner: Int64[ndarray, "n"],
     dt_s: float,
 ) -> _Tracks:
+    # Tracks without a detection go on for a few frames, moved by their velocity
     left = np.setdiff1d(np.flatnonzero(tracks.age < MAX_AGE_FRAMES), partner)
     velocity = np.nan_to_num(here.velocity)
     return _Tracks(
@@ -154,6 +163,7 @@ class TrackingMetric:
             pose = clip.T_world_ego[item, clip.now].cpu().numpy()
             self._found.append(agent_rows(likely(prediction.agents[item]), pose, frame, CLASSES))
             self._true.append(box_rows(clip.boxes[item, clip.now], pose, frame, CLASSES))
+            # A missing frame of the drive starts a new scene
             scene = self._scene[-1] if self._scene else 0
             goes_on = not self._keys or continues(self._keys[-1], key)
             self._scene.append(scene if goes_on else scene + 1)
@@ -168,6 +178,8 @@ class TrackingMetric:
         frames = Frames(np.array(self._scene, dtype=np.int64), times)
         out: Figures = {"frames_counted": len(frames), "scenes": self._scene[-1] + 1}
         if (predicted.track >= 0).any():
+            # Identities of the model, if it has any
             out |= tracking_figures(predicted[predicted.track >= 0], true, true[:0], frames)
+        # The baseline takes the same detections
         simple = tracking_figures(greedy_tracks(predicted, frames, CLASSES), true, true[:0], frames)
         return out | {f"{key}{BASELINE}": value for key, value in simple.items()}

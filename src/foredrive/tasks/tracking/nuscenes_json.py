@@ -51,6 +51,7 @@ def read_labels(
     names: Sequence[str],
 ) -> Int[ndarray, "n"]:
     """Return the index of each box's class, from the first of `keys` that it has; -1 for one of `others`."""
+    # Known classes that are not judged have the label -1
     number = {**dict.fromkeys(others, -1), **{name: n for n, name in enumerate(classes)}}
     label = np.zeros(len(boxes), np.int64)
     for n, box in enumerate(boxes):
@@ -85,6 +86,7 @@ def read_scores(
 
 def read_velocities(boxes: Sequence[Box], names: Sequence[str]) -> Float[ndarray, "n 2"]:
     """Return velocities over ground, m/s. NaN, null, or no `velocity` at all: unknown."""
+    # Boxes that state a velocity; the others are unknown
     stated = [n for n, box in enumerate(boxes) if _states_velocity(box.get("velocity"))]
     velocity = np.full((len(boxes), 2), np.nan)
     velocity[stated] = read_number_rows([boxes[n] for n in stated], "velocity", 2, _Chosen(names, stated))
@@ -133,7 +135,7 @@ _TRUE_NAMES = ("tracking_name", "detection_name")
 
 @dataclass(frozen=True)
 class Sample:
-    """What the ground truth says of a frame."""
+    """Scene, time and ego vehicle of a frame, as far as the ground truth states them."""
 
     scene: str | None
     time_us: int | None
@@ -162,6 +164,7 @@ def read_results(
                 f"{path}: frame {name} has {len(frame_boxes)} boxes, and {max_boxes} are allowed"
             )
     names, boxes = BoxNames(path, by_frame), [box for frame_boxes in by_frame.values() for box in frame_boxes]
+    # Frame of each box as an index into the truth's frames
     number = {name: n for n, name in enumerate(truth.names)}
     frame = np.array(
         [number[name] for name, frame_boxes in by_frame.items() for _ in frame_boxes], dtype=np.int64
@@ -171,6 +174,7 @@ def read_results(
     columns: dict[str, ndarray] = {
         "score": read_scores(boxes, f"{task}_score", names, only_ranks=task == "detection"),
         "velocity": read_velocities(boxes, names),
+        # Range from the ego vehicle decides about what counts
         "from_ego": centre[:, :2] - truth.ego[frame],
     }
     missing = len(number) - len(by_frame)
@@ -178,6 +182,7 @@ def read_results(
         columns["attribute"] = read_attributes(boxes, names)
         rows = make_rows(frame, label, centre, size_lwh, yaw, **columns)
         return FoundObjects(_with_size([rows], path)[0], missing)
+    # Identities are numbered in order of appearance
     identities = read_texts(boxes, "tracking_id", names)
     columns["track"] = number_names(identities)
     rows = make_rows(frame, label, centre, size_lwh, yaw, **columns)
@@ -215,8 +220,10 @@ def make_truth(
     Raises:
         InputError: a box is wrong, or tracking lacks a scene, a time or an identity.
     """
+    # Tracking needs frames by scene and time
     if task == "tracking":
         content = {name: content[name] for name in _in_time(samples, path)}
+    # Bicycle racks are kept apart: they only exclude boxes in them
     racks, objects = (
         {name: [box for box in boxes if (_name(box) == RACK) is rack] for name, boxes in content.items()}
         for rack in (True, False)
@@ -306,7 +313,7 @@ def _name(box: Box) -> object:
 
 
 def _sample(stated: Mapping[str, Any], boxes: Sequence[Box], where: str) -> Sample:
-    """Return what a sample, or else its first box, says of scene, time and ego vehicle."""
+    """Return scene, time and ego vehicle as a sample, or else its first box, states them."""
     box = boxes[0] if boxes else {}
     scene, time_us = (stated.get(key, box.get(key)) for key in ("scene_token", "timestamp"))
     ego = None
@@ -314,6 +321,7 @@ def _sample(stated: Mapping[str, Any], boxes: Sequence[Box], where: str) -> Samp
         ego = read_numbers(stated, "ego_translation", 3, where)[:2]
     elif "ego_translation" in box:
         offset = read_numbers(box, "ego_translation", 3, f"{where}, box 0")
+        # In boxes, `ego_translation` is the offset from the ego vehicle
         if offset.any():  # the devkit writes zeros where it does not know
             ego = (read_numbers(box, "translation", 3, f"{where}, box 0") - offset)[:2]
     if time_us is not None and not isinstance(time_us, int):
@@ -333,6 +341,7 @@ def _in_time(samples: Mapping[str, Sample], path: Path) -> list[str]:
                 f"{path}: frame {name} has no scene_token and timestamp, in its boxes or under `samples`: "
                 "tracking needs them"
             )
+    # Scenes in order of appearance, frames by time
     place = {scene: n for n, scene in enumerate(dict.fromkeys(sample.scene for sample in samples.values()))}
     ordered = sorted(samples, key=lambda name: (place[samples[name].scene], samples[name].time_us))
     for before, name in itertools.pairwise(ordered):

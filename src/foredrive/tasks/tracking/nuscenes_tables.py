@@ -63,6 +63,7 @@ def read_tables_truth(
     """
     samples = _table(folder, "sample")
     check_known_frames(path, list(listed := list(listed)), folder, list(samples))
+    # All samples of every scene that the results touch
     scenes = {samples[token]["scene_token"] for token in listed}
     wanted = {token: row for token, row in samples.items() if row["scene_token"] in scenes}
     ego = _ego_places(folder, wanted)
@@ -104,12 +105,15 @@ def _boxes(folder: Path, samples: Mapping[str, Row], wanted: Mapping[str, Row]) 
 def _velocity(token: str, annotations: Mapping[str, Row], samples: Mapping[str, Row]) -> list[float] | None:
     """Return the velocity over ground between the annotations before and after; None if it is not known."""
     row = annotations[token]
+    # Annotations before and after, or the box itself at an end of its track
     first, last = row["prev"] or token, row["next"] or token
     if first == last:
         return None
     ends = [annotations[end] for end in (first, last)]
     times = [samples[end["sample_token"]]["timestamp"] for end in ends]
+    # Seconds are rounded before the difference, as in the devkit
     step_s = 1e-6 * times[1] - 1e-6 * times[0]
+    # Too long between two annotations: the velocity is unknown
     if step_s > (2 * _MAX_STEP_S if row["prev"] and row["next"] else _MAX_STEP_S):
         return None
     moved = np.subtract(ends[1]["translation"][:2], ends[0]["translation"][:2])
@@ -119,6 +123,7 @@ def _velocity(token: str, annotations: Mapping[str, Row], samples: Mapping[str, 
 
 def _ego_places(folder: Path, wanted: Mapping[str, Row]) -> dict[str, np.ndarray]:
     """Return the place of the ego vehicle over ground at each sample's lidar sweep."""
+    # Places are those of the ego vehicle at the sweep of the top lidar
     lidars = {token for token, row in _table(folder, "sensor").items() if row["channel"] == "LIDAR_TOP"}
     mounted = {
         token for token, row in _table(folder, "calibrated_sensor").items() if row["sensor_token"] in lidars

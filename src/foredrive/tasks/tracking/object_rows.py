@@ -103,9 +103,11 @@ class Region:
 
         A class without a limit, and the label -1, is inside everywhere.
         """
+        # The last row serves the label -1, which has no limit
         limits = np.array([*(self.reach_m.get(name, (np.inf, np.inf)) for name in classes), (np.inf, np.inf)])
         limit = limits[label]
         if self.shape == "circle":
+            # NaN is not at or beyond the limit, so an unknown place is inside
             return ~(np.linalg.norm(from_ego, axis=1) >= limit[:, 0])
         return ~(np.abs(from_ego) >= limit).any(axis=1)
 
@@ -113,6 +115,7 @@ class Region:
 def inside_racks(boxes: ObjectRows, racks: ObjectRows, classes: Sequence[str]) -> Bool[ndarray, "n"]:
     """Return whether each box is a bicycle or motorcycle whose centre lies in a rack of its frame."""
     inside = np.zeros(len(boxes), bool)
+    # Only bicycles and motorcycles in frames that have a rack are tested
     cycles = np.isin(boxes.label, [n for n, name in enumerate(classes) if name in IN_RACKS])
     cycles &= np.isin(boxes.frame, racks.frame)
     for frame in np.unique(boxes.frame[cycles]):
@@ -132,5 +135,6 @@ def counted(
 
     Source: nuscenes-devkit 1.2.0, eval/common/loaders.py, filter_eval_boxes.
     """
+    # In range, with at least one point or an unknown number, and not in a rack
     near = region.contains(boxes.label, boxes.from_ego, classes)
     return near & (boxes.num_points != 0) & ~inside_racks(boxes, racks, classes)

@@ -51,17 +51,23 @@ def whole_tracks(boxes: ObjectRows, frames: Frames) -> ObjectRows:
     """
     boxes = boxes[np.argsort(boxes.frame, kind="stable")]
     identity = _identities(boxes, frames)
+    # The score of a box is replaced by the mean of its track
     boxes = dataclasses.replace(boxes, score=mean_scores(identity, boxes.score))
+    # Boxes by track, then by frame: neighbours are successive boxes of a track
     order = np.lexsort((boxes.frame, identity))
     left, right = order[:-1], order[1:]
     gap = boxes.frame[right] - boxes.frame[left] - 1
+    # There is no gap between two tracks
     gap[identity[left] != identity[right]] = 0
     left, right = np.repeat(left, gap), np.repeat(right, gap)
+    # Number of each filled box within its gap
     since = np.arange(len(left)) - np.repeat(np.cumsum(gap) - gap, gap)
     filled = _between(boxes[left], boxes[right], boxes.frame[left] + 1 + since, frames)
+    # First row of each track in the order of frames
     begins = np.full(identity.max(initial=-1) + 1, len(boxes))
     np.minimum.at(begins, identity, np.arange(len(boxes)))
     every = _joined(boxes, filled)
+    # Filled boxes come after those of the file, in the order in which their tracks begin
     rank = np.concatenate([np.full(len(boxes), -1), begins[identity[left]]])
     return every[np.lexsort((np.arange(len(every)), rank, every.frame))]
 
@@ -76,6 +82,7 @@ def mean_scores(identity: Int[ndarray, "n"], score: Float[ndarray, "n"]) -> Floa
     track, start, length = np.unique(identity[order], return_index=True, return_counts=True)
     mean = np.zeros(track.max(initial=-1) + 1)
     for count in np.unique(length):
+        # Rows of all tracks of this length, one track a row
         rows = start[length == count, None] + np.arange(count)
         mean[track[length == count]] = np.ascontiguousarray(score[order][rows]).mean(axis=1)
     return mean[identity]
@@ -90,12 +97,14 @@ def _identities(boxes: ObjectRows, frames: Frames) -> Int[ndarray, "n"]:
 def _between(left: ObjectRows, right: ObjectRows, frame: Int[ndarray, "n"], frames: Frames) -> ObjectRows:
     """Return the boxes of gaps, weighted as the devkit weights them; angles go the shorter way round."""
     time, end, begin = (frames.time_us[k] for k in (frame, right.frame, left.frame))
+    # The devkit's weight of the next box: share of time left until it (see `whole_tracks`)
     ratio = (end - time) / (end - begin)
 
     def mix(a: Float[ndarray, "n ..."], b: Float[ndarray, "n ..."]) -> Float[ndarray, "n ..."]:
         weight = ratio.reshape(-1, *[1] * (a.ndim - 1))
         return (1.0 - weight) * a + weight * b
 
+    # The shorter way round, in -π to π
     turn = np.angle(np.exp(1j * (right.yaw - left.yaw)))
     return dataclasses.replace(
         right,
@@ -196,6 +205,7 @@ def evaluate_tracking(
         racks: bicycle racks; labels do not matter.
         frames: all frames of the scenes, also those without boxes.
     """
+    # The protocol's floor on single boxes comes before tracks are averaged and filled
     predicted = predicted[predicted.score >= protocol.min_score]
     whole_true, whole_found = (
         whole_tracks(
@@ -220,9 +230,11 @@ def recall_thresholds(
     recalls = np.linspace(protocol.min_recall, 1.0, protocol.recalls).round(12)
     if len(matched_score) == 0:
         return np.full(len(recalls), np.nan)
+    # Scores in descending order: match k is reached at recall k / true
     score = np.sort(matched_score)[::-1]
     reached = np.arange(1, len(score) + 1) / true
     threshold = np.interp(recalls, reached, score, right=0)
+    # Recalls beyond the largest one are not reached
     threshold[recalls > reached[-1]] = np.nan
     return threshold[::-1]
 
@@ -234,15 +246,18 @@ def _class_figures(
     if len(true) == 0:
         return dict.fromkeys(_FIGURES, math.nan)
     layout = _lay_out(true, predicted, frames, protocol)
+    # All found boxes take part first; their matches give the thresholds of all recalls
     everything = ClearEvents(*follow(layout, np.ones(len(predicted), bool)))
     matches = everything.found_row[everything.kind == MATCH]
     threshold = recall_thresholds(predicted.score[matches], len(true), protocol)
     reached = ~np.isnan(threshold)
     if not reached.any():
         return _nothing_found(layout, protocol)
+    # Each threshold is a tracking run of its own
     counts = _counts_at(layout, predicted.score, np.unique(threshold[reached]))
     points = [at_threshold(counts[score]) if score in counts else None for score in threshold.tolist()]
     motar, motp = (np.array([math.nan if f is None else f[key] for f in points]) for key in ("motar", "motp"))
+    # Thresholds that are not reached cannot be the best
     mota = [-math.inf if f is None else f["mota"] for f in points]
     best = points[int(np.argmax(mota))]  # of equal ones, that of the highest recall
     assert best is not None
@@ -272,6 +287,7 @@ def _counts_at(
     counts: dict[float, ClearCounts] = {}
 
     def job(start: int, stop: int) -> None:
+        # Only boxes of at least this score take part
         for threshold in thresholds[start:stop].tolist():
             active: Bool[ndarray, m] = score >= threshold
             counts[threshold] = count_events(layout, ClearEvents(*follow(layout, active)), active)
@@ -284,6 +300,7 @@ def at_threshold(counts: ClearCounts) -> dict[str, float]:
     """Return the devkit's figures of one score threshold."""
     return {
         "recall": counts.recall,
+        # MOTAR of the devkit, in which its other terms cancel
         "motar": max(0.0, 1.0 - counts.false / counts.matches) if counts.matches else math.nan,
         "gt": float(counts.true),
         "mota": max(0.0, counts.mota),
@@ -328,6 +345,7 @@ def _over_classes(by_class: Mapping[str, Mapping[str, float]]) -> dict[str, floa
     every: dict[str, float] = {}
     for key in _FIGURES:
         values = np.array([figures[key] for figures in by_class.values()])
+        # Classes without a figure are left out of the mean
         valid: Float[ndarray, k] = values[~np.isnan(values)]
         if key in SUMMED:
             every[key] = float(valid.sum())

@@ -45,6 +45,7 @@ def read_log_truth(folder: Path, listed: Iterable[str], path: Path, classes: Seq
     """
     wanted = dict.fromkeys(listed)
     names: list[str] = []
+    # Frames of the log have the log's world frame, so places of one drive are comparable
     rows, ego, scene, time_us = [], [], [], []
     for named in log_frames(folder, wanted, path):
         boxes = read_boxes(named.log, named.frame)
@@ -145,6 +146,7 @@ def tracking_figures(predicted: ObjectRows, true: ObjectRows, racks: ObjectRows,
         scored = evaluate_tracking(predicted, true, racks, frames, protocol)
         figures |= _prefixed(name, scored.all_classes)
         for label, values in scored.by_class.items():
+            # Classes without ground truth have no figures
             if values["gt"] > 0:
                 figures |= _prefixed(f"{name}.{label}", values)
     return figures
@@ -165,6 +167,7 @@ def _judged_figures(scored: DetectionFigures, lacks: frozenset[str]) -> Mapping[
     judged = {key: _NEEDED_BY.get(key) not in lacks for key in ERRORS}
     figures: dict[str, float | None] = {
         "map": scored.mean_ap,
+        # NDS needs all errors
         "nds": scored.nds if all(judged.values()) else None,
         **{key: scored.errors[key] if judged[key] else None for key in ERRORS},
     }

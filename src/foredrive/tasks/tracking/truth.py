@@ -59,6 +59,7 @@ class BoxNames(Sequence[str]):
             return [self[n] for n in range(*index.indices(len(self)))]
         if not 0 <= index < len(self):
             raise IndexError(index)
+        # The last start that is not behind the index
         frame = int(np.searchsorted(self._start, index, side="right")) - 1
         return f"{self._path}: frame {self._frames[frame]}, box {index - self._start[frame]}"
 

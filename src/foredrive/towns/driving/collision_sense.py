@@ -31,9 +31,11 @@ class CollisionSense:
     def __init__(self, world: World) -> None:
         self._world = world
         half_width, length = 0.5 * EGO.width_m, EGO.length_m
+        # Rays start at the front bumper, across the width and at two heights
         y = np.linspace(-half_width, half_width, int(np.ceil(EGO.width_m / RAY_SPACING_M)) + 1)
         start = [[EGO.axle_to_centre_m + 0.5 * length, left, up] for up in RAY_HEIGHTS_M for left in y]
         self._start_ego: Float64[np.ndarray, "R 3"] = np.array(start)
+        # The outermost rays scrape along the flanks; only the others count as a frontal contact
         self._in_front = np.abs(self._start_ego[:, 1]) < half_width - FLANK_M
 
     def check(
@@ -51,6 +53,7 @@ class CollisionSense:
         standing_xy = contacts.standing_xy
         if struck is not None:
             xy, surface = struck
+            # The same object is reported once until another place is struck
             if standing_xy is None or np.hypot(*np.subtract(xy, standing_xy)) > SAME_M:
                 what = "parked car" if surface is Surface.VEHICLE else surface.name.lower()
                 text = f"{what} at {ego.speed_mps:.1f} m/s"
@@ -68,12 +71,14 @@ class CollisionSense:
         """
         R, origin = T_world_ego[:3, :3], T_world_ego[:3, 3]
         start = self._start_ego @ R.T + origin
+        # Each ray runs the vehicle's length backwards, so `part` is the depth of the hit as a share of it
         way = np.broadcast_to(-EGO.length_m * R[:, 0], start.shape)
         rays: list[Float32[np.ndarray, "R 3"]] = [np.ascontiguousarray(x, np.float32) for x in (start, way)]
         part, surface = self._world.struck(*rays)
         inside = (part <= 1.0) & SOLID[surface]
         if not inside.any():
             return False, None
+        # Only a hit within `BUMPER_M` of the bumper, and not at the flanks, stops the vehicle
         at_front = inside & self._in_front & (part * EGO.length_m < BUMPER_M)
         first = int(np.argmin(np.where(inside, part, np.inf)))
         xy = start[first, :2] + part[first] * way[first, :2]

@@ -67,6 +67,7 @@ class DisturbedExpert:
     def act(self, observation: Clip) -> Trajectory:
         """Return the expert's plan with the current disturbance, if there is one."""
         plan, t_s, rng = self.expert.plan(), self._clock(), self._rng
+        # The end of a disturbance, then the exponential wait for the next one
         if self._now is not None and t_s >= self._now.until_s:
             self._now, self._begins_s = None, t_s + rng.exponential(CALM_S)
         if self._now is None and t_s >= self._begins_s:
@@ -78,6 +79,7 @@ class DisturbedExpert:
                 self._now = _Disturbance(t_s + rng.uniform(*PACE_S), pace=pace if pace > HALTS else 0.0)
         if self._now is None:
             return plan
+        # Row vectors: the plan is turned to the left by the heading error and scaled by the pace
         cos, sin = math.cos(self._now.bears_rad), math.sin(self._now.bears_rad)
         turned = self._now.pace * torch.tensor([[cos, sin], [-sin, cos]])
         return dataclasses.replace(plan, xy=plan.xy @ turned.to(plan.xy), yaw=plan.yaw + self._now.bears_rad)

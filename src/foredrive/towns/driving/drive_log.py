@@ -67,6 +67,7 @@ def log_frame(frame: KeyFrame, ego: BicycleState, rig: CameraRig | None) -> Fram
         rig: cameras of the images. None without images.
     """
     images = frame.images.permute(0, 2, 3, 1).numpy()
+    # Centripetal acceleration v ω, with the linear acceleration along x
     lateral_mps2 = ego.speed_mps * yaw_rate_radps(ego)
     return Frame(
         t_us=FIRST_TIME_US + round(frame.t_s * 1e6),

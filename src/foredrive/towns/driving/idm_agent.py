@@ -93,13 +93,17 @@ class TruePerception:
         """Return state and distance of the next light on the path."""
         lines = stop_lines(load_town_map(self._simulator.scenario.town))
         states = self._simulator.traffic.zone_lights(self._simulator.state.decided.time_s)
+        # Stop lines into the ego frame, then to distance along and beside the path
         T_ego_world = np.linalg.inv(T_world_ego)
         xyz = lines.xyz @ T_ego_world[:3, :3].T + T_ego_world[:3, 3]
         ahead = lines.ahead @ T_ego_world[:2, :2].T
         along, left = along_path(torch.from_numpy(xyz[:, :2]).float(), path.xy, path.valid)
         heading = path_headings(along, path.xy, path.valid).numpy()
+        # Gap from the front bumper, not from the rear axle
         gap_m = along.double().numpy() - path.front_m
         height_m = np.interp(along.numpy(), np.arange(len(path.z)), path.z)
+        # Lines of lights across this path, in its direction, ahead,
+        # on its level, and with a light that works
         mine = (left.abs().numpy() < BESIDE_M) & ((heading * ahead).sum(-1) > 0.5) & ~lines.is_sign
         mine &= (gap_m > -PASSED_M) & (gap_m < LIGHT_RANGE_M) & (states[lines.zone] != LightState.NONE)
         mine &= np.abs(xyz[:, 2] - height_m) < LEVEL_M
@@ -117,6 +121,7 @@ def true_view(boxes: Boxes, path: PathAhead, light: LightState, light_m: float) 
         path: the path.
         light, light_m: the next light and its distance.
     """
+    # The nearest user in the path now gives gap and speed; the cells say what is in the path over time
     there, gap_m, speed_mps, _ = lead_of(boxes, path)
     t_s = LATER_DT_S * torch.arange(TIMES)
     moved = boxes.velocity.nan_to_num()[:, None] * t_s[:, None]
@@ -143,6 +148,7 @@ def lead_in(occupied: np.ndarray) -> Obstacle | None:
     """Return the first road user in the path now, its speed by the first occupied cell two seconds later."""
     if not occupied[0].any():
         return None
+    # Speed from the shift of the first occupied cell within two seconds
     first, later = int(occupied[0].argmax()), round(2.0 / LATER_DT_S)
     moved = int(occupied[later].argmax()) - first if occupied[later].any() else 0
     return Obstacle(max(CELL_M * first + 0.25 * CELL_M, 0.3), max(CELL_M * moved / 2.0, 0.0))

@@ -69,6 +69,8 @@ _Node = tuple[int, _Part]
 def places_near(graph: LaneGraph, xyz: Float64[np.ndarray, "3"]) -> list[LanePoint]:
     """Return the places on the graph that a waypoint may mean: on the nearest lane and others nearby."""
     distance = np.linalg.norm(graph.xyz - xyz, axis=1)
+    # Shortest distance to the samples of each lane; half a step
+    # of slack because the lane lies between samples
     nearest = np.minimum.reduceat(distance, graph.first)
     places = []
     for lane in np.flatnonzero(
@@ -76,6 +78,7 @@ def places_near(graph: LaneGraph, xyz: Float64[np.ndarray, "3"]) -> list[LanePoi
     ).tolist():
         line = graph.samples(lane)
         start, along = line[:-1], np.diff(line, axis=0)
+        # Foot of the perpendicular on each segment, clamped to the segment
         part = np.einsum("ni,ni->n", xyz - start, along) / np.einsum("ni,ni->n", along, along)
         part = np.clip(part, 0.0, 1.0)
         off = np.linalg.norm(start + part[:, None] * along - xyz, axis=1)
@@ -102,6 +105,7 @@ def find_way(graph: LaneGraph, waypoints: Float64[np.ndarray, "W 3"]) -> tuple[l
     """
     if len(waypoints) < 2:
         raise InputError(f"a route needs at least two waypoints, got {len(waypoints)}")
+    # Dynamic programming over the waypoints: the cheapest way to each place of the present waypoint
     choices = [places_near(graph, xyz) for xyz in waypoints]
     ways: list[list[Leg]] = [[] for _ in choices[0]]
     places = [[place] for place in choices[0]]
@@ -114,6 +118,7 @@ def find_way(graph: LaneGraph, waypoints: Float64[np.ndarray, "W 3"]) -> tuple[l
             found.append(_best_onto(graph, before, costs, end, max_cost))
         if not any(np.isfinite(total) for total, *_ in found):
             raise InputError(f"no lanes lead from waypoint {number} to waypoint {number + 1}")
+        # Extend the best way to the predecessor place that each place chose
         ways = [joined(ways[b], legs) for _, b, legs in found]
         places = [[*places[b], end] for (_, b, _), end in zip(found, here, strict=True)]
         costs = [total for total, *_ in found]
@@ -131,6 +136,7 @@ def _best_onto(
     """
     index, s_m = np.array([place.lane for place in (end, *starts)]), [place.s_m for place in (end, *starts)]
     here, *there = graph.position(index, np.array(s_m))
+    # Lower bound of each start: its cost plus the straight distance, so the search can stop early
     aside = ASIDE_WEIGHT * end.aside_m
     promised = aside - BACK_M + np.array(costs) + np.linalg.norm(np.array(there) - here, axis=1)
     best: tuple[float, int, list[Leg]] = (np.inf, 0, [])
@@ -158,20 +164,24 @@ def _shortest(graph: LaneGraph, start: LanePoint, end: LanePoint, max_m: float) 
     lane.
     """
     first, goals = (start.lane, _Part.FIRST), [(end.lane, _Part.LAST)]
+    # On one stretch of road the end may be reached without leaving the first part of the way
     if (straight := _legs(graph, start, end, _beside(graph, start.lane, end.lane))) is not None:
         goals.append((end.lane, _Part.FIRST))
+    # The cost of a node refers to the beginning of its lane, so the start counts backwards
     cost: dict[_Node, float] = {first: -start.s_m}
     came_from: dict[_Node, _Node] = {}
     done: set[_Node] = set()
     queue: list[tuple[float, _Node]] = [(-start.s_m, first)]
     while queue:
         so_far, node = heapq.heappop(queue)
+        # The first goal taken from the queue is the cheapest one
         if node in goals:
             break
         if node in done:
             continue
         done.add(node)
         for onward, price in _steps(graph, node, start, end):
+            # Prune what is not better than known or exceeds the bound
             if so_far + price < min(cost.get(onward, np.inf), max_m):
                 cost[onward], came_from[onward] = so_far + price, node
                 heapq.heappush(queue, (so_far + price, onward))
@@ -179,6 +189,7 @@ def _shortest(graph: LaneGraph, start: LanePoint, end: LanePoint, max_m: float) 
         return np.inf, []
     if node == (end.lane, _Part.FIRST) and straight is not None:
         return so_far + end.s_m, straight
+    # Follow the predecessors back to the start
     lanes = [node[0]]
     while node != first:
         node = came_from[node]
@@ -192,9 +203,11 @@ def _steps(graph: LaneGraph, node: _Node, start: LanePoint, end: LanePoint) -> I
     lane, part = node
     length_m = float(graph.length_m[lane])
     if part is not _Part.LAST:
+        # Onto a successor, which may or may not be the last lane of the way
         for onward in graph.successors[lane, : graph.successor_count[lane]].tolist():
             yield (onward, _Part.BETWEEN), length_m
             yield (onward, _Part.LAST), length_m
+    # Room for a lane change on this part; in junctions lanes are not changed
     room_m = {_Part.FIRST: length_m - start.s_m, _Part.BETWEEN: length_m, _Part.LAST: end.s_m}[part]
     if room_m < MIN_ROOM_M or graph.junction[lane] >= 0:
         return
@@ -223,6 +236,8 @@ def _legs(graph: LaneGraph, start: LanePoint, end: LanePoint, lanes: list[int]) 
     """
     if lanes[-1] != end.lane:
         return None
+    # Group lanes side by side: within a stretch, lanes are
+    # changed, between stretches they follow each other
     stretches: list[list[int]] = [[lanes[0]]]
     for before, lane in itertools.pairwise(lanes):
         if lane in graph.successors[before, : graph.successor_count[before]]:
@@ -235,6 +250,7 @@ def _legs(graph: LaneGraph, start: LanePoint, end: LanePoint, lanes: list[int]) 
         for k, lane in enumerate(stretch):
             until_m = float(graph.length_m[lane])
             if number == len(stretches) - 1:
+                # On the last stretch the way ends beside the end point
                 until_m = _opposite(graph, end, stretch[k:])
             changes = len(stretch) - 1 - k
             if k == 0 and until_m - at_m < (MIN_ROOM_M if changes else -BACK_M):
@@ -245,12 +261,14 @@ def _legs(graph: LaneGraph, start: LanePoint, end: LanePoint, lanes: list[int]) 
             legs.append(Leg(lane, at_m, to_m, side))
             if changes:
                 side = 1 if graph.left[lane] == stretch[k + 1] else -1
+                # Continue beside the point where the lane was left
                 at_m = float(project_to_neighbour(lane, to_m, side, graph.sides))
     return legs
 
 
 def _opposite(graph: LaneGraph, end: LanePoint, lanes: list[int]) -> float:
     """Return the arc length on the first of several lanes side by side, next to the end on the last."""
+    # Project the end point from lane to lane, back to the first one
     at_m = end.s_m
     for lane, before in itertools.pairwise(reversed(lanes)):
         at_m = project_to_neighbour(lane, at_m, 1 if graph.left[lane] == before else -1, graph.sides)

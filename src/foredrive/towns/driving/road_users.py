@@ -13,10 +13,13 @@ from foredrive.towns.traffic.traffic import Traffic
 
 def road_users(traffic: Traffic, state: TrafficState) -> RoadUsers:
     """Return all road users except vehicle 0."""
+    # Rows from 1 on: vehicle 0 is the ego vehicle
     v, p, scripted, poses = state.vehicles, state.people, state.scripted_actors, traffic.poses(state)
     forward = poses.forward[1:, :2]
+    # Poses give box centres; the foot is half the height below
     foot = poses.centre_m[1:] - 0.5 * v.size_lwh[1:, 2:] * [0.0, 0.0, 1.0]
     way = np.array([actor.speed_mps * actor.ahead for actor in scripted]).reshape(-1, 2)
+    # Slots that are not active have the number -1
     track_id = [np.where(v.active, v.track_id, -1)[1:], np.where(p.active, p.track_id, -1)]
     on_foot = np.full(len(p.active), int(Category.PEDESTRIAN))
     size_lwh = np.array([actor.size_lwh for actor in scripted]).reshape(-1, 3)

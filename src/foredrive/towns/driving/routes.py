@@ -83,24 +83,29 @@ def route_line(graph: LaneGraph, legs: list[Leg]) -> tuple[Float64[np.ndarray, "
 
     Where the legs change lanes, the line moves smoothly from one lane to the other.
     """
+    # Points of all legs, with the leg of each
     points, leg_of = _sampled(graph, legs)
     steps = np.append(0.0, np.linalg.norm(np.diff(points[:, :2], axis=0), axis=1))
     begins = np.append(True, np.diff(leg_of) > 0)
     steps[begins] = 0.0  # a lane change adds no length
+    # At a lane change, the next leg begins beside the end of the last one: no distance is driven
     arc_m = np.cumsum(steps)
     option = np.full(len(points), int(RouteOption.FOLLOW))
     left = _left_of(points, leg_of)
     shift_m = np.zeros(len(points))
     inside = np.array([graph.junction[leg.lane] >= 0 for leg in legs])
+    # Runs of legs inside and outside of junctions alternate: turns there, lane changes here
     for in_junction, run in itertools.groupby(range(len(legs)), key=lambda k: bool(inside[k])):
         of_run = list(run)
         on_run = (leg_of >= of_run[0]) & (leg_of <= of_run[-1])
         if in_junction:
             option[on_run] = _turn(graph, [legs[k] for k in of_run])
             continue
+        # The shift to the new lane is spread over a window instead of a step at the leg's start
         for change, from_m, to_m in _windows(graph, legs, of_run, arc_m, leg_of):
             at = int(np.argmax(leg_of == change))
             aside_m = legs[change].changes * float(np.linalg.norm((points[at] - points[at - 1])[:2]))
+            # Quintic 0 → 1 over the window, minus the step that the points make themselves
             x = np.clip((arc_m - from_m) / max(to_m - from_m, 1e-6), 0.0, 1.0)
             led = x**3 * (10 - 15 * x + 6 * x**2)
             shift_m += aside_m * (led - (np.arange(len(points)) >= at))
@@ -131,6 +136,7 @@ def _thinned(xy: Float64[np.ndarray, "N 2"]) -> list[int]:
     for k in range(1, len(xy)):
         if np.hypot(*(xy[k] - xy[kept[-1]])) >= SPACING_M:
             kept.append(k)
+    # The end point replaces the last point kept, so that the spacing does not fall short there
     if len(kept) > 1:
         kept.pop()
     return [*kept, len(xy) - 1]
@@ -141,6 +147,7 @@ def _left_of(points: Float64[np.ndarray, "N 3"], leg_of: Int[np.ndarray, "N"]) -
     left = np.zeros((len(points), 2))
     for leg in range(leg_of[-1] + 1):
         on = np.flatnonzero(leg_of == leg)
+        # Direction by central differences within one leg; legs of a change do not line up
         dx, dy = np.gradient(points[on, :2], axis=0).T
         left[on] = np.stack([-dy, dx], axis=1) / np.hypot(dx, dy).clip(1e-9)[:, None]
     return left
@@ -169,6 +176,7 @@ def _windows(
     changes = [k for k in run if legs[k].changes]
     on_run = (leg_of >= run[0]) & (leg_of <= run[-1])
     first_m, last_m = float(arc_m[on_run][0]), float(arc_m[on_run][-1])
+    # Wanted lengths, scaled down together if the run is too short for all of them
     wanted = [max(MIN_CHANGE_M, PLANNED_CHANGE_S * float(graph.limit_mps[legs[k].lane])) for k in changes]
     scale = min(1.0, (last_m - first_m) / sum(wanted)) if wanted else 1.0
     windows, free_m = [], first_m
@@ -176,6 +184,7 @@ def _windows(
     for k, length_m, after_m in zip(changes, wanted, room_after, strict=True):
         length_m *= scale
         centre_m = float(arc_m[np.argmax(leg_of == k)])
+        # Around the middle of the change, but after the last one and with room for those that follow
         from_m = max(free_m, min(centre_m - 0.5 * length_m, last_m - after_m - length_m))
         free_m = from_m + length_m
         windows.append((k, from_m, free_m))

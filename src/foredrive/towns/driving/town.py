@@ -112,6 +112,7 @@ class TownSimulator:
             InputError: there is no such town, or the route has no length or begins on no lane.
         """
         self._prepare(scenario)
+        # The vehicle stands at the start of the route, on the nearest lane there
         ego = _start(scenario.route_xyz)
         z_m = float(scenario.route_xyz[0, 2])
         driven = self._driven(ego, z_m)
@@ -125,12 +126,15 @@ class TownSimulator:
         scenarios, traffic = self._director.set_up(
             self._traffic.start(row, lanes), self._seen(ego, RouteProgress(), z_m, 0.0), DECISION_S
         )
+        # Run the traffic for some seconds around the standing
+        # vehicle; its frames are the past of the first clip
         before = max(round(SETTLE_S / DECISION_S), scenario.past_frames * FRAME_STEPS // TRAFFIC_STEPS)
         frames: tuple[KeyFrame, ...] = ()
         for number in range(-before, 1):
             state = TownState(number * TRAFFIC_STEPS, ego, z_m, traffic, traffic, scenarios, frames)
             if number * TRAFFIC_STEPS % FRAME_STEPS == 0:
                 frames = self._with_frame(state)
+            # Time is negative before the drive begins
             if number < 0:
                 scenarios, traffic = self._decide(state)
         self._adopt(TownState(0, ego, z_m, traffic, traffic, scenarios, frames))
@@ -145,11 +149,13 @@ class TownSimulator:
         state = self.state
         if state.ended is not None:
             raise InputError(f"the drive is over ({state.ended}): reset the simulator")
+        # The vehicle moves first; the traffic decides at every second step, from the state before the move
         moved = step(state.ego, control)
         if state.step_index % TRAFFIC_STEPS == 0:
             scenarios, decided = self._decide(state)
             state = dataclasses.replace(state, traffic=state.decided, decided=decided, scenarios=scenarios)
             self._users = self._users[1], road_users(self._traffic, decided)
+        # Scenarios that this decision has begun
         begun = state.scenarios.begun[len(self.state.scenarios.begun) :]
         state, events = self._drive(state, moved)
         events = [*(self._begin_of(number) for number, _ in begun), *events]
@@ -180,6 +186,7 @@ class TownSimulator:
     def predict_now(self) -> PredictedState:
         """Return the prediction for now if the traffic decides now, else for its next decision."""
         state = self.state
+        # Traffic at its next decision, with vehicle 0 handed to the rules of the traffic
         traffic = self._traffic.with_own_driver(state.decided, self.driven)
         return PredictedState(state.t_s, traffic, state.scenarios, state.progress)
 
@@ -187,6 +194,7 @@ class TownSimulator:
         """Return the prediction `DECISION_S` later."""
         v, poses, route = now.traffic.vehicles, self._traffic.poses(now.traffic), self._route
         xyz, speed, t_s = poses.axle_xyz[0], float(v.speed_mps[0]), now.t_s
+        # In the prediction, progress and scenarios follow the simulated vehicle
         progress = route.advance(now.progress, xyz[:2], speed, t_s)
         motion = speed, float(v.acceleration_mps2[0])
         ego = ScenarioEgo(t_s, progress.done_m, *motion, poses.centre_m[0], float(poses.yaw[0]))
@@ -224,6 +232,7 @@ class TownSimulator:
         return self._clip
 
     def _prepare(self, scenario: TownScenario) -> None:
+        # The order matters: lane rules and director need the traffic
         self._scenario = scenario
         self._world = grow(scenario.town, scenario.seed)
         self._traffic = _rules_of(scenario.town, scenario.seed, scenario.background_traffic)
@@ -254,14 +263,17 @@ class TownSimulator:
     def _drive(self, state: TownState, moved: BicycleState) -> tuple[TownState, list[Event]]:
         """Move the ego vehicle unless an obstacle stops it. Return the new state and the events."""
         index = state.step_index + 1
+        # Share of the way from one decision of the traffic to the next
         t_s, part = index * STEP_S, (state.step_index % TRAFFIC_STEPS + 1) / TRAFFIC_STEPS
         users: RoadUsers = self._users[0].towards(self._users[1], part)
         T = self._pose(moved, state.z_m)
+        # A collision that stops the vehicle keeps its old pose at speed 0
         events, contacts, stopped = self._collisions.check(T, moved, users, state.contacts, t_s)
         if stopped:
             moved = dataclasses.replace(state.ego, speed_mps=0.0, acceleration_mps2=0.0)
             T = self._pose(moved, state.z_m)
         z_m = float(T[2, 3])
+        # Lights at the time of this step, which lies between two decisions
         lights = self._traffic.zone_lights(state.traffic.time_s + part * DECISION_S)
         more, rules = self._rules.check(state.ego, moved, z_m, lights, state.rules, t_s)
         progress = self._route.advance(state.progress, T[:2, 3], moved.speed_mps, t_s)
@@ -287,10 +299,12 @@ class TownSimulator:
     def _pose(self, ego: BicycleState, about_z_m: float) -> Float64[np.ndarray, "4 4"]:
         """Return `T_world_ego` on the road: both axles are at road height, and roll is 0."""
         flat = np.array([np.cos(ego.yaw_rad), np.sin(ego.yaw_rad)])
+        # Ground points of rear and front axle; their heights give the pitch
         axles = np.array([ego.x_m, ego.y_m]) + np.array([[0.0], [EGO.wheelbase_m]]) * flat
         rear_m, front_m = self._traffic.lane_index.height_m(axles, about_z_m)
         forward = np.array([*(EGO.wheelbase_m * flat), front_m - rear_m])
         forward /= np.linalg.norm(forward)
+        # No roll: left is horizontal, up completes the right-handed frame
         left = np.array([-flat[1], flat[0], 0.0])
         T = np.eye(4)
         T[:3, :3] = np.stack([forward, left, np.cross(forward, left)], axis=1)
@@ -304,11 +318,13 @@ class TownSimulator:
         near = in_box_range([*actors, *self._world.parked], T)
         images, sweep = no_images(), None
         if sensors is not None:
+            # Image noise depends on seed and key frame, so that a restored drive renders the same images
             number = state.step_index // FRAME_STEPS + self._scenario.past_frames
             noise = np.random.SeedSequence((self._scenario.seed, max(number, 0))).generate_state(1)
             twist = np.array([state.ego.speed_mps, 0.0, 0.0, 0.0, 0.0, yaw_rate_radps(state.ego)])
             lights = self._traffic.zone_lights(state.decided.time_s)
             seen = self._world.render(actors, sensors, T, twist, int(noise[0]), lights)
+            # Images as [camera, channel, row, column]
             images = torch.from_numpy(np.stack(list(seen.images.values()))).permute(0, 3, 1, 2).contiguous()
             sweep = seen.sweep
         frame = KeyFrame(state.t_s, T, state.ego.speed_mps, images, sweep, boxes_in_ego_frame(near, T))

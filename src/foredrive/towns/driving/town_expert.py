@@ -82,15 +82,18 @@ class TownExpert:
         here, now = simulator.driven, simulator.predict_now()
         now = dataclasses.replace(now, traffic=self._gone_on(traffic, now.traffic, here))
         self._imagined = [now]
+        # At a line or a red light it stays where it is
         if traffic.waits_at_line(now.traffic) or _is_too_late(traffic, now.traffic):
             return _in_ego_frame(np.tile(here.axle_xyz[:2], (STEPS, 1)), here)
         for _ in range(EVERY * STEPS):
             self._imagined.append(simulator.predict_next(self._imagined[-1]))
+        # It would stand for ever before a lane change without room: push in slowly along the route
         halts = self._imagined[-1].traffic.vehicles.speed_mps[0] < HALT_MPS
         if halts and traffic.lacks_change_room(now.traffic):
             return _in_ego_frame(self._edged_over(traffic, here)[EVERY - 1 :: EVERY], here)
         path = np.stack([traffic.poses(then.traffic).axle_xyz[0, :2] for then in self._imagined])
         path = self._not_into_anybody(traffic, _rejoined(path, here.axle_xyz[:2]), here)
+        # Every second point of the simulated path, without the present one
         return _in_ego_frame(path[EVERY::EVERY], here)
 
     def _not_into_anybody(
@@ -100,11 +103,14 @@ class TownExpert:
         v, graph = self._imagined[0].traffic.vehicles, traffic.lanes
         leader = find_leaders(graph, v, path_starts(graph, v.path)).leader
         behind = v.track_id[leader == 0]  # vehicles behind take care themselves
+        # The others in each simulated step, without those that follow this vehicle
         users = [road_users(traffic, then.traffic).without(behind) for then in self._imagined]
         arc_m = arc_lengths(path)
         t_s = DECISION_S * np.arange(len(path))
+        # Distances over time: the simulated motion first, then braking at two rates
         options = [arc_m]
         for brakes_mps2 in BRAKES_MPS2:
+            # v t - b t² / 2 until standstill; the vehicle does not leave the end of its path
             till_s = np.minimum(t_s, here.speed_mps / brakes_mps2)
             options.append(np.minimum(here.speed_mps * till_s - 0.5 * brakes_mps2 * till_s**2, arc_m[-1]))
         free = (way_m for way_m in options if _is_free(path, arc_m, way_m, users, here))
@@ -123,6 +129,7 @@ class TownExpert:
         for then in self._imagined[1:]:
             speed = min(speed + EDGES_MPS2 * DECISION_S, EDGES_MPS)
             way_m = min(way_m + speed * DECISION_S, max(max_m, way_m))
+            # Position on the route and a point ahead, from which the heading is taken
             at = now.progress.done_m + way_m + np.array([0.0, LOOK_M])
             (x, ahead_x), (y, ahead_y) = (np.interp(at, arc_m, axis) for axis in xyz.T[:2])
             yaw = math.atan2(ahead_y - y, ahead_x - x)
@@ -130,6 +137,7 @@ class TownExpert:
             middle[:2] += EGO.axle_to_centre_m * np.array([math.cos(yaw), math.sin(yaw)])
             half = 0.5 * np.array([EGO.length_m, EGO.width_m]) + CLEAR_M
             others = road_users(traffic, then.traffic)
+            # Stop at the first contact; wait in place if the other one moves
             met = touched(Box(middle, yaw, half), others)
             if (np.hypot(*others.velocity_mps[met].T) > HALT_MPS).any():
                 points = points[:1]  # the moving road user goes first
@@ -141,16 +149,19 @@ class TownExpert:
 
     def _gone_on(self, traffic: Traffic, state: TrafficState, here: EgoPose) -> TrafficState:
         """Keep the planned path and lane change, if the vehicle is where they lead."""
+        # The imagined state of this very time from the last plan, if there is one
         known = (then.traffic for then in self._imagined)
         meant = next((then for then in known if abs(then.time_s - state.time_s) < 0.5 * DECISION_S), None)
         if meant is None:
             return state
         poses = traffic.poses(meant)
+        # Offset of the real vehicle from that state, along and across its heading
         offset = here.axle_xyz[:2] - poses.axle_xyz[0, :2]
         ahead_m = float(offset @ here.forward[:2])
         beside_m = float(offset @ [-here.forward[1], here.forward[0]])
         if abs(ahead_m) > LOST_AHEAD_M or abs(beside_m) > LOST_BESIDE_M:
             return state
+        # Take the path and lane change from the plan; speed and right of way are those of the real vehicle
         first = np.array([0])
         wanted, real = meant.vehicles.rows(first), state.vehicles.rows(first)
         row = dataclasses.replace(
@@ -174,6 +185,7 @@ def _is_free(
     """Return whether the vehicle touches no road user on a path, given its distance along it at each step."""
     half, yaw = 0.5 * np.array([EGO.length_m, EGO.width_m]) + NEAR_M, here.yaw_rad
     for at_m, others in zip(way_m.tolist(), users, strict=True):
+        # Heading from the last metre of the path; at standstill the last heading stays
         axle, before = (points_at(path, arc_m, m) for m in (at_m, max(at_m - 1.0, 0.0)))
         if np.hypot(*(axle - before)) > 0.5:
             yaw = math.atan2(*(axle - before)[::-1])
@@ -193,11 +205,13 @@ def _is_too_late(traffic: Traffic, state: TrafficState) -> bool:
 def _rejoined(path: Float64[np.ndarray, "K 2"], here: Float64[np.ndarray, "2"]) -> Float64[np.ndarray, "K 2"]:
     """Return a path that begins at the vehicle and gradually approaches the simulated one."""
     way_m = arc_lengths(path)
+    # The lateral error decays exponentially along the path
     return path + np.exp(-way_m / REJOINS_M)[:, None] * (here - path[0])
 
 
 def _in_ego_frame(xy_world: Float64[np.ndarray, "T 2"], here: EgoPose) -> Trajectory:
     cos, sin = math.cos(here.yaw_rad), math.sin(here.yaw_rad)
+    # Row vectors times the rotation to the ego frame
     xy = (xy_world - here.axle_xyz[:2]) @ np.array([[cos, -sin], [sin, cos]])
     points = torch.tensor(xy, dtype=torch.float32)[None, None]
     flat = points[..., 0]

@@ -33,6 +33,7 @@ def stop_lines(town: TownMap) -> StopLines:
         for name in zone.lane_ids
         if zone.kind in kinds and name in lanes
     ]
+    # The stop line lies at the start of the guarded lane, across its direction
     starts = np.array([lane.centreline_xyz[:2] for *_, lane in rows]).reshape(-1, 2, 3)
     ahead = starts[:, 1, :2] - starts[:, 0, :2]
     return StopLines(
@@ -75,6 +76,7 @@ class TownLaneRules:
         samples = self._near.within(xyz, LANES_WITHIN_M)
         if not len(samples):
             return True
+        # Distance beyond the border of the nearest lane decides whether the vehicle is off the road
         lane = self._near.lane[samples]
         away_m = np.hypot(*(self._near.xyz[samples, :2] - xyz[:2]).T)
         if (away_m - 0.5 * self._graph.width_m[lane]).min() > OUTSIDE_BY_M:
@@ -82,5 +84,6 @@ class TownLaneRules:
         inside = away_m < 0.5 * self._graph.width_m[lane]
         if not inside.any() or (self._graph.junction[lane[inside]] >= 0).any():
             return False  # between lanes, or in a junction, where lanes cross
+        # Wrong way only if it faces against all lanes that it is on
         turned = np.abs((yaw_rad - self._near.heading[samples[inside]] + np.pi) % (2 * np.pi) - np.pi)
         return bool((turned > WRONG_WAY_RAD).all())

@@ -48,6 +48,7 @@ class TownReplayRenderer:
     ) -> None:
         self._world, self._sensors, self._moments = world, sensors, moments
         self._T_world_scene = T_world_scene
+        # Added actors are tracks of the scene that look like actors of the town
         rows = torch.tensor([tracks.index_of(number) for number in copied], dtype=torch.int64)
         self._added = tracks.map_tensors(lambda tensor: tensor.detach().cpu()).only(rows)
         known = {actor.track_id: actor for moment in moments for actor in moment.actors}
@@ -88,6 +89,7 @@ class TownReplayRenderer:
     def _actors(self, t_s: float) -> list[ActorState]:
         """Return the added actors that are there at a time."""
         states, actors = states_at(self._added, t_s), []
+        # From the scene's frame to the world, for positions and velocities
         T_world_actor = (self._T_world_scene @ states.T_scene_actor.double()).numpy()
         velocity = states.velocity_mps.double() @ self._T_world_scene[:3, :3].T
         for row, model in enumerate(self._models):

@@ -52,6 +52,7 @@ def draw_routes(town: str, spec: RouteSetSpec, seed: int = 0) -> list[RouteWaypo
     met: Counter[int] = Counter()
     while len(chosen) < spec.per_town:
         best, best_worth = None, -math.inf
+        # Draw until one candidate is valid, then take the one that adds most
         while best is None:
             for _ in range(CANDIDATES):
                 length_m = float(rng.uniform(spec.min_m, spec.max_m))
@@ -72,12 +73,15 @@ def _checked(
 
     Returns None if there is no such route, if it takes another way, or if its length is out of range.
     """
+    # Distance of the end of each lane from the start; the route ends on the last lane outside of junctions
     ends_m = np.append(0.0, np.cumsum(graph.length_m[drawn.lanes])) - drawn.start_m
     last = int(np.flatnonzero((ends_m[:-1] < length_m) & (graph.junction[drawn.lanes] < 0))[-1])
     lanes = drawn.lanes[: last + 1]
+    # One waypoint per lane, late on it, so that a lane change on the lane lies before it
     at_m = WAYPOINT_AT * graph.length_m[lanes]
     at_m[-1] = min(length_m - ends_m[last], graph.length_m[lanes[-1]] - CLEAR_OF_END_M)
     first = graph.position(drawn.entered[:1], np.array([drawn.start_m]))
+    # Waypoints of the first lane only count behind the start
     later = at_m > (drawn.start_m if last == 0 else 0.0)
     later[0] &= at_m[0] > drawn.start_m
     points = np.concatenate([first, graph.position(lanes, at_m)[later]])
@@ -87,11 +91,13 @@ def _checked(
     except InputError:
         return None
     fits = spec.min_m <= route.length_m <= spec.max_m
+    # The lanes that were drawn must all be on the way that the matching finds
     return (waypoints, route) if fits and set(lanes.tolist()) <= {leg.lane for leg in route.legs} else None
 
 
 def _worth(route: DriveRoute, others: Sequence[DriveRoute], met: Counter[int]) -> float:
     """Return the value that a route adds to others: manoeuvres that they lack, and a distant start."""
+    # Rare manoeuvres count more: 1 / (1 + how often they occur so far)
     away_m = min((float(np.hypot(*(route.xyz[0] - o.xyz[0])[:2])) for o in others), default=0.0)
     return sum(1 / (1 + met[option]) for option in _manoeuvres(route)) + min(away_m / APART_M, 1.0)
 

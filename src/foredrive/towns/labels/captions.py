@@ -47,6 +47,7 @@ class FrameFacts:
 def caption(facts: FrameFacts, seed: int) -> str:
     """Compose a caption of two to six sentences. The seed selects phrasings, never facts."""
     words, setting = _Words(np.random.default_rng(seed)), facts.setting
+    # The seed only decides between phrasings: facts are chosen by visibility and distance
     visible = [actor for actor in facts.actors if _is_visible(actor, setting)]
     sentences = [
         _setting(setting, words),
@@ -70,6 +71,7 @@ class _Words:
 
 def _is_visible(actor: CaptionActor, setting: Setting) -> bool:
     distance_m = float(np.hypot(*actor.xy_m))
+    # Ahead one sees further than beside; fog limits both
     reach_m = AHEAD_M if _sector(actor) == "ahead" else NEAR_M
     return actor.visibility >= MIN_VISIBILITY and distance_m < min(reach_m, FOG_SHARE * setting.visibility_m)
 
@@ -180,6 +182,7 @@ def _listed(parts: Sequence[str]) -> str:
 def _traffic(visible: Sequence[CaptionActor], setting: Setting, words: _Words) -> list[str]:
     """Describe the moving vehicles by their position and direction."""
     vehicles = [t for t in visible if not t.parked and t.kind is not ObjectKind.PEDESTRIAN]
+    # Each moving vehicle belongs to one group by sector and direction
     groups = {where: [t for t in vehicles if _direction(t, setting) == where] for where in _DIRECTIONS}
     phrases = [
         _counted(actors, "oncoming ") if where == "oncoming" else f"{_counted(actors)} {words.pick(*ways)}"
@@ -210,6 +213,7 @@ def _direction(actor: CaptionActor, setting: Setting) -> str:
         return sector
     if np.cos(actor.yaw) < ONCOMING_COS:
         return "oncoming"
+    # In bends the road ahead turns, and with it the vehicles on it
     bends = setting.place is Place.ROUNDABOUT or setting.doing in (Doing.TURNS_LEFT, Doing.TURNS_RIGHT)
     return "across" if abs(np.cos(actor.yaw)) < ACROSS_COS and not bends else "ahead"
 
@@ -223,6 +227,7 @@ def _crosses(actor: CaptionActor) -> bool:
 def _crossing(visible: Sequence[CaptionActor], words: _Words) -> list[str]:
     """Describe the pedestrians that walk across the road in front, and the side from which they come."""
     sentences = []
+    # Sign of the lateral velocity: positive moves to the left, so it comes from the right
     for sign, side in ((1.0, "right"), (-1.0, "left")):
         group = [t for t in visible if _crosses(t) and np.sign(t.velocity_mps[1]) == sign]
         if group:

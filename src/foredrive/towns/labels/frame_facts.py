@@ -114,9 +114,11 @@ class FactCollector:
         on_road = self._places.on_road(centre[:, :2])
         seen = zip(actors, in_ego, visibility.tolist(), on_road.tolist(), strict=True)
         things = [_caption_actor(*each, R) for each in seen]
+        # The nearest route point ahead of the last one: routes may cross themselves
         window = slice(self._passed, self._passed + 200)
         self._passed += int(np.linalg.norm(self._line[window] - at, axis=1).argmin())
         lateral_mps = self._lateral_speed(snapshot)
+        # While overtaking, the leader is searched along the vehicle's own lane, parallel to the route
         beside = at - self._line[self._passed]  # the lane beside the route's, while overtaking
         leader, gap_m = self._leader(actors, centre - beside, visibility)
         now = self._conditions
@@ -143,11 +145,13 @@ class FactCollector:
         visibility: Float[np.ndarray, "M"],
     ) -> tuple[ActorState | None, float]:
         """Return the next visible vehicle on the route, and the distance to its middle, m."""
+        # Points of the route ahead, and the distance of every actor from them
         end = int(np.searchsorted(self._arc_m, self._arc_m[self._passed] + LEADER_M))
         way, arc_m = self._line[self._passed : end], self._arc_m[self._passed : end]
         if not len(way) or not len(centre):
             return None, np.inf
         away_m, index = (np.asarray(found) for found in cKDTree(way).query(centre - [0.0, 0.0, MIDDLE_M]))
+        # Distance along the route of the nearest point; vehicles beside it and too near ones do not lead
         ahead_m = arc_m[index] - arc_m[0]
         vehicle = [not (a.parked or a.category is Category.PEDESTRIAN) for a in actors]
         candidate = (
@@ -165,6 +169,7 @@ class FactCollector:
 
     def _lateral_offset_m(self, snapshot: DriveSnapshot) -> float:
         k = min(self._passed, len(self._line) - 2)
+        # Cross product of route direction and offset: positive to the left
         ahead, offset = self._line[k + 1] - self._line[k], snapshot.T_world_ego[:3, 3] - self._line[k]
         return float(ahead[0] * offset[1] - ahead[1] * offset[0]) / float(np.hypot(*ahead[:2]))
 
@@ -172,6 +177,7 @@ class FactCollector:
         self, snapshot: DriveSnapshot, leader: ActorState | None, gap_m: float, lateral_mps: float
     ) -> Doing:
         speed, turn_rate = float(snapshot.twist_ego[0]), float(snapshot.twist_ego[5])
+        # Order of precedence: standing, turning, changing lanes, slowing, following, speeding up
         if speed < STANDING_MPS:
             return Doing.WAITS
         row = int(np.searchsorted(self._begins_m, self._arc_m[self._passed], side="right")) - 1
@@ -195,6 +201,7 @@ class FactCollector:
     ) -> LightColour | None:
         """Return the colour of the next light on the route if its lamps are in view."""
         axle_m = float(self._arc_m[self._passed])
+        # Lanes of the route in order; the first one with a light ahead decides
         for lane, begin_m in zip(self._route.lanes, self._begins_m, strict=True):
             if begin_m > axle_m + LIGHT_M:
                 break
@@ -272,6 +279,7 @@ def _crossed_levels(
     over, under = np.zeros((2, len(xyz)), dtype=np.bool_)
     if np.ptp(xyz[:, 2]) < PASSES_OVER_M:
         return over, under
+    # Pairs that are close seen from above and far apart in height
     pairs = cKDTree(xyz[:, :2]).query_pairs(BELOW_M, output_type="ndarray")
     rise_m = xyz[pairs[:, 0], 2] - xyz[pairs[:, 1], 2]
     for high, low in (pairs[rise_m > PASSES_OVER_M].T, pairs[rise_m < -PASSES_OVER_M].T[::-1]):
@@ -282,6 +290,7 @@ def _crossed_levels(
 def _ring_lanes(lanes: LaneGraph) -> Int[np.ndarray, "R"]:
     """Return the lanes of roundabouts: closed paths that turn left throughout, and lanes in the same
     junctions."""
+    # Lanes that turn left at least as tightly as `RING_RADIUS_M`; short ones may be straight
     bends = lanes.turn_rad > np.where(lanes.length_m < SHORT_M, -0.1, lanes.length_m / RING_RADIUS_M)
     found: set[int] = set()
     for start in np.flatnonzero(bends & (lanes.length_m >= SHORT_M)).tolist():
@@ -294,6 +303,7 @@ def _ring_lanes(lanes: LaneGraph) -> Int[np.ndarray, "R"]:
 
 def _ring_from(lanes: LaneGraph, start: int, bends: Bool[np.ndarray, "L"]) -> list[int]:
     """Return the lanes of a ring that contains a lane; empty if there is none."""
+    # Depth-first search for a closed path with the length and the turn of a roundabout
     ways = [[start]]
     while ways:
         way = ways.pop()
@@ -303,6 +313,7 @@ def _ring_from(lanes: LaneGraph, start: int, bends: Bool[np.ndarray, "L"]) -> li
         for after in lanes.successors[way[-1], : lanes.successor_count[way[-1]]].tolist():
             if after == start and length_m > RING_M[0] and turn_rad > RING_TURN_RAD:
                 return way
+            # Only lanes that bend, and none twice
             if bends[after] and after not in way:
                 ways.append([*way, after])
     return []

@@ -63,6 +63,7 @@ def _tables() -> tuple[UInt8[np.ndarray, "K S"], UInt8[np.ndarray, "K S"]]:
 
     The row is the category's number + 1 (0: no road user), the column the surface's number + 1.
     """
+    # Row 0 and column 0 stand for no road user and for the sky
     shape = (len(Category) + 1, len(Surface) + 1)
     camera, lidar = np.zeros(shape, np.uint8), np.zeros(shape, np.uint8)
     camera[:, SKY + 1] = CameraLabel.SKY
@@ -72,6 +73,7 @@ def _tables() -> tuple[UInt8[np.ndarray, "K S"], UInt8[np.ndarray, "K S"]]:
     for category in Category:
         camera[category + 1, 1:] = _CAMERA_LABEL_OF_CATEGORY.get(category, CameraLabel.VEHICLE)
         lidar[category + 1, 1:] = _LIDAR_LABEL_OF_CATEGORY.get(category, LidarLabel.VEHICLE)
+        # Riders of two-wheelers have the surface of a person and a label of their own
         if category in _TWO_WHEELED:
             camera[category + 1, 1:] = CameraLabel.TWO_WHEELER
             camera[category + 1, Surface.PEDESTRIAN + 1] = CameraLabel.RIDER
@@ -122,5 +124,6 @@ def z_depth(
 ) -> Float32[np.ndarray, "C H W"]:
     """Convert distances along the unit rays of pixels to depths along the optical axes, m; infinite for the
     sky."""
+    # Third column of the rotation: the optical axis in the ego frame
     axis = rig.T_ego_cam[:, :3, 2].numpy()
     return range_m * np.einsum("cni,ci->cn", dir_ego.reshape(len(axis), -1, 3), axis).reshape(range_m.shape)

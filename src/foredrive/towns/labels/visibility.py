@@ -39,10 +39,12 @@ def visibility(
         pixel_ids: track id at each pixel.
     """
     out = np.zeros(len(actors), dtype=np.float32)
+    # Actors without a pixel are not visible and need no rays
     seen = np.isin([actor.track_id for actor, _ in actors], np.unique(pixel_ids))
     if not seen.any():
         return out
     rows: list[int] = np.flatnonzero(seen).tolist()
+    # Map of each unit box into the ego frame: rays are cast in the box
     T_ego_unit = np.linalg.inv(T_world_ego) @ np.array([unit_to_world(actors[m][0]) for m in rows])
     windows = _windows(T_ego_unit, sensors)
     flat_ids = pixel_ids.ravel()
@@ -50,8 +52,10 @@ def visibility(
     for m, T, of_cameras in zip(rows, np.linalg.inv(T_ego_unit), windows, strict=True):
         actor, shape = actors[m]
         pixels, weight = _pixels(of_cameras, sensors.rig.size_hw)
+        # Rays of the sampled pixels in the frame of the unit box; the lengths do not matter
         R = T[:3, :3].T.astype(np.float32)
         unit = origin[pixels] @ R + T[:3, 3].astype(np.float32), direction[pixels] @ R
+        # Weight of the rays that hit the shape alone, and of those whose pixel shows it
         filled = shape.scene.occluded(*unit) * weight
         if filled.any():
             out[m] = (filled * (flat_ids[pixels] == actor.track_id)).sum() / filled.sum()
@@ -71,12 +75,14 @@ def is_point_visible(
     height, width = rig.size_hw
     poses, matrices = rig.T_ego_cam.double().numpy(), rig.K.double().numpy()
     for T_ego_cam, K, ranges in zip(poses, matrices, range_m, strict=True):
+        # Into the camera frame, then to pixels
         in_cam = T_ego_cam[:3, :3].T @ (point_ego - T_ego_cam[:3, 3])
         if in_cam[2] < NEAR_M:
             continue
         u, v = (K @ in_cam)[:2] / in_cam[2]
         if 0 <= u < width and 0 <= v < height:
             row, column = int(v), int(u)
+            # The farthest of 3×3 pixels: an object thinner than a pixel may be beside it
             around = ranges[max(0, row - 1) : row + 2, max(0, column - 1) : column + 2]
             if around.max() > np.linalg.norm(in_cam) - OBJECT_RADIUS_M:
                 return True
@@ -88,16 +94,19 @@ def _windows(T_ego_unit: Float64[np.ndarray, "M 4 4"], sensors: SensorSuite) -> 
     rig = sensors.rig
     height, width = rig.size_hw
     T_cam_ego = np.linalg.inv(rig.T_ego_cam.double().numpy())
+    # Corners of all boxes in all cameras: [M C 8 3]
     corners = np.einsum("cij,mjk,nk->mcni", T_cam_ego, T_ego_unit, _CORNERS)[..., :3]
     depth = corners[..., 2]
     K = rig.K.double().numpy()
     uvw = np.einsum("cij,mcnj->mcni", K, corners)
+    # Bounding box of the projected corners, one pixel wider
     uv = uvw[..., :2] / np.maximum(uvw[..., 2:], NEAR_M)
     low, high = np.floor(uv.min(axis=2)) - 1, np.ceil(uv.max(axis=2)) + 1
     across = (depth.min(axis=-1) < NEAR_M)[..., None]  # it reaches behind the camera: the whole image
     size = np.array([width, height])
     low = np.where(across, 0, low.clip(0, size))
     high = np.where(across, size, high.clip(0, size))
+    # Boxes behind the camera have an empty window
     high = np.where((depth.max(axis=-1) < NEAR_M)[..., None], low, high)
     return np.stack([low[..., 1], high[..., 1], low[..., 0], high[..., 0]], axis=-1).astype(np.int64)
 
@@ -111,6 +120,7 @@ def _pixels(
     for c, (top, bottom, left, right) in enumerate(windows.tolist()):
         area = max(0, bottom - top) * max(0, right - left)
         if area:
+            # A grid of about `RAYS_PER_CAMERA` pixels; each stands for step² of them
             step = max(1, int(np.ceil((area / RAYS_PER_CAMERA) ** 0.5)))
             rows, columns = np.arange(top, bottom, step), np.arange(left, right, step)
             pixels.append(((c * height + rows[:, None]) * width + columns).ravel())

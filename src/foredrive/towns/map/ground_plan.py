@@ -70,11 +70,13 @@ class Piece:
         The height is that of the nearest point of the piece's middle line.
         """
         middle = 0.5 * (self.left_xyz + self.right_xyz)
+        # Foot of the perpendicular on each segment of the middle line, clamped to it
         start, step = middle[:-1, :2], np.diff(middle[:, :2], axis=0)
         offset = xy[:, None] - start
         t = (offset * step).sum(-1) / (step * step).sum(-1).clip(1e-9)
         t = t.clip(0.0, 1.0)
         distance = np.linalg.norm(offset - t[..., None] * step, axis=-1)
+        # Height at the nearest one
         nearest = distance.argmin(axis=1)
         t = t[np.arange(len(xy)), nearest]
         return middle[nearest, 2] * (1 - t) + middle[nearest + 1, 2] * t
@@ -124,10 +126,12 @@ class BorderHeights:
 @lru_cache(maxsize=1)  # several worlds are often generated on one town in a row
 def make_ground_plan(town: TownMap) -> GroundPlan:
     """Cut a town's strips into pieces, clip the pieces, and fill the junctions."""
+    # Strips are cut into pieces of some metres, so that levels and clipping are local
     parts = [part for strip in town.strips for part in _cut(strip)]
     whole = np.array(
         [shapely.Polygon(np.concatenate([left, right[::-1]])[:, :2]) for _, left, right, _ in parts]
     )
+    # A buffer of 0 repairs outlines that cross themselves
     whole = shapely.buffer(whole, 0.0)
     z = np.array([left[:, 2].mean() for _, left, _, _ in parts])
     rank = np.array([RANK[strip.kind] for strip, *_ in parts])
@@ -143,7 +147,9 @@ def make_ground_plan(town: TownMap) -> GroundPlan:
     return GroundPlan(
         pieces=pieces,
         fills=fills,
+        # Lanes have rank 0
         lanes=shapely.union_all([p.area for p in pieces if RANK[p.strip.kind] == 0]),
+        # A small buffer closes hairline gaps between pieces
         ground=shapely.union_all(shapely.buffer([*grounded, *fills], 0.01)),
         bridges=shapely.union_all([p.area for p in pieces if p.bridge]),
         borders=_border_heights([piece for piece in pieces if not piece.bridge]),
@@ -152,6 +158,7 @@ def make_ground_plan(town: TownMap) -> GroundPlan:
 
 def _border_heights(pieces: list[Piece]) -> BorderHeights:
     samples, raises = [], []
+    # Samples of both borders: the land and the walls take their heights from there
     for piece in pieces:
         at = np.arange(piece.along_m[0], piece.along_m[-1], BORDER_SPACING_M)
         at = np.append(at, piece.along_m[-1])
@@ -170,16 +177,19 @@ def _cut(strip: Strip) -> list[tuple[Strip, Points, Points, Float[np.ndarray, "N
     """
     middle = 0.5 * (strip.left_xyz + strip.right_xyz)
     along = arc_lengths(middle)
+    # Strips without width or length have no surface
     if np.linalg.norm(strip.left_xyz - strip.right_xyz, axis=1).max() < 0.05 or along[-1] < 0.05:
         return []
     changes = {mark.start_m for mark in strip.left_markings + strip.right_markings}
     changes |= {mark.end_m for mark in strip.left_markings + strip.right_markings}
+    # Cut where markings change, and every `PIECE_SAMPLES` intervals
     cuts = {int(np.abs(along - change).argmin()) for change in changes} | {0, len(along) - 1}
     cuts |= set(range(0, len(along), PIECE_SAMPLES))
     parts = []
     for first, last in itertools.pairwise(sorted(cuts)):
         chosen = np.arange(first, last + 1)
         both = np.concatenate([strip.left_xyz, strip.right_xyz], axis=1)[chosen]
+        # Second differences of both borders show where they bend
         bend = np.abs(both[:-2] - 2 * both[1:-1] + both[2:]).max(axis=1) > STRAIGHT_M
         chosen = chosen[np.concatenate([[True], bend, [True]])]
         parts.append((strip, strip.left_xyz[chosen], strip.right_xyz[chosen], along[chosen]))
@@ -188,12 +198,14 @@ def _cut(strip: Strip) -> list[tuple[Strip, Points, Points, Float[np.ndarray, "N
 
 def _on_bridges(area: np.ndarray, z: Float[np.ndarray, "P"]) -> Bool[np.ndarray, "P"]:
     """Return for each piece whether it is on a bridge: above, or close beside, a piece of a lower level."""
+    # Candidates: pieces clearly above another one, and pieces clearly below another one
     high = np.flatnonzero(z - z.min() > LEVEL_GAP_M)
     low = np.flatnonzero(z.max() - z > LEVEL_GAP_M)
     i, j = shapely.STRtree(area[low]).query(area[high], predicate="dwithin", distance=BRIDGE_REACH_M)
     i, j = high[i], low[j]
     above = z[i] - z[j] > LEVEL_GAP_M
     i, j = i[above], j[above]
+    # Steeper than an embankment between them: it must be a bridge
     steep = z[i] - z[j] > LEVEL_GAP_M + BANK_SLOPE * shapely.distance(area[i], area[j])
     bridge = np.zeros(len(area), dtype=bool)
     bridge[i[steep]] = True
@@ -205,6 +217,7 @@ def _clip(
 ) -> tuple[np.ndarray, Bool[np.ndarray, "P"]]:
     """Remove from each area its overlaps with areas of a higher rank on the same level."""
     i, j = shapely.STRtree(area).query(area, predicate="intersects")
+    # Only areas of higher rank (a smaller number) on the same level cut
     near = (rank[j] < rank[i]) & (np.abs(z[i] - z[j]) < LEVEL_GAP_M)
     i, j = i[near], j[near]
     over = shapely.area(shapely.intersection(area[i], area[j])) > OVERLAP_M2
@@ -218,6 +231,7 @@ def _clip(
 
 def _polygons(geometry: shapely.Geometry) -> shapely.Geometry:
     """Return only the polygons of a geometry, without slivers."""
+    # Opening with 1 cm removes slivers
     opened = geometry.buffer(-0.01).buffer(0.01, join_style="mitre")
     parts = shapely.get_parts(opened)
     return shapely.union_all([p for p in parts if p.geom_type == "Polygon" and p.area > OVERLAP_M2])
@@ -233,6 +247,7 @@ def _fill_junctions(pieces: tuple[Piece, ...]) -> tuple[shapely.Polygon, ...]:
             by_junction.setdefault(piece.strip.junction_id, []).append(piece.area)
     fills = []
     for _, parts in sorted(by_junction.items()):
+        # Closing joins the lanes of a junction; large holes stay open
         closed = shapely.union_all(parts).buffer(JUNCTION_CLOSING_M).buffer(-JUNCTION_CLOSING_M)
         shells = [
             shapely.Polygon(
@@ -241,6 +256,7 @@ def _fill_junctions(pieces: tuple[Piece, ...]) -> tuple[shapely.Polygon, ...]:
             for p in shapely.get_parts(closed)
         ]
         shell = shapely.union_all(shells)
+        # What no other strip covers is paved
         rest = _polygons(shell.difference(shapely.union_all(areas[tree.query(shell)])))
         fills += [p for p in shapely.get_parts(rest) if p.area > OVERLAP_M2]
     return tuple(fills)

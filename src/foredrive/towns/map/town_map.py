@@ -198,6 +198,7 @@ def load_town_map(name: str) -> TownMap:
     roads, _, helpers, _, objects, centre_marks, signals = collect_element_helpers(
         xodr, SAMPLE_SPACING_M, CONNECTION_TOLERANCE_M
     )
+    # Heights from the elevation profile, then junctions brought to one height
     strips = _level([_strip(helper, helpers, centre_marks, roads) for helper in helpers.values()])
     lanes = tuple(_lane(strip, helpers) for strip in strips if strip.kind is StripKind.DRIVING)
     crosswalks = tuple(
@@ -220,12 +221,14 @@ def _with_road_height(helper: Any, xyz: Points, roads: dict[int, Any]) -> Points
     1 m in Town04).
     """
     profile = roads[int(helper.lane_id.split("_")[0])].elevation_profile.elevations
+    # Cubic polynomial of the profile's piece at each sample
     s = np.linspace(helper.s_range[0], helper.s_range[1], len(xyz))
     starts = np.array([e.s for e in profile])
     index = np.clip(np.searchsorted(starts, s, side="right") - 1, 0, None)
     a, b, c, d = np.array([[e.a, e.b, e.c, e.d] for e in profile])[index].T
     ds = s - starts[index]
     z = a + ds * (b + ds * (c + ds * d))
+    # Strips on the left run against the road's direction
     return np.column_stack([xyz[:, :2], z[::-1] if helper.id > 0 else z])
 
 
@@ -234,6 +237,7 @@ def _strip(
 ) -> Strip:
     section, _, index = helper.lane_id.rsplit("_", 2)
     road = roads[int(section.split("_")[0])]
+    # The inner border's markings are those of the next strip inwards, or of the reference line
     inward = helpers.get(_beside(helper, -1))
     if abs(int(index)) == 1:
         inner_marks = centre_marks.get(section, [])
@@ -293,6 +297,7 @@ def _markings(helper: Any, marks: list[Any], swap: bool) -> tuple[Marking, ...]:
         kind = MarkingKind(name) if name in set(MarkingKind) else MarkingKind.SOLID
         if end_m - start_m < MIN_MARKING_M or kind is MarkingKind.NONE:
             continue
+        # From the road's coordinate to the strip's own direction
         if helper.id > 0:
             start_m, end_m = length - end_m, length - start_m
         yellow = (mark.color or "").lower() == "yellow"
@@ -336,6 +341,7 @@ def _lane(strip: Strip, helpers: dict[str, Any]) -> Lane:
 
 def _stop_zones(helpers: dict[str, Any], signals: dict[int, Any], xodr: XODR) -> list[StopZone]:
     posts = {}
+    # Post of each signal: a point beside the reference line, with the heading of the traffic
     for road in xodr.roads:
         if road.signals:
             line = XODRReferenceLine.from_plan_view(

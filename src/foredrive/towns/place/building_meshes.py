@@ -38,14 +38,18 @@ EAVES_M = 0.45
 def gable_roof(plot: Plot, eaves: float, ridge: float, roof: int, wall: int) -> Mesh:
     """Build two slopes of material `roof` that extend beyond the eaves, and gables of material `wall`."""
     w, d, e = plot.width_m, plot.depth_m, EAVES_M
+    # The slope goes on beyond the eaves, so its lower edge lies below them
     drop = (ridge - eaves) / (0.5 * d) * e
     slopes = []
     for y0, x0, x1 in ((-e, -e, w + e), (d + e, w + e, -e)):
+        # From the lower edge at the eaves up to the ridge: seen from outside, counter-clockwise
         corners = [[x0, y0, eaves - drop], [x1, y0, eaves - drop]]
         corners += [[x1, 0.5 * d, ridge], [x0, 0.5 * d, ridge]]
         run = float(np.hypot(0.5 * d + e, ridge - eaves + drop))
+        # Texture: u along the eaves, v up the slope
         uvw = np.array([[[0, 0, 0], [w, 0, 0], [w, run, 0], [0, run, 0]]], float)
         top = np.array([corners])
+        # The underside is the same quad with reversed corners, a little lower
         slopes += [quads(top, roof, uvw), quads(top[:, ::-1] - [0.0, 0.0, 0.15], roof, uvw)]
     peak = ridge - 0.1
     gables = np.array(
@@ -62,6 +66,7 @@ def hip_roof(plot: Plot, eaves: float, ridge: float, roof: int) -> Mesh:
     """Build four slopes on a plot that is wider than deep."""
     w, d, e = plot.width_m, plot.depth_m, EAVES_M
     a, b, c, f = [-e, -e, eaves], [w + e, -e, eaves], [w + e, d + e, eaves], [-e, d + e, eaves]
+    # The ridge is shorter than the house by half its depth at both ends, so that all slopes have one pitch
     p, q = [0.5 * d, 0.5 * d, ridge], [w - 0.5 * d, 0.5 * d, ridge]
     run = float(np.hypot(0.5 * d + e, ridge - eaves))
     parts = [quads(np.array([[f, c, b, a]], float), roof)]
@@ -92,6 +97,7 @@ class _Facade:
 
     def centres(self, width_m: float) -> Float[np.ndarray, "n"]:
         """Return the positions of the middles of a wall's bays, m, as in the texture."""
+        # Windows keep clear of the corners; the same formula as in the texture, so that balconies fit
         usable = width_m - 2 * CORNER_M
         count = max(1, int(usable / self.bay_m + 0.3))
         return CORNER_M + (np.arange(count) + 0.5) * usable / count
@@ -141,6 +147,7 @@ class BuildingMaker:
         parts = [
             box((x0, y - 0.02, base + z), (x1, y + 0.02, base + z + 0.1), self._wood) for z in (0.25, 0.75)
         ]
+        # Pickets every 0.3 m; every sixth is a stronger post
         x = np.arange(x0, x1, 0.3)
         post = np.arange(len(x)) % 6 == 0
         half, top = np.where(post, 0.06, 0.045), base + np.where(post, FENCE_M + 0.1, FENCE_M)
@@ -165,6 +172,7 @@ class BuildingMaker:
     ) -> _Facade:
         storey, bay, ground = storey_bay_ground_m
         accent = self.assets.accents[int(self.rng.integers(len(self.assets.accents)))]
+        # Materials are shared by number: equal parameters give the same material
         kinds = (float(wall[0]), float(windows), float(ground_floor), float(accent))
         params = (storey, bay, *share, ground, *kinds)
         reflectivity = 0.55 if wall[0] is WallKind.SHEET else 0.3 + 0.25 * float(np.mean(wall[1]))
@@ -181,6 +189,7 @@ class BuildingMaker:
         storeys, ground_m, storey_m = int(rng.integers(1, 3)), 2.9, 2.8
         facade = self._facade(
             self._wall(WallKind.STONE),
+            # Walls first, then a roof: hipped on wide houses, else gabled
             self.assets.windows[0],
             GroundFloor.DOORS,
             (storey_m, 2.9, ground_m - 0.1),
@@ -195,10 +204,12 @@ class BuildingMaker:
             parts.append(hip_roof(plot, eaves, ridge, roof))
         else:
             parts.append(gable_roof(plot, eaves, ridge, roof, facade.material))
+        # A chimney through the roof
         if rng.random() < 0.6:
             x, y = rng.uniform(0.35, 0.6) * w, 0.5 * d + rng.uniform(0.3, 1.2)
             brick = self._plain((0.45, 0.30, 0.26), 0.35)
             parts.append(plot.box((x, y), (0.7, 0.7), (eaves, ridge + 0.9), brick))
+        # A porch: roof, step and two posts
         if rng.random() < 0.5:
             x, wide = rng.uniform(0.3, 0.7) * w, rng.uniform(1.6, 3.0)
             parts.append(plot.box((x, -0.6), (wide, 1.4), (base + 2.55, base + 2.7), self._metal))
@@ -221,6 +232,7 @@ class BuildingMaker:
             plot.walls([[0, 0], [w, 0], [w, d], [0, d]], base, eaves, facade.material),
             gable_roof(plot, eaves, ridge, roof, facade.material),
         ]
+        # A silo beside the barn: a cylinder with a conical roof
         if rng.random() < 0.6:
             steel = self._plain((0.70, 0.71, 0.72), 0.6)
             radius, top = rng.uniform(1.4, 2.0), base + rng.uniform(7.0, 11.0)
@@ -269,6 +281,7 @@ class BuildingMaker:
         roof = self._plain(self._choose(self.assets.flat_roofs), 0.3)
         top = base + facade.ground_m + (storeys - 1) * facade.storey_m + PARAPET_M
         outline: list[Vector] = [[0, 0], [w, 0], [w, d], [0, d]]
+        # An L-shaped outline: a notch in the back left corner
         if w > 15.0 and rng.random() < 0.45:
             x, y = rng.uniform(0.35, 0.65) * w, rng.uniform(0.4, 0.6) * d
             outline = [[0, 0], [w, 0], [w, d], [x, d], [x, y], [0, y]]
@@ -280,6 +293,7 @@ class BuildingMaker:
         ]
         if not detail:
             return join(parts)
+        # A cornice below the parapet or below the top storey
         if not tower and rng.random() < 0.5:
             ledge = self._plain((0.74, 0.72, 0.68), 0.4)
             rim = area.buffer(0.3, join_style="mitre")
@@ -319,8 +333,10 @@ class BuildingMaker:
         if rng.random() < 0.5:
             rail = self._plain(self._choose(self.assets.awnings), 0.4)
         half = 0.46 * facade.bay_m
+        # Every second or third bay, from the first or second on
         some = centres[int(rng.integers(0, 2)) :: int(rng.integers(2, 4))]
         floors = base + facade.ground_m + np.arange(storeys - 1) * facade.storey_m
+        # One balcony for each pair of chosen bay and storey
         x, z = (a.ravel() for a in np.meshgrid(some, floors))
 
         def part(x0: float, y0: float, z0: float, x1: float, y1: float, z1: float, material: int) -> Mesh:
@@ -331,6 +347,7 @@ class BuildingMaker:
             return boxes(low, high, material)
 
         y = -BALCONY_M
+        # Slab, front rail and two side rails
         parts = [
             part(-half, y, -0.1, half, 0.05, 0.08, slab),
             part(-half, y, 0.12, half, y + 0.05, 1.0, rail),

@@ -64,6 +64,7 @@ class _Builder:
         """Build buildings side by side along one line."""
         rng, length = self.rng, frontage.line.length
         density = self.style.density if frontage.walkway else self.style.open_density
+        # Walk along the line: skip gaps, and place a building wherever its plot is free
         parts, s = [], rng.uniform(0.0, 8.0)
         while s < length - 8.0:
             if rng.random() > density:
@@ -71,16 +72,20 @@ class _Builder:
                 continue
             kind = self._draw_kind()
             width, depth = self._draw_size(kind)
+            # The road lies to the left of the line, so the plot's front
+            # runs from b to a, with its left away from it
             a, b = frontage.at(s), frontage.at(min(s + width, length))
             back_m = 0.0 if frontage.walkway else rng.uniform(6.0, 16.0)
             back_m += rng.uniform(0.0, 5.0) if kind == "house" else rng.choice([0.0, 0.0, 0.6])
             plot = self._plot(b, a, depth, back_m)
             if plot is None or not self.site.is_free(plot.polygon(CLEARANCE_M)):
+                # Not free: try again a little further on
                 s += 3.0
                 continue
             parts.append(self._build_on(plot, kind, detail=True))
             if kind == "house" and frontage.walkway:
                 parts += self._garden(plot, back_m)
+            # Blocks stand almost wall to wall, other buildings have space between them
             s += width + (rng.uniform(0.2, 1.0) if kind == "block" else rng.uniform(2.0, 7.0)) + CLEARANCE_M
         return parts
 
@@ -88,6 +93,7 @@ class _Builder:
         """Build free-standing buildings behind the first row."""
         rng, terrain = self.rng, self.site.terrain
         lower = terrain.origin_xy + 20.0
+        # Cells are 4 m wide; buildings keep 20 m from the border
         extent = np.array(terrain.z.shape[::-1]) * 4.0 - 40.0
         count = int(extent.prod() * SKYLINE_TRIES_PER_M2)
         spots = lower + rng.random((count, 2)) * extent
@@ -97,6 +103,7 @@ class _Builder:
         for xy in spots[near & (rng.random(count) < self.style.skyline)]:
             kind = self._draw_kind()
             width, depth = self._draw_size(kind)
+            # Behind the first row, buildings are roughly aligned with the axes
             angle = rng.choice([0.0, 0.5 * np.pi]) + rng.normal(0.0, 0.05)
             along = np.array([np.cos(angle), np.sin(angle)])
             plot = Plot(xy, along, width, depth)
@@ -127,6 +134,7 @@ class _Builder:
         corners = plot.world(
             np.array([[0, 0], [plot.width_m, 0], [plot.width_m, plot.depth_m], [0, plot.depth_m]], float)
         )
+        # A building stands on its lowest corner; its walls reach into the ground
         return self.maker.build(kind, plot, float(self.site.height(corners).min()), detail)
 
     def _garden(self, plot: Plot, back_m: float) -> list[Mesh]:
@@ -137,6 +145,7 @@ class _Builder:
             return []
         gate = rng.uniform(0.3, 0.6) * plot.width_m
         parts = []
+        # Two pieces of hedge or fence, with a gap of 1.6 m for the gate
         for start, end in ((0.0, gate - 0.8), (gate + 0.8, plot.width_m)):
             ends = np.array([[start, y], [end, y]])
             line = shapely.LineString(plot.world(ends)).buffer(0.35)

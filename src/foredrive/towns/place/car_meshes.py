@@ -102,12 +102,16 @@ def loft(
             point.
         ends: materials of the rear and the front face.
     """
+    # Sections as 3-D points, and the next point around the ring
     xyz = np.concatenate([np.broadcast_to(x[:, None, None], (*rings.shape[:2], 1)), rings], axis=-1)
     after = np.roll(xyz, -1, axis=1)
+    # One quad between each pair of neighbouring points of neighbouring sections
     corners = np.stack([xyz[:-1], after[:-1], after[1:], xyz[1:]], axis=2).reshape(-1, 4, 3)
     sides = quads(corners, 0)
+    # Each quad has two triangles
     material = np.repeat(np.array(mats, dtype=np.int32).ravel(), 2)
     fans = []
+    # Close both ends with fans about their centres; the rear one is reversed to face backwards
     for end, ring in zip(ends, (xyz[0, ::-1], xyz[-1]), strict=True):
         hub = np.broadcast_to(ring.mean(axis=0), ring.shape)
         fans.append(triangles(np.stack([hub, ring, np.roll(ring, -1, axis=0)], axis=1), end))
@@ -125,12 +129,14 @@ def wheels(
             parts.append(frustum((x, inner, radius), (x, outer, radius), (radius, radius), 12, mats.tyre))
             hub = (x, outer, radius), (x, outer + side * 0.012, radius)
             parts.append(frustum(*hub, (0.62 * radius, 0.5 * radius), 7, mats.hub))
+            # Half discs over the wheels, just outside of the body
             if arches is not None:
                 angle = np.linspace(0.0, np.pi, 9)
                 rim = np.stack([x + 1.2 * radius * np.cos(angle), radius + 1.2 * radius * np.sin(angle)], -1)
                 y = np.full((8, 1), side * (half_width + 0.004))
                 first, second = (np.insert(r, [1], y, axis=1) for r in (rim[:-1], rim[1:]))
                 hub_xyz = np.broadcast_to([x, side * (half_width + 0.004), radius], first.shape)
+                # The order of the corners makes the disc face outwards on either side
                 order = (hub_xyz, second, first) if side > 0 else (hub_xyz, first, second)
                 parts.append(triangles(np.stack(order, axis=1), arches))
     return join(parts)
@@ -149,6 +155,7 @@ def car(mats: MeshMaterials, form: CarForm) -> Mesh:
         box((rear - 0.05, -0.26, 0.62), (rear + 0.02, 0.26, 0.73), mats.plate),
         box((front - 0.05, -0.26, 0.36), (front + 0.04, 0.26, 0.47), mats.plate),
     ]
+    # Lights and mirrors on both sides
     nose_z, tail_z = form.deck[-1][1], form.deck[0][1]
     for side in (-1.0, 1.0):
         y0, y1 = sorted((side * 0.72 * w, side * 0.46 * w))
@@ -170,14 +177,18 @@ def _body(mats: MeshMaterials, form: CarForm) -> Mesh:
     """Build the body, from the sills up to the belt, the boot and the bonnet."""
     from_rear, share = np.array(_END_WIDTH).T
     deck_x, deck_z = np.array(form.deck).T
+    # Sections wherever the outline or the deck has a corner
     x = np.unique(np.concatenate([from_rear - 2.25, deck_x]).round(3))
     half = HALF_WIDTH_M * np.interp(x, from_rear - 2.25, share)
     top = np.interp(x, deck_x, deck_z)
+    # The underside rises at both ends
     low = form.clearance_m + 0.1 * (np.abs(x) > 2.1)
     shoulder, sill = top - 0.09, low + 0.16
+    # Right half of the ring from below to above, then its mirror image
     right = [(0.9 * half, low), (half, sill), (half, shoulder), (half - 0.09, top)]
     ring = [*right, *((-y, z) for y, z in reversed(right))]
     rings = np.stack([np.stack(np.broadcast_arrays(y, z), axis=-1) for y, z in ring], axis=1)
+    # One material for each face around the ring
     edge = mats.dark if form.cladding else BODY
     around = [edge, BODY, BODY, BODY, BODY, BODY, edge, mats.dark]
     return loft(x, rings, [around] * (len(x) - 1), (BODY, BODY))
@@ -187,10 +198,13 @@ def _cabin(mats: MeshMaterials, form: CarForm) -> Mesh:
     """Build the cabin: windows between pillars, under a roof."""
     a, b, c, d = form.cabin
     middle = 0.5 * (b + c) - 0.1
+    # Sections at the pillars: windscreen and rear window lie between the first and last two
     x = np.array([a, b, b + PILLAR_M, middle, middle + PILLAR_M, c - 0.02, c, d])
     deck_x, deck_z = np.array(form.deck).T
     belt = np.interp(x, deck_x, deck_z) - 0.03
+    # The roof's ends fall to the belt at both ends, which gives the sloping windows
     top = np.array([0.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 0.0]) * (form.roof_z - belt - 0.04) + belt + 0.02
+    # Windows lean inwards in proportion to their height
     lean = (top - belt) / (form.roof_z - 0.95)
     foot = np.full_like(x, HALF_WIDTH_M - 0.09)
     eave = foot - 0.16 * lean

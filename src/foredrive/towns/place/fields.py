@@ -40,13 +40,16 @@ def lay_out_fields(site: Site, table: MaterialTable, rng: np.random.Generator) -
     """
     low = site.terrain.origin_xy + 4.0 * CELL_M
     high = site.terrain.origin_xy + CELL_M * (np.array(site.terrain.z.shape[::-1]) - 5.0)
+    # Fields keep clear of all pavement
     paved = site.plan.covered.buffer(ROAD_SETBACK_M).simplify(1.0)
     shapely.prepare(paved)
     names, shares = [*_CROPS, _MEADOW], [crop[0] for crop in _CROPS.values()]
     fields = []
     for parcel in _parcels(low, high, rng):
+        # What is left of a parcel after its hedge, the roads and all objects
         taken = [area.buffer(CLEARANCE_M) for area in site.near(parcel)]
         free = shapely.difference(parcel.buffer(-HEDGE_M), shapely.union_all([paved, *taken]))
+        # Opening with half the minimum width removes narrow strips
         free = free.buffer(-0.5 * MIN_WIDTH_M).buffer(0.5 * MIN_WIDTH_M, join_style="mitre")
         for area in shapely.get_parts(free.intersection(parcel)):
             kind = str(rng.choice(names, p=[*shares, 1.0 - sum(shares)]))
@@ -102,6 +105,7 @@ def _material(kind: str, table: MaterialTable) -> int | None:
     if kind == _MEADOW:
         return None
     _, crop, soil, step_m, row_m = _CROPS[kind]
+    # The second colour of the texture is a parameter, so it must be linear already
     params = (step_m, row_m, *srgb_to_linear([soil])[0].tolist())
     return table.add(Material(Surface.TERRAIN, Texture.FIELD, crop, 0.45, params=params))
 
@@ -110,6 +114,7 @@ def _fence(area: shapely.Polygon, site: Site, material: int) -> tuple[Mesh, Floa
     """Build posts and rails around a meadow, with an open gate. Also return points on them."""
     ring = area.exterior
     count = max(int((ring.length - GATE_M) / POST_STEP_M), 1)
+    # Posts at equal distances around the ring, except for the gate at its start
     along = GATE_M + (ring.length - GATE_M) * np.arange(count + 1) / count
     xy = shapely.get_coordinates(shapely.line_interpolate_point(ring, along))
     feet = np.column_stack([xy, site.height(xy)])
@@ -117,6 +122,7 @@ def _fence(area: shapely.Polygon, site: Site, material: int) -> tuple[Mesh, Floa
     parts = [boxes(feet - half - [0.0, 0.0, 0.4], feet + half + [0.0, 0.0, POST_M], material)]
     points = [pole_points(foot[:2], foot[2], POST_M) for foot in feet]
     for a, b in itertools.pairwise(feet):
+        # Rails between neighbouring posts; their points are thin structures for the labels
         steps = np.linspace(0.0, 1.0, int(np.linalg.norm(b - a) / POLE_SAMPLE_M) + 2)[:, None]
         for z in RAILS_M:
             up = np.array([0.0, 0.0, z])
@@ -135,8 +141,10 @@ def _bales(field: Field, site: Site, material: int, rng: np.random.Generator) ->
     radius, length = BALE_M
     parts = []
     for (x, y), z in zip(xy.tolist(), site.height(xy).tolist(), strict=True):
+        # Bales lie on their round side, roughly along the rows
         angle = float(rng.normal(0.0, 0.4)) + float(np.arctan2(field.along[1], field.along[0]))
         ahead = 0.5 * length * np.array([np.cos(angle), np.sin(angle), 0.0])
+        # They sink a little into the ground
         middle = np.array([x, y, z + 0.93 * radius])
         parts.append(frustum(tuple(middle - ahead), tuple(middle + ahead), (radius, radius), 14, material))
     return parts

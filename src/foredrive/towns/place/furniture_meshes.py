@@ -188,6 +188,7 @@ def _board(
 ) -> FurnitureItem:
     """Build a sign with lines of text that faces the traffic."""
     parts = [box((-0.07, y[0], z[0]), (-0.04, y[1], z[1]), material)]
+    # Lines of text: white bars on the sign, which faces against x
     lines = max(1, int(np.ptp(z) / 0.5))
     step, wide = np.ptp(z) / lines, np.ptp(y)
     for k in range(lines):
@@ -229,7 +230,9 @@ def wires(start: Float[np.ndarray, "3"], end: Float[np.ndarray, "3"], material: 
     parts = []
     for y in (-CROSSARM_M, 0.0, CROSSARM_M):
         line = start + share * (end - start) + y * left
+        # A parabola hangs 0.8 m below the straight line in the middle
         line[:, 2] += POWER_POLE_M - 0.2 - 3.2 * (share * (1.0 - share))[:, 0]
+        # A wire is a triangular tube
         edges = [line + WIRE_M * side for side in (left, np.array([0.0, 0.0, 1.0]), -left)]
         for a, b in zip(edges, edges[1:] + edges[:1], strict=True):
             parts.append(quads(np.stack([b[:-1], b[1:], a[1:], a[:-1]], axis=1), material))
@@ -281,6 +284,7 @@ def guard_rail(feet: Float[np.ndarray, "N 3"], mats: FurnitureMaterials) -> Mesh
     parts = [boxes(low - half, high + half, mats.steel)]
     front, back = feet + 0.13 * left, feet + 0.05 * left
     middle = 0.5 * (RAIL_LOW_M + RAIL_HIGH_M)
+    # Profile of the rail: two ridges towards the road and a groove between them
     lines = [
         _raised(front, RAIL_LOW_M),
         _raised(back, middle),
@@ -288,6 +292,7 @@ def guard_rail(feet: Float[np.ndarray, "N 3"], mats: FurnitureMaterials) -> Mesh
         _raised(back - 0.02 * left, RAIL_HIGH_M),
         _raised(back - 0.02 * left, RAIL_LOW_M),
     ]
+    # The tube between neighbouring profiles
     for a, b in zip(lines, lines[1:] + lines[:1], strict=True):
         parts.append(quads(np.stack([b[:-1], b[1:], a[1:], a[:-1]], axis=1), mats.steel))
     return join(parts)
@@ -298,6 +303,7 @@ def sound_barrier(feet: Float[np.ndarray, "N 3"], mats: FurnitureMaterials) -> M
     left = _left_of(feet)
     low, high = _raised(feet, -SINK_M), _raised(feet, BARRIER_HEIGHT_M)
     parts = []
+    # Rectangle of panels, 0.14 m thick
     lines = [low + 0.07 * left, high + 0.07 * left, high - 0.07 * left, low - 0.07 * left]
     for a, b in zip(lines, lines[1:] + lines[:1], strict=True):
         parts.append(quads(np.stack([b[:-1], b[1:], a[1:], a[:-1]], axis=1), mats.panel))

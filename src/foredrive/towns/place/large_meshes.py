@@ -25,6 +25,7 @@ def taper(
     """
     (x0, x1), (z0, z1), (w0, w1) = x, z, half_width
     top, ends, sides = mats
+    # The upper rectangle is shorter at the rear and at the front
     a, b = x0 + inset[0], x1 - inset[1]
     return hexahedron(
         [[x0, -w0, z0], [x1, -w0, z0], [x1, w0, z0], [x0, w0, z0]],
@@ -37,6 +38,7 @@ def van(mats: MeshMaterials) -> Mesh:
     """Build a panel van with a sloping nose."""
     w = 1.0
     parts = [
+        # Body, upper body, side windows, windscreen; then doors, bumper, grille and trim
         taper((-2.7, 2.7), (0.25, 1.05), (w, w), (0.0, 0.12), (BODY, BODY, BODY)),
         taper((-2.7, 2.58), (1.05, 2.3), (w, w - 0.12), (0.04, 1.15), (BODY, BODY, BODY)),
         taper((1.05, 2.44), (1.15, 1.85), (w - 0.003, w - 0.07), (0.0, 0.64), (BODY, mats.glass, mats.glass)),

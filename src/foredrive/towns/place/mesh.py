@@ -54,6 +54,7 @@ def quads(
     corners: Float[np.ndarray, "Q 4 3"], material: int, uvw: Float[np.ndarray, "Q 4 3"] | None = None
 ) -> Mesh:
     """Build quads of two triangles each, with corners counter-clockwise seen from outside."""
+    # Triangles of a quad
     halves = np.array([[0, 1, 2], [0, 2, 3]])
     xyz = np.asarray(corners)[:, halves].reshape(-1, 3, 3)
     return triangles(xyz, material, None if uvw is None else np.asarray(uvw)[:, halves].reshape(-1, 3, 3))
@@ -70,6 +71,7 @@ def ribbon(
     `uvw` holds the texture coordinates of the left and the right line.
     """
 
+    # Corners of each quad: counter-clockwise seen from above if `left` is left
     def corners(a: np.ndarray, b: np.ndarray) -> np.ndarray:
         return np.stack([b[:-1], b[1:], a[1:], a[:-1]], axis=1)
 
@@ -88,6 +90,7 @@ def polygon_triangles(polygon: shapely.Geometry) -> Float[np.ndarray, "F 3 2"]:
     parts = shapely.get_parts(shapely.constrained_delaunay_triangles(polygon))
     if len(parts) == 0:
         return np.zeros((0, 3, 2))
+    # Triangles come as closed rings of four points; turn those that run clockwise
     xy = shapely.get_coordinates(parts).reshape(-1, 4, 2)[:, :3]
     a, b = xy[:, 1] - xy[:, 0], xy[:, 2] - xy[:, 0]
     clockwise = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0] < 0
@@ -118,6 +121,7 @@ def walls(
         axis=1,
     )
     length = np.linalg.norm(b - a, axis=1)
+    # Texture: distance from the start, above the lower edge, from the end of each face
     zero, height = np.zeros_like(length), (high - low)[:-1]
     u = np.stack([zero, length, length, zero], axis=1)
     v = np.stack([zero, zero, height, height], axis=1)
@@ -144,6 +148,7 @@ def box(lower: Vector, upper: Vector, material: int) -> Mesh:
 def boxes(lower: Float[np.ndarray, "B 3"], upper: Float[np.ndarray, "B 3"], material: int) -> Mesh:
     """Build many axis-aligned boxes."""
     ends = np.stack([lower, upper])
+    # Corner order of `_HEX_FACES`: bottom ring, then top ring, counter-clockwise
     which = np.array([[x, y, z] for z in (0, 1) for x, y in ((0, 0), (1, 0), (1, 1), (0, 1))])
     corners = ends[which, :, np.arange(3)].transpose(2, 0, 1)
     return quads(corners[:, np.array(_HEX_FACES)].reshape(-1, 4, 3), material)
@@ -166,13 +171,16 @@ def frustum(bottom: Vector, top: Vector, radii: tuple[float, float], sides: int,
     """Build a closed cone frustum between two points. A top radius of 0 gives a cone."""
     base, tip = np.asarray(bottom, dtype=float), np.asarray(top, dtype=float)
     axis = (tip - base) / np.linalg.norm(tip - base)
+    # Any vector that is not parallel to the axis gives a perpendicular one
     helper = np.array([1.0, 0.0, 0.0]) if abs(axis[0]) < 0.9 else np.array([0.0, 1.0, 0.0])
     across = np.cross(axis, helper)
     across /= np.linalg.norm(across)
     angle = np.arange(sides + 1) * (2 * np.pi / sides)
     circle = np.cos(angle)[:, None] * across + np.sin(angle)[:, None] * np.cross(axis, across)
+    # Rings at both ends; the first point is repeated at the end
     low, high = base + radii[0] * circle, tip + radii[1] * circle
     ends = np.broadcast_to(base, (sides, 3)), np.broadcast_to(tip, (sides, 3))
+    # Two triangles per side, and a fan for either end, all facing outwards
     faces = [
         (low[:-1], low[1:], high[1:]),
         (low[:-1], high[1:], high[:-1]),

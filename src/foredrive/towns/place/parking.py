@@ -29,15 +29,18 @@ def park_on_strips(town: TownMap, site: Site, rng: np.random.Generator) -> list[
     shapely.prepare(lanes)
     cars: list[ActorState] = []
     for strip in town.strips_of(StripKind.PARKING):
+        # Bays along the middle of the strip; on deep strips cars stand across it
         middle = 0.5 * (strip.left_xyz + strip.right_xyz)
         along = arc_lengths(middle)
         width = np.linalg.norm(strip.left_xyz - strip.right_xyz, axis=1)
         across = float(np.median(width)) >= CROSS_DEPTH_M
         bay = CROSS_BAY_M if across else KERB_BAY_M
         for s in np.arange(0.5 * bay + 1.0, along[-1] - 0.5 * bay - 1.0, bay):
+            # Some bays stay empty, and the strip may be too narrow in places
             if rng.random() > SHARE_OF_BAYS or np.interp(s, along, width) < KERB_WIDTH_M:
                 continue
             car = _car(_pose_on(middle, along, s), across, rng)
+            # Not on a lane, and not into the cars placed just before
             if not lanes.intersects(footprint(car).buffer(0.05)) and all(
                 not footprint(car).intersects(footprint(other)) for other in cars[-3:]
             ):
@@ -58,6 +61,7 @@ def build_car_parks(
     for frontage in frontages(site.plan, LOT_SETBACK_M):
         if not frontage.walkway:
             continue
+        # Car parks at random distances along the walkway
         s = rng.uniform(0.2, 1.0) * LOT_SPACING_M
         while s < frontage.line.length - LOT_WIDTH_M[1]:
             mesh, parked = _lot(site, frontage, s, (asphalt, paint), rng)
@@ -87,8 +91,10 @@ def _pose_on(
     middle: Float[np.ndarray, "N 3"], along: Float[np.ndarray, "N"], s: float
 ) -> tuple[Float[np.ndarray, "3"], float, float]:
     """Return the point, heading and pitch on a strip."""
+    # Heading and pitch from the points 2 m before and after
     at, before, after = (points_at(middle, along, s + ds) for ds in (0.0, -2.0, 2.0))
     step = after - before
+    # The pitch is positive with the nose down
     return at, float(np.arctan2(step[1], step[0])), float(-np.arctan2(step[2], np.hypot(step[0], step[1])))
 
 
@@ -101,6 +107,7 @@ def _car(
     if van:
         size = np.array([rng.uniform(5.05, 5.2), 1.95, rng.uniform(2.0, 2.3)])
     yaw += rng.normal(0.0, 0.02) + (0.5 * np.pi if across else 0.0)
+    # Some cars face the other way; their pitch changes sign
     if rng.random() < 0.15:
         yaw += np.pi
         pitch = -pitch
@@ -121,6 +128,7 @@ def _lot(
     site: Site, frontage: Frontage, s: float, materials: tuple[int, int], rng: np.random.Generator
 ) -> tuple[list[Mesh], list[ActorState]]:
     asphalt, paint = materials
+    # The road lies to the left of the line; local x runs along the road, y away from it
     end, start = frontage.at(s), frontage.at(s + rng.uniform(*LOT_WIDTH_M))
     width = float(np.linalg.norm(end - start))
     along = (end - start) / width
@@ -131,16 +139,19 @@ def _lot(
 
     ring = np.array([world(0.0, 0.0), world(width, 0.0), world(width, LOT_DEPTH_M), world(0.0, LOT_DEPTH_M)])
     area = shapely.Polygon(ring)
+    # The ground must be level within `LOT_SLOPE_M`, and free
     heights = site.height(np.concatenate([ring, [ring.mean(axis=0)]]))
     if not site.is_free(area.buffer(0.3)) or np.ptp(heights) > LOT_SLOPE_M:
         return [], []
     site.take(area)
+    # Level with the highest corner; the walls reach down into the ground
     z = float(heights.max()) + LOT_LIFT_M
     closed = np.concatenate([ring, ring[:1]])
     top = np.column_stack([ring, np.full(4, z)])
     parts = [quads(top[None], asphalt, np.zeros((1, 4, 3))), walls(closed, z - 1.0, z, asphalt)]
     cars = []
     bays = int((width - 1.0) / CROSS_BAY_M)
+    # Lines between the bays at the back; cars stand between them with their front to the back
     for bay in range(bays + 1):
         x = 0.5 * (width - bays * CROSS_BAY_M) + bay * CROSS_BAY_M
         line = [world(x, LOT_DEPTH_M - 0.4), world(x, LOT_DEPTH_M - CROSS_DEPTH_M)]

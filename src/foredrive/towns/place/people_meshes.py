@@ -33,12 +33,15 @@ def pedestrian(mats: MeshMaterials, phase: float | None, dress: str) -> Mesh:
     legs, feet = [], []
     coat = dress == "coat"
     for side, shift in ((1.0, 0.0), (-1.0, 0.5)):
+        # Standing: straight legs with a slight bend of the knee
         hip, knee = 0.0, 0.04
         if phase is not None:
+            # Sine for the hip; the other leg is half a double step behind
             turn = 2.0 * math.pi * (phase + shift)
             hip = HIP_SWING_RAD * math.sin(turn) * (0.8 if coat else 1.0)
             knee += KNEE_BEND_RAD * max(0.0, math.cos(turn)) ** 1.5  # bent while the leg swings forward
         y = side * 0.09
+        # Forward kinematics in the side view: hip, knee, foot
         knee_x, knee_z = THIGH_M * math.sin(hip), HIP_M - THIGH_M * math.cos(hip)
         foot_x, foot_z = knee_x + SHANK_M * math.sin(hip - knee), knee_z - SHANK_M * math.cos(hip - knee)
         foot_z -= 0.06
@@ -48,8 +51,10 @@ def pedestrian(mats: MeshMaterials, phase: float | None, dress: str) -> Mesh:
             frustum((knee_x, y, knee_z), (foot_x, y, foot_z + 0.06), (0.065, 0.045), 6, SECOND),
             box((foot_x - 0.07, y - 0.045, foot_z), (foot_x + 0.16, y + 0.045, foot_z + 0.08), mats.dark),
         ]
+    # Put the lower foot on the ground
     low = min(feet)
     parts = [*legs, *_arms(phase)]
+    # Trunk, shoulders, neck and head
     parts += [
         frustum((0, 0, 0.86), (0, 0, 1.2), (0.155, 0.15), 8, SECOND if dress == "jacket" else BODY),
         frustum((0, 0, 1.02), (0, 0, 1.4), (0.16, 0.2), 8, BODY),
@@ -69,6 +74,7 @@ def pedestrian(mats: MeshMaterials, phase: float | None, dress: str) -> Mesh:
 
 def _arms(phase: float | None) -> list[Mesh]:
     parts = []
+    # Arms swing against the legs of their side
     for side, shift in ((1.0, 0.5), (-1.0, 0.0)):
         swing = 0.0 if phase is None else ARM_SWING_RAD * math.sin(2.0 * math.pi * (phase + shift))
         bend = 0.15 + (0.0 if phase is None else 0.3 + 0.3 * swing)
@@ -95,8 +101,10 @@ def _rim(x: float, radius: float, thick: float, material: int) -> Mesh:
     """Build an open tyre whose axis is along y."""
     angle = np.arange(15) * (2 * np.pi / 14)
     circle = np.stack([np.cos(angle), np.zeros_like(angle), np.sin(angle)], axis=-1)
+    # Four circles around the tyre: inner and outer, on both sides
     centre, aside = np.array([x, 0.0, radius]), np.array([0.0, thick, 0.0])
     inner, outer = (1.0 - 0.1 - thick) * radius, radius
+    # Bands between neighbouring circles close the tyre
     rings = [inner * circle - aside, outer * circle - aside, outer * circle + aside, inner * circle + aside]
     bands = [
         ribbon(centre + a, centre + b, material) for a, b in zip(rings, rings[1:] + rings[:1], strict=True)
@@ -112,6 +120,7 @@ def _two_wheeler(mats: MeshMaterials, wheel_m: float, thick: float, frame_materi
         parts.append(_rim(x, wheel_m, thick, mats.tyre))
     seat, bar = 0.9, 1.0
     tube = 0.6 * thick + 0.02
+    # Frame, bar and saddle, then the rider's trunk and head
     parts += [
         frustum((-reach, 0, wheel_m), (0.0, 0, 0.45), (tube, tube), 6, frame_material),
         frustum((0.0, 0, 0.45), (reach * 0.75, 0, bar - 0.1), (tube, tube), 6, frame_material),
@@ -122,6 +131,7 @@ def _two_wheeler(mats: MeshMaterials, wheel_m: float, thick: float, frame_materi
         frustum((-0.25, 0, seat), (0.02, 0, 1.45), (0.15, 0.18), 8, BODY),
         _ball((0.12, 0.0, 1.62), 0.12, THIRD),
     ]
+    # Legs to the pedals, arms to the bar
     for side in (-1.0, 1.0):
         knee = (0.12, side * 0.13, 0.72)
         parts += [

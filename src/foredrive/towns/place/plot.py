@@ -49,6 +49,7 @@ class Plot:
         """Build walls over a local outline that reach into the ground. A façade's v starts at the base."""
         ring = self.world(np.array([*outline, outline[0]], float))
         mesh = walls(ring, base - FOUNDATION_M, top, material)
+        # The wall's texture starts at its lower end; a façade's at the base
         mesh.uvw[..., 1] -= FOUNDATION_M
         return mesh
 

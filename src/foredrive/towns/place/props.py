@@ -82,6 +82,7 @@ def build_posts(town: TownMap, site: Site, table: MaterialTable) -> Props:
     for index, zone in enumerate(town.stop_zones):
         foot = _off_lanes(zone, lanes)
         if foot is None:
+            # The foot of the post is moved off the lanes, and its place is taken first
             continue
         site.take(shapely.Point(foot[:2]).buffer(0.4))
         z = float(site.height(foot[None, :2])[0])
@@ -102,6 +103,7 @@ def build_street_lamps(site: Site, table: MaterialTable, rng: np.random.Generato
     mats = _Materials(table)
     parts, poles, lamps = [], [], []
     for frontage in frontages(site.plan, LAMP_SETBACK_M):
+        # A lamp wherever there is room, with its arm over the road on the left
         for s in np.arange(rng.uniform(0.0, LAMP_SPACING_M), frontage.line.length, LAMP_SPACING_M):
             foot = frontage.at(s)
             if site.is_free(shapely.Point(foot).buffer(0.25)):
@@ -135,6 +137,7 @@ def _lamp_materials(table: MaterialTable, zone: int) -> tuple[int, int, int]:
     The zone separates them from those of other lights.
     """
     off = ((0.24, 0.05, 0.05), (0.24, 0.17, 0.04), (0.04, 0.20, 0.10))
+    # The zone as a parameter makes each light's materials its own, so that they can be switched singly
     red, yellow, green = (
         table.add(Material(Surface.SIGNAL, Texture.PLAIN, rgb, 0.3, params=(0.0, float(zone)))) for rgb in off
     )
@@ -160,12 +163,15 @@ def _traffic_light(
     parts.append(_head(np.array([-0.22, 0.0, 2.6]), lamps, mats))
     lanes = {lane.lane_id: lane for lane in town.lanes}
     left = np.array([-np.sin(zone.post_yaw), np.cos(zone.post_yaw)])
+    # Lateral positions of the lanes that the light guards, as seen from the post
     starts = np.array([lanes[i].centreline_xyz[0, :2] for i in zone.lane_ids])
     across = np.unique(((starts - foot[:2]) @ left).round(1))
+    # Lanes close to the post need no arm, and very distant ones get none
     reach = across[(np.abs(across) > 2.0) & (np.abs(across) < MAX_ARM_M)]
     if len(reach):
         tip = reach[np.abs(reach).argmax()]
         end = (0.0, float(tip), MAST_HEIGHT_M - 0.1)
+        # An arm to the farthest lane, with heads at least `HEAD_GAP_M` apart
         parts.append(frustum((0.0, 0.0, MAST_HEIGHT_M - 0.15), end, (0.07, 0.05), 6, mats.metal))
         last = None
         for y in sorted(reach, key=abs):

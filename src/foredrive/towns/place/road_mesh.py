@@ -76,9 +76,11 @@ def add_road_materials(table: MaterialTable) -> RoadMaterials:
 def build_roads(town: TownMap, plan: GroundPlan, table: MaterialTable) -> Mesh:
     """Build all paved surfaces of a town."""
     mats = add_road_materials(table)
+    # One surface per piece of the road, then kerbs around raised ones
     parts = [_surface(piece, mats, table) for piece in plan.pieces]
     parts += [_kerbs(piece, mats) for piece in plan.pieces if piece.raise_m > 0]
     plain = table.add(_asphalt(None, None))
+    # Fills close the gaps between pieces; paint is laid on top
     parts += [drape(fill, plan, plain, 0.0) for fill in plan.fills]
     parts += _crosswalks(town, plan, mats) + _stop_lines(town, mats)
     parts += _bridges(plan, mats)
@@ -109,6 +111,7 @@ def _piece_material(piece: Piece, mats: RoadMaterials, table: MaterialTable) -> 
         return mats.median
     if piece.strip.junction_id is not None or not piece.whole:
         return table.add(_asphalt(None, None))
+    # Lane lines change along a road: the marking at the middle of the piece counts
     middle_m = float(piece.along_m[[0, -1]].mean())
     left = marking_at(piece.strip.left_markings, middle_m)
     return table.add(_asphalt(left, marking_at(piece.strip.right_markings, middle_m)))
@@ -118,11 +121,13 @@ def _surface(piece: Piece, mats: RoadMaterials, table: MaterialTable) -> Mesh:
     material = _piece_material(piece, mats, table)
     lift = np.array([0.0, 0.0, piece.raise_m])
     if not piece.whole:
+        # A cut piece: triangles over its area, without lines (texture coordinates far from the borders)
         xy = polygon_triangles(piece.area)
         z = piece.height(xy.reshape(-1, 2)).reshape(xy.shape[:2]) + piece.raise_m
         return triangles(
             np.concatenate([xy, z[..., None]], axis=-1), material, np.full((*xy.shape[:2], 3), 9.0)
         )
+    # A whole piece: a band between its borders; u and v are the distances from them
     left, right = piece.left_xyz + lift, piece.right_xyz + lift
     width = np.linalg.norm(left - right, axis=1)
     zero = np.zeros_like(width)
@@ -159,6 +164,7 @@ def _crosswalks(town: TownMap, plan: GroundPlan, mats: RoadMaterials) -> list[Me
     parts = []
     for crosswalk in town.crosswalks:
         area = shapely.Polygon(crosswalk.outline_xyz[:, :2]).buffer(0)
+        # Stripes run along the lanes, so they are counted along the longer side of the crosswalk
         corners = shapely.get_coordinates(shapely.minimum_rotated_rectangle(area))[:4]
         sides = corners[1:3] - corners[:2]
         along = max(sides, key=lambda side: float(np.linalg.norm(side)))
@@ -167,6 +173,7 @@ def _crosswalks(town: TownMap, plan: GroundPlan, mats: RoadMaterials) -> list[Me
         across = np.array([-along[1], along[0]])
         start = float((corners @ along).min())
         raised = shapely.clip_by_rect(walkways, *area.bounds)
+        # Narrow bands keep the paint close to a road that is not flat
         for s in np.arange(start, start + length, PATCH_M):
             band = shapely.Polygon(
                 [
@@ -174,8 +181,10 @@ def _crosswalks(town: TownMap, plan: GroundPlan, mats: RoadMaterials) -> list[Me
                     for u, v in ((s, -1e4), (s + PATCH_M, -1e4), (s + PATCH_M, 1e4), (s, 1e4))
                 ]
             )
+            # The part of the crosswalk in the band, without walkways
             patch = area.intersection(band).difference(raised)
             mesh = drape(patch, plan, mats.stripes, PAINT_M)
+            # Texture: distance across the stripes
             u = mesh.xyz[..., :2] @ along - start
             parts.append(triangles(mesh.xyz, mats.stripes, np.stack([u, 0 * u, 0 * u], axis=-1)))
     return parts
@@ -186,10 +195,12 @@ def _stop_lines(town: TownMap, mats: RoadMaterials) -> list[Mesh]:
     one."""
     crosswalks = shapely.union_all([shapely.Polygon(c.outline_xyz[:, :2]) for c in town.crosswalks])
     lanes = {lane.lane_id: lane for lane in town.lanes}
+    # Lanes that lead to a light or a sign
     entries = {i for zone in town.stop_zones for lane in zone.lane_ids for i in lanes[lane].predecessor_ids}
     parts = []
     for name in sorted(entries):
         lane = lanes[name]
+        # Move the line back until it is clear of the crosswalk
         for gap in np.arange(STOP_LINE_GAP_M, 8.0, 0.5):
             left = _before_end(lane.left_boundary_xyz, gap)
             right = _before_end(lane.right_boundary_xyz, gap)
@@ -215,8 +226,10 @@ def _bridges(plan: GroundPlan, mats: RoadMaterials) -> list[Mesh]:
     top = shapely.STRtree([p.area for p in bridge])
     parts = []
     for piece in bridge:
+        # The underside of the deck, facing down
         down = np.array([0.0, 0.0, -DECK_M])
         parts.append(ribbon(piece.right_xyz + down, piece.left_xyz + down, mats.concrete))
+    # Parapets run along the border of all decks together, so that none stands between two pieces
     decks = shapely.union_all([p.area for p in bridge]).buffer(0.05)
     for ring in _rings(shapely.orient_polygons(decks)):
         parts += _edge(shapely.get_coordinates(ring), bridge, top, plan, mats)
@@ -232,17 +245,21 @@ def _edge(
     mats: RoadMaterials,
 ) -> list[Mesh]:
     """Build fascia and parapet along one ring of the decks, with no parapet where the road continues."""
+    # Height of the nearest deck at each point of the border
     nearest = top.query_nearest(shapely.points(ring), all_matches=False)[1]
     z = np.array([bridge[n].height(xy[None])[0] for n, xy in zip(nearest, ring, strict=True)])
     step = ring[1:] - ring[:-1]
     length = np.linalg.norm(step, axis=1)
+    # The solid is on the left of the ring, so outward is to the right
     outward = np.column_stack([step[:, 1], -step[:, 0]]) / length.clip(1e-6)[:, None]
+    # Where the road continues at about the same height beyond the edge, there is no parapet
     beyond = 0.5 * (ring[1:] + ring[:-1]) + 0.6 * outward
     road_z = plan.borders.road(beyond)
     goes_on = shapely.contains_xy(plan.ground, beyond[:, 0], beyond[:, 1])
     goes_on &= np.abs(road_z - 0.5 * (z[1:] + z[:-1])) < 1.5
     parts = [walls(ring, z - DECK_M, z, mats.concrete)]
     for i in np.flatnonzero(~goes_on & (length > 0.05)):
+        # A wall of `PARAPET_WIDTH_M` on the deck's edge, with a top
         inner = np.stack([ring[i], ring[i + 1]]) - PARAPET_WIDTH_M * outward[i]
         foot = np.concatenate([ring[i : i + 2], inner[::-1], ring[i : i + 1]])
         z_foot = np.concatenate([z[i : i + 2], z[i : i + 2][::-1], z[i : i + 1]])
@@ -257,6 +274,7 @@ def _pillars(bridge: list[Piece], plan: GroundPlan, mats: RoadMaterials) -> list
     for piece in bridge:
         x, y, z = (0.5 * (piece.left_xyz + piece.right_xyz))[0]
         spot = shapely.Point(x, y)
+        # Pillars keep their distance from each other and stay off the roads below
         if spot.distance(placed) < PILLAR_SPACING_M * 0.5:
             continue
         if ground.intersects(spot.buffer(PILLAR_RADIUS_M + PILLAR_CLEARANCE_M)):

@@ -34,6 +34,7 @@ class Site:
 
     def near(self, area: shapely.Geometry) -> list[shapely.Geometry]:
         """Return the areas that are taken near an area."""
+        # A hash grid: only areas in the same cells can touch
         indices = {i for cell in self._cells_of(area) for i in self._cells.get(cell, ())}
         return [self.taken[i] for i in sorted(indices)]
 
@@ -56,6 +57,7 @@ class Site:
 
     @staticmethod
     def _cells_of(area: shapely.Geometry) -> Iterator[tuple[int, int]]:
+        # Cells that the bounding box covers
         x0, y0, x1, y1 = (int(c // GRID_M) for c in area.bounds)
         return ((x, y) for x in range(x0, x1 + 1) for y in range(y0, y1 + 1))
 
@@ -78,10 +80,12 @@ def frontages(plan: GroundPlan, setback_m: float) -> list[Frontage]:
     walkways = shapely.union_all([p.area for p in plan.pieces if p.raise_m > 0]).buffer(setback_m + 1.0)
     shapely.prepare(walkways)
     rings = []
+    # Rings around all pavement; oriented, so that the road is on the left
     for polygon in shapely.get_parts(shapely.orient_polygons(plan.ground.buffer(setback_m).simplify(0.1))):
         rings += [polygon.exterior, *polygon.interiors]
     lines = []
     for ring in rings:
+        # A line counts as along a walkway if most of its points are
         segments = shapely.segmentize(ring, 5.0)
         beside = shapely.contains_xy(walkways, shapely.get_coordinates(segments))
         lines.append(Frontage(shapely.LineString(segments.coords), bool(beside.mean() > 0.5)))

@@ -50,9 +50,11 @@ def build_street_furniture(
 
     Their places are taken from the site.
     """
+    # Motorways by their speed limit
     fast = [x.centreline_xyz[:, :2] for x in town.lanes if (x.speed_limit_mps or 0.0) > FAST_MPS]
     motorways = shapely.STRtree([shapely.LineString(line) for line in fast])
     placer = _FurniturePlacer(site, motorways, STYLES[town.name], FurnitureMaterials(table), rng)
+    # Rails first, because they need continuous space; then large objects, then small ones
     lines = frontages(site.plan, SETBACK_M)
     for frontage in lines:
         if not frontage.walkway:
@@ -83,6 +85,7 @@ class _FurniturePlacer:
         count = int(frontage.line.length / RAIL_STEP_M)
         if count < 3:
             return
+        # Points every `RAIL_STEP_M`, marked where a motorway is near
         points = shapely.line_interpolate_point(frontage.line, np.arange(count + 1) * RAIL_STEP_M)
         fast = np.zeros(count + 1, dtype=np.bool_)
         fast[np.unique(self.motorways.query(points, predicate="dwithin", distance=FAST_WITHIN_M)[0])] = True
@@ -90,10 +93,12 @@ class _FurniturePlacer:
         z = self.site.height(xy)
         per_section = int(SECTION_M / RAIL_STEP_M)
         for start in range(0, count, per_section):
+            # Each section has rails, a barrier or nothing
             u = self.rng.random()
             if u > RAILS + BARRIERS:
                 continue
             part = slice(start, min(start + per_section, count) + 1)
+            # Only stretches that are near a motorway and free
             usable = fast[part] & self._free_steps(xy[part])
             for run in _runs(usable):
                 feet = np.column_stack([xy[part], z[part]])[run]
@@ -115,6 +120,7 @@ class _FurniturePlacer:
         last: Float[np.ndarray, 3] | None = None
         for s in np.arange(self.rng.uniform(0.0, POLE_STEP_M), frontage.line.length, POLE_STEP_M):
             foot = self._place("power_pole", frontage, float(s), POLE_OFFSET_M)
+            # Wires only between neighbouring poles: a pole may be missing
             near = foot is not None and last is not None and np.linalg.norm(foot - last) < 1.3 * POLE_STEP_M
             if near and foot is not None and last is not None:
                 self.parts.append(furniture_meshes.wires(last, foot, self.materials.wire))
@@ -143,11 +149,13 @@ class _FurniturePlacer:
     ) -> Float[np.ndarray, "3"] | None:
         """Place an object beside a frontage if there is room. Return its foot, or None."""
         thing: FurnitureItem = self._things[name]
+        # Direction of the line at the place, also at its end
         reach = min(s + 0.5, frontage.line.length)
         ahead = frontage.at(reach) - frontage.at(reach - 0.5)
         ahead /= np.linalg.norm(ahead)
         left = np.array([-ahead[1], ahead[0]])
         half = thing.room_m
+        # Away from the road: left of the line is the road
         xy = frontage.at(s) - (offset_m + max(half[1] - SETBACK_M + 0.25, 0.0)) * left
         corners = xy + np.array(
             [
@@ -157,10 +165,12 @@ class _FurniturePlacer:
         )
         area = shapely.Polygon(corners)
         heights = self.site.height(np.concatenate([corners, xy[None]]))
+        # No object on steep ground or on another object
         if np.ptp(heights) > STEEP_M or not self.site.is_free(area):
             return None
         self.site.take(area)
         T = np.eye(4)
+        # The object's x axis points along the traffic
         T[:2, 0], T[:2, 1], T[:2, 3], T[2, 3] = ahead, left, xy, heights[-1]
         moved = thing.mesh.transformed(T)
         self.parts.append(Mesh(moved.xyz, thing.mesh.uvw, moved.material))
@@ -171,5 +181,6 @@ class _FurniturePlacer:
 
 def _runs(usable: Bool[np.ndarray, "N"]) -> list[slice]:
     """Return ranges of points joined by usable steps, with their last points included."""
+    # Starts and ends of the runs of True, by the changes of the padded mask
     edges = np.flatnonzero(np.diff(np.concatenate([[False], usable, [False]]).astype(np.int8)))
     return [slice(int(a), int(b) + 1) for a, b in edges.reshape(-1, 2)]

@@ -39,6 +39,7 @@ class Terrain:
 
     def height(self, xy: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n"]:
         """Return the height of the land, bilinear between the nodes."""
+        # map_coordinates takes rows before columns
         rows_columns = ((xy - self.origin_xy) / CELL_M).T[::-1]
         return map_coordinates(self.z, rows_columns, order=1, mode="nearest")
 
@@ -59,13 +60,17 @@ def make_terrain(
     plan: GroundPlan, bounds_m: tuple[float, float, float, float], rng: np.random.Generator
 ) -> Terrain:
     """Make land that is level with the roads on the ground and has gentle hills further away."""
+    # A grid around the roads with a margin
     origin = np.array(bounds_m[:2]) - MARGIN_M
     columns, rows = np.ceil((np.array(bounds_m[2:]) + MARGIN_M - origin) / CELL_M).astype(int) + 1
     y, x = np.meshgrid(np.arange(rows) * CELL_M, np.arange(columns) * CELL_M, indexing="ij")
     xy = np.stack([x + origin[0], y + origin[1]], axis=-1)
+    # Known heights: the nodes on and close to the roads
     near_road = _inside(plan.ground.buffer(ROAD_REACH_M), xy)
+    # Fill the rest smoothly, then add hills that begin some way from the roads
     z = _spread(np.where(near_road, plan.borders.top(xy), 0.0), near_road)
     away_m = distance_transform_edt(~near_road) * CELL_M
+    # Gaussian noise of a given wavelength, scaled to unit deviation
     noise = gaussian_filter(rng.standard_normal(z.shape), HILL_WAVE_M / CELL_M / 2.5, mode="wrap")
     hills = HILL_M * noise / noise.std()
     z += hills * np.clip((away_m - HILL_START_M) / HILL_RAMP_M, 0.0, 1.0)
@@ -87,11 +92,13 @@ def build_terrain(
     j, i = np.meshgrid(np.arange(rows - 1), np.arange(columns - 1), indexing="ij")
     lower = terrain.origin_xy + CELL_M * np.stack([i, j], axis=-1)
     cells = shapely.box(*np.moveaxis(lower, -1, 0), *np.moveaxis(lower + CELL_M, -1, 0))
+    # Cells that the roads do not touch stay whole; cells on their border are cut; the others are sunk
     shapely.prepare(plan.ground)
     touched = shapely.intersects(plan.ground, cells)
     cut = touched & ~shapely.contains_properly(plan.ground, cells)
     whole, tilled = ~touched, []
     for field in fields:
+        # Cells that a field touches get its texture; beyond its border the texture is grass
         if field.material is not None:
             inside = whole & shapely.intersects(field.area, cells)
             tilled.append(_tilled(field, _cell_corners(terrain, j[inside], i[inside]), field.material))
@@ -102,6 +109,7 @@ def build_terrain(
             quads(_cell_corners(terrain, j[whole], i[whole]), material),
             *tilled,
             _paved_in_gaps(edges, plan, asphalt),
+            # Below the roads, for rays through cracks
             quads(_cell_corners(terrain, j[touched], i[touched]) - np.array([0.0, 0.0, SUNK_M]), sunk),
             _horizon(terrain, material),
         ]
@@ -116,9 +124,11 @@ def _inside(area: shapely.Geometry, xy: Float[np.ndarray, "Y X 2"]) -> Bool[np.n
 def _spread(z: Grid, known: Bool[np.ndarray, "Y X"]) -> Grid:
     """Fill unknown heights smoothly (Laplace's equation), starting from the nearest known heights."""
     nearest = distance_transform_edt(~known, return_distances=False, return_indices=True)
+    # From coarse to fine, so that the relaxation converges in few rounds
     filled = z[tuple(nearest)]
     for sigma in (16.0, 8.0, 4.0, 2.0):
         filled = np.where(known, z, gaussian_filter(filled, sigma, mode="nearest"))
+    # Jacobi iteration: each unknown height becomes the mean of its four neighbours
     for _ in range(SMOOTHING_ROUNDS):
         padded = np.pad(filled, 1, mode="edge")
         mean = 0.25 * (padded[:-2, 1:-1] + padded[2:, 1:-1] + padded[1:-1, :-2] + padded[1:-1, 2:])
@@ -131,6 +141,7 @@ def _below_decks(z: Grid, xy: Float[np.ndarray, "Y X 2"], plan: GroundPlan) -> G
     decks = [piece for piece in plan.pieces if piece.bridge]
     if not decks:
         return z
+    # Nodes under bridges: lower them below the nearest deck's lowest edge, less a clearance
     under = _inside(plan.bridges.buffer(CELL_M), xy)
     index = shapely.STRtree([p.area for p in decks]).query_nearest(
         shapely.points(xy[under]), all_matches=False
@@ -156,10 +167,12 @@ def _tilled(field: Field, corners: Float[np.ndarray, "n 4 3"], material: int) ->
     """Build the cells of a field, with the distance to its border in their texture coordinates."""
     xy = corners[..., :2]
     points = shapely.points(xy)
+    # Distance from the border, positive inside
     within = shapely.distance(field.area.exterior, points)
     within = np.where(shapely.covers(field.area, points), within, -within)
     across = np.array([-field.along[1], field.along[0]])
     middle = shapely.get_coordinates(field.area.centroid)[0]
+    # Texture: across the rows, along them, from the border inwards
     uvw = np.stack([(xy - middle) @ across, (xy - middle) @ field.along, within], axis=-1)
     return quads(corners, material, uvw)
 
@@ -171,6 +184,7 @@ def _cut_cells(
 
     Nodes keep their height. Points on the cut have the height of the road.
     """
+    # Clip the roads tile by tile: differences with the whole network would be slow
     tiles, tile_of_cell = np.unique(index // TILE_CELLS, axis=0, return_inverse=True)
     low = terrain.origin_xy + tiles[:, ::-1] * TILE_CELLS * CELL_M - 0.5
     high = low + TILE_CELLS * CELL_M + 1.0
@@ -180,6 +194,7 @@ def _cut_cells(
     rest = shapely.difference(cells, roads[tile_of_cell.reshape(-1)])
     parts = shapely.get_parts(shapely.get_parts(shapely.constrained_delaunay_triangles(rest)))
     xy = shapely.get_coordinates(shapely.orient_polygons(parts)).reshape(-1, 4, 2)[:, :3]
+    # Corners of the triangles that are nodes of the grid keep the land's height
     at_node = np.abs((xy - terrain.origin_xy) / CELL_M % 1.0 - 0.5).min(axis=-1) > 0.5 - 1e-6
     z = np.where(
         at_node, terrain.height(xy.reshape(-1, 2)).reshape(at_node.shape), plan.borders.top(xy) - EDGE_DROP_M
@@ -189,6 +204,7 @@ def _cut_cells(
 
 def _paved_in_gaps(land: Mesh, plan: GroundPlan, material: int) -> Mesh:
     """Return the land with small gaps between lanes paved."""
+    # Holes in the ground with a small area are gaps between lanes
     rings = [ring for part in shapely.get_parts(plan.ground) for ring in part.interiors]
     gaps = [gap for gap in map(shapely.Polygon, rings) if gap.area < GAP_M2]
     middle = land.xyz[..., :2].mean(axis=1)
@@ -201,12 +217,14 @@ def _paved_in_gaps(land: Mesh, plan: GroundPlan, material: int) -> Mesh:
 def _horizon(terrain: Terrain, material: int) -> Mesh:
     """Build a far plain around the grid."""
     rows, columns = terrain.z.shape
+    # Around the border of the grid, counter-clockwise
     ring = [(0, i) for i in range(columns)] + [(j, columns - 1) for j in range(1, rows)]
     ring += [(rows - 1, i) for i in range(columns - 2, -1, -1)] + [(j, 0) for j in range(rows - 2, -1, -1)]
     j, i = np.array(ring).T
     inner = _node_xyz(terrain, j, i)
     centre = terrain.origin_xy + 0.5 * CELL_M * np.array([columns - 1, rows - 1])
     away = inner[:, :2] - centre
+    # Each border node is pushed outwards from the centre, to a common height
     outer_xy = inner[:, :2] + away / np.linalg.norm(away, axis=1, keepdims=True) * HORIZON_M
     outer = np.column_stack([outer_xy, np.full(len(inner), inner[:, 2].mean())])
     return quads(np.stack([inner[:-1], outer[:-1], outer[1:], inner[1:]], axis=1), material)

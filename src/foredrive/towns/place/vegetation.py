@@ -52,6 +52,7 @@ def build_vegetation(
     for xy, detail in zip(spots, near, strict=True):
         kind = assets.trees[int(rng.integers(len(assets.trees)))]
         radius = float(rng.uniform(*RADIUS_M[kind]))
+        # Plants need room for their crown; what stands in the way is left out
         if not _has_room(site, xy, kind, radius):
             continue
         site.take(shapely.Point(xy).buffer(0.6))
@@ -79,6 +80,7 @@ def _open_tree_spots(site: Site, rng: np.random.Generator) -> list[Float[np.ndar
     count = int(extent.prod() * OPEN_TREES_PER_M2)
     xy = terrain.origin_xy + rng.random((count, 2)) * extent
     away = site.distance_to_road(xy)
+    # Smooth waves decide where trees stand close together
     clump = np.sin(xy[:, 0] / 17.0 + 1.3 * np.sin(xy[:, 1] / 23.0)) + np.sin(xy[:, 1] / 19.0)
     wanted = (away > MIN_TREE_M) & (away < MAX_TREE_M) & (clump > rng.uniform(-0.6, 1.6, count))
     return list(xy[wanted])
@@ -87,6 +89,7 @@ def _open_tree_spots(site: Site, rng: np.random.Generator) -> list[Float[np.ndar
 def _has_room(site: Site, xy: Float[np.ndarray, "2"], kind: str, radius: float) -> bool:
     if not site.is_free(shapely.Point(xy).buffer(0.35)):
         return False
+    # The crown reaches beyond the nominal radius
     spread = shapely.Point(xy).buffer(CROWN_SPREAD * radius, quad_segs=2)
     if kind in _LOW:
         return site.is_free(spread)
@@ -122,6 +125,7 @@ class _PlantMaker:
         """Return a plant whose crown has about this radius (m)."""
         rng = self.rng
         grown = self._grown[kind, detail][int(rng.integers(VARIANTS))]
+        # A copy is turned, scaled to the radius, and stretched in height at random
         angle, rise = rng.uniform(0.0, 2.0 * np.pi), radius * rng.uniform(0.85, 1.2)
         T = np.eye(4)
         T[:2, :2] = radius * np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
@@ -129,6 +133,7 @@ class _PlantMaker:
         colours = self._needles if kind == "conifer" else self._leaves
         leaves = colours[-1] if kind == "palm" else colours[int(rng.integers(len(colours)))]
         moved = grown.transformed(T)
+        # Placeholders become bark and leaves
         material = np.where(grown.material == BARK, self._bark, leaves).astype(np.int32)
         return Mesh(moved.xyz, np.zeros_like(moved.uvw), material)
 
@@ -141,6 +146,7 @@ def _grow(kind: str, detail: bool, rng: np.random.Generator) -> Mesh:
         return _conifer(rng, detail)
     if kind == "palm":
         return _palm(rng)
+    # Height of the crown in radii, and height of the trunk
     stretch = {"round": 1.0, "tall": 2.0, "poplar": 3.6, "willow": 0.8}[kind]
     trunk = {"round": 1.25, "tall": 2.0, "poplar": 1.2, "willow": 1.6}[kind] * rng.uniform(0.9, 1.1)
     middle = (0.0, 0.0, trunk + 0.9 * stretch)
@@ -148,11 +154,13 @@ def _grow(kind: str, detail: bool, rng: np.random.Generator) -> Mesh:
         frustum((0, 0, -0.2), middle, (0.09, 0.04), 6, BARK),
         _crown(middle, (1.0, 1.0, stretch), detail, rng),
     ]
+    # Smaller crowns around the main one
     if kind in ("round", "willow"):
         for angle in rng.uniform(0.0, 2.0 * np.pi) + np.array([0.0, 2.2, 4.1]):
             offset = 0.55 * np.array([np.cos(angle), np.sin(angle), rng.uniform(-0.25, 0.5) * stretch])
             r = rng.uniform(0.55, 0.7)
             parts.append(_crown(np.array(middle) + offset, (r, r, 0.85 * r), False, rng))
+    # Hanging branches around the crown
     if kind == "willow":
         for angle in np.arange(14) * 0.45 + rng.uniform(0.0, 0.3, 14):
             ahead = np.array([np.cos(angle), np.sin(angle), 0.0])
@@ -164,11 +172,13 @@ def _grow(kind: str, detail: bool, rng: np.random.Generator) -> Mesh:
 def _conifer(rng: np.random.Generator, detail: bool) -> Mesh:
     parts = [frustum((0, 0, -0.2), (0, 0, 1.3), (0.14, 0.11), 5, BARK)]
     height, tiers = rng.uniform(4.6, 6.2), 5 if detail else 3
+    # Cones that overlap and become narrower towards the top
     for k in range(tiers):
         share = k / tiers
         low, top = 0.6 + share * height, 0.6 + min(share + 1.5 / tiers, 1.0) * height
         parts.append(frustum((0, 0, low), (0, 0, top), (1.15 * (1.0 - 0.8 * share), 0.0), 8, LEAVES))
     mesh = join(parts)
+    # A wavy outline instead of circles
     sway = 1.0 + 0.1 * np.sin(7.0 * mesh.xyz[..., :1] + 5.0 * mesh.xyz[..., 1:2] + 3.0 * mesh.xyz[..., 2:])
     xyz = np.concatenate([mesh.xyz[..., :2] * sway, mesh.xyz[..., 2:]], axis=-1)
     return Mesh(xyz.astype(np.float32), mesh.uvw, mesh.material)
@@ -194,11 +204,13 @@ def _crown(
     """Build an irregular ball of leaves. With detail, twigs stick out of it."""
     ball = _SPHERE if detail else _COARSE
     inner = 0.9 if detail else 1.05
+    # Each vertex of the ball at a random distance
     lumps = inner * rng.uniform(0.8, 1.15, (len(ball.vertices), 1))
     parts = [triangles((np.asarray(centre) + ball.vertices * lumps * radii)[ball.faces], LEAVES)]
     if detail:
         out = rng.normal(size=(26, 3))
         out /= np.linalg.norm(out, axis=1, keepdims=True)
+        # Twigs: clumps of leaves across the crown's surface
         for direction in out:
             side = np.cross(direction, rng.normal(size=3))
             root = np.asarray(centre) + 0.86 * direction * radii - 0.26 * side
@@ -217,6 +229,7 @@ def _leaf(
 ) -> Mesh:
     """Build a clump of leaves: a flat octahedron from root to tip."""
     along = 0.5 * (tip - root)
+    # Width across the clump, and a third of it as thickness
     across = np.cross(along, rng.normal(size=3))
     across *= width / max(float(np.linalg.norm(across)), 1e-6)
     thick = np.cross(along, across)

@@ -122,6 +122,7 @@ class ScenarioContext(NamedTuple):
         lane = int(v.path[slot, BEHIND])
         if not v.active[slot] or lane not in lanes:
             return None
+        # Length of the lanes before the current one, plus the arc length on it
         before_m = graph.length_m[list(lanes[: lanes.index(lane)])].sum()
         return float(before_m + v.s_m[slot])
 
@@ -141,5 +142,6 @@ class ScenarioContext(NamedTuple):
 
     def towards_mps(self, slot: int, wanted_mps: float) -> None:
         """Order a vehicle to drive no faster than a speed, reached within `SOON_S`."""
+        # Acceleration that reaches the wanted speed in `SOON_S`, limited
         wanted = (wanted_mps - self.speed_mps(slot)) / SOON_S
         self.orders.max_mps2[slot] = min(max(wanted, -TO_SPEED_MPS2), TO_SPEED_MPS2)

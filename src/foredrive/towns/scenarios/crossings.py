@@ -44,6 +44,7 @@ def crossing(
         seen_m: distance before the crossing from which its start must be visible, m.
     """
     point, ahead = pose(road.route, at_m)
+    # Straight across the route, from the right edge of the lanes to the left one
     left = np.array([-ahead[1], ahead[0], 0.0])
     right_m = _to_edge_m(road, point, -left, MAX_RIGHT_M)
     left_m = _to_edge_m(road, point, left, MAX_LEFT_M)
@@ -51,7 +52,9 @@ def crossing(
         return
     cycles = category is Category.BICYCLE
     start_m = right_m + (RUN_UP_M if cycles else 0.0)
+    # The way begins off the road, for cyclists with a run-up
     way = np.stack([point - start_m * left, point + left_m * left])
+    # The driver must see the start from far enough, and nothing may stand in the way
     eye, _ = pose(road.route, max(at_m - seen_m, 0.0))
     if not _is_clear(road.world, way[0], way[1]) or not _is_seen(road.world, eye, way[0]):
         return
@@ -72,6 +75,7 @@ def _to_edge_m(
     for away_m in np.arange(0.0, max_m, STEP_M).tolist():
         here = point + away_m * aside
         samples = near.within(here, 3.0)
+        # Distance to the border of every lane nearby: negative inside
         off_m = np.hypot(*(near.xyz[samples, :2] - here[:2]).T) - 0.5 * graph.width_m[near.lane[samples]]
         free_m = 0.0 if (off_m < 0.0).any() else free_m + STEP_M
         if free_m > OFF_LANES_M:
@@ -82,6 +86,7 @@ def _to_edge_m(
 def beside_parked(road: RoadContext) -> Iterator[Scenario]:
     """Yield the pedestrians that may step out before parked cars."""
     route, graph = road.route, road.graph
+    # Only cars close to the route; the pedestrian steps out just before the car
     for car in road.world.parked:
         away_m = np.hypot(*(route.xyz[:, :2] - car.centre_m[:2]).T)
         if away_m.min() > PARKED_ASIDE_M[1]:
@@ -96,8 +101,10 @@ def _before_car(road: RoadContext, car: ActorState, at_m: float) -> Scenario | N
     point, ahead = pose(road.route, at_m)
     right = np.array([ahead[1], -ahead[0], 0.0])
     aside_m = float((car.centre_m - point) @ right)
+    # Angle between car and route, modulo half a turn: cars may face either way
     skew = (car.yaw - np.arctan2(ahead[1], ahead[0]) + 0.5 * np.pi) % np.pi - 0.5 * np.pi
     _, before = pose(road.route, max(at_m - STRAIGHT_M, 0.0))
+    # On the right, parallel to a straight stretch of the route
     is_beside = PARKED_ASIDE_M[0] < aside_m < PARKED_ASIDE_M[1] and abs(skew) < PARKED_SKEW_RAD
     if not is_beside or before @ ahead < STRAIGHT_COS:
         return None
@@ -105,6 +112,7 @@ def _before_car(road: RoadContext, car: ActorState, at_m: float) -> Scenario | N
     if not _is_clear(road.world, start, out):
         return None
     limit = float(road.graph.limit_mps[_lane_at(road, at_m)])
+    # Out into the lane and back the same way
     actor = ScriptedActor(
         FIRST_TRACK_ID, Category.PEDESTRIAN, 0, np.array(PEDESTRIAN_LWH), np.stack([start, out, start])
     )
@@ -120,6 +128,7 @@ def _lane_at(road: RoadContext, at_m: float) -> int:
 def _is_clear(world: World, start: Float64[np.ndarray, "3"], end: Float64[np.ndarray, "3"]) -> bool:
     """Return whether nothing stands between two points on the ground."""
     up = np.array([[0.0, 0.0, height] for height in HEIGHTS_M])
+    # Rays in both directions: a ray that starts inside an object does not see it
     origins = np.concatenate([start + up, end + up])
     way = np.concatenate([np.tile(end - start, (len(up), 1)), np.tile(start - end, (len(up), 1))])
     return not _is_struck(world, origins, way)

@@ -41,16 +41,21 @@ def pace_to_begin(scenario: Scenario, actor: ScriptedActor, ego: ScenarioEgo) ->
     Returns None if it is too early, or no longer fair.
     """
     gap_m, speed = ego.front_gap_m(scenario.at_m) - HALF_WIDTH_M, ego.speed_mps
+    # Distance that the ego vehicle has beyond its stopping distance
     spare_m = gap_m - ego.stopping_m()
     if speed < MIN_EGO_MPS:
         return None
+    # The way until the pedestrian is visible in the lane counts too
     if scenario.kind is ScenarioKind.DOOR_ZONE:  # visible in the lane while the ego vehicle can still stop
         spare_m -= speed * scenario.meet_m / STEP_OUT_MPS
+        # Begin in a window of `LATE_M`: the ego vehicle can still just stop
         return STEP_OUT_MPS if SPARE_M - LATE_M < spare_m < SPARE_M else None
     arrives_s = ego.arrival_s(scenario)
+    # Too early: the actor would have to walk more slowly than it likes to
     early = arrives_s > scenario.meet_m / PREFERRED_MPS[actor.category] and spare_m > SPARE_M
     if spare_m < 0 or early:
         return None
+    # The pace at which both meet, within what the actor can do
     pace = cruise_mps(scenario.meet_m, arrives_s, 0.0, ACCELERATION_MPS2)
     return min(max(pace, MIN_MPS), MAX_MPS[actor.category])
 
@@ -64,9 +69,11 @@ def is_on_the_spot(scenario: Scenario, actor: ScriptedActor, since_s: float) -> 
 def would_hit(actor: ScriptedActor, pace_mps: float, others: MovingBoxes) -> bool:
     """Return whether a crossing actor that goes on hits a vehicle that it would not hit if it stood still."""
     to_go_m = actor.length_m - actor.s_m if pace_mps > 0 else actor.s_m
+    # Time until the actor has left the road, and times to collision if it goes on or stands
     left_s = to_go_m / abs(pace_mps)
     goes = time_to_collision_s(_box(actor, pace_mps), others).min(initial=np.inf)
     stands = time_to_collision_s(_box(actor, 0.0), others).min(initial=np.inf)
+    # It hits only by going on: waiting would avoid it
     return bool(goes < min(left_s, SAFE_S) and stands > goes)
 
 
@@ -86,6 +93,7 @@ def pace_among(actor: ScriptedActor, pace_mps: float, others: MovingBoxes) -> fl
 def vehicle_boxes(traffic: Traffic, state: TrafficState, ego: ScenarioEgo) -> MovingBoxes:
     """Return the vehicles that crossing actors avoid: all, but vehicle 0 only while it stands."""
     v, poses = state.vehicles, traffic.poses(state)
+    # Vehicle 0 is not avoided while it drives: it is the one that has to react
     rows = np.flatnonzero(v.active)
     rows = rows[rows > 0]
     velocity: Float64[np.ndarray, "M 2"] = v.speed_mps[rows, None] * poses.forward[rows, :2]
@@ -155,6 +163,7 @@ class Director:
     ) -> ScenarioProgress:
         index = self._numbers.index(progress.number)
         actor = state.scripted_actors[index]
+        # Over if the vehicle has passed or the actor has crossed
         if ego.front_gap_m(scenario.at_m) < -PASSED_M or actor.s_m >= actor.length_m:
             return progress.after()
         pace = pace_to_begin(scenario, actor, ego) if progress.since_s is None else None

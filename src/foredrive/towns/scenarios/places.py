@@ -35,17 +35,21 @@ def at_junctions(road: RoadContext, stretches: list[Stretch]) -> Iterator[Scenar
     """Yield oncoming traffic at left turns, and red light runners from the side at lights."""
     graph = road.graph
     heading = _start_headings(graph)
+    # Only lanes inside junctions that the route does not begin in
     for leg, from_m, to_m in stretches:
         lane = leg.lane
         if graph.junction[lane] < 0 or from_m < 1.0:
             continue
+        # Other lanes that cross this one, by the kind of scenario that they allow
         ways: dict[ScenarioKind, list[tuple[float, Way]]] = {}
         for other in np.unique(_conflicting(graph, lane)).tolist():
             facing = float(np.cos(heading[other] - heading[lane]))
+            # Both lanes have lights; at stop and yield signs there is no such scenario
             lit = graph.control[lane] == LaneControl.LIGHT and graph.control[other] == LaneControl.LIGHT
             guarded = graph.control[[lane, other]].max() > LaneControl.LIGHT
             if abs(graph.turn_rad[other]) > TURN_RAD or guarded:
                 continue
+            # Against each other and turning left: oncoming. Across at a light: red light runner
             if graph.turn_rad[lane] > TURN_RAD and facing < AHEAD_COS:
                 kind = ScenarioKind.ONCOMING_TRAFFIC
             elif lit and abs(facing) < ACROSS_COS:
@@ -56,9 +60,11 @@ def at_junctions(road: RoadContext, stretches: list[Stretch]) -> Iterator[Scenar
             if met is not None:
                 ways.setdefault(kind, []).append(met)
         limit = float(graph.limit_mps[lane])
+        # The first meeting point counts, with all ways that meet about there
         for kind, found in ways.items():
             first_m = min(at_m for at_m, _ in found)
             nearest = tuple(way for at_m, way in found if at_m < first_m + MEET_M)
+            # Speed of the ego vehicle in its turn
             through = float(graph.speed_mps[graph.first[lane] : graph.first[lane] + graph.count[lane]].min())
             predictable = first_m > MIN_APPROACH_M and through > MIN_THROUGH_MPS
             if kind is ScenarioKind.RED_LIGHT_RUNNER and not predictable:
@@ -82,8 +88,10 @@ def _met(road: RoadContext, lane: int, other: int, about_m: float) -> tuple[floa
     """
     graph = road.graph
     mine, theirs = graph.samples(lane), graph.samples(other)
+    # Nearest pair of samples of both lanes
     apart_m = np.hypot(*(mine[:, None, :2] - theirs[None, :, :2]).transpose(2, 0, 1))
     i, j = np.unravel_index(int(np.argmin(apart_m)), apart_m.shape)
+    # The other vehicle needs a straight approach of some length
     before = _upstream(graph, other)
     upstream_m = float(graph.length_m[before].sum())
     if apart_m[i, j] > MEET_M or upstream_m < MIN_UPSTREAM_M:
@@ -107,6 +115,7 @@ def _upstream(graph: LaneGraph, lane: int) -> list[int]:
             break
         before.insert(0, straightest)
         length_m += float(graph.length_m[straightest])
+    # It may not begin on a contested lane
     while before and graph.contested[before[0]]:
         before.pop(0)
     return before
@@ -153,6 +162,7 @@ def possible_scenarios(route: DriveRoute, world: World, rng: np.random.Generator
     possible = [*at_junctions(road, stretches), *_on_stretches(road, stretches, rng)]
     possible += beside_parked(road)
     last_m = route.length_m - CLEAR_OF_END_M
+    # Clear of the route's ends; some kinds only have to be over before the end
     within = [s for s in possible if s.at_m >= FIRST_M and (s.at_m <= last_m or s.kind in ENDS_BEFORE)]
     return sorted(within, key=lambda scenario: scenario.at_m)
 
@@ -163,9 +173,11 @@ def _drawn(possible: Sequence[Scenario], rng: np.random.Generator) -> list[Scena
     while True:
         last_m = drawn[-1].at_m if drawn else FIRST_M - APART_M
         apart_m = STAGED_APART_M if drawn else APART_M
+        # The next scenario must be far enough from the last one
         open_to = [s for s in possible if s.at_m >= last_m + (APART_M if s.actor else apart_m)]
         if not open_to:
             return drawn
+        # Among those near, the kind that has been drawn least; then one of that kind
         near = [s for s in open_to if s.at_m <= open_to[0].at_m + CHOICE_M]
         min_count = min(count[s.kind] for s in near)
         kinds = sorted({s.kind for s in near if count[s.kind] == min_count})
@@ -189,11 +201,13 @@ def _on_stretches(
 ) -> Iterator[Scenario]:
     """Yield the scenarios outside of junctions, on runs of lanes between them."""
     graph = road.graph
+    # Runs of lanes between junctions
     for is_inside, group in itertools.groupby(stretches, key=lambda s: bool(graph.junction[s.leg.lane] >= 0)):
         run = list(group)
         if is_inside:
             continue
         first = stretches.index(run[0])
+        # Whether the route has just turned
         turned = first > 0 and abs(graph.turn_rad[stretches[first - 1].leg.lane]) > TURN_RAD
         from_m, to_m = run[0].from_m, run[-1].to_m
         if turned:
@@ -206,6 +220,7 @@ def _on_stretches(
 def _after_turn(road: RoadContext, run: list[Stretch]) -> Iterator[Scenario]:
     graph, leg, from_m = road.graph, run[0].leg, run[0].from_m
     limit = float(graph.limit_mps[leg.lane])
+    # A standing vehicle needs room behind the corner and must be placed unseen
     if leg.to_m - leg.from_m > BEHIND_CORNER_M + 3.0 and can_stand(road, from_m + BEHIND_CORNER_M):
         way = Way((leg.lane, *onward(graph, leg.lane)), leg.from_m + BEHIND_CORNER_M)
         yield Scenario(ScenarioKind.OBSTACLE_BEHIND_CORNER, from_m + BEHIND_CORNER_M, limit, ways=(way,))
@@ -222,6 +237,7 @@ def _along(
         lane = next((s.leg.lane for s in run if at_m <= s.to_m), run[-1].leg.lane)
         limit = float(road.graph.limit_mps[lane])
         category = Category.PEDESTRIAN if rng.random() < 0.5 else Category.BICYCLE
+        # The start of the crossing must be visible for the whole stopping distance
         yield from crossing(road, at_m, limit, category, min(stopping_m(limit) + SPARE_M, at_m))
 
 
@@ -232,6 +248,7 @@ def _lead_and_cut_in(road: RoadContext, stretch: Stretch) -> Iterator[Scenario]:
         return
     way = Way((lane, *onward(graph, lane)), leg.to_m)
     yield Scenario(ScenarioKind.LEAD_BRAKES, to_m, limit, ways=(way,))
+    # Cut-ins from either side where the line may be crossed towards the route
     for side in (0, 1):
         beside = int(graph.sides.lane[side, lane])
         if beside < 0 or not graph.may_cross[1 - side, beside] or graph.contested[beside]:

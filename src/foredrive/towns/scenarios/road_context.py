@@ -40,6 +40,7 @@ def stretches_of(road: RoadContext) -> list[Stretch]:
     route, graph, at_m, found = road.route, road.graph, 0.0, []
     for leg in route.legs:
         ends = graph.position(np.array([leg.lane, leg.lane]), np.array([leg.from_m, leg.to_m]))
+        # Both ends of the leg on the route, searched from the end of the last one
         from_m = arc_m(route, ends[0], at_m)
         at_m = arc_m(route, ends[1], from_m + leg.to_m - leg.from_m)
         found.append(Stretch(leg, from_m, at_m))
@@ -49,12 +50,14 @@ def stretches_of(road: RoadContext) -> list[Stretch]:
 def arc_m(route: DriveRoute, xyz: Float64[np.ndarray, "3"], about_m: float) -> float:
     """Return the position on the route, m, that is nearest to a point, searched around `about_m`."""
     away_m = np.hypot(*(route.xyz[:, :2] - xyz[:2]).T)
+    # Only points near the expected position: routes may cross themselves
     away_m[np.abs(route.arc_m - about_m) > AROUND_M] = np.inf
     return float(route.arc_m[np.argmin(away_m)]) if np.isfinite(away_m).any() else about_m
 
 
 def pose(route: DriveRoute, at_m: float) -> tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "2"]]:
     """Return a point of the route, m, and the unit vector of its heading there."""
+    # Heading from 1.5 m before to 1.5 m after
     at, before, after = (points_at(route.xyz, route.arc_m, at_m + ds) for ds in (0.0, -1.5, 1.5))
     step = (after - before)[:2]
     return at, step / np.hypot(*step)
@@ -67,5 +70,6 @@ def onward(graph: LaneGraph, lane: int) -> list[int]:
         options = graph.successors[lanes[-1], : graph.successor_count[lanes[-1]]]
         if not len(options):
             break
+        # The straightest successor each time
         lanes.append(int(options[np.argmin(np.abs(graph.turn_rad[options]))]))
     return lanes[1:]

@@ -50,6 +50,7 @@ long."""
 def give_orders(context: ScenarioContext, dt_s: float) -> ScenarioContext:
     """Return the context with the orders for its vehicles. When a scenario is over, the next one follows."""
     progress, ego = context.progress, context.ego
+    # A cut-in goes on even when the ego vehicle has passed
     if context.scenario.kind is ScenarioKind.CUT_IN and progress.since_s is not None:
         return _continue_cut_in(context, progress.since_s)
     if ego.front_gap_m(context.scenario.at_m) < -PASSED_M:
@@ -59,11 +60,13 @@ def give_orders(context: ScenarioContext, dt_s: float) -> ScenarioContext:
     if context.scenario.kind in MEETINGS:
         progress = _without_passed(context)
         context = context._replace(progress=progress)
+    # Without its vehicle a scenario is over
     lead_m = context.along_m(progress.slots[0]) if progress.slots else None
     if lead_m is None:
         return _ended(context)
     if progress.since_s is None and context.scenario.kind in ENDS_BEFORE and lead_m > context.way.meet_m:
         return _ended(context)  # no vehicle brakes or changes lanes in a junction for the scenario
+    # Count for how long other vehicles are held up
     if progress.since_s is None and context.scenario.kind in LANE_BLOCKERS:
         held_s = progress.holds_up_s + dt_s if context.holds_up() else 0.0
         context = context._replace(progress=dataclasses.replace(progress, holds_up_s=held_s))
@@ -109,6 +112,7 @@ def _gap_m(context: ScenarioContext, lead_m: float) -> float:
 
     That vehicle is ahead on the route or beside it.
     """
+    # Position of the lead vehicle on the route: its distance to the meeting point, taken from there
     on_route_m = context.scenario.at_m - (context.way.meet_m - lead_m)
     return context.ego.front_gap_m(on_route_m) - context.half_m(context.progress.slots[0])
 
@@ -116,6 +120,7 @@ def _gap_m(context: ScenarioContext, lead_m: float) -> float:
 def _cruise_ahead(context: ScenarioContext, gap_m: float) -> None:
     """Order the lead vehicle to drive slowly once the ego vehicle is near."""
     slot = context.progress.slots[0]
+    # It sets off when the ego vehicle is near, or when others wait behind it
     goes = context.ego.has_set_out and (gap_m < SETS_OFF_M or context.speed_mps(slot) > MOVES_MPS)
     goes |= context.progress.holds_up_s > STANDS_S
     context.towards_mps(slot, SLOW[context.scenario.kind] * context.scenario.limit_mps if goes else 0.0)
@@ -123,6 +128,7 @@ def _cruise_ahead(context: ScenarioContext, gap_m: float) -> None:
 
 def _order_lead(context: ScenarioContext, lead_m: float, dt_s: float) -> ScenarioContext:
     progress, ego, slot = context.progress, context.ego, context.progress.slots[0]
+    # Braking: hard for `BRAKES_S`, then it is over
     if progress.since_s is not None:
         if ego.t_s - progress.since_s > BRAKES_S:
             return _ended(context)
@@ -130,9 +136,12 @@ def _order_lead(context: ScenarioContext, lead_m: float, dt_s: float) -> Scenari
         return context
     gap_m, lead_mps = _gap_m(context, lead_m), context.speed_mps(slot)
     _cruise_ahead(context, gap_m)
+    # It would come to rest beyond the end: do not begin
     if lead_m + lead_mps**2 / (2 * BRAKES_MPS2) > context.way.meet_m:
         return context
+    # The ego vehicle needs its stopping distance less the lead's braking distance
     min_gap_m = ego.stopping_m() - lead_mps**2 / (2 * BRAKES_MPS2)
+    # The next step might be too late: `soon_m` includes the way until then
     soon_m = min_gap_m + SPARE_M + ego.speed_mps * dt_s
     if _follows(context, gap_m) and gap_m >= min_gap_m and (gap_m < soon_m or progress.waited_s > FOLLOWED_S):
         context.orders.max_mps2[slot] = -BRAKES_MPS2
@@ -148,8 +157,10 @@ def _follows(context: ScenarioContext, gap_m: float) -> bool:
 def _order_obstacle(context: ScenarioContext) -> ScenarioContext:
     progress, ego, slot = context.progress, context.ego, context.progress.slots[0]
     gap_m = ego.front_gap_m(context.scenario.at_m) - context.half_m(slot)
+    # It counts as begun when the ego vehicle has to brake for it
     if progress.since_s is None and gap_m < ego.stopping_m() + SPARE_M and ego.speed_mps > MOVES_MPS:
         context = _begun(context)
+    # It drives on when somebody has waited behind it, or after a maximum time
     if progress.waited_s > STANDS_S or (
         progress.since_s is not None and ego.t_s - progress.since_s > BLOCKS_S
     ):
@@ -174,9 +185,11 @@ def _order_cut_in(context: ScenarioContext, lead_m: float) -> ScenarioContext:
     ego, slot, gap_m = context.ego, context.progress.slots[0], _gap_m(context, lead_m)
     _cruise_ahead(context, gap_m)
     lead_mps = context.speed_mps(slot)
+    # The change must be completed before the meeting point
     has_room = lead_m + change_length_m(context.state.vehicles)[slot] < context.way.meet_m
     if lead_mps < MOVES_MPS or not has_room:
         return context
+    # Only a faster ego vehicle can be cut in on, and it must still be able to slow down
     closing_mps = ego.speed_mps - lead_mps
     # The lead keeps its speed, so the ego vehicle's excess speed counts.
     min_gap_m = max(stopping_m(closing_mps, ego.acceleration_mps2), MIN_CUT_IN_M)
@@ -199,6 +212,7 @@ def _is_free(context: ScenarioContext, slot: int) -> bool:
     poses, v = context.traffic.poses(context.state), context.state.vehicles
     ahead = poses.forward[slot, :2]
     left = np.array([-ahead[1], ahead[0]]) * (1.0 if context.scenario.side == 0 else -1.0)
+    # Others in the frame of the cutting-in vehicle: beside it on the side of the change
     offset = poses.centre_m[:, :2] - poses.centre_m[slot, :2]
     there = v.active & (np.abs(offset @ ahead) < BESIDE_M) & (offset @ left > ASIDE_M)
     there &= offset @ left < 3 * ASIDE_M
@@ -214,10 +228,13 @@ def _order_meeting(context: ScenarioContext, lead_m: float) -> ScenarioContext:
     """
     scenario, progress, ego, slot = context.scenario, context.progress, context.ego, context.progress.slots[0]
     runs = scenario.kind is ScenarioKind.RED_LIGHT_RUNNER
+    # Distance of the bumper to the junction's line, and room before the crossing area
     line_m = context.way.line_m - lead_m - context.half_m(slot)
     room_m = ego.front_gap_m(scenario.at_m - ROOM_M)
+    # Others react to the ego vehicle only if it stands in their way
     context.orders.ignores_ego[list(progress.slots)] = ego.speed_mps > MOVES_MPS or room_m > 0.0
     comes = ego.speed_mps > MOVES_MPS and ego.middle_gap_m(scenario.at_m) > 0.0
+    # Begun: a red light runner keeps its speed; oncoming traffic keeps adjusting its arrival
     if progress.since_s is not None:
         if runs:
             context.towards_mps(slot, progress.cruise_mps)
@@ -225,13 +242,17 @@ def _order_meeting(context: ScenarioContext, lead_m: float) -> ScenarioContext:
         return _order_arrival(context, lead_m, 1.0) if comes and room_m > 0.0 else context
     if progress.waited_s > MAX_WAIT_S:
         return _ended(context)
+    # Wait until the ego vehicle comes, has no red light, and it is time to go
     if not comes or not is_let_go(context, ego.arrival_s(scenario)) or (runs and _has_time(context, lead_m)):
         _order_wait(context, slot, line_m if runs else context.way.meet_m - lead_m)
         return context
+    # Approach so that both arrive together
     context = _order_arrival(context, lead_m, MAX_LIMIT_SHARE if runs else 1.0)
     spare_m = room_m - ego.stopping_m()
+    # Oncoming traffic has begun when the ego vehicle must brake or go first
     if not runs:
         return _begun(context) if spare_m < SPARE_M else context
+    # A runner has begun when it visibly cannot stop. Before that, the ego vehicle must have room to stop
     if line_m < context.speed_mps(slot) ** 2 / (2 * RUNS_MPS2):
         return _order_run(_begun(context), slot, line_m)
     return _ended(context) if spare_m < 0.0 else _order_run(context, slot, line_m)
@@ -240,6 +261,7 @@ def _order_meeting(context: ScenarioContext, lead_m: float) -> ScenarioContext:
 def _has_time(context: ScenarioContext, lead_m: float) -> bool:
     """Return whether it is too early for a standing vehicle to start."""
     speed, way_m = context.speed_mps(context.progress.slots[0]), context.way.meet_m - lead_m
+    # Time that the vehicle would need with an easy start
     needs_s = SETS_OUT_S + arrival_s(way_m, speed, GATHERS_MPS2, EASY * context.scenario.limit_mps)
     return speed < MOVES_MPS and context.ego.arrival_s(context.scenario) > needs_s
 
@@ -250,6 +272,7 @@ def _order_arrival(context: ScenarioContext, lead_m: float, limit_share: float) 
     if lead_m > context.way.meet_m:
         return context
     arrives_s = max(context.ego.arrival_s(scenario), 0.1)
+    # Speed that arrives with the ego vehicle, limited
     wanted = cruise_mps(context.way.meet_m - lead_m, arrives_s, context.speed_mps(slot), GATHERS_MPS2)
     wanted = min(wanted, limit_share * scenario.limit_mps)
     context.towards_mps(slot, wanted)
@@ -262,6 +285,7 @@ def _order_wait(context: ScenarioContext, slot: int, to_go_m: float) -> None:
     A red light runner waits before its line. For all other vehicles the lights do this.
     """
     if context.scenario.kind is ScenarioKind.RED_LIGHT_RUNNER:
+        # Creep towards the waiting place, slower as it comes nearer
         context.towards_mps(slot, min(max((to_go_m - RUN_UP_M) / 3.0, 0.0), CREEP_MPS))
     elif not context.ego.has_set_out:
         context.towards_mps(slot, 0.0)
@@ -271,6 +295,7 @@ def _order_wait(context: ScenarioContext, slot: int, to_go_m: float) -> None:
 
 def _order_run(context: ScenarioContext, slot: int, line_m: float) -> ScenarioContext:
     context.orders.runs_lights[slot] = True
+    # Near the line it gets right of way, so that others let it pass
     if line_m > RESERVES_M:
         return context
     lane = next(

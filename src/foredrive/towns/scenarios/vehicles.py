@@ -34,8 +34,10 @@ APPROACHING_MPS = 3.0
 
 def can_stand(road: RoadContext, at_m: float) -> bool:
     """Return whether a standing vehicle can be placed at a point of a route unseen."""
+    # Near the start of the drive a vehicle may be placed in sight
     if at_m < EARLY_M:
         return True
+    # From a distance at which it cannot be seen, some time on the way there
     away_m = np.arange(SPAWN_MIN_M, EARLY_M, SAMPLES_M)
     return _is_far(road, np.full(len(away_m), at_m), at_m - away_m)
 
@@ -64,8 +66,10 @@ def place_vehicles(context: ScenarioContext, at_start: bool) -> ScenarioContext:
         at_start: whether the drive is about to begin, so that vehicles may also appear in sight.
     """
     gap_m = context.ego.middle_gap_m(context.scenario.at_m)
+    # Only scenarios ahead and near enough
     if not 0.0 < gap_m < EARLY_M:
         return context
+    # Take the first way on which the vehicles can be placed
     for number, way in enumerate(context.scenario.ways):
         begin_m, speed_mps = _begin(context, way, gap_m, at_start)
         if begin_m is None or begin_m < BEGIN_M:
@@ -83,13 +87,16 @@ def _begin(context: ScenarioContext, way: Way, gap_m: float, at_start: bool) -> 
         return way.meet_m, 0.0
     if scenario.kind in MEETINGS:
         if at_start and scenario.kind is ScenarioKind.RED_LIGHT_RUNNER:
+            # A runner waits before its line; oncoming traffic at the distance of the ego vehicle
             return way.line_m - RUN_UP_M - CAR_M, 0.0
         if at_start:
             return way.meet_m - min(max(gap_m, AT_START_M[0]), AT_START_M[1]), 0.0
+        # Later: where a vehicle at the limit would have to be now to arrive at the same time
         arrives_s = ego.arrival_s(scenario)
         if ego.speed_mps < APPROACHING_MPS or not is_let_go(context, arrives_s):
             return None, 0.0
         return way.meet_m - scenario.limit_mps * arrives_s, scenario.limit_mps
+    # Lead and cut-in vehicles begin some distance ahead of the ego vehicle
     ahead_m, shared_m = (AHEAD_AT_START_M, SHARED_AT_START_M) if at_start else (AHEAD_M, SHARED_M)
     if gap_m - ahead_m < shared_m:
         return None, 0.0
@@ -107,17 +114,21 @@ def _placed(
 ) -> ScenarioContext | None:
     traffic, way, kind = context.traffic, context.scenario.ways[number], context.scenario.kind
     count = STREAM if kind is ScenarioKind.ONCOMING_TRAFFIC else 1
+    # Oncoming traffic is a stream of several vehicles, one behind the other
     begins_m = [begin_m - k * STREAM_APART_M for k in range(count)]
     begins_m = [m for m in begins_m if m >= BEGIN_M]
     places = points_along(traffic.lanes, way.lanes, np.array(begins_m))
+    # None may appear in sight
     if not at_start and np.linalg.norm(places - context.ego.centre_m, axis=1).min() < SPAWN_MIN_M:
         return None
+    # Remove other vehicles from the stretch that they need
     until_m = way.meet_m if kind is ScenarioKind.RED_LIGHT_RUNNER else begin_m + 2 * SAMPLES_M
     from_m = begins_m[-1] - 2 * SAMPLES_M
     if kind in (ScenarioKind.LEAD_BRAKES, ScenarioKind.CUT_IN) and at_start:
         from_m = begin_m - AHEAD_AT_START_M + 2 * SAMPLES_M
     room = points_along(traffic.lanes, way.lanes, np.arange(max(from_m, 0.0), until_m, SAMPLES_M))
     state = clear_area(traffic, context.state, room, 0.0 if at_start else SPAWN_MIN_M - 5.0)
+    # Slots of scenarios that are not in use
     free = (
         [] if state is None else [slot for slot in traffic.scenario_slots if not state.vehicles.active[slot]]
     )

@@ -80,6 +80,7 @@ class ShapeLibrary:
             palettes = ("bus", "bus", "bus")
         else:
             palettes = ("car", "cargo", "car")
+        # Random numbers follow from the style, so that an actor keeps its paint
         mixed = zip(palettes, _paint_numbers(actor.style), strict=True)
         chosen = [self.paints[p][int(u * len(self.paints[p]))] for p, u in mixed]
         return np.array([*chosen, rear_light], dtype=np.int32)
@@ -128,6 +129,7 @@ def _person(actor: ActorState) -> str:
     dress = DRESSES[actor.style % len(DRESSES)]
     if np.linalg.norm(actor.velocity_mps) < WALKING_MPS:
         return f"{dress}_standing"
+    # Phase of the step by the distance along the heading: feet do not slide
     along = actor.centre_m[0] * np.cos(actor.yaw) + actor.centre_m[1] * np.sin(actor.yaw)
     return f"{dress}_{int(along / STRIDE_M * POSES) % POSES}"
 
@@ -156,8 +158,10 @@ def unit_to_world(actor: ActorState) -> Float[np.ndarray, "4 4"]:
     cos, sin = np.cos(actor.yaw), np.sin(actor.yaw)
     up, ahead = np.sin(actor.pitch), np.cos(actor.pitch)
     yaw = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
+    # Positive pitch lowers the nose: x ahead tilts towards -z
     pitch = np.array([[ahead, 0.0, up], [0.0, 1.0, 0.0], [-up, 0.0, ahead]])
     T = np.eye(4)
+    # Scale to the box first, then pitch, then yaw
     T[:3, :3] = yaw @ pitch * actor.size_lwh
     T[:3, 3] = actor.centre_m
     return T
@@ -168,13 +172,16 @@ def _solid(scene: TriangleScene, size_m: tuple[float, float]) -> Intervals:
 
     `size_m` is the approximate size of the object and sets the sampling.
     """
+    # A grid of vertical lines through the unit box
     counts = [int(np.ceil(edge / SOLID_CELL_M)) for edge in size_m]
     x, y = (a.ravel() for a in np.meshgrid(*((np.arange(n) + 0.5) / n - 0.5 for n in counts)))
     ends = []
+    # Cast from above and from below: the first hits are the upper and the lower end
     for side in (1.0, -1.0):
         origin = np.column_stack([x, y, np.full_like(x, side)]).astype(np.float32)
         direction = np.tile(np.array([0.0, 0.0, -side], np.float32), (len(x), 1))
         hits = scene.cast(origin, direction)
+        # The unit box reaches from -½ to ½; rays begin outside of it
         ends.append(side - side * hits.t)
     met = hits.triangle != MISS
     x, y, high, low = (a[met].astype(np.float32) for a in (x, y, *ends))

@@ -63,6 +63,7 @@ class SensorSuite(VehicleSensors):
     def pixel_rad(self) -> Float32[np.ndarray, "P"]:
         """Return the angle between neighbouring pixels at each pixel, rad."""
         height, width = self.rig.size_hw
+        # A pixel's width over the focal length
         return (1.0 / self.rig.K[:, 0, 0]).repeat_interleave(height * width).numpy()
 
 
@@ -97,8 +98,10 @@ class EgoMotion:
 
     def to_world_at_ray_times(self, rays: EgoRays) -> WorldRays:
         """Transform rays from the ego frame of the time at which each of them is measured to the world."""
+        # A vehicle at rest has the same pose at all times; the others may still move
         if not self.twist_ego.any():
             return self.to_world(rays, np.arange(len(rays.dt_s)))._replace(dt_s=rays.dt_s)
+        # Rays of one row share their time: compute each pose once
         dt_s, row = np.unique(rays.dt_s, return_inverse=True)
         T_now_then = exp_se3(torch.from_numpy(dt_s[:, None].astype(np.float64) * self.twist_ego)).numpy()
         T = (self.T_world_ego @ T_now_then)[:, :3].astype(np.float32)[row]
@@ -125,6 +128,7 @@ class RayTracer:
 
         `ray_rad` is the angle between neighbouring rays, rad.
         """
+        # Hits, then surfaces there, then shadows: one ray to the sun for each surface that faces it
         hits = self.cast(rays)
         found = shading.surfaces(self.scene, hits, rays.origin, rays.direction, ray_rad)
         return hits, found, self.sunlit(found, hits, rays.dt_s)
@@ -146,6 +150,7 @@ class RayTracer:
         materials, light = self.scene.materials, self.light
         out = shading.shade(materials, found, hits.t, rays.direction, lit, light, mirrored, known)
         if light.air.foggy and len(light.lamps.lamp_index) > 0:
+            # Rays into the sky pass all fog lamps: their end is at infinity
             t = np.where(found.material == shading.MISS, np.float32(np.inf), hits.t)
             add_beams(light.lamps, light.air.extinction_per_m, t, rays.origin, rays.direction, known, out)
         return out
@@ -171,6 +176,7 @@ class RayTracer:
         """
         if self.light.air.wetness == 0.0:
             return NOT_KNOWN
+        # One more ray for each hit on water that mirrors enough; it is shaded without further mirrors
         out = np.full((len(hits.t), 3), -1.0, np.float32)
         origin, direction = np.empty_like(out), np.empty_like(out)
         wetness, materials = self.light.air.wetness, self.scene.materials
@@ -195,6 +201,7 @@ class Film:
 
     def expose(self, pixels: slice | Int64[np.ndarray, "n"], radiance: Rays, samples: int) -> None:
         """Set the light of pixels, from `samples` rays for each."""
+        # Without noise the pixels are developed at once; noise needs all linear values first
         if self._linear is None:
             self._rgb[pixels] = shading.develop(radiance, self._exposure, samples)
         else:
@@ -240,6 +247,7 @@ def _render_sharp(
     rgb, normal = np.empty((count, 3), np.float32), np.empty((count, 3), np.float32)
     known = ShadedPixels(rgb, normal, np.empty(count, np.bool_))
 
+    # Rows of a rolling shutter have their own times; else one pose serves all rays
     def to_world(rays: EgoRays, rows: Int64[np.ndarray, "n"]) -> WorldRays:
         return (
             ego.to_world_at_ray_times(EgoRays(*(column[rows] for column in rays)))
@@ -256,10 +264,12 @@ def _render_sharp(
         record_hits(buffer, part, hits, found.material)
         known.radiance[part], known.normal[part], known.lit[part] = radiance, found.normal, lit
 
+    # First pass: one ray through each pixel's centre
     in_parallel(trace_centres, count, PIXEL_GRAIN)
     if samples == 1:
         return
     shape = (len(sensors.rig.names), *sensors.rig.size_hw)
+    # Second pass: several rays for the pixels on edges, with correspondingly smaller footprints
     pixels = np.flatnonzero(outlines(buffer, known, film.noise_free, shape))
 
     def trace_outlines(start: int, stop: int) -> None:
@@ -268,6 +278,7 @@ def _render_sharp(
         rays = to_world(sensors.outline_rays, rows)
         ray_rad = np.repeat(sensors.pixel_rad[some], samples) / np.float32(samples**0.5)
         hits, found, lit = tracer.trace(rays, ray_rad)
+        # Rays that find the same as the centre take its result instead of being shaded
         same = same_as_centre(some, samples, found, hits.actor, lit, buffer, known)
         film.expose(some, tracer.radiance(hits, found, lit, rays, ray_rad, same), samples)
 
@@ -282,12 +293,14 @@ def _render_blurred(
 
     def job(start: int, stop: int) -> None:
         part = slice(start, stop)
+        # The buffer for labels has the hits in the middle of the exposure
         rays = ego.to_world_at_ray_times(EgoRays(*(column[part] for column in sensors.pixel_rays)))
         hits = tracer.cast(rays)
         ray_rad = sensors.pixel_rad[part]
         found = shading.surfaces(tracer.scene, hits, rays.origin, rays.direction, ray_rad)
         record_hits(buffer, part, hits, found.material)
         total = np.zeros((stop - start, 3), np.float32)
+        # Each instant uses another of the pixel's sub-positions, so that edges are smooth too
         for k, dt_s in enumerate(optics.sub_exposure_dt_s):
             origin, direction, row_dt_s = sensors.outline_rays
             rows = slice(start * samples + k % samples, stop * samples, samples)
@@ -308,16 +321,19 @@ def simulate_sweep(
     Road users move straight ahead during the revolution. A beam without a return is free up to the surface
     that it hit.
     """
+    # All beams of a revolution, each with its own firing time and the vehicle's pose then
     beams = lidar.beams(torch.from_numpy(np.asarray(ego.twist_ego, dtype=np.float32)))
     rays, n = lidar.footprints(beams), lidar.rays_per_beam
     ego_rays = EgoRays(rays.origin_ego.numpy(), rays.dir_ego.numpy(), rays.dt_s.numpy())
     count = len(beams.dt_s)
+    # Random numbers are drawn for all beams at once: the result does not depend on threads
     chance = rng.random((count, 2), dtype=np.float32)
     noise_m = rng.standard_normal(count, dtype=np.float32) * np.float32(lidar.range_noise_m)
     range_m, intensity = np.empty(count, np.float32), np.empty(count, np.float32)
     returned = np.empty(count, np.bool_)
     buffer, air, far_m = empty_hit_buffer(count), tracer.light.air, np.float32(lidar.max_range_m)
     clutter = rng.random((count if air.backscatter_per_m_sr > 0 else 0, 4), dtype=np.float32)
+    # Angle between neighbouring rays, for the filter of textures
     beam_rad = np.float32(2 * np.pi / lidar.azimuth_steps if n == 1 else lidar.divergence_rad / n**0.5)
 
     def job(start: int, stop: int) -> None:
@@ -327,9 +343,11 @@ def simulate_sweep(
         ray_rad = np.full(len(hits.t), beam_rad)
         found = shading.surfaces(tracer.scene, hits, rays.origin, rays.direction, ray_rad)
         odds = chance[part]
+        # Rays of one beam that end within a pulse's depth form one echo
         if n > 1:
             t = np.where(found.material == shading.MISS, np.inf, hits.t).reshape(-1, n)
             group, share = echoes.group_echoes(t, lidar.pulse_m)
+            # Returns of the surfaces; then one echo for each beam
             odds = echoes.footprint_chance(odds, share)
         material = found.material
         echo = lidar_returns(tracer.scene.materials, found, hits.t, far_m, odds, air)
@@ -338,12 +356,15 @@ def simulate_sweep(
             hits, material = shading.Hits(*(column[picked] for column in hits)), material[picked]
         range_m[part], returned[part], intensity[part] = echo
         record_hits(buffer, part, hits, material)
+        # Fog and rain may return the pulse before the surface does
         if len(clutter):
             surfaces = range_m[part], returned[part], intensity[part]
             of_air = air_returns(air, clutter[part], lidar.pulse_m, far_m, *surfaces)
+            # An echo of the air has no surface: its labels are those of a miss
             buffer.triangle[part][of_air], buffer.material[part][of_air] = shading.MISS, shading.MISS
 
     in_parallel(job, count, BEAM_GRAIN // n)
+    # Too close returns are lost; range noise is added to what is left
     returned &= range_m >= lidar.min_range_m
     range_m = np.where(returned, (range_m + noise_m).clip(min=0.0), range_m)
     return LidarSweep(

@@ -29,10 +29,12 @@ def group_echoes(t, pulse_m):
     for b in range(beams):
         order = np.argsort(t[b])
         number, start = 0, 0
+        # Sorted by range, an echo grows while the rays lie within one pulse from its first
         for k in range(n + 1):
             if k < n and (k == start or t[b, order[k]] - t[b, order[start]] <= pulse_m):
                 group[b, order[k]] = number
                 continue
+            # Close the echo: each of its rays gets the share of the beam that it stands for
             for j in range(start, k):
                 share[b, order[j]] = (k - start) / n
             if k < n:
@@ -60,6 +62,8 @@ def footprint_chance(
 def _pick(group, range_m, returned, intensity, last, out_range, out_returned, out_intensity, out_ray):
     beams, n = group.shape
     for b in range(beams):
+        # Energy of each echo: sum of intensity over r²; groups are
+        # numbered by range, so the last wins for `last`
         best, found = -1.0, -1
         for g in range(n):
             energy = 0.0
@@ -69,6 +73,7 @@ def _pick(group, range_m, returned, intensity, last, out_range, out_returned, ou
             if energy > 0.0 and (last or energy > best):
                 best, found = energy, g
         out_returned[b] = found >= 0
+        # Without an echo take the nearest ray; else the weighted mean range and the strongest ray
         total, weighted, ray = 0.0, 0.0, 0
         for k in range(n):
             if found < 0:

@@ -143,6 +143,7 @@ def new_instances(scenes: list[int], T: Float[np.ndarray, "A K 3 4"]) -> int:
     """
     geometries = []
     for scene, steps in zip(scenes, np.ascontiguousarray(T, dtype=np.float32), strict=True):
+        # Equal maps need no motion blur
         steps = steps[:1] if (steps == steps[0]).all() else steps
         geometry = _lib.rtcNewGeometry(_device(), _INSTANCE)
         _lib.rtcSetGeometryInstancedScene(geometry, scene)
@@ -194,6 +195,7 @@ def _fill(packet, valid, origin, direction, time, first):
     whole = packet.view(np.int32)
     for lane in range(WIDTH):
         i = first + lane
+        # -1 is a valid lane, 0 an inactive one
         valid[lane] = -1 if i < len(origin) else 0
         if i >= len(origin):
             continue
@@ -201,6 +203,7 @@ def _fill(packet, valid, origin, direction, time, first):
             packet[(_ORIGIN + axis) * WIDTH + lane] = origin[i, axis]
             packet[(_DIRECTION + axis) * WIDTH + lane] = direction[i, axis]
         packet[_NEAR * WIDTH + lane] = 0.0
+        # Without times all rays are at the middle of the interval
         packet[_TIME * WIDTH + lane] = time[i] if len(time) > 0 else 0.5
         packet[_FAR * WIDTH + lane] = np.inf
         whole[_MASK * WIDTH + lane] = -1
@@ -215,7 +218,9 @@ def _intersect_all(scenes, origin, direction, time, hits, arguments):
     whole = packet.view(np.int32)
     for first in range(0, len(origin), WIDTH):
         _fill(packet, valid, origin, direction, time, first)
+        # MISS in all result words: Embree writes only where there is a hit
         whole[_TRIANGLE * WIDTH : (_ACTOR + 1) * WIDTH] = MISS
+        # Each scene shortens `far`, so that the nearest hit of all remains
         for scene in scenes:
             _intersect(valid.ctypes.data, scene, packet.ctypes.data, arguments)
         for lane in range(min(WIDTH, len(origin) - first)):
@@ -234,6 +239,7 @@ def _occluded_all(scenes, origin, direction, time, out, arguments):
         for scene in scenes:
             _occluded(valid.ctypes.data, scene, packet.ctypes.data, arguments)
         for lane in range(min(WIDTH, len(origin) - first)):
+            # Embree sets `far` to minus infinity where something is hit
             out[first + lane] = packet[_FAR * WIDTH + lane] < 0.0
 
 

@@ -57,11 +57,13 @@ def gather_lamps(
     """Gather the lamps near the vehicle: street lamps, lamps of other vehicles, and its own."""
     centre = T_world_ego[:2, 3]
     origin = centre - 0.5 * CELL_M * CELLS
+    # Lamps beyond the grid can still reach into it
     close = (np.abs(street_xyz[:, :2] - centre) < 0.5 * CELL_M * CELLS + REACH_M[STREET]).all(1)
     lamps: list[tuple[Sequence[float], Sequence[float], int]] = [
         (xyz, (0.0, 0.0), STREET) for xyz in street_xyz[close].tolist()
     ]
     ahead, length = T_world_ego[:3, 0], EGO_VEHICLE.length
+    # The vehicle's own lamps: middle of its body, 0.65 m above the road
     middle = T_world_ego[:3, 3] + EGO_VEHICLE.rear_axle_to_center_longitudinal * ahead
     middle = middle + 0.65 * T_world_ego[:3, 2]
     lamps += _pair(middle, float(np.arctan2(ahead[1], ahead[0])), length)
@@ -73,6 +75,7 @@ def gather_lamps(
     xyz = np.array([lamp[0] for lamp in lamps], dtype=np.float32)
     heading = np.array([lamp[1] for lamp in lamps], dtype=np.float32)
     kind = np.array([lamp[2] for lamp in lamps], dtype=np.int32)
+    # Intensities relative to `UNIT_LUX`, so that irradiance is in units of the radiance scale
     power = np.array([STREET_CD, HEAD_CD, TAIL_CD])[:, None] * [STREET_RGB, HEAD_RGB, TAIL_RGB] / UNIT_LUX
     first, near = _into_cells(xyz, kind, heading, origin, np.array(REACH_M))
     return LampArrays(xyz, heading, power[kind].astype(np.float32), kind, origin, first, near)
@@ -100,6 +103,7 @@ def _into_cells(xyz, kind, heading, origin, reach_m):
     counts = np.zeros(CELLS * CELLS + 1, np.int32)
     near = np.empty(0, np.int32)
     half = 0.7072 * CELL_M
+    # Two passes over the same loops: count the entries of each cell, then write them
     for fill in range(2):
         for k in range(len(xyz)):
             r = reach_m[kind[k]]
@@ -107,9 +111,11 @@ def _into_cells(xyz, kind, heading, origin, reach_m):
             for row in range(max(int((y - r) // CELL_M), 0), min(int((y + r) // CELL_M) + 1, CELLS)):
                 for column in range(max(int((x - r) // CELL_M), 0), min(int((x + r) // CELL_M) + 1, CELLS)):
                     cx, cy = (column + 0.5) * CELL_M - x, (row + 0.5) * CELL_M - y
+                    # Lamp's reach against the circle around the cell
                     if cx * cx + cy * cy > (r + half) ** 2:
                         continue
                     if kind[k] != STREET:
+                        # Vehicle lamps light a sector of ±45° ahead of them
                         along = cx * heading[k, 0] + cy * heading[k, 1]
                         aside = abs(cx * heading[k, 1] - cy * heading[k, 0])
                         if along < -half or aside > along + 2.0 * half:
@@ -121,6 +127,7 @@ def _into_cells(xyz, kind, heading, origin, reach_m):
                     else:
                         counts[cell + 1] += 1
         if not fill:
+            # Prefix sums: the start of each cell's list
             counts = np.cumsum(counts).astype(np.int32)
             near = np.empty(counts[-1], np.int32)
     first = np.empty_like(counts)  # filling moved the start of each cell to its end
@@ -140,6 +147,7 @@ def relative_intensity(kind, hx, hy, lx, ly, lz):
         return 0.0
     if kind == TAIL:
         return ahead
+    # Angles from the beam's axis, in units of its spread; the cut-off lies below the horizon
     aside = math.atan2(lx * hy - ly * hx, ahead) / HEAD_SPREAD_RAD
     up = (math.asin(min(max(lz, -1.0), 1.0)) + DIPPED_RAD) / HEAD_DEPTH_RAD
     # a soft edge, and stray light above it
@@ -163,6 +171,7 @@ def lamp_light(lamps, x, y, z, nx, ny, nz, dx, dy, dz, shine, out):
     """
     for c in range(6):
         out[c] = 0.0
+    # Cell of the point; beyond the grid there is no lamp light
     column, row = (x - lamps.origin_xy[0]) // CELL_M, (y - lamps.origin_xy[1]) // CELL_M
     if not (0 <= column < CELLS and 0 <= row < CELLS):
         return
@@ -170,9 +179,11 @@ def lamp_light(lamps, x, y, z, nx, ny, nz, dx, dy, dz, shine, out):
     for item in range(lamps.first[cell], lamps.first[cell + 1]):
         k = lamps.lamp_index[item]
         lx, ly, lz = x - lamps.xyz[k, 0], y - lamps.xyz[k, 1], z - lamps.xyz[k, 2]
+        # The smallest distance is limited, so that surfaces at a lamp are not infinitely bright
         square = max(lx * lx + ly * ly + lz * lz, 0.05)
         scale = 1.0 / math.sqrt(square)
         lx, ly, lz = lx * scale, ly * scale, lz * scale
+        # Lambert: cosine between normal and direction to the lamp, and 1 / r²
         facing = -(nx * lx + ny * ly + nz * lz)
         if facing <= 0.0:
             continue
@@ -180,6 +191,7 @@ def lamp_light(lamps, x, y, z, nx, ny, nz, dx, dy, dz, shine, out):
             relative_intensity(lamps.kind[k], lamps.heading[k, 0], lamps.heading[k, 1], lx, ly, lz) / square
         )
         if shine > 0.0:
+            # Blinn-Phong: half vector between light and viewer, with an energy-preserving scale
             hx, hy, hz = -lx - dx, -ly - dy, -lz - dz
             length = math.sqrt(hx * hx + hy * hy + hz * hz)
             middle = max((nx * hx + ny * hy + nz * hz) / max(length, 1e-6), 0.0)

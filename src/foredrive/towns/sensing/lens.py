@@ -26,6 +26,7 @@ Image = UInt8[np.ndarray, "H W 3"]
 
 def add_glare(image: Image) -> Image:
     """Spread the light of the brightest areas, as lenses do at night."""
+    # Only what exceeds the level is blurred and added
     bright = np.maximum(image, GLARE_LEVEL) - np.uint8(GLARE_LEVEL)
     spilt = cv2.GaussianBlur(bright, (0, 0), GLARE_WIDTH * image.shape[1])
     return np.asarray(cv2.addWeighted(image, 1.0, spilt, GLARE_SHARE * 255 / (255 - GLARE_LEVEL), 0.0))
@@ -60,19 +61,23 @@ def _streaks(
 ) -> Float32[np.ndarray, "H W"]:
     """Return the share of each pixel that falling drops hide. The number of drops grows with R^0.63."""
     height, width = size_hw
+    # Drops per volume grow with R^0.63; streaks are drawn as a share of the pixel that they hide
     count = round(STREAKS_PER_PIXEL * height * width * (rain_mmph / 10.0) ** 0.63)
     distance_m = rng.uniform(MIN_STREAK_M, MAX_STREAK_M, count)
     start = rng.random((count, 2)) * (width, 1.3 * height) - (0.0, 0.3 * height)
     slant = rng.normal(0.05, 0.03, count)
+    # Length by the way that the drop falls during the exposure, at its distance
     length_px = focal_px * FALL_MPS * EXPOSURE_S / distance_m
     ends = start + length_px[:, None] * np.column_stack([slant, np.ones(count)])
     wide_px = DROP_M * focal_px / distance_m
     out = np.zeros(size_hw, np.float32)
     lines = np.stack([start, ends], axis=1)
+    # Widths below a pixel become opacity: lines are drawn in groups of similar width
     for low, high in ((0.0, 0.15), (0.15, 0.4), (0.4, np.inf)):
         some = (wide_px >= low) & (wide_px < high)
         if some.any():
             layer = np.zeros(size_hw, np.uint8)
+            # OpenCV's fixed-point coordinates with 4 fractional bits
             points = np.round(lines[some] * 16).astype(np.int32)
             cv2.polylines(layer, list(points), False, 255, 1, cv2.LINE_AA, 4)
             out += layer * np.float32(min(0.5, wide_px[some].mean()) / 255)
@@ -92,6 +97,7 @@ def _lens_drops(
     for _ in range(int(rng.integers(LENS_DROPS // 2, LENS_DROPS + 1))):
         centre_x, centre_y = rng.uniform(0.0, width), rng.uniform(0.0, height)
         radius = width * rng.uniform(*DROP_RADIUS)
+        # A drop acts as a lens: it shows the scene upside down, over a wide angle
         dx, dy = x - np.float32(centre_x), (y - np.float32(centre_y)) * np.float32(rng.uniform(0.75, 1.0))
         near = (dx * dx + dy * dy) / np.float32(radius * radius)
         inside = near < 1.0

@@ -66,21 +66,27 @@ def lidar_returns(materials, found, t, max_range_m, chance, air):
         range_m[i] = max_range_m
         if material == MISS or t[i] > max_range_m:
             continue
+        # The material at the hit, filtered over the beam's footprint
         texture(materials, material, found.xyz, found.uvw, found.extent, i, colour)
         glass, paint, cosine = colour[3], colour[4], found.cosine[i]
+        # Paint with glass beads is brighter; windows transmit or mirror most of the pulse
         reflectivity = materials.reflectivity[material] * (1.0 - paint) + PAINT_REFLECTIVITY * paint
         reflectivity *= 1.0 - GLASS_LOSS * glass
+        # Wet surfaces return less, and level ones below water almost nothing
         if air.wetness > 0.0:
             level = abs(found.normal[i, 2]) > LEVEL_COS and is_paved(materials.surface[material])
             film = 0.0
             if level:
                 film = water_film(air.wetness, materials.surface[material], found.xyz, found.extent, i)
             reflectivity *= (1.0 - WET_LIDAR_LOSS * air.wetness) * (1.0 - FILM_LIDAR_LOSS * film)
+        # The range is known whether the beam returns or not
         range_m[i] = t[i]
         dimmed = math.exp(-2.0 * air.lidar_extinction_per_m * t[i])
+        # Relative to the echo that is lost half of the time
         echo = reflectivity * cosine * dimmed * (LIDAR_REFERENCE_M / max(t[i], 1.0)) ** 2
         if chance[i, 0] < echo / (echo + LIDAR_THRESHOLD):
             returned[i] = True
+            # Retroreflectors return the same at all angles; the intensity has no cosine for them
             back = 1.0 if materials.reflectivity[material] > 1.0 else RETROREFLECTED * paint
             facing = cosine + (1.0 - cosine) * back
             intensity[i] = min(INTENSITY_OF_WHITE * reflectivity * facing * dimmed, 1.0)
@@ -112,19 +118,23 @@ def air_returns(air, chance, pulse_m, max_range_m, range_m, returned, intensity)
     from_air = np.zeros(count, np.bool_)
     if air.backscatter_per_m_sr <= 0.0:
         return from_air
+    # In rain the whole backscatter is concentrated on the pulses that hit a large drop
     share = 1.0 - math.exp(-air.rain_mmph / DROP_MMPH) if air.rain_mmph > 0.0 else 1.0
     reflectivity = math.pi * air.backscatter_per_m_sr * pulse_m / share
     for i in range(count):
         if chance[i, 0] > share:
             continue
+        # Near ranges are more frequent
         r = MIN_CLUTTER_M + CLUTTER_DEPTH_M * chance[i, 1] ** 2
         if r >= min(range_m[i], max_range_m):
             continue
         there = reflectivity * math.exp(-2.0 * air.lidar_extinction_per_m * r)
+        # Exponential fluctuation of the strength (speckle)
         there *= -math.log(max(chance[i, 2], 1e-6))
         echo = there * (LIDAR_REFERENCE_M / r) ** 2
         if chance[i, 3] > echo / (echo + LIDAR_THRESHOLD):
             continue
+        # The lidar reports the stronger of both echoes
         of_surface = intensity[i] / INTENSITY_OF_WHITE * (LIDAR_REFERENCE_M / max(range_m[i], 1.0)) ** 2
         if returned[i] and of_surface > echo:
             continue

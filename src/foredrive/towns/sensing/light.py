@@ -53,6 +53,7 @@ def make_air(conditions: Conditions) -> AirArrays:
     Fog droplets are larger than both wavelengths, so light of 905 nm is attenuated as visible light is.
     Extinction by rain is a part of the extinction that follows from the visibility; the rest is haze.
     """
+    # Koschmieder: extinction = 3.912 / visibility
     extinction = CONTRAST_LOST / conditions.visibility_m
     rain = rain_extinction_per_m(conditions.rain_mmph)
     foggy = conditions.visibility_m < FOG_BELOW_M
@@ -60,6 +61,7 @@ def make_air(conditions: Conditions) -> AirArrays:
     return AirArrays(
         foggy=foggy,
         extinction_per_m=extinction,
+        # Fog attenuates the lidar as it does visible light, haze less; rain by its own law
         lidar_extinction_per_m=rain + droplets * (1.0 if foggy else HAZE_AT_905_NM),
         backscatter_per_m_sr=BACKSCATTER_RATIO * (rain + (droplets if foggy else 0.0)),
         rain_mmph=conditions.rain_mmph,
@@ -139,8 +141,10 @@ def sun_direction(hour: float, east_rad: float) -> Rgb:
     At noon it stands 60° high in the south, as on an equinox at 30° north. `east_rad` is the direction of
     east, counter-clockwise from the world's x, rad.
     """
+    # Angle of the sun on its circle: 0 at 6 o'clock, π at 18
     angle, highest = np.pi * (hour - 6.0) / 12.0, np.deg2rad(NOON_ELEVATION_DEG)
     east, south = np.cos(angle), np.sin(angle) * np.cos(highest)
+    # From east and south to the axes of the world
     cos, sin = np.cos(east_rad), np.sin(east_rad)
     xyz = (east * cos + south * sin, east * sin - south * cos, np.sin(angle) * np.sin(highest))
     return np.array(xyz, dtype=np.float32)
@@ -170,12 +174,16 @@ def _daylight(conditions: Conditions) -> _Daylight:
     """
     height = float(sun_direction(conditions.hour, 0.0)[2])
     elevation_deg, clouds = math.degrees(math.asin(height)), conditions.clouds
+    # Beam: sunlight after the air; level: its part on level ground
     beam = _sun_rgb(elevation_deg)
     level = float(beam[1]) * max(height, 0.0)
+    # Light of the clear sky by interpolation of its logarithm over the elevation
     clear_sky = 10 ** float(np.interp(elevation_deg, _ELEVATION_DEG, np.log10(_SKY_LUX))) / UNIT_LUX
+    # Share of the sun that passes clouds, and then fog on the slant way
     through = min(max((0.9 - clouds) / 0.3, 0.0), 1.0)
     through *= math.exp(-CONTRAST_LOST / conditions.visibility_m * FOG_TOP_M / max(height, 0.05))
     through = through if through > 0.02 else 0.0
+    # Clouds are lit from above where the sun passes, else they are grey
     dimmed = (1.0 - 0.75 * clouds**3.4) * (level + clear_sky)
     cloud = through * SUNLIT_CLOUD * (level + clear_sky) + (1.0 - through) * dimmed
     sky = (1.0 - clouds) * clear_sky + clouds * cloud
@@ -195,13 +203,16 @@ def make_light(conditions: Conditions, east_rad: float) -> LightArrays:
     behind = (1.0 - clouds) * fall.clear + clouds * sky  # of the sky between the clouds
     level_sun = beam * max(float(toward[2]), 0.0)
     town = TOWN_GLOW_LUX + clouds * (TOWN_GLOW_CLOUDED_LUX - TOWN_GLOW_LUX)
+    # By night: glow of the town, scattered light of lit roads, and exposure for a lit street
     dark = white_lux < LAMPS_BELOW_LUX
     night = _rgb(1.0, 0.80, 0.62) * np.float32((town + LIT_STREET_AMBIENT_LUX) / UNIT_LUX if dark else 0.0)
     white = (white_lux + (STREET_LUX if dark else 0.0)) / UNIT_LUX
+    # Cameras adapt incompletely: nights stay darker than days
     exposure = NOON_EXPOSURE * (NOON_WHITE / white) ** ADAPTATION
     exposure *= 1.0 - (0.0 if dark else GREY_SKY_METERED * clouds**2)
     colours = _sky_colours(fall.elevation_deg, clouds)
     glow_lux = _rgb(0.92, 0.80, 0.74) * np.float32(town / UNIT_LUX if dark else 0.0)
+    # Haze shows the light of the sky and a part of the sun's
     veiled = (_rgb(0.46, 0.50, 0.55) + colours.sky) * np.float32(0.5 * sky) + through * 0.2 * level_sun
     return LightArrays(
         sun=toward * np.float32(through > 0.0),
@@ -250,6 +261,7 @@ def _sky_colours(elevation_deg: float, clouds: float) -> _SkyColours:
 
     An overcast sky is three times as bright at the zenith as at the horizon (CIE standard overcast sky).
     """
+    # 1 at the horizon, 0 at 18° and above; 1 for an overcast sky
     low = min(max(1.0 - elevation_deg / 18.0, 0.0), 1.0)
     grey = min(max((clouds - 0.45) / 0.5, 0.0), 1.0)
 
@@ -274,6 +286,7 @@ def _sun_rgb(elevation_deg: float) -> Rgb:
     if elevation_deg < -0.5:
         return _rgb(0.0, 0.0, 0.0)
     height = max(elevation_deg, 0.0)
+    # Beer-Lambert with the air mass of the elevation
     air_mass = 1.0 / (math.sin(math.radians(height)) + 0.50572 * (height + 6.07995) ** -1.6364)
     return (np.array(SUN_OUTSIDE_RGB) * np.exp(-air_mass * np.array(AIR_DEPTH_RGB))).astype(np.float32)
 

@@ -39,14 +39,17 @@ def outlines(buffer, centre, rgb, shape):
     cameras, height, width = shape
     out = np.zeros(cameras * height * width, np.bool_)
     for i in range(len(out)):
+        # Compare with the pixel to the right and the pixel below, within the image
         for step in (1, width):
             j = i + step
             inside = (i % width) + 1 < width if step == 1 else (i // width) % height + 1 < height
             if not inside:
                 continue
+            # An edge of an object or a material; else an edge of a shadow or a bend
             edge = buffer.material[i] != buffer.material[j] or buffer.actor[i] != buffer.actor[j]
             if not edge and buffer.material[i] != MISS:
                 edge = centre.lit[i] != centre.lit[j] or _bends(centre.normal, i, centre.normal, j)
+            # Only edges with a visible contrast need more rays
             if edge:
                 for c in range(3):
                     if abs(np.int32(rgb[i, c]) - np.int32(rgb[j, c])) > CONTRAST:
@@ -69,6 +72,7 @@ def same_as_centre(pixels, samples, found, actor, lit, buffer, centre):
     out = np.full((len(pixels) * samples, 3), np.float32(-1.0))
     for i in range(len(out)):
         pixel = pixels[i // samples]
+        # The same material, actor, light and direction of the surface give the same radiance
         same = found.material[i] == buffer.material[pixel] and actor[i] == buffer.actor[pixel]
         if same and found.material[i] != MISS:
             same = lit[i] == centre.lit[pixel] and not _bends(found.normal, i, centre.normal, pixel)

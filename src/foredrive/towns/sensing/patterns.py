@@ -26,6 +26,7 @@ _kernel = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=True,
 @no_type_check
 def lattice(ix: int, iy: int, seed: int) -> float:
     """Return a random number in 0..1 for a lattice point."""
+    # Integer hash of the lattice point; the table is a power of two
     h = ix * 73856093 ^ iy * 19349663 ^ seed * 83492791
     h ^= (h >> 15) & 0x1FFFF
     h *= 668265263
@@ -43,7 +44,9 @@ def noise(x: float, y: float, footprint: float, seed: int) -> float:
     fx, fy = math.floor(x), math.floor(y)
     ix, iy = int(fx), int(fy)
     tx, ty = x - fx, y - fy
+    # Smoothstep weights: no visible lattice in the derivative
     tx, ty = tx * tx * (3.0 - 2.0 * tx), ty * ty * (3.0 - 2.0 * ty)
+    # Bilinear interpolation of the four lattice values
     a = lattice(ix, iy, seed) * (1.0 - tx) + lattice(ix + 1, iy, seed) * tx
     b = lattice(ix, iy + 1, seed) * (1.0 - tx) + lattice(ix + 1, iy + 1, seed) * tx
     return fade * (2.0 * (a * (1.0 - ty) + b * ty) - 1.0)
@@ -53,6 +56,7 @@ def noise(x: float, y: float, footprint: float, seed: int) -> float:
 @no_type_check
 def band(x: float, low: float, high: float, footprint: float) -> float:
     """Return the share of the footprint around x that lies between low and high."""
+    # The small number keeps the width of a point footprint positive
     half = 0.5 * footprint + 1e-4
     return max(0.0, min(high, x + half) - max(low, x - half)) / (2.0 * half)
 
@@ -64,5 +68,6 @@ def bands(x: float, period: float, width: float, footprint: float) -> float:
     half = 0.5 * footprint + 1e-4
     a, b = x - half, x + half
     ka, kb = math.floor(a / period), math.floor(b / period)
+    # Whole periods between the ends, plus the parts at either end
     inside = (kb - ka) * width + min(b - kb * period, width) - min(a - ka * period, width)
     return inside / (2.0 * half)

@@ -58,6 +58,7 @@ class ShapeInstances:
     ) -> None:
         self._scenes = scenes  # kept alive
         self.T_world_unit = np.ascontiguousarray(T_world_unit[:, :3], dtype=np.float32)
+        # Poses at both ends of the interval: actors move in a straight line
         steps = np.repeat(T_world_unit[:, None, :3].astype(np.float64), 2, axis=1)
         steps[..., 3] += np.array([[-LOOKAHEAD_S], [LOOKAHEAD_S]]) * velocity_mps[:, None]
         self.handle = embree.new_instances([scene.handle for scene in scenes], steps)

@@ -105,6 +105,7 @@ def transform_rays(T, origin, direction, rows):
         row = rows[i]
         x, y, z = origin[row, 0], origin[row, 1], origin[row, 2]
         dx, dy, dz = direction[row, 0], direction[row, 1], direction[row, 2]
+        # Positions are transformed with the translation, directions without
         for a in range(3):
             origins[i, a] = T[a, 0] * x + T[a, 1] * y + T[a, 2] * z + T[a, 3]
             directions[i, a] = T[a, 0] * dx + T[a, 1] * dy + T[a, 2] * dz
@@ -141,6 +142,7 @@ def _find_surfaces(static, shapes, actors, hits, origin, direction, ray_rad, out
         triangle, actor = hits.triangle[i], hits.actor[i]
         if triangle == MISS:
             continue
+        # Corners and texture coordinates: of the static world, or of an actor's shape moved to the world
         if actor < 0:
             material = static.material[triangle]
             for k in range(3):
@@ -150,6 +152,7 @@ def _find_surfaces(static, shapes, actors, hits, origin, direction, ray_rad, out
         else:
             row = actors.first[actor] + triangle
             material = shapes.material[row]
+            # Paint slots have negative numbers
             if material < 0:
                 material = actors.paint[actor, -1 - material]
             for k in range(3):
@@ -165,11 +168,13 @@ def _find_surfaces(static, shapes, actors, hits, origin, direction, ray_rad, out
         out.material[i] = material
         t, u, v = hits.t[i], hits.u[i], hits.v[i]
         dx, dy, dz = direction[i, 0], direction[i, 1], direction[i, 2]
+        # Edges from the first corner, and the normal by their cross product
         px, py, pz = corner[1, 0] - corner[0, 0], corner[1, 1] - corner[0, 1], corner[1, 2] - corner[0, 2]
         qx, qy, qz = corner[2, 0] - corner[0, 0], corner[2, 1] - corner[0, 1], corner[2, 2] - corner[0, 2]
         nx, ny, nz = py * qz - pz * qy, pz * qx - px * qz, px * qy - py * qx
         scale = 1.0 / max(math.sqrt(nx * nx + ny * ny + nz * nz), 1e-20)
         cosine = (nx * dx + ny * dy + nz * dz) * scale
+        # Turn the normal against the ray
         if cosine > 0.0:
             scale = -scale
         nx, ny, nz = nx * scale, ny * scale, nz * scale
@@ -181,12 +186,15 @@ def _find_surfaces(static, shapes, actors, hits, origin, direction, ray_rad, out
         out.xyz[i, 2] = origin[i, 2] + t * dz
         # Let g be the gradient of a coordinate within the triangle's plane. A ray that moves sideways by δ ⟂
         # d shifts the hit by δ - d (n·δ)/(n·d), and so the coordinate by h·δ, h = g - n (g·d)/(n·d).
+        # Solve for the gradient in the basis of the two edges (Gram matrix)
         pp, pq, qq = px * px + py * py + pz * pz, px * qx + py * qy + pz * qz, qx * qx + qy * qy + qz * qz
         inverse = 1.0 / max(pp * qq - pq * pq, 1e-20)
         pd, qd = px * dx + py * dy + pz * dz, qx * dx + qy * dy + qz * dz
+        # Width of the footprint across the ray
         width = t * ray_rad[i]
         for k in range(3):
             base = coordinate[0, k]
+            # Interpolate the coordinate, then project the footprint onto it
             dp, dq = coordinate[1, k] - base, coordinate[2, k] - base
             out.uvw[i, k] = base + u * dp + v * dq
             r, s = (qq * dp - pq * dq) * inverse, (pp * dq - pq * dp) * inverse
@@ -208,6 +216,7 @@ def sun_rays(found, t, sun, out_origin):
             continue
         nx, ny, nz = found.normal[i, 0], found.normal[i, 1], found.normal[i, 2]
         if nx * sun[0] + ny * sun[1] + nz * sun[2] > 0.0:
+            # Start off the surface, further at a distance, where coordinates are less precise
             offset = SHADOW_OFFSET_M + 2e-5 * t[i]
             out_origin[count, 0] = found.xyz[i, 0] + offset * nx
             out_origin[count, 1] = found.xyz[i, 1] + offset * ny
@@ -222,6 +231,7 @@ def sun_rays(found, t, sun, out_origin):
 def _mirrored_surroundings(light, gloss, dx, dy, dz, nx, ny, nz, cosine, out):
     """Fill out [3] with the mirrored radiance of a surface of this gloss: the sky, or the street for low
     rays."""
+    # Direction mirrored at the surface: d + 2 cos θ n
     rise = dz + 2.0 * cosine * nz
     mx, my, upward = dx + 2.0 * cosine * nx, dy + 2.0 * cosine * ny, max(rise, 0.05)
     if gloss > CLEAR_MIRROR:
@@ -239,8 +249,10 @@ def _lit_window(light, glass, chance):
     """Return the brightness of a room behind a window. `chance` is the window's random number, 0 for many."""
     if glass <= 0.0:
         return 0.0
+    # Several windows in one footprint show the mean
     if chance <= 0.0:
         return light.lit_windows  # the mean of many
+    # Another digit of the same random number decides whether the room is lit
     return 0.2 + 0.8 * chance if chance * 7.3 % 1.0 < light.lit_windows else 0.0
 
 
@@ -283,11 +295,13 @@ def shade(materials, found, t, direction, lit, light, mirrored, known):
     mirror = np.empty(3, np.float32)
     by_lamps, wetness = len(light.lamps.lamp_index) > 0, light.air.wetness
     for i in range(len(t)):
+        # Results of the central ray are taken over
         if len(known) > 0 and known[i, 0] >= 0.0:
             out[i, 0], out[i, 1], out[i, 2] = known[i, 0], known[i, 1], known[i, 2]
             continue
         material = found.material[i]
         dx, dy, dz = direction[i, 0], direction[i, 1], direction[i, 2]
+        # Rays into the sky
         if material == MISS:
             sky(light, dx, dy, dz, colour)
             out[i, 0], out[i, 1], out[i, 2] = colour[0], colour[1], colour[2]
@@ -295,15 +309,18 @@ def shade(materials, found, t, direction, lit, light, mirrored, known):
         texture(materials, material, found.xyz, found.uvw, found.extent, i, colour)
         kind, glass, cosine = materials.texture[material], colour[3], found.cosine[i]
         nx, ny, nz = found.normal[i, 0], found.normal[i, 1], found.normal[i, 2]
+        # Sunlight by the cosine to the sun; mirrors by gloss, glass and water
         facing = max(nx * light.sun[0] + ny * light.sun[1] + nz * light.sun[2], 0.0)
         direct = _direct_light(kind, facing, lit[i])
         gloss = _gloss(materials.gloss[material], glass, cosine)
         film = 0.0
+        # Water on level ground: darker below, and a mirror on top
         if wetness > 0.0 and nz > LEVEL_COS and is_paved(materials.surface[material]):
             film = water_film(wetness, materials.surface[material], found.xyz, found.extent, i)
             gloss = max(gloss, film * water_mirror(cosine))
             for c in range(3):
                 colour[c] *= 1.0 - WET_DARKENING * min(2.0 * wetness, 1.0)
+        # The mirror shows what the extra ray found, else the sky or the street
         if film > 0.0 and len(mirrored) > 0 and mirrored[i, 0] >= 0.0:
             mirror[0], mirror[1], mirror[2] = mirrored[i, 0], mirrored[i, 1], mirrored[i, 2]
         elif gloss > 0.0:
@@ -311,10 +328,12 @@ def shade(materials, found, t, direction, lit, light, mirrored, known):
         if by_lamps:
             x, y, z = found.xyz[i, 0], found.xyz[i, 1], found.xyz[i, 2]
             lamp_light(light.lamps, x, y, z, nx, ny, nz, dx, dy, dz, WET_SHINE if film > 0.0 else 0.0, lamp)
+        # Ambient light: from the sky above and from the ground below, by the normal's tilt
         up = 0.5 + 0.5 * nz
         haze = 1.0 - math.exp(-t[i] * light.air.extinction_per_m)
         window = _lit_window(light, glass, colour[5]) if kind == _FACADE else 0.0
         for c in range(3):
+            # Diffuse light, then mirror, then lit windows, then haze in front of all
             ambient = light.sky_rgb[c] * up + light.bounce_rgb[c] * (1.0 - up)
             radiance = colour[c] * (light.sun_rgb[c] * direct + ambient + lamp[c])
             if kind == _GLOW:
@@ -334,6 +353,7 @@ def develop(radiance, exposure, samples):
     out = np.empty((count, 3), np.uint8)
     for pixel in range(count):
         for c in range(3):
+            # Mean of the tone-mapped samples: bright samples do not spoil an edge
             total = 0.0
             for i in range(pixel * samples, (pixel + 1) * samples):
                 x = radiance[i, c] * exposure

@@ -19,8 +19,10 @@ def sky(light, dx, dy, dz, out):
     """Fill out [3] with the sky: a gradient, a glow around the sun, clouds, and haze in front of all of
     it."""
     cloud = 0.0
+    # Clouds on a plane above; the offset keeps the horizon finite
     if dz > 0.02:
         x, y = dx / (dz + 0.12) * 1.3, dy / (dz + 0.12) * 1.3
+        # Three octaves of noise against a threshold that falls with the cloud cover
         n = noise(x, y, 0.0, 81)
         n += 0.5 * noise(2.1 * x, 2.1 * y, 0.0, 82) + 0.25 * noise(4.3 * x, 4.3 * y, 0.0, 83)
         cloud = min(max(1.1 * n + 1.6 * light.clouds - 0.8, 0.0), 1.0) * min(1.0, 6.0 * dz)
@@ -39,12 +41,15 @@ def blurred_sky(light, dx, dy, dz, out):
 @no_type_check
 def _air_and_sun(light, dx, dy, dz, cloud, out):
     up = max(dz, 0.0)
+    # From the colour of the horizon to that of the zenith
     blend = 1.0 - (1.0 - up) ** 5
     near = max(
         dx * light.glow_direction[0] + dy * light.glow_direction[1] + dz * light.glow_direction[2], 0.0
     )
+    # Wide and narrow halo around the sun, and its disc
     halo = 0.25 * near**6 + 0.6 * near**64
     disc = 8.0 if near > 0.9999 else 0.0
+    # Haze in front of the sky: the way through the layer grows towards the horizon
     veil = 1.0 - math.exp(-light.air.extinction_per_m * FOG_TOP_M / max(dz, 0.02))
     for c in range(3):
         clear = light.horizon[c] * (1.0 - blend) + light.zenith[c] * blend

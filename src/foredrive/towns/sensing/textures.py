@@ -38,6 +38,7 @@ def _line(distance: float, along: float, du: float, dw: float, pattern: int, wid
     """Return the painted share of the footprint at a distance from the border that the line follows."""
     if pattern == _LINE_NONE:
         return 0.0
+    # Double lines: each lane paints the one on its own side, half a gap from the border
     if pattern >= _LINE_DOUBLE:
         low = 0.5 * DOUBLE_LINE_GAP_M
         share = band(distance, low, low + width, du)
@@ -53,15 +54,18 @@ def _line(distance: float, along: float, du: float, dw: float, pattern: int, wid
 def _road(p, material, x, y, uvw, extent, i, out):
     """Compute asphalt: grain, wear along the wheel tracks, patches, lines."""
     size = extent[i, 3]
+    # Grain at three wavelengths, and patches of another age
     shade = 1.0 + 0.10 * noise(x / 11.0, y / 11.0, size / 11.0, 1)
     shade += 0.08 * noise(x / 2.3, y / 2.3, size / 2.3, 2) + 0.10 * noise(x * 4.0, y * 4.0, size * 4.0, 3)
     if lattice(math.floor(x / 9.0), math.floor(y / 6.0), 4) > 0.9:
         shade *= 0.9
     left, right = uvw[i, 0], uvw[i, 1]
+    # Wheel tracks on pieces of the width of a lane
     if 2.5 < left + right < 5.0:
         track = abs(abs(0.5 * (left - right)) - 0.85)
         shade *= 1.0 - 0.10 * math.exp(-8.0 * track * track)
     paint, yellow = 0.0, False
+    # Left and right line; the stronger one decides the colour
     for side in range(2):
         pattern = int(p[material, 3 * side])
         if pattern != _LINE_NONE:
@@ -95,6 +99,7 @@ def _grass(x, y, size):
 def _field(p, material, x, y, uvw, extent, i, out):
     """Compute rows of crops with the ruts of tractors, and grass beyond the border."""
     u, size = uvw[i, 0], extent[i, 3]
+    # Rows of plants, wavy; tractors' ruts run in pairs
     crop = bands(u + 0.06 * noise(x, y, size, 26), p[material, 0], p[material, 1], extent[i, 0])
     rut = bands(u, TRAMLINES_M, RUT_M, extent[i, 0]) + bands(u + TRACK_M, TRAMLINES_M, RUT_M, extent[i, 0])
     crop *= 1.0 - 0.8 * rut
@@ -104,6 +109,7 @@ def _field(p, material, x, y, uvw, extent, i, out):
         + 0.10 * noise(x / 3.0, y / 3.0, size / 3.0, 28)
     )
     shade += 0.12 * noise(x * 3.0, y * 3.0, size * 3.0, 29)
+    # The border is irregular too; beyond it there is grass
     border = uvw[i, 2] + 0.3 * noise(x / 1.5, y / 1.5, size / 1.5, 30)
     inside = band(border, 0.0, 1e6, extent[i, 2])
     grass = _grass(x, y, size)
@@ -120,6 +126,7 @@ def _tint(kind, p, material, xyz, uvw, extent, i):
     if kind == _GRASS:
         return _grass(x, y, size)
     if kind == _SLABS:
+        # Joints between slabs, brightness of each slab, and kerb stones along the edges
         edge = p[material, 0]
         joint = bands(x, edge, 0.025, size) + bands(y, edge, 0.025, size)
         slab = lattice(math.floor(x / edge), math.floor(y / edge), 31) - 0.5
@@ -131,11 +138,13 @@ def _tint(kind, p, material, xyz, uvw, extent, i):
         shade += 0.06 * noise(x / 4.0, y / 4.0, size / 4.0, 32)
         return shade, shade, shade
     if kind == _FOLIAGE:
+        # Leaves and clumps in three dimensions, by shifting the plane with the height
         leaf = noise((x + 0.7 * z) * 3.2, (y - 0.7 * z) * 3.2, size * 3.2, 41)
         clump = noise((x - z) * 1.1, (y + z) * 1.1, size * 1.1, 42)
         shade = 0.95 + 0.42 * leaf + 0.38 * clump
         return shade * (1.0 + 0.1 * clump), shade, shade * (1.0 - 0.1 * leaf)
     if kind == _TILES:
+        # Rows of tiles, every second one shifted by half a tile
         row = math.floor(uvw[i, 1] / 0.33)
         shade = 1.0 + 0.2 * (lattice(math.floor(uvw[i, 0] / 0.25 + 0.5 * row), row, 61) - 0.5)
         shade *= 1.0 - 0.3 * bands(uvw[i, 1], 0.33, 0.05, extent[i, 1])

@@ -45,11 +45,13 @@ def water_film(wetness, surface, xyz, extent, i):
     Walkways have no puddles because they slope and drain.
     """
     x, y, size = xyz[i, 0], xyz[i, 1], extent[i, 3]
+    # A thin film everywhere, and puddles in the hollows of a noise
     film = THIN_FILM * wetness * wetness * (1.0 + 0.4 * noise(x * 2.0, y * 2.0, size * 2.0, 93))
     if surface != _ROAD:
         return 0.6 * film
     deep = noise(x / PUDDLE_M, y / PUDDLE_M, size / PUDDLE_M, 91)
     deep += 0.4 * noise(x * 0.9, y * 0.9, size * 0.9, 92)
+    # Puddles grow with the wetness: the threshold falls
     puddle = min(max(5.0 * (deep - _DRY_DEPTH + 0.85 * wetness**3), 0.0), 1.0)
     return film + (1.0 - film) * puddle
 
@@ -72,23 +74,27 @@ def mirror_rays(materials, found, t, direction, wetness, out_origin, out_directi
     count = 0
     for i in range(len(t)):
         material, nz = found.material[i], found.normal[i, 2]
+        # Only level paved ground, and only films that mirror enough
         if material < 0 or nz < LEVEL_COS or not is_paved(materials.surface[material]):
             continue
         film = water_film(wetness, materials.surface[material], found.xyz, found.extent, i)
         if film * water_mirror(found.cosine[i]) < MIN_MIRROR:
             continue
         x, y, size = found.xyz[i, 0], found.xyz[i, 1], found.extent[i, 3]
+        # Ripples tilt the normal a little
         rx = RIPPLES * noise(x * 4.0, y * 4.0, 2.0 * size, 94)
         ry = RIPPLES * noise(x * 4.0, y * 4.0, 2.0 * size, 95)
         nx, ny = found.normal[i, 0] + rx, found.normal[i, 1] + ry
         scale = 1.0 / math.sqrt(nx * nx + ny * ny + nz * nz)
         nx, ny, nz = nx * scale, ny * scale, nz * scale
         dx, dy, dz = direction[i, 0], direction[i, 1], direction[i, 2]
+        # Reflection d - 2 (d · n) n, at least slightly upwards
         along = dx * nx + dy * ny + dz * nz
         out_direction[count, 0] = dx - 2.0 * along * nx
         out_direction[count, 1] = dy - 2.0 * along * ny
         out_direction[count, 2] = max(dz - 2.0 * along * nz, 1e-3)
         out_origin[count, 0], out_origin[count, 1] = x, y
+        # Start above the surface, further at a distance
         out_origin[count, 2] = found.xyz[i, 2] + 0.01 + 0.02 * size
         index[count] = i
         count += 1

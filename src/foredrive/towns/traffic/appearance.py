@@ -23,6 +23,7 @@ def vehicle_actors(
         motion: the result of `motion`.
     """
     before, after = motion
+    # Mean velocity over `MOTION_S` about now
     velocity_mps = (after.centre_m - before.centre_m) / MOTION_S
     slows = (v.acceleration_mps2 < -BRAKE_LIGHTS_MPS2) | (v.speed_mps < STANDSTILL_MPS)
     braking = slows & (v.category != Category.BICYCLE)
@@ -49,6 +50,7 @@ def people_actors(p: Pedestrians) -> list[ActorState]:
         ActorState(
             track_id=int(p.track_id[i]),
             category=Category.PEDESTRIAN,
+            # Positions are those of the feet; boxes are placed by their centre
             centre_m=p.xyz[i] + [0.0, 0.0, 0.5 * p.size_lwh[i, 2]],
             yaw=float(p.yaw[i]),
             pitch=0.0,

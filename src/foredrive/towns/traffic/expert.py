@@ -81,6 +81,7 @@ class ExpertDrive:
         self._planned = plan_route(traffic.lanes, traffic.starts, traffic.seed, seconds)
         first, start_m = self._planned.lanes[:1], np.array([self._planned.start_m])
         ego = ego_vehicle(traffic.lanes, first, start_m)
+        # Run the traffic until the ego vehicle drives and the random initial state has dissolved
         self.state = traffic.start(ego, self._planned.lanes)
         while not self._is_settled():
             self.state = traffic.step(self.state, MAX_STEP_S)
@@ -90,6 +91,7 @@ class ExpertDrive:
 
     def snapshots(self, count: int, dt_s: float) -> Iterator[DriveSnapshot]:
         """Yield `count` moments of the drive, `dt_s` apart."""
+        # The fewest equal steps that are not longer than `MAX_STEP_S`; the small number absorbs rounding
         steps = max(1, int(np.ceil(dt_s / MAX_STEP_S - 1e-9)))
         for index in range(count):
             if index:
@@ -110,6 +112,7 @@ class ExpertDrive:
         """Return the poses of all vehicles of `state`, with the steering disturbance applied to the ego
         vehicle."""
         poses, ego = self._traffic.poses(self.state), self._ego
+        # The planned pose of the rear axle, shifted and turned by the deviation in the frame of the path
         T_world_ego = poses.axle_frame() @ T_path_ego(self._deviation)
         to_centre_ego = [float(ego.axle_to_centre_m[0]), 0.0, 0.5 * ego.size_lwh[0, 2], 1.0]
         poses.axle_xyz[0], poses.forward[0] = T_world_ego[:3, 3], T_world_ego[:3, 0]
@@ -130,6 +133,7 @@ class ExpertDrive:
 
     def _remaining(self) -> Route:
         """Return the route from the present position of the ego vehicle."""
+        # The route is measured at the rear axle, s_m at the box centre
         axle_m = float(self.state.vehicles.s_m[0] - self.state.vehicles.axle_to_centre_m[0])
         to_come = slice(self.state.route_passed, None)
         entered = self._planned.entered[to_come].copy()
@@ -147,6 +151,7 @@ class ExpertDrive:
             t_s=t_s,
             T_world_ego=T_world_ego,
             twist_ego=twist,
+            # In a curve, the lateral acceleration is speed times turn rate
             acceleration_ego_mps2=np.array([float(ego.acceleration_mps2[0]), twist[0] * twist[5], 0.0]),
             actors=self._traffic.actors(self.state),
             lights=self._traffic.zone_lights(self.state.time_s),
@@ -167,8 +172,10 @@ def ego_twist(
     half_m = 0.5 * MOTION_S * float(ego.speed_mps[0])
     if half_m == 0:
         return np.zeros(6)
+    # Central difference over `MOTION_S`: poses half of it earlier and later at the present speed
     paths = zip(motion(lanes, ego), (-half_m, half_m), strict=True)
     before, after = (poses.axle_frame() @ T_path_ego(deviation.moved(moved_m)) for poses, moved_m in paths)
+    # Displacement in the axes of the ego frame now; rotation as a vector, both divided by the time
     moved_ego = T_world_ego[:3, :3].T @ (after[:3, 3] - before[:3, 3])
     turned = Rotation.from_matrix(before[:3, :3].T @ after[:3, :3]).as_rotvec()
     return np.concatenate([moved_ego, turned]) / MOTION_S
@@ -177,6 +184,7 @@ def ego_twist(
 def plan_route(lanes: LaneGraph, starts: StartPoints, seed: int, seconds: float) -> Route:
     """Plan the route of a drive. It depends on the arguments alone."""
     rng = np.random.default_rng((seed, 3))
+    # Long enough at the highest limit of the town for the time to settle and the whole drive
     max_length_m = lanes.limit_mps.max() * (seconds + MAX_SETTLE_S) + ROUTE_MARGIN_M
     return draw_route(lanes, starts, rng, max_length_m, SETTLE_S, SETTLE_S + seconds)
 

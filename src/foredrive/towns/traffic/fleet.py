@@ -87,11 +87,13 @@ def draw_fleet(
     share = np.array([kind.share for kind in KINDS])
     large = np.array([kind.is_large for kind in KINDS])
     bicycle = np.array([kind.category == Category.BICYCLE for kind in KINDS])
+    # A kind's weight is 0 where it is not allowed; draw from the cumulated weights
     weight = share * (for_large[:, None] | ~large) * (for_bicycles[:, None] | ~bicycle)
     cumulated = np.cumsum(weight, axis=1)
     kinds = np.argmax(cumulated > rng.random((count, 1)) * cumulated[:, -1:], axis=1)
     low = np.array([[*kind.min_lwh, kind.top_speed_mps[0]] for kind in KINDS])[kinds]
     high = np.array([[*kind.max_lwh, kind.top_speed_mps[1]] for kind in KINDS])[kinds]
+    # One random number for length, width and height, another for the top speed
     u = np.repeat(rng.random((count, 2)), [3, 1], axis=1)  # long vehicles are also wide and high
     drawn = low + u * (high - low)
     wheelbase = np.array([kind.wheelbase for kind in KINDS])[kinds] * drawn[:, 0]
@@ -137,12 +139,14 @@ class StartPoints:
 def find_start_points(graph: LaneGraph) -> StartPoints:
     """Find all starts of a town, `START_SPACING_M` apart."""
     lanes, along = [], []
+    # Only lanes outside junctions and before no junction that others cross
     for lane in np.flatnonzero((graph.junction < 0) & ~graph.contested):
         s = np.arange(CLEAR_OF_END_M, graph.length_m[lane] - CLEAR_OF_END_M, START_SPACING_M)
         lanes.append(np.full(len(s), lane))
         along.append(s)
     at_lane, at_m = np.concatenate(lanes), np.concatenate(along)
     xyz = graph.position(at_lane, at_m)
+    # Heading from a point 1 m further on
     ahead = graph.position(at_lane, at_m + 1.0) - xyz
     return StartPoints(at_lane, at_m, xyz, ahead / np.linalg.norm(ahead, axis=1, keepdims=True))
 
@@ -155,11 +159,14 @@ def place_vehicles(
     Of the path only the lanes behind and the current lane are set.
     """
     path = np.full((len(lane), WINDOW), -1)
+    # The path behind follows the first predecessors; the lanes ahead are drawn later
     path[:, BEHIND] = lane
     for column in range(BEHIND - 1, -1, -1):
         path[:, column] = np.where(path[:, column + 1] >= 0, graph.predecessors[path[:, column + 1], 0], -1)
+    # Room from the front bumper to the end, less a margin of 2 m
     to_end = np.maximum(graph.length_m[lane] - s_m - 0.5 * vehicles.size_lwh[:, 0] - 2.0, 0.0)
     speed = vehicles.speed_factor * np.minimum(graph.speed(lane, s_m), vehicles.top_speed_mps)
+    # v² = 2 b s: it must be able to stop at the end of the lane
     speed = np.minimum(speed, np.sqrt(2 * BRAKING_MPS2 * to_end))
     return Vehicles(**{**vars(vehicles), "path": path, "s_m": s_m.astype(np.float64), "speed_mps": speed})
 

@@ -83,8 +83,10 @@ def find_change_ranges(graph: LaneGraph) -> ChangeRanges:
     wait.
     """
     sides = graph.sides.lane
+    # Side by side means the same height: one may lead onto a bridge
     level = np.abs(graph.xyz[graph.first, 2] - graph.xyz[graph.first[sides], 2]) < FLAT_M
     possible = ~graph.contested & (graph.min_radius_m >= MIN_RADIUS_M)
+    # Both lanes must be straight enough and outside of contested stretches
     open_to = graph.may_cross & (sides >= 0) & possible & possible[sides] & level
     target = np.where(open_to, sides, -1)
     room = np.where(open_to, graph.length_m, 0.0)
@@ -127,16 +129,19 @@ def lane_change_allowed(
     `fits` states which lanes each vehicle can use.
     """
     v, lane = vehicles, vehicles.lane
+    # A change needs its own length, and room for the rear axle to complete it
     need = change_length_m(v) + v.wheelbase_m + v.axle_to_centre_m
     stops = v.speed_mps**2 / (2 * STOPPING_MPS2)
     # After a change, a vehicle drives on for a while before it changes again, unless it has to.
     settled = v.changed_m > v.change_length_m + np.where(mandatory, 0.0, CHANGE_SPACING_M)
     target = change_ranges.target[:, lane]
+    # The whole vehicle must be on lanes that lie side by side
     begun = (v.rear_m > 0) | change_ranges.continues[:, lane]
     # Room along the vehicle's own path, which may leave the lanes that go on side by side.
     ahead = v.path[:, BEHIND:]
     onward = (ahead >= 0) & (change_ranges.target[:, ahead] >= 0)
     onward[:, :, 1:] &= change_ranges.continues[:, ahead[:, 1:]]
+    # Add up the lanes of the path from the current one as long as a change stays possible
     room_m = np.sum(np.logical_and.accumulate(onward, axis=2) * graph.length_m[ahead], axis=2)
     goes_on = room_m > v.s_m + need + np.where(mandatory, MIN_GAP_M, stops)
     fitting = (target >= 0) & fits[np.arange(len(lane)), target]
@@ -235,9 +240,11 @@ def incentive(
     """
     v, every, length = vehicles, np.arange(len(free_mps2)), vehicles.size_lwh[:, 0]
     leaders, n, o = context.leaders, gaps.follower, _followers(context.leaders)
+    # Accelerations of the three after the change; before the change they are `desired`
     desired, halt, free = context.desired_mps2(v), context.halt_mps2, context.free_mps2
     own = following_acceleration(v, every, free_mps2, gaps.leader, gaps.leader_gap_m)
     new = following_acceleration(v, n, free[n], np.where(n >= 0, every, -1), gaps.follower_gap_m)
+    # When c leaves, o follows c's leader: both gaps and c's length become its gap
     old = following_acceleration(
         v, o, free[o], leaders.leader, leaders.leader_gap_m[o] + length + leaders.leader_gap_m
     )
@@ -269,11 +276,13 @@ def room_to_change_m(
     Return None if it is in that lane already or cannot reach it.
     """
     here = int(vehicles.lane[0])
+    # Walk to the side over all neighbouring lanes until the wanted one is found
     for side in (LEFT, RIGHT):
         beside = here
         while beside >= 0 and beside != lane:
             beside = int(graph.sides.lane[side, beside])
         if beside == lane and beside != here:
+            # Distance that the change itself takes
             need = MIN_CHANGE_M + vehicles.wheelbase_m[0] + vehicles.axle_to_centre_m[0] + MIN_GAP_M
             return side, float(change_ranges.room_m[side, here] - vehicles.s_m[0] - need)
     return None
@@ -310,6 +319,7 @@ def choose_change(
         if not (target >= 0).any():
             continue
         gaps = find_gaps(graph, v, starts_m, target, side)
+        # The open-road acceleration is the smaller of the old lane's and the new lane's
         desired = v.speed_factor * np.minimum(v.top_speed_mps, graph.speed(target, v.s_m))
         free = np.minimum(
             context.free_mps2, free_acceleration(v.speed_mps, desired, v.accel_mps2, v.decel_mps2)
@@ -339,14 +349,17 @@ def courtesy_limits(
     """
     limit = np.full(len(target), np.inf)
     gaps = find_gaps(graph, vehicles, starts_m, target, side)
+    # Only followers that are still behind can open a gap
     who = np.flatnonzero((gaps.follower >= 0) & (gaps.follower_gap_m >= MIN_GAP_M))
     n = gaps.follower[who]
     desired = following_acceleration(
         vehicles, n, context.free_mps2[n], who, gaps.follower_gap_m[who] - COURTEOUS_GAP_M
     )
+    # Followers brake harder for a standing vehicle, which cannot create a gap by itself
     max_braking = np.where(
         vehicles.speed_mps[who] < STANDSTILL_MPS, COURTEOUS_TO_STANDING_MPS2, COURTEOUS_MPS2
     )
+    # One follower may let in several: its strictest limit holds
     np.minimum.at(limit, n, np.maximum(desired, -max_braking))
     return limit
 
@@ -383,6 +396,7 @@ def begin_change(graph: LaneGraph, vehicles: Vehicles, who: int, side: int) -> V
         "has_stopped": False,
         "shift_m": apart_m if side == RIGHT else -apart_m,
         "change_length_m": change_length_m(v)[who],
+        # The change is measured at the rear axle, so it begins with the front axle now
         "changed_m": -v.wheelbase_m[who],
     }
     values = {}

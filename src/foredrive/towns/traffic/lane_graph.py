@@ -137,6 +137,7 @@ class LaneGraph:
         return self.xyz[self.first[lane] : self.first[lane] + self.count[lane]]
 
     def _sample(self, lane: np.ndarray, s_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        # Sample number and the fraction to the next one; the last sample belongs to the last interval
         steps = np.clip(s_m / self.step_m[lane], 0, self.count[lane] - 1)
         i = np.minimum(steps.astype(np.int64), self.count[lane] - 2)
         return self.first[lane] + i, steps - i
@@ -151,6 +152,7 @@ class LaneGraph:
 @lru_cache(maxsize=1)  # several drives in a row are often in one town
 def build_lane_graph(town: TownMap) -> LaneGraph:
     """Build the lane graph of a town."""
+    # Order matters: geometry first, then controls, limits and conflicts that build on it
     lanes, index = _merge_connectors(town.lanes)
     lines = [resample(line) for line in join_centrelines(lanes, index)]
     length = np.array([np.linalg.norm(np.diff(line, axis=0), axis=1).sum() for line in lines])
@@ -159,12 +161,14 @@ def build_lane_graph(town: TownMap) -> LaneGraph:
     limit = np.array([_limit(lane.speed_limit_mps) for lane in lanes])
     count = np.array([len(line) for line in lines])
     successors = [[index[i] for i in lane.successor_ids] for lane in lanes]
+    # Traffic slows to city speed before and at lights
     limit = np.where(control == LaneControl.LIGHT, np.minimum(limit, CITY_SPEED_MPS), limit)
     to_light = _to_light_m(control == LaneControl.LIGHT, length, successors)
     limits = [_limits(*lane) for lane in zip(limit, length, lines, to_light, strict=True)]
     predecessors = [[index[i] for i in lane.predecessor_ids] for lane in lanes]
     junction = np.array([-1 if lane.junction_id is None else lane.junction_id for lane in lanes])
     groups = [lane.group_id for lane in lanes]
+    # Overlaps decide right of way: siblings part from one start, conflicts cross or merge
     siblings, conflicts = find_overlaps(lines, length, successors, predecessors, junction, groups)
     beside = np.array([[index.get(i or "", -1) for i in (lane.left_id, lane.right_id)] for lane in lanes]).T
     return LaneGraph(
@@ -177,6 +181,7 @@ def build_lane_graph(town: TownMap) -> LaneGraph:
         length_m=length,
         limit_mps=limit,
         width_m=np.array([lane.width_m for lane in lanes]),
+        # Curvature 0 would be an infinite radius: clip at 1e6 m
         min_radius_m=np.array([1 / np.abs(at).max().clip(1e-6) for at in curves]),
         turn_rad=np.array([headings(line)[-1] - headings(line)[0] for line in lines]),
         successors=_padded(successors),
@@ -185,6 +190,7 @@ def build_lane_graph(town: TownMap) -> LaneGraph:
         left=beside[0],
         right=beside[1],
         sides=_sides(lines, beside, count, length / (count - 1)),
+        # Lane changes are not allowed within junctions
         may_cross=(junction < 0) & _crossable(lanes),
         junction=junction,
         control=control,
@@ -207,6 +213,8 @@ def _merge_connectors(lanes: tuple[Lane, ...]) -> tuple[list[Lane], dict[str, in
     Also return the new index of every original lane. Maps cut lanes where the cross-section of the road
     changes; the places where other lanes cross would be cut as well.
     """
+    # A piece is continued by its only successor if that lies in
+    # the same junction and has no other predecessor
     by_id = {lane.lane_id: lane for lane in lanes}
 
     def continued_by(lane: Lane) -> Lane | None:
@@ -215,6 +223,7 @@ def _merge_connectors(lanes: tuple[Lane, ...]) -> tuple[list[Lane], dict[str, in
             return None
         return following if following.predecessor_ids == (lane.lane_id,) else None
 
+    # Pieces that continue another one do not begin a lane of their own
     absorbed = {following.lane_id for lane in lanes if (following := continued_by(lane))}
     whole: list[Lane] = []
     index: dict[str, int] = {}
@@ -224,6 +233,7 @@ def _merge_connectors(lanes: tuple[Lane, ...]) -> tuple[list[Lane], dict[str, in
         pieces = [lane]
         while following := continued_by(pieces[-1]):
             pieces.append(following)
+        # All pieces map to the index of the whole
         index.update({piece.lane_id: len(whole) for piece in pieces})
         whole.append(
             dataclasses.replace(
@@ -239,6 +249,7 @@ def _merge_connectors(lanes: tuple[Lane, ...]) -> tuple[list[Lane], dict[str, in
 
 def _concatenated(lines: list[Float64[np.ndarray, "_ 3"]]) -> Float64[np.ndarray, "_ 3"]:
     """Join lines that continue each other into one."""
+    # The first point of each piece repeats the last one of the piece before
     return np.concatenate([lines[0]] + [line[1:] for line in lines[1:]])
 
 
@@ -254,11 +265,14 @@ def _contested(
     contested = crossed.copy()
     room_m = np.full(len(length_m), WAITING_ROOM_M)  # reduced step by step
     changed = True
+    # Fixed point: contested lanes grow backwards until every wait has room for a vehicle
     while changed:
         changed = False
         for lane in np.flatnonzero(~contested).tolist():
+            # Free length behind a lane, up to the bound; contested lanes offer none
             behind = min((0.0 if contested[p] else room_m[p] for p in predecessors[lane]), default=np.inf)
             room = min(WAITING_ROOM_M, length_m[lane] + behind)
+            # A lane before a contested one is contested too if a waiting vehicle would block something
             before = [n for n in successors[lane] if contested[n]]
             inside = junction[lane] >= 0 and any(junction[n] == junction[lane] for n in before)
             if before and (inside or room < WAITING_ROOM_M):
@@ -280,6 +294,7 @@ def _to_light_m(
     `BEFORE_LIGHT_M`."""
     to_light = np.full(len(length_m), np.inf)
     changed = True
+    # Fixed point of shortest distances: each pass can extend a way by one lane
     while changed:
         changed = False
         for lane, onward in enumerate(successors):
@@ -313,10 +328,13 @@ def _sides(lines: list[np.ndarray], lane: np.ndarray, count: np.ndarray, step_m:
     first = np.cumsum(count) - count
     for side, a in np.argwhere(lane >= 0).tolist():
         b = lane[side, a]
+        # For each sample of a, the nearest sample of b
         _, near = cKDTree(lines[b]).query(lines[a])
+        # Direction of b there, by central difference
         near = np.clip(near, 1, len(lines[b]) - 2) if len(lines[b]) > 2 else np.zeros_like(near)
         ahead = lines[b][np.minimum(near + 1, len(lines[b]) - 1)] - lines[b][np.maximum(near - 1, 0)]
         ahead /= np.linalg.norm(ahead, axis=1, keepdims=True).clip(1e-9)
+        # Arc length on b: that of the nearest sample, plus the offset along b
         along = near * step_m[b] + np.sum((lines[a] - lines[b][near]) * ahead, axis=1)
         neighbour_s_m[side, first[a] : first[a] + count[a]] = along
     return Neighbours(lane.astype(np.int64), neighbour_s_m, first, count, step_m)
@@ -331,6 +349,7 @@ def _crossable(lanes: list[Lane]) -> Bool[np.ndarray, "2 L"]:
         ends = starts.get(beside or "")
         if ends is None or marking not in CROSSABLE:
             return False
+        # The lanes must be apart at both ends; elsewhere one of them grows from zero width
         gaps = [np.linalg.norm(lane.centreline_xyz[i] - end) for i, end in zip((0, -1), ends, strict=True)]
         return bool(min(gaps) > MIN_OPEN_WIDTH_M)  # lanes that begin or end there grow from zero width
 
@@ -345,6 +364,7 @@ def _crossable(lanes: list[Lane]) -> Bool[np.ndarray, "2 L"]:
 def lanes_for(graph: LaneGraph, min_radius_m: float) -> Bool[np.ndarray, "L"]:
     """Return the lanes from which a vehicle can drive on for ever without a curve tighter than a radius."""
     kept = graph.min_radius_m >= min_radius_m
+    # Remove lanes that lead to no kept lane until none is left: the rest can be driven for ever
     while True:
         onward = (kept[graph.successors] & (graph.successors >= 0)).any(axis=1)
         if not (kept & ~onward).any():

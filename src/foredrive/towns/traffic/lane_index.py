@@ -32,6 +32,7 @@ class LaneIndex:
     def within(self, xyz: Float64[np.ndarray, "3"], reach_m: float) -> Int[np.ndarray, "K"]:
         """Return the samples on the level of a point within a distance of it, seen from above, sorted by
         lane."""
+        # return_sorted orders by sample index, and samples are stored lane by lane
         found = np.array(self.tree.query_ball_point(xyz[:2], reach_m, return_sorted=True), dtype=np.int64)
         return found[np.abs(self.xyz[found, 2] - xyz[2]) < LEVEL_M]
 
@@ -41,9 +42,11 @@ class LaneIndex:
         Beside the road the height is the same as on it. Where no lane of that level is close, it is
         `about_m`.
         """
+        # The nearest sample on the level among the nearest few: argmax gives the first that fits
         found = np.asarray(self.tree.query(xy, HEIGHT_SAMPLES)[1])
         level = np.abs(self.xyz[found, 2] - about_m) < LEVEL_M
         nearest = found[np.arange(len(xy)), np.argmax(level, axis=1)]
+        # The height continues along the slope, at most a metre from the sample
         along_m = np.sum((xy - self.xyz[nearest, :2]) * self.ahead[nearest], axis=1)
         z = self.xyz[nearest, 2] + along_m.clip(-1.0, 1.0) * self.slope[nearest]
         return np.where(level.any(axis=1), z, about_m)
@@ -53,6 +56,7 @@ def build_lane_index(graph: LaneGraph) -> LaneIndex:
     """Build the search for the samples of a graph's lanes."""
     lane = np.repeat(np.arange(len(graph.ids)), graph.count)
     at = np.arange(len(lane))
+    # Direction of the segment that begins at each sample; the last sample takes the one before
     last = at == (graph.first + graph.count - 1)[lane]
     step = graph.xyz[np.where(last, at, at + 1)] - graph.xyz[np.where(last, at - 1, at)]
     flat_m = np.hypot(step[:, 0], step[:, 1]).clip(1e-9)

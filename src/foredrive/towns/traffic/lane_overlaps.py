@@ -47,16 +47,20 @@ def find_overlaps(
     """
     parted, crossed = _Rows(), _Rows()
     flat = [shapely.LineString(line[:, :2]) for line in lines]
+    # Candidate pairs by distance in the plane; each pair once
     pairs = shapely.STRtree(flat).query(flat, predicate="dwithin", distance=APART_M).T
     for a, b in pairs[pairs[:, 0] < pairs[:, 1]].tolist():
         parting = bool(set(predecessors[a]) & set(predecessors[b]))
+        # Lanes may meet if they share a junction, a predecessor or a successor
         merging = bool(set(successors[a]) & set(successors[b]))
         together = junction[a] >= 0 and junction[a] == junction[b]
         serial = b in successors[a] or a in successors[b]
         if serial or not (together or parting or merging):
             continue
+        # Lanes side by side need less distance than paths that cross
         abreast = groups[a] == groups[b] or not together
         near = _near(lines[a], lines[b], APART_ABREAST_M if abreast else APART_M)
+        # The common start is a sibling stretch; only what comes together again later is a conflict
         if parting:
             near_a, near_b = _first_stretch(near.max(axis=1)), _first_stretch(near.max(axis=0))
             parted.add(a, b, near_a, near_b, lengths_m)
@@ -90,10 +94,12 @@ class _Rows:
             return
         enter_a, clear_a = _span_m(near_a, lengths_m[a])
         enter_b, clear_b = _span_m(near_b, lengths_m[b])
+        # Each pair is listed twice, once from each lane's point of view
         self._rows += [(a, b, enter_a, enter_b, clear_b), (b, a, enter_b, enter_a, clear_a)]
 
     def compressed(self, lane_count: int) -> LaneOverlaps:
         """Return the rows sorted by lane."""
+        # Compressed rows: sorted by lane, `first` is the running count
         table = np.array(sorted(self._rows)).reshape(-1, 5)
         counts = np.bincount(table[:, 0].astype(np.int64), minlength=lane_count)
         return LaneOverlaps(

@@ -80,6 +80,7 @@ def find_leaders(graph: LaneGraph, vehicles: Vehicles, starts_m: Float64[np.ndar
     that changes lanes is on both lanes. It also keeps its distance to vehicles on the old lane that it would
     reach before it has left that lane.
     """
+    # 2 √(a b), the denominator of IDM's desired gap
     driver = (vehicles.time_gap_s, 2 * np.sqrt(vehicles.accel_mps2 * vehicles.decel_mps2))
     motion = motion_arrays(vehicles, starts_m)
     return Leaders(*_find_leaders(motion, driver, graph.length_m, graph.sides, graph.siblings))
@@ -132,6 +133,7 @@ def project_to_neighbour(lane, s, beside, sides):
         sides.neighbour_s_m[side, sides.first[lane] + i],
         sides.neighbour_s_m[side, sides.first[lane] + i + 1],
     )
+    # Linear interpolation between samples; i is clamped, so the ends continue straight
     return a + (steps - i) * (b - a)
 
 
@@ -139,6 +141,7 @@ def project_to_neighbour(lane, s, beside, sides):
 @no_type_check
 def add_occupant(occupants, lane, vehicle, column, rear_m):
     """Add a vehicle to a lane, which is a column of the vehicle's path or beside it."""
+    # Prepend to the linked list of the lane
     entry = occupants.used[0]
     occupants.who[entry], occupants.where[entry] = vehicle, column
     occupants.rear_m[entry] = rear_m
@@ -203,5 +206,6 @@ def _desired_gap_m(i, j, speed_mps, driver):
     The smaller the present gap is in comparison, the harder i brakes.
     """
     time_gap_s, braking_mps2 = driver
+    # IDM: s* = s0 + max(0, v T + v Δv / (2 √(a b)))
     closing = speed_mps[i] - speed_mps[j]
     return STANDSTILL_M + max(0.0, speed_mps[i] * (time_gap_s[i] + closing / braking_mps2[i]))

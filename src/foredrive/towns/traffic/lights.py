@@ -27,6 +27,7 @@ class SignalPlan:
 
     def light_states(self, time_s: float) -> Int[np.ndarray, "L"]:
         """Return the `LightState` at the start of each lane."""
+        # Time since the lane's last green began, within the cycle
         into_s = (time_s - self.green_from_s) % self.cycle_s
         light = np.where(
             into_s < GREEN_S,
@@ -41,12 +42,14 @@ def plan_signals(graph: LaneGraph, rng: np.random.Generator) -> SignalPlan:
     guarded = graph.control == LaneControl.LIGHT
     green_from_s = np.zeros(len(guarded))
     cycle_s = np.full(len(guarded), PHASE_S)
+    # Approach direction of each guarded lane
     start = graph.xyz[graph.first + 1] - graph.xyz[graph.first]
     heading = np.arctan2(start[:, 1], start[:, 0])
     for junction in np.unique(graph.junction[guarded]):
         lanes = np.flatnonzero(guarded & (graph.junction == junction))
         axes: list[float] = []
         phase = np.zeros(len(lanes), dtype=np.int64)
+        # Assign each approach to an existing axis within 45° (from either end), or begin a new one
         for k, angle in enumerate(heading[lanes]):
             along = [i for i, axis in enumerate(axes) if abs(np.cos(angle - axis)) > SAME_AXIS_COS]
             if not along:

@@ -43,6 +43,7 @@ class PathDeviation:
     def moved(self, distance_m: float) -> "PathDeviation":
         """Return the deviation after a distance at the present steering; a negative distance moves
         backwards."""
+        # Curvature is constant over the distance: heading is linear, position by the mean heading
         yaw_rad = self.yaw_rad + distance_m * self.curvature
         lateral_m = self.lateral_m + distance_m * float(np.sin(0.5 * (self.yaw_rad + yaw_rad)))
         return dataclasses.replace(self, lateral_m=lateral_m, yaw_rad=yaw_rad)
@@ -66,19 +67,25 @@ def step_deviation(
     Args:
         noise_rad: standard deviation σ of the disturbance, rad.
     """
+    # The clock runs only while driving; a disturbance always runs to its end
     next_s = deviation.next_s - dt_s if speed_mps > 1.0 or deviation.next_s < 0 else deviation.next_s
     if next_s < -DISTURBANCE_S:
+        # Draw the next time: at least `RECOVERY_S`, on average twice that
         next_s = RECOVERY_S + float(rng.exponential(RECOVERY_S))
+    # Exact step of the Ornstein-Uhlenbeck process; without disturbance the noise decays
     decay = np.exp(-dt_s / CORRELATION_S)
     innovation = noise_rad * np.sqrt(1 - decay**2) * float(rng.standard_normal())
     noise = float(deviation.noise * decay + (innovation if next_s < 0 else 0.0))
     length = RETURN_M + RETURN_S * speed_mps
+    # Limit by the vehicle's steering and by lateral acceleration v² κ
     max_curvature = min(MAX_CURVATURE_PER_M, LATERAL_MPS2 / max(speed_mps, 1.0) ** 2)
+    # Disturb while the predicted offset stays small, else steer back
     if next_s < 0 and abs(deviation.lateral_m + length * deviation.yaw_rad) < MAX_OFFSET_M:
         target = np.clip(
             np.tan(noise) / wheelbase_m, -DISTURBANCE_SHARE * max_curvature, DISTURBANCE_SHARE * max_curvature
         )
     else:
+        # Critically damped: both poles at -1 / ℓ
         target = -deviation.lateral_m / length**2 - 2 * deviation.yaw_rad / length
     # The wheel turns over some tenths of a second.
     curvature = deviation.curvature + (

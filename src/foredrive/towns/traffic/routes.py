@@ -45,22 +45,28 @@ class Route:
 
         Lane changes come early on their stretch.
         """
+        # Distance at which each lane begins, from the start of the first lane
         length = graph.length_m[self.lanes]
         begins = np.cumsum(length) - length
         s = np.arange(self.start_m, begins[-1] + length[-1], ROUTE_SPACING_M)
+        # Stretch of each point, and the arc length on its lane
         at = np.searchsorted(begins, s, side="right") - 1
         lane, along = self.lanes[at], s - begins[at]
         points = graph.position(lane, along)
+        # Points on stretches with a lane change are moved from the old lane to the new one
         for k in np.flatnonzero((self.lanes != self.entered)[at]):
             old = int(self.entered[at[k]])
             beside = 1 if graph.left[lane[k]] == old else -1
             before = graph.position(
                 np.array([old]), np.array([project_to_neighbour(lane[k], along[k], beside, graph.sides)])
             )
+            # The change takes some seconds at the limit, but ends within the stretch
             from_m = self.start_m if at[k] == 0 else 0.0
             over_m = max(MIN_CHANGE_M, PLANNED_CHANGE_S * graph.limit_mps[old])
             over_m = min(over_m, graph.length_m[lane[k]] - from_m)
             x = np.clip((along[k] - from_m) / over_m, 0.0, 1.0)
+            # Quintic blend from the point beside on the old lane: zero
+            # lateral speed and acceleration at both ends
             points[k] += (1 - x**3 * (10 - 15 * x + 6 * x**2)) * (before[0] - points[k])
         return points
 
@@ -72,6 +78,7 @@ class Route:
         return self.commands_on(graph, int(first), int(end))
 
     def commands_on(self, graph: LaneGraph, first: int, end: int) -> list[Command]:
+        # A fork is where there is a choice, or where the lane turns
         """Return the command at each fork on the way from lane number `first` to number `end`."""
         return [
             graph.command(int(lane))
@@ -82,13 +89,16 @@ class Route:
     def distance_m(self, graph: LaneGraph, seconds: float) -> float:
         """Return the approximate distance that is driven in a time, m, with delays by other traffic and
         lights."""
+        # Mean time per metre on each lane: mean of 1 / speed over its samples
         pace_s = np.add.reduceat(1 / graph.speed_mps, graph.first) / graph.count
         length = graph.length_m[self.lanes].copy()
         length[0] -= self.start_m
+        # Waiting time at the start of each lane: lights, stop signs and yield signs
         waits_s = np.array([0.0, LIGHT_S, GIVE_WAY_S, GIVE_WAY_S])[graph.control[self.lanes]]
         waits_s[0] = 0.0
         steps_s = np.stack([waits_s, TRAFFIC_FACTOR * pace_s[self.lanes] * length], axis=1)
         steps_m = np.stack([np.zeros(len(length)), length], axis=1)
+        # Distance over time is piecewise linear: flat while waiting
         at_s, at_m = (np.append(0.0, np.cumsum(steps)) for steps in (steps_s, steps_m))
         return float(np.interp(seconds, at_s, at_m))
 
@@ -118,6 +128,7 @@ def draw_route(
         from_m, until_m = route.distance_m(graph, from_s), route.distance_m(graph, until_s)
         commands = route.commands(graph, until_m, from_m)
         turns, options = len(commands) - commands.count(Command.STRAIGHT), len(set(commands))
+        # Good enough: a turn, and the wanted variety of commands
         if turns and options >= (len(Command) if until_m - from_m > LONG_DRIVE_M else 2):
             return route
         if (options, wanted in commands, turns) > best_key:
@@ -139,16 +150,20 @@ def _extend(
     lanes, entered, to_go = [lane], [lane], length_m + start_m - graph.length_m[lane]
     taken: Counter[Command] = Counter()
     while to_go > 0:
+        # On the first lane there is no room for a lane change
         options = _options(graph, change_ranges, lanes[-1], may_change=len(lanes) > 1)
         if not options:
             break
         commands = [graph.command(onward) for _, onward in options]
+        # The commands used least so far; among them prefer the ones without a lane change
         min_count = min(taken[command] for command in commands)
         least_taken = [i for i, command in enumerate(commands) if taken[command] == min_count]
         straight_on = [i for i in least_taken if options[i][0] == lanes[-1]]
         choice = int(rng.choice(straight_on or least_taken))
+        # A way without choice is no fork and does not count
         if len(options) > 1:
             taken[commands[choice]] += 1
+        # The last lane is replaced: the route changes lanes on its stretch
         lanes[-1], onward = options[choice]
         lanes.append(onward)
         entered.append(onward)
@@ -165,6 +180,7 @@ def _options(
     """
     ends = [lane]
     onward = graph.successors[lane, : graph.successor_count[lane]]
+    # A change needs room, and only pays where the junction offers other ways from the neighbour
     enough_m = CHANGE_ROOM_M + CHANGE_ROOM_S * graph.limit_mps[lane]
     if may_change and len(onward) and (graph.junction[onward] >= 0).all() and graph.length_m[lane] > enough_m:
         ends += change_ranges.target[change_ranges.target[:, lane] >= 0, lane].tolist()

@@ -42,6 +42,7 @@ def add_vehicle(
     graph = traffic.lanes
     rng = np.random.default_rng((traffic.seed, 3, state.step_index, slot))
     no = np.zeros(CANDIDATES, dtype=np.bool_)
+    # Draw until one is a short car: other kinds are not wanted here
     drawn = draw_fleet(rng, np.full(CANDIDATES, state.next_track_id), no, no)
     car = int(np.argmax((drawn.category == Category.CAR) & (drawn.size_lwh[:, 0] < 5.0)))
     one = drawn.rows(np.array([car]))
@@ -49,6 +50,7 @@ def add_vehicle(
     one = place_vehicles(graph, one, np.array([lanes[at]]), np.array([s_m]))
     path = one.path.copy()
     onward = list(lanes[at + 1 : at + 1 + AHEAD])
+    # The path ahead is given; what lies beyond it is drawn at random
     path[0, BEHIND + 1 : BEHIND + 1 + len(onward)] = onward
     one = dataclasses.replace(
         one,
@@ -73,6 +75,7 @@ def clear_area(
         seen_within_m: the distance from vehicle 0 within which things are visible, m.
     """
     v, centre = state.vehicles, traffic.poses(state).centre_m
+    # None may vanish in sight of vehicle 0, and vehicle 0 never does
     near = (np.linalg.norm(centre[:, None] - xyz, axis=2) < CLEAR_M).any(axis=1) & v.active
     if near[0] or (near & (np.linalg.norm(centre - centre[0], axis=1) < seen_within_m)).any():
         return None
@@ -85,9 +88,11 @@ def grant_junction(traffic: Traffic, state: TrafficState, slot: int, lane: int) 
     ahead = v.path[slot, BEHIND:]
     if lane not in ahead:
         return state
+    # Extend the grant to the end of the junction
     last = int(np.argmax(ahead == lane))
     while last + 1 < len(ahead) and ahead[last + 1] >= 0 and graph.contested[ahead[last + 1]]:
         last += 1
     granted, rank = v.granted.copy(), v.rank.copy()
+    # A negative rank goes before all ranks, which are times
     granted[slot], rank[slot] = last, -1.0
     return dataclasses.replace(state, vehicles=dataclasses.replace(v, granted=granted, rank=rank))

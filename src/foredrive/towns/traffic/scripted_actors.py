@@ -55,6 +55,7 @@ class ScriptedActor:
     def ahead(self) -> Float64[np.ndarray, "2"]:
         """Return the unit heading, seen from above."""
         arc_m = self.arc_m
+        # Leg of the path at this arc length; `side="right"` takes the next one at a vertex
         leg = min(int(np.searchsorted(arc_m, self.s_m, side="right")), len(arc_m) - 1)
         step = (self.path_xyz[leg] - self.path_xyz[leg - 1])[:2]
         return np.asarray(step / np.hypot(*step))
@@ -69,6 +70,7 @@ class ScriptedActor:
 
         A negative speed moves it backwards. It stands at the ends of its path.
         """
+        # Limited change of speed, then the mean speed over the step
         max_change = ACCELERATION_MPS2 * dt_s
         speed = min(max(target_mps, self.speed_mps - max_change), self.speed_mps + max_change)
         s_m = self.s_m + 0.5 * (self.speed_mps + speed) * dt_s

@@ -45,6 +45,7 @@ class Spawner:
         self._vehicle_count = vehicle_count
         self._lanes, self._walks, self._starts, self._for_large = lanes, walks, starts, for_large
         self._for_bicycles = lanes.limit_mps <= MOTORWAY_LIMIT_MPS
+        # People appear on walkways, with a probability that grows with the length
         walkable = np.where(walks.is_crossing, 0.0, walks.length_m)
         self._walk_weight = walkable / max(walkable.sum(), 1e-9)
 
@@ -71,13 +72,16 @@ class Spawner:
         if not len(state.route):
             return state
         centre_m = vehicle_poses(self._lanes, state.vehicles).centre_m
+        # An ego vehicle off its lane is where it was driven to
         if ego_m is not None:
             centre_m[0] = ego_m
+        # Beyond the range it cannot be seen any more
         far = np.linalg.norm(centre_m - centre_m[0], axis=1) > DESPAWN_M
         far_off = np.linalg.norm(state.people.xyz - centre_m[0], axis=1) > PEOPLE_DESPAWN_M
         vehicles = dataclasses.replace(state.vehicles, active=state.vehicles.active & ~far)
         people = dataclasses.replace(state.people, active=state.people.active & ~far_off)
         state = dataclasses.replace(state, vehicles=vehicles, people=people)
+        # New ones appear farther away than the ego vehicle can see, but within the simulated region
         state = self._spawn_vehicles(state, SPAWN_MIN_M, 1, rng, centre_m[0])
         return self._spawn_people(state, PEOPLE_SPAWN_MIN_M, 1, rng, centre_m[0])
 
@@ -99,6 +103,7 @@ class Spawner:
             return state
         vehicles = state.vehicles
         for k, row in enumerate(rows.tolist()):
+            # Several tries at random places; the first that works is taken
             tries = rng.choice(places, TRIES)
             for start in tries[self._is_free(vehicles, tries)].tolist():
                 spawned = self._try_spawn(vehicles, row, start, state.next_track_id + k, rng)
@@ -111,11 +116,13 @@ class Spawner:
         """Return for each start whether it is far enough from all vehicles, and in time from those ahead and
         behind."""
         centres = vehicle_poses(self._lanes, vehicles).centre_m[vehicles.active]
+        # Offset of all vehicles in the frame of each start
         offset = centres[None] - self._starts.xyz[starts][:, None]
         forward = self._starts.forward[starts][:, None]
         along = np.sum(offset * forward, axis=2)
         lateral = np.linalg.norm(offset - along[..., None] * forward, axis=2)
         speed = self._lanes.speed(self._starts.lane[starts], self._starts.s_m[starts])
+        # Ahead and behind on the same lane (less than 3 m aside), more distance is needed at speed
         reach = CLEAR_M + CLEAR_S * speed[:, None]
         clear = (np.hypot(along, lateral) >= CLEAR_M) & ((np.abs(along) >= reach) | (lateral >= 3.0))
         return np.asarray(clear.all(axis=1))
@@ -132,12 +139,14 @@ class Spawner:
         one = draw_fleet(rng, np.array([track_id]), self._for_large[lane], self._for_bicycles[lane])
         one = place_vehicles(self._lanes, one, lane, self._starts.s_m[[start]])
         v = vehicles.replace_rows(np.array([row]), one)
+        # Draw its turns, so that its leader on the path is known
         nowhere = np.zeros(0, dtype=np.int64)
         v = extend_paths(self._lanes, self._for_large, v, nowhere, rng)
         starts_m = path_starts(self._lanes, v.path)
         leaders = find_leaders(self._lanes, v, starts_m)
         speed = v.speed_mps.copy()
         speed[row] = min(speed[row], desired_speed(self._lanes, v, starts_m)[row])
+        # v² = v_leader² + 2 b s: slow enough to brake gently behind the leader
         if leaders.leader[row] >= 0:
             room_m = max(leaders.leader_gap_m[row] - STANDSTILL_M, 0.0)
             leader_mps = v.speed_mps[leaders.leader[row]]
@@ -145,6 +154,7 @@ class Spawner:
         v = dataclasses.replace(v, speed_mps=speed)
         leaders = find_leaders(self._lanes, v, starts_m)  # the leaders of the others depend on its speed
         no_halt = np.full(len(speed), np.inf)
+        # Accept only if neither it nor a follower has to brake hard at once
         wanted = driving_context(self._lanes, v, starts_m, leaders, no_halt).desired_mps2(v)
         concerned = ((leaders.leader == row) | (leaders.limiting == row)) & v.active
         concerned[row] = True
@@ -162,6 +172,7 @@ class Spawner:
         rows = np.flatnonzero(~state.people.active)[:max_count]
         if not len(rows):
             return state
+        # Walks by length, and a uniform place on each
         tries = rng.choice(len(self._walk_weight), size=(len(rows), TRIES), p=self._walk_weight)
         s_m = rng.random(tries.shape) * self._walks.length_m[tries]
         xyz = self._walks.position(tries.ravel(), s_m.ravel()).reshape(*tries.shape, 3)
@@ -169,6 +180,7 @@ class Spawner:
         if ego_m is not None:
             distance = np.linalg.norm(xyz - ego_m, axis=2)
             ok = (distance >= beyond_m) & (distance <= PEOPLE_SPAWN_MAX_M)
+        # The first try that fits; people without one wait for the next step
         chosen = np.argmax(ok, axis=1)
         found = ok.any(axis=1)
         each = np.arange(len(rows))

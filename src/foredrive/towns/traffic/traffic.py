@@ -94,6 +94,7 @@ class Traffic:
         self._spawner = Spawner(self.lanes, self.walks, self.starts, self._for_large, vehicle_count)
 
     @cached_property
+    # A town without walkways has no people
     def lane_index(self) -> LaneIndex:
         """Return the town's lanes, searchable by position."""
         return build_lane_index(self.lanes)
@@ -106,6 +107,7 @@ class Traffic:
             route: the lane in which vehicle 0 has to be at the end of each stretch, from its current stretch
                 on. After the last one it takes random turns.
         """
+        # Every use of random numbers has a generator of its own, seeded by purpose
         rng = np.random.default_rng((self.seed, 1))
         lanes = np.zeros(0, dtype=np.int64) if route is None else route
         state = TrafficState(
@@ -134,24 +136,30 @@ class Traffic:
                 the same rules as the others.
             orders: orders for some of the other road users. None: no orders, and scripted actors stand still.
         """
+        # Seeded by step: equal states give equal steps, also after unpickling
         rng = np.random.default_rng((self.seed, 2, state.step_index))
+        # Vehicle 0 from outside: put it on its lane, and its shadows on the other lanes that it blocks
         perceived = None if ego is None else self._perceive_ego(state, ego)
         may_request = None if perceived is None else perceived.may_request
         if perceived is not None:
             route_passed = perceived.route_passed
             state = dataclasses.replace(state, vehicles=perceived.vehicles, route_passed=route_passed)
         known = len(state.vehicles.active)
+        # Shadows of scripted actors come after those of vehicle 0
         if state.scripted_actors:
             shadows = scripted_actor_shadows(self.lanes, self.lane_index, state.scripted_actors)
             state = dataclasses.replace(state, vehicles=state.vehicles.appended(shadows))
             if may_request is not None:
                 may_request = np.pad(may_request, (0, len(shadows.active)), constant_values=True)
         starts_m = path_starts(self.lanes, state.vehicles.path)
+        # Shadows have no orders
         orders = (orders or Orders.none(self._slot_count)).padded(len(state.vehicles.active))
         light = self.signals.light_states(state.time_s)
         decision = self._decide(state, starts_m, light, may_request, orders.runs_lights)
+        # Vehicles that ignore vehicle 0 decide in a world without it and without its shadows
         if orders.ignores_ego.any():
             active = state.vehicles.active.copy()
+            # Rows from the slots up to `known` are the shadows of vehicle 0
             active[[0, *range(self._slot_count, known)]] = False
             unseen = dataclasses.replace(state, vehicles=dataclasses.replace(state.vehicles, active=active))
             blindly = self._decide(unseen, starts_m, light, may_request, orders.runs_lights)
@@ -159,6 +167,7 @@ class Traffic:
         v = dataclasses.replace(state.vehicles, **decision.right_of_way)
         danger = None if perceived is None else perceived.is_endangered
         state = dataclasses.replace(
+            # People and scripted actors react to the state before this step's motion of the vehicles
             state,
             time_s=state.time_s + dt_s,
             step_index=state.step_index + 1,
@@ -166,12 +175,15 @@ class Traffic:
             people=step_pedestrians(self.walks, state.people, v, starts_m, light, dt_s, rng, danger),
             scripted_actors=step_scripted_actors(state.scripted_actors, orders.scripted_mps, dt_s),
         )
+        # A lane change replaces the path; then all move by the accelerations decided before it
         changed = self._begin_change(state, decision.context, perceived, orders)
         desired_mps2 = np.minimum(decision.desired_mps2, orders.max_mps2)
         moved = move_vehicles(state.vehicles if changed is None else changed, desired_mps2, dt_s)
+        # Drop the shadows
         own = slice(self._slot_count)
         vehicles = moved.rows(own) if perceived is None else perceived.without_shadows(moved)
         state = dataclasses.replace(state, vehicles=vehicles)
+        # The lanes beyond the new path are drawn or taken from the route
         if changed is not None:
             state = self._extend_paths(state, rng)
         state = self._change_lanes_at_ends(state, rng)
@@ -189,6 +201,7 @@ class Traffic:
         v = state.vehicles
         if v.speed_mps[0] > HALT_MPS or v.granted[0] > 0:
             return False
+        # Contested lanes ahead whose line is close
         ahead = v.path[0, BEHIND + 1 :]
         contested = (ahead >= 0) & self.lanes.contested[ahead]
         gap_m = path_starts(self.lanes, v.path[:1])[0, BEHIND + 1 :] - v.front_m[0]
@@ -206,6 +219,7 @@ class Traffic:
         its light is green `in_s` seconds from now.
         """
         v, ahead = state.vehicles, state.route[state.route_passed :]
+        # Columns of the route that need right of way; the first one's light decides
         on_it = np.flatnonzero(self.lanes.contested[ahead])
         shows = self.signals.light_states(state.time_s + in_s)
         closed = len(on_it) > 0 and shows[ahead[on_it[0]]] not in (LightState.NONE, LightState.GREEN)
@@ -224,16 +238,21 @@ class Traffic:
         """Decide the acceleration and the right of way of all vehicles."""
         v = state.vehicles
         leaders = find_leaders(self.lanes, v, starts_m)
+        # Yellow counts as closed
         green = (light == LightState.NONE) | (light == LightState.GREEN)
         way = claim_junctions(self.lanes, v, starts_m, leaders, green, state.time_s, may_request, runs)
+        # Stop for the nearest of: line of the junction, people on a crossing, vehicles with priority inside
         halt_gap = np.minimum(way.line_gap_m, crossing_gap(self.walks, state.people, v, starts_m))
         halt_gap = np.minimum(halt_gap, way.inside_gap_m)
         change_to_route = self._change_to_route(state)
+        # Vehicle 0 waits at the last place from which it can still reach its route
         if change_to_route is not None:
             halt_gap[0] = min(halt_gap[0], max(change_to_route[1], 0.0))
         context = driving_context(self.lanes, v, starts_m, leaders, halt_gap)
         courtesy_mps2 = self._courtesy_limits(v, change_to_route, context, starts_m)
+        # Let vehicle 0 in where it has to change lanes
         desired_mps2 = np.minimum(context.desired_mps2(v), courtesy_mps2)
+        # A stop counts where the line is close
         halted = (v.speed_mps < STOPPED_MPS) & (way.line_gap_m < AT_LINE_M)
         right_of_way = {
             "granted": way.granted,
@@ -281,9 +300,11 @@ class Traffic:
             return begin_change(self.lanes, v, *orders.change)
         fits = (self._for_large | ~is_large(v)[:, None]) & (v.category != Category.BICYCLE)[:, None]
         bonus = self._route_bonus(state)
+        # Bicycles stay in their lane, large vehicles out of tight curves
         may = lane_change_allowed(self.lanes, self._change_ranges, v, fits, bonus >= MANDATORY_MPS2)
         may &= np.isinf(orders.max_mps2)
         may[:, self._slot_count :] = False  # shadows
+        # From outside, vehicle 0 changes lanes by being driven there
         may[:, 0] &= perceived is None
         change = choose_change(self.lanes, self._change_ranges, v, context, may, bonus)
         if change is None:
@@ -298,13 +319,16 @@ class Traffic:
         v, bonus = state.vehicles, np.zeros((2, len(state.vehicles.active)))
         if state.route_passed >= len(state.route):
             return bonus
+        # Distance at which a change for the route becomes mandatory
         enough_m = CHANGE_SPACING_M + URGENT_S * v.speed_mps[0]
         change_to_route = self._change_to_route(state)
         if change_to_route is not None:
             side, room_m = change_to_route
+            # Towards the route: a small bonus far away, a large one close to the end
             bonus[side, 0] = DISCRETIONARY_MPS2 if room_m > enough_m else MANDATORY_MPS2
             bonus[1 - side, 0] = -np.inf
         else:
+            # In the right lane already: leave it only with ample room to come back
             room_m = self._change_ranges.room_m[:, v.lane[0]] - v.s_m[0]
             bonus[:, 0] = np.where(room_m > 2 * enough_m, 0.0, -np.inf)
         return bonus
@@ -320,6 +344,7 @@ class Traffic:
         m/s²."""
         if change_to_route is None or change_to_route[1] > CHANGE_SPACING_M + URGENT_S * v.speed_mps[0]:
             return np.full(len(v.active), np.inf)
+        # Only vehicle 0 needs room; the others have no target
         side, target = change_to_route[0], np.full(len(v.active), -1)
         target[0] = self._change_ranges.target[side, v.lane[0]]
         return courtesy_limits(self.lanes, v, starts_m, context, target, side)
@@ -339,11 +364,13 @@ class Traffic:
         return dataclasses.replace(state, vehicles=vehicles)
 
     def _change_lanes_at_ends(self, state: TrafficState, rng: np.random.Generator) -> TrafficState:
+        # A vehicle may pass several short lanes within one step
         while True:
             v = state.vehicles
             over = v.active & (v.s_m >= self.lanes.length_m[v.lane]) & (v.path[:, BEHIND + 1] >= 0)
             if not over.any():
                 return state
+            # Shift the window of the path by one lane; the last column becomes unknown
             path = np.where(
                 over[:, None], np.pad(v.path[:, 1:], ((0, 0), (0, 1)), constant_values=-1), v.path
             )
@@ -351,6 +378,7 @@ class Traffic:
                 v,
                 path=path,
                 s_m=np.where(over, v.s_m - self.lanes.length_m[v.lane], v.s_m),
+                # Grants count lanes ahead; a stop belongs to the line that has been passed
                 granted=np.where(over, np.maximum(v.granted - 1, 0), v.granted),
                 has_stopped=v.has_stopped & ~over,
             )

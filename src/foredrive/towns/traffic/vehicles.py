@@ -83,11 +83,13 @@ class Vehicles(Slots):
     def beside(self) -> Int[np.ndarray, "N"]:
         """Return the side of the path on which the lane lies that a vehicle has not left yet: 1 left, -1
         right, 0 none."""
+        # The old lane lies on the side from which the change began
         return np.where(self.to_clear_m > 0, np.sign(self.shift_m), 0.0).astype(np.int64)
 
     @property
     def to_clear_m(self) -> Float64[np.ndarray, "N"]:
         """Return the distance to drive until the old lane of a lane change is free, m."""
+        # Distance to drive until the rear axle has done the share after which the old lane is free
         to_go = CLEAR_OF_LANE * self.change_length_m - self.changed_m
         return np.where(self.shift_m != 0, np.maximum(to_go, 0.0), 0.0)
 
@@ -99,6 +101,7 @@ class Vehicles(Slots):
         length.
         """
         curved = np.where(self.changed_m < self.change_length_m, np.abs(self.shift_m), 0.0)
+        # Maximum curvature of the quintic; v² κ must not exceed the lateral acceleration
         curvature = 10 / np.sqrt(3) * curved / self.change_length_m**2
         return np.sqrt(CHANGE_LATERAL_MPS2 / np.maximum(curvature, 1e-9))
 
@@ -141,8 +144,10 @@ class Poses:
     def axle_frame(self, row: int = 0) -> Float64[np.ndarray, "4 4"]:
         """Return the pose of a body's ego frame: on the road below its rear axle, x along the slope."""
         forward = self.forward[row]
+        # Left is horizontal: the body does not roll
         left = np.array([-forward[1], forward[0], 0.0]) / np.hypot(forward[0], forward[1])
         T = np.eye(4)
+        # Columns of the rotation are the ego axes in the world: x forward, y left, z up
         T[:3, :3] = np.stack([forward, left, np.cross(forward, left)], axis=1)
         T[:3, 3] = self.axle_xyz[row]
         return T
@@ -167,9 +172,11 @@ def empty_slots(count: int) -> Vehicles:
 
 def path_starts(graph: LaneGraph, path: Int[np.ndarray, "N W"]) -> Float64[np.ndarray, "N W"]:
     """Return the arc length at which each lane of a path starts, m from the start of the current lane."""
+    # Unknown lanes ahead are infinitely long, so nothing beyond them is ever near
     length = np.where(path >= 0, graph.length_m[path], np.inf)
     length[:, :BEHIND] = np.where(path[:, :BEHIND] >= 0, length[:, :BEHIND], 0.0)
     start = np.zeros(path.shape)
+    # Ahead: sum of the lengths from the current lane on; behind: negative sums backwards
     start[:, BEHIND + 1 :] = np.cumsum(length[:, BEHIND:-1], axis=1)
     start[:, :BEHIND] = -np.cumsum(length[:, BEHIND - 1 :: -1], axis=1)[:, ::-1]
     return start
@@ -185,6 +192,7 @@ def points_on_paths(
 
     Paths continue straight beyond their ends.
     """
+    # The last lane that begins at or before the arc length; the first known lane if none does
     column = np.where(path >= 0, starts_m <= s_m[:, None], False)
     column = np.where(
         column.any(1), WINDOW - 1 - np.argmax(column[:, ::-1], axis=1), np.argmax(path >= 0, axis=1)
@@ -193,6 +201,7 @@ def points_on_paths(
     lane, local = path[rows, column], s_m - starts_m[rows, column]
     inside = np.clip(local, 0, graph.length_m[lane])
     point = graph.position(lane, inside)
+    # Beyond the ends of the path: straight on along the last or first segment
     beyond = local - inside
     if np.abs(beyond).max(initial=0.0) > 0:
         end = np.where(beyond > 0, graph.first[lane] + graph.count[lane] - 2, graph.first[lane])
@@ -209,14 +218,18 @@ def vehicle_poses(graph: LaneGraph, vehicles: Vehicles) -> Poses:
     live = np.flatnonzero(vehicles.active)
     path = vehicles.path[live]
     starts = path_starts(graph, path)
+    # s_m is the box centre, so the rear axle lies behind it
     axle_s = vehicles.s_m[live] - vehicles.axle_to_centre_m[live]
     rear = points_on_paths(graph, path, starts, axle_s)
     front = points_on_paths(graph, path, starts, axle_s + vehicles.wheelbase_m[live])
+    # Lateral offsets of both axles, across the chord between their points on the centreline
     left = _left_of(front - rear)
     axle = rear + vehicles.offset_m(np.zeros(len(vehicles.active)))[live, None] * left
+    # The body's heading is that of the chord between the axles
     forward = front + vehicles.offset_m(vehicles.wheelbase_m)[live, None] * left - axle
     forward /= np.linalg.norm(forward, axis=1, keepdims=True)
     left = _left_of(forward)
+    # From the axle forward to the middle of the box, and up by half its height
     centre = axle + vehicles.axle_to_centre_m[live, None] * forward
     centre += 0.5 * vehicles.size_lwh[live, 2:] * _up_of(forward, left)
     out = [np.zeros((len(vehicles.active), 3)) for _ in range(3)]
@@ -257,10 +270,12 @@ def desired_speed(
 
     Drivers look `SLOWING_TIME_S` ahead, because they reach the speed that they want now only after this time.
     """
+    # Point where the vehicle will be when it has adapted its speed
     soon_m = vehicles.s_m + SLOWING_TIME_S * vehicles.speed_mps
     here = np.minimum(graph.speed(vehicles.lane, vehicles.s_m), graph.speed(vehicles.lane, soon_m))
     ahead = vehicles.path[:, BEHIND + 1 :]
     entry = np.where(ahead >= 0, graph.speed_mps[graph.first[ahead]], np.inf)
+    # Way to the start of each lane ahead; v² = v_entry² + 2 b s slows down in time
     to_go = starts_m[:, BEHIND + 1 :] - soon_m[:, None]
     in_time = np.sqrt(entry**2 + 2 * SLOWING_MPS2 * np.maximum(to_go, 0.0)).min(axis=1)
     wanted = np.minimum(vehicles.top_speed_mps, vehicles.speed_factor * np.minimum(here, in_time))
