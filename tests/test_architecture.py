@@ -150,3 +150,18 @@ def test_carla_is_driven_in_without_the_embedded_towns() -> None:
     assert not {name for name in names if name.startswith("towns/")}
     source = foredrive_files(ROOT / "runs" / "drive" / "in_carla.py")
     assert not source & {ROOT / "towns" / "driving" / "town.py", ROOT / "runs" / "drive" / "in_towns.py"}
+
+
+NO_NOUNS = {"found", "at", "each", "there", "told"}
+
+
+@pytest.mark.parametrize("path", sorted(ROOT.rglob("*.py")), ids=lambda path: str(path.relative_to(ROOT)))
+def test_variables_arguments_and_fields_are_named_by_nouns(path: Path) -> None:
+    """A reader cannot guess what `found` holds. A method may be called `at`: `trajectory.at(t_s)`."""
+    nodes = list(ast.walk(ast.parse(path.read_text())))
+    variables = {node.id for node in nodes if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store)}
+    fields = {
+        node.attr for node in nodes if isinstance(node, ast.Attribute) and isinstance(node.ctx, ast.Store)
+    }
+    arguments = {node.arg for node in nodes if isinstance(node, ast.arg)}
+    assert not NO_NOUNS & (variables | fields | arguments)

@@ -231,21 +231,21 @@ def remove_abandoned(folder: Path, *, below: bool = False) -> None:
         folder: may not exist.
         below: whether all folders in it are looked at too.
     """
-    for at in _folders_below(folder) if below else (folder,):
-        if at in _tidied:
+    for place in _folders_below(folder) if below else (folder,):
+        if place in _tidied:
             continue
         with contextlib.suppress(FileNotFoundError):
-            lock = _lock(at, wait=True)
+            lock = _lock(place, wait=True)
             try:
-                _remove_abandoned(at)
+                _remove_abandoned(place)
             finally:
                 _unlock(lock)
 
 
 def _folders_below(folder: Path) -> Iterator[Path]:
-    for found, folders, _ in os.walk(folder):
+    for parent, folders, _ in os.walk(folder):
         folders[:] = [name for name in folders if _SCRATCH.fullmatch(name) is None]
-        yield Path(found)
+        yield Path(parent)
 
 
 def _new_scratch(final: Path, alone: bool) -> tuple[Path, int | None]:

@@ -96,18 +96,18 @@ def collide(
     """
     # Impact speed is the norm of the velocity difference
     velocity = ego.speed_mps * np.array([np.cos(ego.yaw_rad), np.sin(ego.yaw_rad)])
-    known, events = dict(met), []
+    contacts, events = dict(met), []
     for i in np.flatnonzero(touched(box, users)).tolist():
         track, category = int(users.track_id[i]), Category(int(users.category[i]))
         # The same road user counts again only after some seconds without contact
-        if t_s - known.get(track, -np.inf) > SAME_S:
+        if t_s - contacts.get(track, -np.inf) > SAME_S:
             kind = "pedestrian" if category is Category.PEDESTRIAN else "vehicle"
             impact_mps = float(np.hypot(*(velocity - users.velocity_mps[i])))
             where = (float(users.foot_m[i, 0]), float(users.foot_m[i, 1]))
             text = f"{category.name.lower()} {track} at {impact_mps:.1f} m/s"
             events.append(Event(f"collision_{kind}", t_s, where, text, category.name.lower(), impact_mps))
-        known[track] = t_s
-    return events, tuple((track, at_s) for track, at_s in known.items() if t_s - at_s <= SAME_S)
+        contacts[track] = t_s
+    return events, tuple((track, at_s) for track, at_s in contacts.items() if t_s - at_s <= SAME_S)
 
 
 def blocked(box: Box, users: RoadUsers) -> bool:

@@ -158,7 +158,7 @@ def drive_route(
             on_frame()
         # The first event that is an ending ends the drive
         ending = next((Ending(event.kind) for event in step.events if event.kind in set(Ending)), None)
-    infractions = tuple(found for event in events if (found := infraction_of(event)) is not None)
+    infractions = tuple(infraction for event in events if (infraction := infraction_of(event)) is not None)
     duration_s, progress = (len(states) - 1) * STEP_S, vars(simulator.progress())
     score = RouteScore(
         route, repetition, ending=ending, infractions=infractions, duration_s=duration_s, **progress

@@ -46,9 +46,9 @@ class Faults:
         Raises:
             InputError: it has no such camera.
         """
-        known = {name.lower() for name in names}
+        lower_names = {name.lower() for name in names}
         for fault in self.cameras:
-            if fault.camera.lower() not in known:
+            if fault.camera.lower() not in lower_names:
                 raise InputError(f"--camera-fault: no camera {fault.camera}; there are {', '.join(names)}")
 
 

@@ -104,15 +104,15 @@ def _knots(waypoints: Float64[np.ndarray, "T 2"]) -> Int[np.ndarray, "K"]:
     Each knot lies ahead of the one before. The last waypoint is a knot if possible.
     """
     index: list[int] = []
-    at, towards = np.zeros(2), np.array([1.0, 0.0])
+    point_xy, towards = np.zeros(2), np.array([1.0, 0.0])
     for k, point in enumerate(waypoints):
-        offset = point - at
+        offset = point - point_xy
         # Only points far enough and ahead of the last knot
         if np.linalg.norm(offset) >= KNOT_M and offset @ towards > 0:
             index.append(k)
-            at, towards = point, offset / np.linalg.norm(offset)
+            point_xy, towards = point, offset / np.linalg.norm(offset)
     # The last waypoint replaces the last knot if it lies beyond it
-    beyond_m = float((waypoints[-1] - at) @ towards)
+    beyond_m = float((waypoints[-1] - point_xy) @ towards)
     if beyond_m > (0.0 if index else 0.5 * KNOT_M):
         index[max(0, len(index) - 1) :] = [len(waypoints) - 1]
     return np.array(index, dtype=np.int64)

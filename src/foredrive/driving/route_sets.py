@@ -61,8 +61,8 @@ def load_route_set(name_or_path: str) -> list[RouteWaypoints]:
     if name_or_path == SHORT_10:
         return sets[OF][:10]
     if name_or_path not in sets:
-        known = ", ".join(route_set_names())
-        raise InputError(f"unknown route set {name_or_path!r}: one of {known}, or a CARLA route file (.xml)")
+        names = ", ".join(route_set_names())
+        raise InputError(f"unknown route set {name_or_path!r}: one of {names}, or a CARLA route file (.xml)")
     return sets[name_or_path]
 
 
@@ -119,7 +119,7 @@ def _route(path: Path, number: int, element: ElementTree.Element) -> RouteWaypoi
     if name is None or town is None:
         raise InputError(f"{where} has no {'id' if name is None else 'town'}")
     waypoints = [*element.findall("waypoint"), *element.findall("waypoints/position")]
-    scenarios = tuple(each.get("type", "?") for each in element.findall("scenarios/scenario"))
+    scenarios = tuple(scenario.get("type", "?") for scenario in element.findall("scenarios/scenario"))
     if len(waypoints) < 2:
         raise InputError(f"{where} has {len(waypoints)} waypoints; a route needs at least two")
     try:

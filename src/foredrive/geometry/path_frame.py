@@ -20,17 +20,17 @@ def along_path(
         path_valid: which of its points exist.
     """
     start, step = path_xy[..., :-1, :], path_xy.diff(dim=-2)
-    there = path_valid[..., 1:] & path_valid[..., :-1]
+    valid = path_valid[..., 1:] & path_valid[..., :-1]
     length = step.norm(dim=-1)
     # Arc length at the start of each segment; segments with an invalid end have no length
-    begins = (length * there).cumsum(-1) - length * there
+    begins = (length * valid).cumsum(-1) - length * valid
     offset = points[..., :, None, :] - start[..., None, :, :]  # [*b N R-1 2]
     # Foot of the perpendicular on every segment, clamped to it
     share = (offset * step[..., None, :, :]).sum(-1) / length.square().clamp_min(1e-12)[..., None, :]
     share = share.clamp(0, 1)
     away = offset - share[..., None] * step[..., None, :, :]
     # Segments that do not exist are infinitely far
-    away_m = away.norm(dim=-1).masked_fill(~there[..., None, :], torch.inf)
+    away_m = away.norm(dim=-1).masked_fill(~valid[..., None, :], torch.inf)
     nearest_m, segment = away_m.min(dim=-1)
     along = begins[..., None, :] + share * length[..., None, :]
     along_m = along.gather(-1, segment[..., None])[..., 0]
@@ -45,11 +45,11 @@ def path_headings(
 ) -> Float[Tensor, "*b N 2"]:
     """Return the unit direction of a path at distances along it."""
     step = path_xy.diff(dim=-2)
-    there = path_valid[..., 1:] & path_valid[..., :-1]
-    length = step.norm(dim=-1) * there
+    valid = path_valid[..., 1:] & path_valid[..., :-1]
+    length = step.norm(dim=-1) * valid
     # The segment that contains the distance; beyond the end the last one
     ends = length.cumsum(-1)
     segment = (along_m[..., :, None] > ends[..., None, :]).sum(-1)
-    segment = segment.clamp_max((there.sum(-1, keepdim=True) - 1).clamp_min(0))
+    segment = segment.clamp_max((valid.sum(-1, keepdim=True) - 1).clamp_min(0))
     unit = step / step.norm(dim=-1, keepdim=True).clamp_min(1e-9)
     return unit.gather(-2, segment[..., None].expand(*segment.shape, 2))

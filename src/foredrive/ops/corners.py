@@ -91,5 +91,5 @@ def sample_point_backward(values, base, block, p, corners, grad, zero, grad_valu
     # Each corner gets the gradient times its interpolation weight
     if grad_values.size > 0:
         for k in range(corners):
-            at = base + block.corner[k * BLOCK + p]
-            store(grad_values, at, mul_add(block.part[k * BLOCK + p], grad, load(grad_values, at, zero)))
+            row = base + block.corner[k * BLOCK + p]
+            store(grad_values, row, mul_add(block.part[k * BLOCK + p], grad, load(grad_values, row, zero)))

@@ -59,7 +59,7 @@ def grid_levels(
         log2_rows: binary logarithm of the maximum number of rows of a level.
         actors: number of actors that the grid serves.
     """
-    found, first = [], 0
+    table, first = [], 0
     for i in range(levels):
         # N_l = N_min · b^l. The small number keeps floor from losing a cell by rounding
         growth = (finest / coarsest) ** (i / max(levels - 1, 1))
@@ -67,9 +67,9 @@ def grid_levels(
         # A level has one row per vertex of all actors, as far as the limit of rows allows
         vertices = actors * (cells + 1) ** 3
         rows = min(vertices, 2**log2_rows)
-        found.append(Level(cells, first, rows, dense=vertices <= 2**log2_rows))
+        table.append(Level(cells, first, rows, dense=vertices <= 2**log2_rows))
         first += rows
-    return tuple(found)
+    return tuple(table)
 
 
 def read_hash_grid(
@@ -125,7 +125,7 @@ def read_hash_grid_reference(
 ) -> Float[Tensor, "LF N"]:
     """Compute `read_hash_grid` in plain PyTorch."""
     with full_precision(table, points) as (table, points):
-        found = []
+        features = []
         for level in levels:
             # Position in cells, moved to the surface of the cube where it lies outside
             place = (points * level.cells).clamp(0, level.cells)
@@ -142,8 +142,8 @@ def read_hash_grid_reference(
             # Fade the levels whose cells are smaller than twice the footprint
             if footprint is not None:
                 total = total / (2 * level.cells * footprint.detach().to(total)).clamp_min(1)[:, None]
-            found.append(total.T)
-        return torch.cat(found)
+            features.append(total.T)
+        return torch.cat(features)
 
 
 def _row(vertex: Int[Tensor, "N 3"], level: Level, actor: Int[Tensor, "N"] | None) -> Int[Tensor, "N"]:
@@ -201,8 +201,8 @@ class _ReadHashGrid(torch.autograd.Function):
         # Each level writes its own part, so that the sum over levels has a fixed order
         grad_points = points.new_empty(len(levels) if wants_points else 0, 3, len(points))
         inputs = _inputs(table, points, footprint, actor)
-        found = (grad_out.contiguous(), grad_table, grad_points)
-        grads = GridGradients(*(tensor.numpy() for tensor in found))
+        arguments = (grad_out.contiguous(), grad_table, grad_points)
+        grads = GridGradients(*(tensor.numpy() for tensor in arguments))
 
         # One thread does all points of a level: rows of a table are never shared between threads
         def job(start: int, stop: int) -> None:

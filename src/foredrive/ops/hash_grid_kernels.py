@@ -94,21 +94,21 @@ def _fill_block(inputs, block, level, first, count):
             width = np.float32(2) * cells * inputs.footprint[first + i]
             scale[i] = ONE / width if width > ONE else ONE
     for axis in range(3):
-        at = axis * BLOCK
+        axis_start = axis * BLOCK
         for i in range(count):
             place = inputs.points[first + i, axis] * cells
             # NaN differs from itself. A NaN weight carries it to all features of the level
             scale[i] = scale[i] if place == place else np.float32(np.nan)
             # Positions outside of the cube are clamped, so they have no gradient
             within = (place >= ZERO) & (place <= cells)
-            scale[BLOCK + at + i] = cells if within else ZERO
+            scale[BLOCK + axis_start + i] = cells if within else ZERO
             place = place if place > ZERO else ZERO  # NaN becomes 0 too
             place = place if place < cells else cells
             low = np.floor(place)
             # The upper face belongs to the last cell, with position 1 in it
             low = low if low < cells - ONE else cells - ONE
-            cell[at + i] = low
-            block.inside[at + i] = place - low
+            cell[axis_start + i] = low
+            block.inside[axis_start + i] = place - low
     if level.dense:
         _dense_corners(inputs, block, level, first, count)
     else:
@@ -245,8 +245,12 @@ def _read_back(inputs, block, level, first, count, number, zero, grads):
                 block.dots[k * BLOCK + i] = dot(row, grad)
         if to_table:
             for k in range(8):
-                at = base + corner[k * BLOCK + i]
-                store(grads.table, at, mul_add(part[k * BLOCK + i], grad, load(grads.table, at, zero)))
+                table_row = base + corner[k * BLOCK + i]
+                store(
+                    grads.table,
+                    table_row,
+                    mul_add(part[k * BLOCK + i], grad, load(grads.table, table_row, zero)),
+                )
 
 
 @kernel_part

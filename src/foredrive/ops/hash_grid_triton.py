@@ -113,9 +113,9 @@ def _launch(
 
 @triton.jit
 @no_type_check
-def _axis(points, at, inside, axis, cells):
+def _axis(points, point, inside, axis, cells):
     """Return a coordinate's cell, the place in it, its derivative, and NaN if it is NaN (else 0)."""
-    place = tl.load(points + 3 * at + axis, mask=inside, other=0.0).to(tl.float32) * cells
+    place = tl.load(points + 3 * point + axis, mask=inside, other=0.0).to(tl.float32) * cells
     # Positions outside of the cube are clamped and have no gradient
     slope = tl.where((place >= 0) & (place <= cells), cells, 0.0)
     # NaN is carried to the result by adding it to the weight of the level
@@ -130,10 +130,10 @@ def _axis(points, at, inside, axis, cells):
 
 @triton.jit
 @no_type_check
-def _level_weight(footprint, at, inside, cells, FOOTPRINTS: tl.constexpr):
+def _level_weight(footprint, point, inside, cells, FOOTPRINTS: tl.constexpr):
     weight = tl.where(inside, 1.0, 0.0)
     if FOOTPRINTS:
-        width = 2.0 * cells * tl.load(footprint + at, mask=inside, other=0.0)
+        width = 2.0 * cells * tl.load(footprint + point, mask=inside, other=0.0)
         weight = weight / tl.where(width > 1.0, width, 1.0)
     return weight
 
@@ -150,10 +150,10 @@ def _row(x, y, z, owner, cells, rows, dense):
 
 @triton.jit
 @no_type_check
-def _owner(actor, at, inside, ACTORS: tl.constexpr):
-    owner = tl.zeros(at.shape, tl.int64)
+def _owner(actor, point, inside, ACTORS: tl.constexpr):
+    owner = tl.zeros(point.shape, tl.int64)
     if ACTORS:
-        owner = tl.load(actor + at, mask=inside, other=0).to(tl.int64)
+        owner = tl.load(actor + point, mask=inside, other=0).to(tl.int64)
     return owner
 
 
@@ -174,16 +174,16 @@ def _read_points(
     POINTS: tl.constexpr,
 ):
     # 64-bit indices: the number of points times features may exceed 32 bits
-    at = tl.program_id(0).to(tl.int64) * POINTS + tl.arange(0, POINTS)
-    level, inside = tl.program_id(1), at < count
+    point = tl.program_id(0).to(tl.int64) * POINTS + tl.arange(0, POINTS)
+    level, inside = tl.program_id(1), point < count
     cells, first = tl.load(shape + level), tl.load(shape + levels + level)
     rows, dense = tl.load(shape + 2 * levels + level), tl.load(shape + 3 * levels + level)
     # Cell and position in the cell along each axis
-    x, wx, _, bad_x = _axis(points, at, inside, 0, cells)
-    y, wy, _, bad_y = _axis(points, at, inside, 1, cells)
-    z, wz, _, bad_z = _axis(points, at, inside, 2, cells)
-    owner = _owner(actor, at, inside, ACTORS)
-    scale = _level_weight(footprint, at, inside, cells, FOOTPRINTS) + bad_x + bad_y + bad_z
+    x, wx, _, bad_x = _axis(points, point, inside, 0, cells)
+    y, wy, _, bad_y = _axis(points, point, inside, 1, cells)
+    z, wz, _, bad_z = _axis(points, point, inside, 2, cells)
+    owner = _owner(actor, point, inside, ACTORS)
+    scale = _level_weight(footprint, point, inside, cells, FOOTPRINTS) + bad_x + bad_y + bad_z
     f = tl.arange(0, FEATURES)
     total = tl.zeros([POINTS, FEATURES], tl.float32)
     for corner in tl.static_range(8):
@@ -195,8 +195,8 @@ def _read_points(
         place = row[:, None] * FEATURES + f[None, :]
         value = tl.load(table + place, mask=inside[:, None], other=0.0).to(tl.float32)
         total += (scale * pz * py * px)[:, None] * value
-    # The result has the points last: row level · F + f, column `at`
-    to = (level * FEATURES + f)[None, :].to(tl.int64) * count + at[:, None]
+    # The result has the points last: row level · F + f, column `point`
+    to = (level * FEATURES + f)[None, :].to(tl.int64) * count + point[:, None]
     tl.store(out + to, total, mask=inside[:, None])
 
 
@@ -221,17 +221,17 @@ def _read_points_back(
     TO_POINTS: tl.constexpr,
 ):
     # The same cells, weights and rows as in the forward pass, computed again
-    at = tl.program_id(0).to(tl.int64) * POINTS + tl.arange(0, POINTS)
-    level, inside = tl.program_id(1), at < count
+    point = tl.program_id(0).to(tl.int64) * POINTS + tl.arange(0, POINTS)
+    level, inside = tl.program_id(1), point < count
     cells, first = tl.load(shape + level), tl.load(shape + levels + level)
     rows, dense = tl.load(shape + 2 * levels + level), tl.load(shape + 3 * levels + level)
-    x, wx, slope_x, bad_x = _axis(points, at, inside, 0, cells)
-    y, wy, slope_y, bad_y = _axis(points, at, inside, 1, cells)
-    z, wz, slope_z, bad_z = _axis(points, at, inside, 2, cells)
-    owner = _owner(actor, at, inside, ACTORS)
-    scale = _level_weight(footprint, at, inside, cells, FOOTPRINTS) + bad_x + bad_y + bad_z
+    x, wx, slope_x, bad_x = _axis(points, point, inside, 0, cells)
+    y, wy, slope_y, bad_y = _axis(points, point, inside, 1, cells)
+    z, wz, slope_z, bad_z = _axis(points, point, inside, 2, cells)
+    owner = _owner(actor, point, inside, ACTORS)
+    scale = _level_weight(footprint, point, inside, cells, FOOTPRINTS) + bad_x + bad_y + bad_z
     f = tl.arange(0, FEATURES)
-    source = (level * FEATURES + f)[None, :].to(tl.int64) * count + at[:, None]
+    source = (level * FEATURES + f)[None, :].to(tl.int64) * count + point[:, None]
     grad = tl.load(grad_out + source, mask=inside[:, None], other=0.0)
     to_x, to_y = tl.zeros([POINTS], tl.float32), tl.zeros([POINTS], tl.float32)
     to_z = tl.zeros([POINTS], tl.float32)
@@ -255,7 +255,7 @@ def _read_points_back(
             to_z += px * py * sz * dot
     # Each level has its own part: the caller sums over the levels
     if TO_POINTS:
-        row = grad_points + level.to(tl.int64) * 3 * count + at
+        row = grad_points + level.to(tl.int64) * 3 * count + point
         tl.store(row, to_x * slope_x, mask=inside)
         tl.store(row + count, to_y * slope_y, mask=inside)
         tl.store(row + 2 * count, to_z * slope_z, mask=inside)

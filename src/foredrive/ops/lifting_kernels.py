@@ -97,13 +97,13 @@ def _read(inputs, block, first, last, channel, zero, out):
     for pair in range(first, last):
         # Offset of the camera's image and of the query's result, in floats
         base = inputs.image[pair] * pixels * channels + channel
-        at = inputs.query[pair] * channels + channel
-        total = load(out, at, zero)
+        place = inputs.query[pair] * channels + channel
+        total = load(out, place, zero)
         for level in range(levels):
             i = (level * (last - first) + pair - first) * points
             for p in range(i, i + points):
                 total = sample_point(inputs.values, base, block, p, 4, total, zero)
-        store(out, at, total)
+        store(out, place, total)
 
 
 @kernel

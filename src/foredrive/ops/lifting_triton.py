@@ -93,11 +93,11 @@ def _launch(kernel: Any, inputs: Sequence[Tensor], outputs: Sequence[Tensor | No
 
 @triton.jit
 @no_type_check
-def _points(offsets, weights, at, inside):
+def _points(offsets, weights, place, inside):
     """Load offsets and weights of rows × points."""
-    dx = tl.load(offsets + 2 * at, mask=inside, other=0.0).to(tl.float32)
-    dy = tl.load(offsets + 2 * at + 1, mask=inside, other=0.0).to(tl.float32)
-    return dx, dy, tl.load(weights + at, mask=inside, other=0.0).to(tl.float32)
+    dx = tl.load(offsets + 2 * place, mask=inside, other=0.0).to(tl.float32)
+    dy = tl.load(offsets + 2 * place + 1, mask=inside, other=0.0).to(tl.float32)
+    return dx, dy, tl.load(weights + place, mask=inside, other=0.0).to(tl.float32)
 
 
 @triton.jit
@@ -153,8 +153,8 @@ def _lift_rows(
             p = first + tl.arange(0, P)
             inside = exists[:, None] & (p < POINTS)[None, :]
             # Flat index into [b·Q H L P]
-            at = ((row * levels + level) * POINTS)[:, None] + p[None, :]
-            dx, dy, weight = _points(offsets, weights, at, inside)
+            place = ((row * levels + level) * POINTS)[:, None] + p[None, :]
+            dx, dy, weight = _points(offsets, weights, place, inside)
             for camera in range(0, cameras):
                 image, pair, part = _camera(share, query, queries, camera, cameras, exists)
                 # Skip the camera if it sees none of the program's queries.
@@ -216,8 +216,8 @@ def _lift_rows_back(
         for first in range(0, POINTS, P):
             p = first + tl.arange(0, P)
             inside = exists[:, None] & (p < POINTS)[None, :]
-            at = ((row * levels + level) * POINTS)[:, None] + p[None, :]
-            dx, dy, weight = _points(offsets, weights, at, inside)
+            place = ((row * levels + level) * POINTS)[:, None] + p[None, :]
+            dx, dy, weight = _points(offsets, weights, place, inside)
             to_x, to_y = tl.zeros([ROWS, P], tl.float32), tl.zeros([ROWS, P], tl.float32)
             to_weight = tl.zeros([ROWS, P], tl.float32)
             for camera in range(0, cameras):
@@ -247,6 +247,6 @@ def _lift_rows_back(
                         to_weight += wy * wx * dot
             # A row owns its offsets and weights, so a plain store suffices
             if TO_POINTS:
-                tl.store(grad_offsets + 2 * at, to_x, mask=inside)
-                tl.store(grad_offsets + 2 * at + 1, to_y, mask=inside)
-                tl.store(grad_weights + at, to_weight, mask=inside)
+                tl.store(grad_offsets + 2 * place, to_x, mask=inside)
+                tl.store(grad_offsets + 2 * place + 1, to_y, mask=inside)
+                tl.store(grad_weights + place, to_weight, mask=inside)

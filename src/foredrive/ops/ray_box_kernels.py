@@ -47,7 +47,7 @@ def cross_rays(inputs, first, last, counts, starts, ray, box, span):
     for r in range(first, last):
         ox, oy, oz = inputs.origin[r, 0], inputs.origin[r, 1], inputs.origin[r, 2]
         dx, dy, dz = inputs.direction[r, 0], inputs.direction[r, 1], inputs.direction[r, 2]
-        k, share, found = inputs.segment[r], inputs.share[r], 0
+        k, share, count = inputs.segment[r], inputs.share[r], 0
         for a in range(inputs.position.shape[0]):
             if not inputs.present[a, k]:
                 continue
@@ -73,15 +73,19 @@ def cross_rays(inputs, first, last, counts, starts, ray, box, span):
             if near < far:
                 if write:
                     # Insertion sort by distance of entry: a ray crosses few boxes
-                    at = starts[r] + found
-                    while at > starts[r] and span[at - 1, 0] > near:
-                        box[at], span[at, 0], span[at, 1] = box[at - 1], span[at - 1, 0], span[at - 1, 1]
-                        at -= 1
-                    box[at], span[at, 0], span[at, 1] = a, near, far
-                    ray[starts[r] + found] = r
-                found += 1
+                    slot = starts[r] + count
+                    while slot > starts[r] and span[slot - 1, 0] > near:
+                        box[slot], span[slot, 0], span[slot, 1] = (
+                            box[slot - 1],
+                            span[slot - 1, 0],
+                            span[slot - 1, 1],
+                        )
+                        slot -= 1
+                    box[slot], span[slot, 0], span[slot, 1] = a, near, far
+                    ray[starts[r] + count] = r
+                count += 1
         if not write:
-            counts[r] = found
+            counts[r] = count
 
 
 @inlined_part

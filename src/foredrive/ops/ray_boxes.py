@@ -216,12 +216,12 @@ def _crossings(
     """Compute the distances and the rays in the boxes' frames of given pairs, differentiably."""
     # The pairs are fixed: all that follows is differentiable
     ray, box = pair.unbind(-1)
-    keys, at = boxes.key_t_s, segment[ray]
+    keys, key = boxes.key_t_s, segment[ray]
     if len(keys) == 1:
         share = t_s.new_zeros(len(ray))
     else:
-        share = (t_s.index_select(0, ray) - keys[at]) / (keys[at + 1] - keys[at])
-    pose = _pose(boxes.T_scene_box, box, at, share)
+        share = (t_s.index_select(0, ray) - keys[key]) / (keys[key + 1] - keys[key])
+    pose = _pose(boxes.T_scene_box, box, key, share)
     R_box_scene = pose[:, :3, :3].transpose(-1, -2)
     start = (R_box_scene @ (origin.index_select(0, ray) - pose[:, :3, 3])[..., None])[..., 0]
     way = (R_box_scene @ direction.index_select(0, ray)[..., None])[..., 0]

@@ -130,5 +130,5 @@ def _enter_boxes(
         near, far = _slab(qx, ex, tl.load(half_size + 3 * a), near, far)
         near, far = _slab(qy, ey, tl.load(half_size + 3 * a + 1), near, far)
         near, far = _slab(qz, ez, tl.load(half_size + 3 * a + 2), near, far)
-        there = tl.load(shown + a * segments + k, mask=inside, other=0) != 0
-        tl.store(enter + r * boxes + a, tl.where(there & (near < far), near, float("inf")), mask=inside)
+        present = tl.load(shown + a * segments + k, mask=inside, other=0) != 0
+        tl.store(enter + r * boxes + a, tl.where(present & (near < far), near, float("inf")), mask=inside)

@@ -147,8 +147,8 @@ def _last_at_most(values, start, stop, x):
 
 @inlined_part
 @no_type_check
-def _find_tiles_in_box(row, points, box, turn, found, count):
-    """Add the tiles that a splat touches within a box x0 x1 y0 y1 to `found`. Return the new count.
+def _find_tiles_in_box(row, points, box, turn, tiles, count):
+    """Add the tiles that a splat touches within a box x0 x1 y0 y1 to `tiles`. Return the new count.
 
     The box is shifted by `turn` periods from the splat.
     """
@@ -177,8 +177,8 @@ def _find_tiles_in_box(row, points, box, turn, found, count):
                 touched = touches(row, bounds, x)
             if touched:
                 # Beyond the end of the buffer only count: the caller comes again with a longer one
-                if count < found.size:
-                    found[count] = t
+                if count < tiles.size:
+                    tiles[count] = t
                 count += 1
             t += 1
         r += 1
@@ -187,10 +187,10 @@ def _find_tiles_in_box(row, points, box, turn, found, count):
 
 @kernel
 @no_type_check
-def find_tiles(start, stop, packed, points, per_splat, found):
-    """Write the tiles that the splats start … stop - 1 touch to `found`, Int32, splat by splat.
+def find_tiles(start, stop, packed, points, per_splat, tiles):
+    """Write the tiles that the splats start … stop - 1 touch to `tiles`, Int32, splat by splat.
 
-    `per_splat` gets the number of tiles of each splat. Return the total number. If `found` is too short, call
+    `per_splat` gets the number of tiles of each splat. Return the total number. If `tiles` is too short, call
     the function again with a longer array.
     """
     count = 0
@@ -211,7 +211,7 @@ def find_tiles(start, stop, packed, points, per_splat, found):
                 # Only copies that reach into one period about 0 meet tiles
                 if turns == 0 or (x1 + away >= -half_turn and x0 + away <= half_turn):
                     count = _find_tiles_in_box(
-                        row, points, (x0 + away, x1 + away, y0, y1), turn, found, count
+                        row, points, (x0 + away, x1 + away, y0, y1), turn, tiles, count
                     )
         per_splat[i] = count - before
     return count
@@ -239,9 +239,9 @@ def sort_by_range(packed, order):
             starts[digit, (key >> np.uint32(11 * digit)) & np.uint32(2047)] += 1
     for digit in range(3):
         # Exclusive prefix sum: counts become the first place of each value
-        place, at = starts[digit], 0
+        place, next_place = starts[digit], 0
         for value in range(2048):
-            place[value], at = at, at + place[value]
+            place[value], next_place = next_place, next_place + place[value]
         # Stable distribution by the digit, least significant digit first
         for i in range(count):
             value = (keys[i] >> np.uint32(11 * digit)) & np.uint32(2047)
@@ -271,7 +271,7 @@ def fill_tile_lists(order, first_slot, tile_of, first, splat, slot):
     # Splats come in order of range, so that each list is sorted front to back
     for i in order:
         for k in range(first_slot[i], first_slot[i + 1]):
-            at = first[tile_of[k] + 1]
+            tile_slot = first[tile_of[k] + 1]
             # `slot` leads back from a list entry to the pair's row, which is contiguous per splat
-            splat[at], slot[at] = i, k
-            first[tile_of[k] + 1] = at + 1
+            splat[tile_slot], slot[tile_slot] = i, k
+            first[tile_of[k] + 1] = tile_slot + 1

@@ -236,18 +236,18 @@ def list_splats(splats: Splats, points: TiledPoints) -> SplatLists:
     # Front to back, without splats that are too faint everywhere
     order = splats.range_m.argsort(stable=True)
     order = order[max_exponent[order] >= 0]
-    found, tile_of = [], []
+    splat_ids, tile_of = [], []
     for start in range(0, tiles, step := max(REFERENCE_SIZE // max(count, 1), 1)):
         touched = _touches(
             splats, order, max_exponent, low[start : start + step], high[start : start + step], points
         )
         # Row-major: tile by tile, and front to back within each tile
         tile, rank = touched.nonzero(as_tuple=True)
-        found.append(order[rank])
+        splat_ids.append(order[rank])
         tile_of.append(tile + start)
     empty = torch.zeros(0, dtype=torch.long, device=splats.mean.device)
     in_tile = torch.cat([empty, *tile_of]).bincount(minlength=tiles)
-    return SplatLists(torch.cat([empty, *found]), torch.cat([in_tile.new_zeros(1), in_tile.cumsum(0)]))
+    return SplatLists(torch.cat([empty, *splat_ids]), torch.cat([in_tile.new_zeros(1), in_tile.cumsum(0)]))
 
 
 def _touches(

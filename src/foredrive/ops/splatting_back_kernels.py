@@ -95,13 +95,13 @@ def _accumulate_backward(splat, feature, base, state, dx, dy, t, hit, by_centre,
     to_before = load_row(state, base + 4 * ROW)
     if by_centre is None:
         grad_weight = grad_weight + select_greater(hit, range_m, to_before, ZERO)
-    at = base + 5 * ROW
+    cell = base + 5 * ROW
     for d in range(feature.size):
-        grad = load_row(state, at)
+        grad = load_row(state, cell)
         grad_weight = grad_weight + grad * feature[d]
         to_feature = (GEOMETRY_COLUMNS + d) * ROW
         store(sums, to_feature, load_row(sums, to_feature) + weight * grad)
-        at += ROW
+        cell += ROW
     # What remains behind this splat of Σ out · grad
     behind = load_row(state, base + ROW) - weight * grad_weight
     store(state, base, select_greater(passed, MIN_TRANSMITTANCE, passed, ZERO))
@@ -139,14 +139,16 @@ def composite_tiles_backward(start, stop, lists, points, out, grad_out, pairs):
         for begin in range(lists.first[tile], lists.first[tile + 1], BATCH):
             end = min(begin + BATCH, lists.first[tile + 1])
             find_touched_blocks(lists, points, tile, begin, end, touched)
-            for at in range(begin, end):
+            for entry in range(begin, end):
                 # Skip blocks that the splat does not reach or whose rays have all ended
-                blocks = active & touched[at - begin]
+                blocks = active & touched[entry - begin]
                 if blocks == 0:
                     continue
-                active = _composite_splat_backward(lists, points, tile, at, blocks, active, hits, state, sums)
+                active = _composite_splat_backward(
+                    lists, points, tile, entry, blocks, active, hits, state, sums
+                )
                 # Sum over the points: 16 rows of sums become one row of columns
-                pair = lists.slot[at] * pairs.shape[1]
+                pair = lists.slot[entry] * pairs.shape[1]
                 for c in range(0, pairs.shape[1], ROW):
                     store(pairs, pair + c, row_sums(sums, c * ROW))
             if active == 0:
@@ -155,9 +157,9 @@ def composite_tiles_backward(start, stop, lists, points, out, grad_out, pairs):
 
 @inlined_part
 @no_type_check
-def _composite_splat_backward(lists, points, tile, at, blocks, active, hits, state, sums):
+def _composite_splat_backward(lists, points, tile, entry, blocks, active, hits, state, sums):
     """Fill `sums` with the rows that add up to the gradient of a pair. Return the blocks that continue."""
-    splat, feature = lists.packed[lists.splat[at]], lists.feature[lists.splat[at]]
+    splat, feature = lists.packed[lists.splat[entry]], lists.feature[lists.splat[entry]]
     rows, columns = points.rows[tile], feature.size + 5
     x = nearest_turn(splat[MEAN_X], points.tile_bounds[tile], points.period)
     # Twelve named accumulators stay in registers

@@ -108,11 +108,11 @@ def blocks_touched(splat, bounds, x):
 
 @inlined_part
 @no_type_check
-def offsets(splat, rows, at, x):
+def offsets(splat, rows, first, x):
     """Return the offsets d of the points of a block from a splat, and their times."""
-    t = load_row(rows, 2 * POINTS + at)
-    dx = load_row(rows, at) - x - t * splat[VELOCITY_X]
-    dy = load_row(rows, POINTS + at) - splat[MEAN_Y] - t * splat[VELOCITY_Y]
+    t = load_row(rows, 2 * POINTS + first)
+    dx = load_row(rows, first) - x - t * splat[VELOCITY_X]
+    dy = load_row(rows, POINTS + first) - splat[MEAN_Y] - t * splat[VELOCITY_Y]
     return dx, dy, t
 
 
@@ -182,10 +182,10 @@ def _accumulate(splat, feature, base, state, dx, dy, t, hit, by_centre):
         nearer = select_greater(hit, range_m, weight, ZERO)
     store(state, base + 4 * ROW, load_row(state, base + 4 * ROW) + nearer)
     # Features follow the transmittance and the four other sums
-    at = base + (EXTRA_COLUMNS + 1) * ROW
+    cell = base + (EXTRA_COLUMNS + 1) * ROW
     for d in range(feature.size):
-        store(state, at, load_row(state, at) + weight * feature[d])
-        at += ROW
+        store(state, cell, load_row(state, cell) + weight * feature[d])
+        cell += ROW
     return greater_mask(passed, MIN_TRANSMITTANCE) != 0
 
 
@@ -195,13 +195,13 @@ def find_touched_blocks(lists, points, tile, begin, end, touched):
     """Fill `touched` with the block masks of the entries begin … end - 1 of a tile's list."""
     bounds, tile_bounds = points.block_bounds[tile], points.tile_bounds[tile]
     last = lists.splat.size - 1
-    for at in range(begin, end):
-        splat = lists.packed[lists.splat[at]]
+    for entry in range(begin, end):
+        splat = lists.packed[lists.splat[entry]]
         # The splats of a list are scattered in memory: fetch those of the next steps ahead
-        soon = lists.splat[min(at + PREFETCH_DISTANCE, last)]
+        soon = lists.splat[min(entry + PREFETCH_DISTANCE, last)]
         prefetch(lists.packed, soon * lists.packed.shape[1])
         prefetch(lists.feature, soon * lists.feature.shape[1])
-        touched[at - begin] = blocks_touched(
+        touched[entry - begin] = blocks_touched(
             splat, bounds, nearest_turn(splat[MEAN_X], tile_bounds, points.period)
         )
 
@@ -219,9 +219,11 @@ def composite_tiles(start, stop, lists, points, out):
         for begin in range(lists.first[tile], lists.first[tile + 1], BATCH):
             end = min(begin + BATCH, lists.first[tile + 1])
             find_touched_blocks(lists, points, tile, begin, end, touched)
-            for at in range(begin, end):
+            for entry in range(begin, end):
                 # Front to back: the order of the list
-                active = _composite_splat(lists, points, tile, at, touched[at - begin], active, hits, state)
+                active = _composite_splat(
+                    lists, points, tile, entry, touched[entry - begin], active, hits, state
+                )
             if active == 0:
                 break
         _write(points, tile, state, columns, out)
@@ -229,9 +231,9 @@ def composite_tiles(start, stop, lists, points, out):
 
 @inlined_part
 @no_type_check
-def _composite_splat(lists, points, tile, at, touched, active, hits, state):
-    """Add the splat of entry `at` to the blocks that it touches. Return the blocks that continue."""
-    splat, feature = lists.packed[lists.splat[at]], lists.feature[lists.splat[at]]
+def _composite_splat(lists, points, tile, entry, touched, active, hits, state):
+    """Add the splat of entry `entry` to the blocks that it touches. Return the blocks that continue."""
+    splat, feature = lists.packed[lists.splat[entry]], lists.feature[lists.splat[entry]]
     rows, columns = points.rows[tile], feature.size + EXTRA_COLUMNS + 1
     x = nearest_turn(splat[MEAN_X], points.tile_bounds[tile], points.period)
     blocks = active & touched

@@ -57,7 +57,7 @@ class CompositeSplats(torch.autograd.Function):
         in_parallel(job, len(points.point), grain=MIN_TILES)
         out = torch.from_numpy(composited)
         ctx.save_for_backward(out, *fields)
-        ctx.found = lists, points, first_slot
+        ctx.listed = lists, points, first_slot
         return out
 
     @staticmethod
@@ -65,7 +65,7 @@ class CompositeSplats(torch.autograd.Function):
     def backward(ctx: Any, grad_out: Tensor) -> tuple[Tensor | None, ...]:
         """Return the gradients of the fields of `Splats`."""
         out, *fields = ctx.saved_tensors
-        lists, points, first_slot = ctx.found
+        lists, points, first_slot = ctx.listed
         # Columns of a pair, padded to whole rows of 16
         columns = -(-(GEOMETRY_COLUMNS + lists.feature.shape[1]) // ROW) * ROW
         pairs = np.zeros((len(lists.splat), columns), np.float32)
@@ -110,7 +110,7 @@ def _list(splats: SplatArrays, points: PointArrays) -> tuple[TileLists, np.ndarr
     count = len(splats.feature)
     packed = np.empty((count, COLUMNS), np.float32)
     per_splat = np.empty(count, np.int64)
-    found: dict[int, np.ndarray] = {}
+    buffers: dict[int, np.ndarray] = {}
 
     def job(start: int, stop: int) -> None:
         pack_splats(start, stop, splats, points.period, packed)
@@ -120,11 +120,11 @@ def _list(splats: SplatArrays, points: PointArrays) -> tuple[TileLists, np.ndarr
         if needed > len(buffer):
             buffer = np.empty(needed, np.int32)
             find_tiles(start, stop, packed, points, per_splat, buffer)
-        found[start] = buffer[:needed]
+        buffers[start] = buffer[:needed]
 
     in_parallel(job, count, grain=MIN_SPLATS)
     # By splat: each thread found a range of splats
-    tile_of = np.concatenate([np.empty(0, np.int32), *(found[start] for start in sorted(found))])
+    tile_of = np.concatenate([np.empty(0, np.int32), *(buffers[start] for start in sorted(buffers))])
     first_slot = np.concatenate([np.zeros(1, np.int64), per_splat.cumsum()])
     order = np.empty(count, np.int32)
     sort_by_range(packed, order)

@@ -82,9 +82,9 @@ def _add_adjacent(builder: ir.IRBuilder, a: ir.Value, b: ir.Value, run: int) -> 
     even = [lane for lane in range(count) if lane // run % 2 == 0]
     order = [
         lane + shift
-        for at in range(0, len(even), run)
+        for place in range(0, len(even), run)
         for shift in (0, count)
-        for lane in even[at : at + run]
+        for lane in even[place : place + run]
     ]
     odd = [lane + run for lane in order]
     return builder.fadd(_shuffle(builder, a, b, order), _shuffle(builder, a, b, odd))

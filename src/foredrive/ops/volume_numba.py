@@ -75,8 +75,8 @@ class AttendVolume(torch.autograd.Function):
         grad_points = points.new_empty(b, queries, slots if wants_points else 0, per_head, 3)
         grad_weights = weights.new_empty(b, queries, slots if wants_weights else 0, per_head)
         inputs = VolumeInputs(*(tensor.numpy() for tensor in (values, points, weights)))
-        found = (grad_out.contiguous(), grad_values, grad_points, grad_weights)
-        grads = VolumeGradients(*(tensor.numpy() for tensor in found))
+        arguments = (grad_out.contiguous(), grad_values, grad_points, grad_weights)
+        grads = VolumeGradients(*(tensor.numpy() for tensor in arguments))
 
         def job(start: int, stop: int) -> None:
             for item, index in (divmod(i, len(slices)) for i in range(start, stop)):

@@ -75,12 +75,12 @@ def _launch(kernel: Any, inputs: Sequence[Tensor], outputs: Sequence[Tensor | No
 
 @triton.jit
 @no_type_check
-def _places(points, weights, at, inside):
+def _places(points, weights, place, inside):
     """Load coordinates (integers are voxel centres) and weights of rows × points."""
-    x = tl.load(points + 3 * at, mask=inside, other=0.0).to(tl.float32) - 0.5
-    y = tl.load(points + 3 * at + 1, mask=inside, other=0.0).to(tl.float32) - 0.5
-    z = tl.load(points + 3 * at + 2, mask=inside, other=0.0).to(tl.float32) - 0.5
-    weight = tl.load(weights + at, mask=inside, other=0.0).to(tl.float32)
+    x = tl.load(points + 3 * place, mask=inside, other=0.0).to(tl.float32) - 0.5
+    y = tl.load(points + 3 * place + 1, mask=inside, other=0.0).to(tl.float32) - 0.5
+    z = tl.load(points + 3 * place + 2, mask=inside, other=0.0).to(tl.float32) - 0.5
+    weight = tl.load(weights + place, mask=inside, other=0.0).to(tl.float32)
     # NaN coordinates must give NaN.
     weight = tl.where((x == x) & (y == y) & (z == z), weight, float("nan"))
     return x, y, z, tl.where(inside, weight, 0.0)
@@ -163,8 +163,8 @@ def _attend_rows_back(
     for first in range(0, POINTS, P):
         p = first + tl.arange(0, P)
         inside = exists[:, None] & (p < POINTS)[None, :]
-        at = (row * POINTS)[:, None] + p[None, :]
-        x, y, z, w = _places(points, weights, at, inside)
+        place = (row * POINTS)[:, None] + p[None, :]
+        x, y, z, w = _places(points, weights, place, inside)
         x0, x1, wx0, wx1, sx0, sx1 = neighbours(x, width)
         y0, y1, wy0, wy1, sy0, sy1 = neighbours(y, height)
         z0, z1, wz0, wz1, sz0, sz1 = neighbours(z, depth)
@@ -187,7 +187,7 @@ def _attend_rows_back(
             to_weight += part * dot
         # A row owns its points and weights, so a plain store suffices
         if TO_POINTS:
-            tl.store(grad_points + 3 * at, to_x, mask=inside)
-            tl.store(grad_points + 3 * at + 1, to_y, mask=inside)
-            tl.store(grad_points + 3 * at + 2, to_z, mask=inside)
-            tl.store(grad_weights + at, to_weight, mask=inside)
+            tl.store(grad_points + 3 * place, to_x, mask=inside)
+            tl.store(grad_points + 3 * place + 1, to_y, mask=inside)
+            tl.store(grad_points + 3 * place + 2, to_z, mask=inside)
+            tl.store(grad_weights + place, to_weight, mask=inside)

@@ -60,8 +60,8 @@ def with_missed_beams(sweep: LidarSweep, lidar: SpinningLidar, twist_ego: Float[
         upward = elevation[mine].mean() if enough else torch.tensor(table_rad)
         parts.append(_misses(dt_s, azimuth, upward.expand_as(azimuth), number, lidar, twist_ego))
     names = ("origin_ego", "dir_ego", "range_m", "returned", "intensity", "dt_s", "beam", "valid")
-    found = LidarSweep(**{**{n: getattr(sweep, n) for n in names}, "beam": channel})
-    return LidarSweep(*(torch.cat([getattr(part, name) for part in (found, *parts)]) for name in names))
+    returned = LidarSweep(**{**{n: getattr(sweep, n) for n in names}, "beam": channel})
+    return LidarSweep(*(torch.cat([getattr(part, name) for part in (returned, *parts)]) for name in names))
 
 
 def _alone(place: Float[Tensor, "S"], taken: Float[Tensor, "N"], reach: float) -> Float[Tensor, "M"]:

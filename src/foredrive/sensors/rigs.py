@@ -116,7 +116,7 @@ def find_rig(name: str) -> RigPlan:
         return TypeAdapter(RigPlan).validate_python(written, extra="forbid")
     except ValidationError as error:
         # The right name of a mistyped entry is missing. The mistyped one tells more.
-        first = min(error.errors(), key=lambda each: each["type"] == "missing")
+        first = min(error.errors(), key=lambda error_entry: error_entry["type"] == "missing")
         where = ".".join(str(part) for part in first["loc"]) or "the file"
         why = first["msg"].removeprefix("Value error, ").removesuffix(" or an instance of RigPlan")
         raise InputError(f"{path}: {where}: {why}") from error
@@ -128,8 +128,8 @@ def same_rig(one: RigPlan, other: RigPlan) -> bool:
     """Return whether two rigs are the same but for rounding and the order of the cameras."""
     if one.image_hw != other.image_hw or set(one.cameras) != set(other.cameras):
         return False
-    here, there = _numbers(one), _numbers(other)
-    return all(math.dist(here[name], there[name]) < ROUNDING for name in here)
+    here, beyond = _numbers(one), _numbers(other)
+    return all(math.dist(here[name], beyond[name]) < ROUNDING for name in here)
 
 
 def _numbers(plan: RigPlan) -> dict[str, tuple[float, ...]]:

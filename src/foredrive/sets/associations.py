@@ -193,13 +193,13 @@ def sum_associations(
     # Leave out what cannot matter, then sum the components of what is left
     row, column, lost_nats = gate(log_pair, log_absent, log_background, gate_nats)
     sum_large = partial(_sum_large, k=k, max_states=max_states)
-    found = _sum_kept(log_pair, log_absent, log_background, row, column, max_states, sum_large)
+    sums = _sum_kept(log_pair, log_absent, log_background, row, column, max_states, sum_large)
     return AssociationSum(
         # Alone is what no pair accounts for; rounding may leave the range
-        found.log_lower, found.log_upper + lost_nats, found.row, found.column, found.share,
-        np.clip(1.0 - np.bincount(found.row, found.share, len(log_absent)), 0.0, 1.0),
-        np.clip(1.0 - np.bincount(found.column, found.share, len(log_background)), 0.0, 1.0),
-        found.best, np.flatnonzero(found.bad_rows), np.flatnonzero(found.bad_columns),
+        sums.log_lower, sums.log_upper + lost_nats, sums.row, sums.column, sums.share,
+        np.clip(1.0 - np.bincount(sums.row, sums.share, len(log_absent)), 0.0, 1.0),
+        np.clip(1.0 - np.bincount(sums.column, sums.share, len(log_background)), 0.0, 1.0),
+        sums.best, np.flatnonzero(sums.bad_rows), np.flatnonzero(sums.bad_columns),
     )  # fmt: skip
 
 
@@ -234,12 +234,12 @@ def _sum_kept(
     components = find_components(row, column, len(log_row), len(log_column))
     log_edge = log_pair[row, column]
     exact = sum_components(components, row, column, log_edge, log_row, log_column, max_states)
-    found = _Found(
+    sums = _Found(
         exact.log_sum, exact.log_sum, row, column, exact.share, exact.log_freed, exact.best,
         exact.bad_rows, exact.bad_columns,
     )  # fmt: skip
     if len(exact.too_large) == 0:
-        return found
+        return sums
     parts, summed = [], np.ones(len(row), bool)
     # Components that were too large to be summed: a dense matrix of each one
     for n in exact.too_large:
@@ -247,19 +247,19 @@ def _sum_kept(
         here = np.full((len(i), len(j)), -np.inf)
         here[np.searchsorted(i, row[edge]), np.searchsorted(j, column[edge])] = log_edge[edge]
         part = sum_large(here, log_row[i], log_column[j])
-        found.log_lower += part.log_lower
-        found.log_upper += part.log_upper
+        sums.log_lower += part.log_lower
+        sums.log_upper += part.log_upper
         # Indices of the part become those of the whole
-        found.best[j] = np.where(part.best < 0, -1, i[part.best])
-        found.log_freed[j] = part.log_freed
+        sums.best[j] = np.where(part.best < 0, -1, i[part.best])
+        sums.log_freed[j] = part.log_freed
         summed[edge] = False
         parts.append((i[part.row], j[part.column], part.share))
     # Pairs that were summed exactly, and those kept in the large components
-    found.row, found.column, found.share = (
-        np.concatenate(each)
-        for each in zip((row[summed], column[summed], exact.share[summed]), *parts, strict=True)
+    sums.row, sums.column, sums.share = (
+        np.concatenate(arguments)
+        for arguments in zip((row[summed], column[summed], exact.share[summed]), *parts, strict=True)
     )
-    return found
+    return sums
 
 
 def _members(
@@ -281,19 +281,19 @@ def _sum_large(
     max_states: int,
 ) -> _Found:
     """Sum a subset of the pairs of a component that is too large, and bound the contribution of the rest."""
-    found = _sum_thinned(log_pair, log_row, log_column, k, max_states, _THINNING_NATS)
+    sums = _sum_thinned(log_pair, log_row, log_column, k, max_states, _THINNING_NATS)
     # Pairs left out by the thinning: bound their contribution
     left_out = log_pair > -np.inf
-    left_out[found.row, found.column] = False
+    left_out[sums.row, sums.column] = False
     row, column = np.nonzero(left_out)
     alone = log_row[row] > -np.inf  # thinning keeps all pairs of rows that cannot be alone
     log_weight = np.full(len(row), np.inf)
-    log_weight[alone] = (log_pair[row, column] + found.log_freed[column])[alone] - log_row[row][alone]
-    found.log_upper += bound_left_out(log_weight, row, column)
+    log_weight[alone] = (log_pair[row, column] + sums.log_freed[column])[alone] - log_row[row][alone]
+    sums.log_upper += bound_left_out(log_weight, row, column)
     # A wide interval may have a better bound from independent choices
-    if found.log_upper - found.log_lower > _LOOSE_NATS:
-        found.log_upper = min(found.log_upper, bound_choices(scale(log_pair, log_row, log_column)))
-    return found
+    if sums.log_upper - sums.log_lower > _LOOSE_NATS:
+        sums.log_upper = min(sums.log_upper, bound_choices(scale(log_pair, log_row, log_column)))
+    return sums
 
 
 def _sum_thinned(

@@ -32,10 +32,10 @@ def box_log_prob(mean, chol, state, laplace):
         out[:] = constant
         for d in range(dims):
             offset, scale, row = mean[i, d], 1.0 / chol[i, d, d], white[d]
-            at = by_dim[d]
+            coordinate = by_dim[d]
             for j in range(boxes):
                 # w[d] = (offset[d] - Σ_e<d L[d, e] w[e]) / L[d, d]
-                row[j] = at[j] - offset
+                row[j] = coordinate[j] - offset
             for e in range(d):
                 factor, other = chol[i, d, e], white[e]
                 if factor != 0.0:

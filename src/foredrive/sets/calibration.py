@@ -95,21 +95,21 @@ def fit_set_calibration(
     `background`.
     """
     existence, has_object, boxes, paired = [], [], [], []
-    for found, truth in zip(detected, objects, strict=True):
+    for found_boxes, truth in zip(detected, objects, strict=True):
         # Associations of the frame under the detector's own densities
-        pairs = set_nll(PoissonMultiBernoulli(found, background), truth).associations
-        existence.append(found.log_existence.exp().cpu().numpy())
+        pairs = set_nll(PoissonMultiBernoulli(found_boxes, background), truth).associations
+        existence.append(found_boxes.log_existence.exp().cpu().numpy())
         has_object.append(1.0 - pairs.absent)
         # Scales are fitted on the most likely pairs only
         has = np.flatnonzero(pairs.best >= 0)
-        boxes.append(found.boxes[pairs.best[has]])
+        boxes.append(found_boxes.boxes[pairs.best[has]])
         paired.append(truth[has])
     if not existence:
         raise InputError("calibration needs frames")
     factor = fit_scale(
         BoxDensity(
-            torch.cat([each.mean for each in boxes]),
-            torch.cat([each.chol for each in boxes]),
+            torch.cat([part.mean for part in boxes]),
+            torch.cat([part.chol for part in boxes]),
             family=boxes[0].family,
         ),
         LabelledBoxes(torch.cat([o.label for o in paired]), torch.cat([o.state for o in paired])),

@@ -30,21 +30,21 @@ def pmb_from_detections(
         InputError: a probability is outside [0, 1], a covariance is not positive definite, or a background
             has no region.
     """
-    found = dataclasses.replace(detections, background_rate=None)[detections.valid]
-    existence = found.existence.double()
+    kept = dataclasses.replace(detections, background_rate=None)[detections.valid]
+    existence = kept.existence.double()
     require("existence of detection", (existence >= 0) & (existence <= 1))
-    sin, cos = found.mean[:, 6].double(), found.mean[:, 7].double()
+    sin, cos = kept.mean[:, 6].double(), kept.mean[:, 7].double()
     # dθ = (cos · d sin - sin · d cos) / ρ², for any length ρ of the vector (sin, cos).
     square = (sin.square() + cos.square()).clamp_min(_TINY)
     across = torch.stack([cos, -sin], dim=-1) / square[:, None]
-    variance = (across[:, None] @ found.chol[:, 6:].double()).square().sum((-2, -1))
+    variance = (across[:, None] @ kept.chol[:, 6:].double()).square().sum((-2, -1))
     boxes = BoxDensity(
-        mean=found.mean[:, :6],
-        chol=found.chol[:, :6, :6],  # the marginal: the factor is lower triangular
+        mean=kept.mean[:, :6],
+        chol=kept.chol[:, :6, :6],  # the marginal: the factor is lower triangular
         yaw=torch.atan2(sin, cos),
         concentration=1.0 / variance.clamp_min(_TINY),
     )
-    detected = MultiBernoulli(existence.log(), torch.log1p(-existence), found.log_class, boxes)
+    detected = MultiBernoulli(existence.log(), torch.log1p(-existence), kept.log_class, boxes)
     if detections.background_rate is None:
         return PoissonMultiBernoulli(detected)
     if lower is None or upper is None:
@@ -59,6 +59,6 @@ def objects_from_boxes(boxes: Boxes) -> LabelledBoxes:
         InputError: a size is not positive. The message names the first such box.
     """
     require("size of box", (boxes.size_lwh > 0).all(-1) | ~boxes.valid)
-    found = boxes[boxes.valid]
-    state = torch.cat([found.centre.double(), found.size_lwh.double().log()], dim=-1)
-    return LabelledBoxes(found.category, state, found.yaw.double())
+    kept = boxes[boxes.valid]
+    state = torch.cat([kept.centre.double(), kept.size_lwh.double().log()], dim=-1)
+    return LabelledBoxes(kept.category, state, kept.yaw.double())

@@ -190,4 +190,4 @@ def bound_left_out(
     with np.errstate(over="ignore"):
         weight = np.exp(log_weight)
     # Π (1 + Σ) over the columns, or over the rows; the smaller one is the bound
-    return float(min(np.log1p(np.bincount(each, weight)).sum() for each in (row, column)))
+    return float(min(np.log1p(np.bincount(index, weight)).sum() for index in (row, column)))

@@ -75,29 +75,29 @@ def set_nll(
     # The sum needs no gradient: it enters through the probabilities of its pairs
     with torch.no_grad():
         log_pair = detected.boxes.log_prob(objects) + detected.log_label(objects)
-    found = sum_associations(
+    sums = sum_associations(
         *(log.detach().cpu().numpy() for log in (log_pair, log_absent, log_background)),
         k=k, max_states=max_states, gate_nats=gate_nats,
     )  # fmt: skip
-    i, j = (torch.as_tensor(index, device=log_absent.device) for index in (found.detection, found.object))
+    i, j = (torch.as_tensor(index, device=log_absent.device) for index in (sums.detection, sums.object))
     # Terms with gradients, for the pairs that matter
     log_box = detected.boxes.log_prob_of_pairs(i, objects, j)
     log_label = detected.log_label_of_pairs(i, objects, j)
-    localisation, classification = (_expected(found.probability, log) for log in (log_box, log_label))
-    false, missed = _expected(found.absent, log_absent), _expected(found.background, log_background)
+    localisation, classification = (_expected(sums.probability, log) for log in (log_box, log_label))
+    false, missed = _expected(sums.absent, log_absent), _expected(sums.background, log_background)
     # Energy: expected negative log-weight under the association probabilities
     energy = localisation + classification + false + missed + expected
-    value = energy.new_tensor(-found.log_lower) + expected.detach()
+    value = energy.new_tensor(-sums.log_lower) + expected.detach()
     # d(-log Σ w) = Σ P(association) d(-log w): the gradient of the energy at fixed probabilities.
     # The value of the sum with the gradient of the energy
     nll = energy + (value - energy).detach()
-    false = false + (math.inf if len(found.impossible_detections) else 0.0)
-    missed = missed + (math.inf if len(found.impossible_objects) else 0.0)
+    false = false + (math.inf if len(sums.impossible_detections) else 0.0)
+    missed = missed + (math.inf if len(sums.impossible_objects) else 0.0)
     # Difference between the value and its parts: minus the entropy of the associations
     ambiguity = nll - (localisation + classification + false + missed + expected)
-    lower = float(expected.detach()) - found.log_upper
+    lower = float(expected.detach()) - sums.log_upper
     return SetNll(
-        nll, lower, localisation, classification, false, missed, expected, ambiguity, found,
+        nll, lower, localisation, classification, false, missed, expected, ambiguity, sums,
         log_box, log_label, log_background,
     )  # fmt: skip
 

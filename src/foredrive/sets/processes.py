@@ -238,10 +238,10 @@ class PoissonMultiBernoulli:
 
     def sample(self, rng: np.random.Generator) -> LabelledBoxes:
         """Draw one set."""
-        found = self.detected.sample(rng)
+        samples = self.detected.sample(rng)
         if self.background is None:
-            return found
-        return _joined([found, self.background.sample(rng)])
+            return samples
+        return _joined([samples, self.background.sample(rng)])
 
 
 def poisson_log_prob(process: PoissonProcess, objects: LabelledBoxes) -> Float[Tensor, ""]:
@@ -263,8 +263,8 @@ def checked_labels(label: Int[Tensor, "..."], classes: int) -> Int[Tensor, "..."
     """
     wrong = ((label < 0) | (label >= classes)).nonzero()
     if len(wrong):
-        at = tuple(wrong[0].tolist())
-        raise InputError(f"object {at} has label {int(label[at])}, of {classes} classes")
+        place = tuple(wrong[0].tolist())
+        raise InputError(f"object {place} has label {int(label[place])}, of {classes} classes")
     return label.long()
 
 

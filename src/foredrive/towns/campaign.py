@@ -140,13 +140,13 @@ def _town_drives(
         for commands in chosen.values():
             counts.update(commands)
         # Distribute the chosen seeds over the conditions in turn
-        found = [(groups[i % len(groups)], seed) for i, seed in enumerate(chosen)]
+        planned = [(groups[i % len(groups)], seed) for i, seed in enumerate(chosen)]
     else:
-        found = [(group, seed) for group in groups for seed in dict.fromkeys(campaign.seeds)]
+        planned = [(group, seed) for group in groups for seed in dict.fromkeys(campaign.seeds)]
     if any_conditions:
         # Every drive takes the next of all conditions
-        found = [(next(conditions_cycle), seed) for _, seed in found]
-    return sorted(found, key=lambda drive: (groups.index(drive[0]) if not any_conditions else 0, drive[1]))
+        planned = [(next(conditions_cycle), seed) for _, seed in planned]
+    return sorted(planned, key=lambda drive: (groups.index(drive[0]) if not any_conditions else 0, drive[1]))
 
 
 def _cycle_conditions() -> Iterator[str]:
@@ -202,7 +202,7 @@ def select_balanced(
     # Commands of each route, one row per route; at first those that are expected
     times = np.array([[route[kind] for kind in commands] for route in routes])
     total = np.array([counts[kind] for kind in commands], dtype=np.int64)
-    available, tries, known = np.ones(len(routes), dtype=bool), 0, dict[int, Counter[Command]]()
+    available, tries, counts_of = np.ones(len(routes), dtype=bool), 0, dict[int, Counter[Command]]()
     chosen: dict[int, Counter[Command]] = {}
     while len(chosen) < count:
         # Totals after each possible choice, over the commands that occur at all
@@ -212,13 +212,13 @@ def select_balanced(
         gain = np.where(available, number - np.sum((after - mean) ** 2, axis=1), -np.inf)
         # Enough routes driven for this choice: only those whose commands are known remain
         if tries == MAX_TRIES_PER_DRIVE:
-            gain[[i for i in range(len(routes)) if i not in known]] = -np.inf
+            gain[[i for i in range(len(routes)) if i not in counts_of]] = -np.inf
         best = int(gain.argmax())
         # Drive a route before it is chosen, because traffic may change what it meets
-        if best not in known:
-            known[best], tries = drive_route(best), tries + 1
-            times[best] = [known[best][kind] for kind in commands]
+        if best not in counts_of:
+            counts_of[best], tries = drive_route(best), tries + 1
+            times[best] = [counts_of[best][kind] for kind in commands]
         else:
-            chosen[best], available[best], tries = known[best], False, 0
+            chosen[best], available[best], tries = counts_of[best], False, 0
             total = total + times[best]
     return chosen

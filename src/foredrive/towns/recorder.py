@@ -188,12 +188,12 @@ def lamps_near(
         T_world_ego: pose of the vehicle.
     """
     id_of = ToIntMapping.from_list([lane.lane_id for lane in town.lanes]).str_to_int
-    found = dict[int, Float64[np.ndarray, "_ 3"]]()
+    lamps = dict[int, Float64[np.ndarray, "_ 3"]]()
     for zone, xyz in signal_xyz.items():
         near = xyz[np.linalg.norm(xyz - T_world_ego[:3, 3], axis=1) < LAMPS_M]
         if len(near):
-            found |= {id_of[lane]: near for lane in town.stop_zones[zone].lane_ids if lane in id_of}
-    return found
+            lamps |= {id_of[lane]: near for lane in town.stop_zones[zone].lane_ids if lane in id_of}
+    return lamps
 
 
 class SensedFrame(NamedTuple):

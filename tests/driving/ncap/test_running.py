@@ -218,9 +218,9 @@ def test_scenarios_that_nobody_hits_are_named_and_left_out() -> None:
     references = [run_reference(here, STANDING, number, OURS) for number in range(2)]
     assert references == pytest.approx([8.0, 8.0], rel=0.03)
     assert set(tested.left_out) == {f"stationary-{name}" for name in ("aside", "long", "nobody", "elsewhere")}
-    assert "run 0 passes without any action" in tested.told
-    assert "the log ends at 10.0 s" in tested.told
-    assert "no actor '0102'; some of those that it has: 0101" in tested.told
+    assert "run 0 passes without any action" in tested.reasons
+    assert "the log ends at 10.0 s" in tested.reasons
+    assert "no actor '0102'; some of those that it has: 0101" in tested.reasons
 
 
 def test_the_run_of_a_number_is_the_same_for_every_agent() -> None:

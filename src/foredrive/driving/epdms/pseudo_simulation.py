@@ -131,8 +131,8 @@ class PseudoSimulation:
         Raises:
             Exception: any error of the agent: the start has failed, and has no score.
         """
-        there = Offset()
-        before, now = (self._planned(t_s, there, human=True) for t_s in (start_s - FRAME_DT_S, start_s))
+        end = Offset()
+        before, now = (self._planned(t_s, end, human=True) for t_s in (start_s - FRAME_DT_S, start_s))
         first = _with_comfort(before, now)
         groups, second = [], []
         later_s = start_s + HORIZON_S
@@ -148,11 +148,11 @@ class PseudoSimulation:
                 two_stage_score(
                     planned.scores.epdms,
                     planned.end_m,
-                    np.stack([each.start_m for each in follow_ups]),
-                    [each.scores.epdms for each in follow_ups],
+                    np.stack([follow_up.start_m for follow_up in follow_ups]),
+                    [follow_up.scores.epdms for follow_up in follow_ups],
                 )
             )
-            second += [each.scores for each in follow_ups]
+            second += [follow_up.scores for follow_up in follow_ups]
         return PseudoScore(start_s, float(np.mean(groups)), first[1].scores, tuple(second))
 
     def _planned(self, start_s: float, offset: Offset, human: bool = False) -> _Planned:
@@ -259,8 +259,10 @@ def figures_of(scores: list[PseudoScore], failed: int) -> Mapping[str, float | i
     figures["epdms"] = float(np.mean([score.score for score in scores])) if scores else None
     for stage, of in (
         ("first", [score.first for score in scores]),
-        ("second", [each for score in scores for each in score.second]),
+        ("second", [entry for score in scores for entry in score.second]),
     ):
         for name in ("epdms", *(field.name for field in dataclasses.fields(DriverScores))):
-            figures[f"{stage}.{name}"] = float(np.mean([getattr(each, name) for each in of])) if of else None
+            figures[f"{stage}.{name}"] = (
+                float(np.mean([getattr(entry, name) for entry in of])) if of else None
+            )
     return figures

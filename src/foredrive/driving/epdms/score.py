@@ -52,8 +52,8 @@ class DriverScores:
     def epdms(self) -> float:
         """Return the score: the multipliers times the weighted mean of the others."""
         # Without extended comfort the weights of the others are normalised
-        known = {name: weight for name, weight in WEIGHTS.items() if getattr(self, name) is not None}
-        mean = sum(weight * getattr(self, name) for name, weight in known.items()) / sum(known.values())
+        weights = {name: weight for name, weight in WEIGHTS.items() if getattr(self, name) is not None}
+        mean = sum(weight * getattr(self, name) for name, weight in weights.items()) / sum(weights.values())
         return self.multiplied * mean
 
     def forgiven(self, human: "DriverScores") -> "DriverScores":

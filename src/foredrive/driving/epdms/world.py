@@ -113,8 +113,8 @@ class Surroundings:
         """Return the outline of each object at each step; None where it is absent."""
         return [
             [
-                shapely.Polygon(corners) if there else None
-                for corners, there in zip(rectangles(centre, yaw, self.half_lw), present, strict=True)
+                shapely.Polygon(corners) if is_present else None
+                for corners, is_present in zip(rectangles(centre, yaw, self.half_lw), present, strict=True)
             ]
             for centre, yaw, present in zip(self.centre_m, self.yaw_rad, self.present, strict=True)
         ]

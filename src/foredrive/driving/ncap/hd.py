@@ -216,9 +216,11 @@ def _in_traffic(
 def _outlines(
     tracks: ActorTracks, T_world_scene: Float64[Tensor, "4 4"], t_s: float
 ) -> tuple[shapely.Polygon, ...]:
-    users, found = users_at(tracks, T_world_scene, t_s), []
+    users, outlines = users_at(tracks, T_world_scene, t_s), []
     for row in np.flatnonzero((users.track_id >= 0) & np.isin(users.category, [int(c) for c in VEHICLES])):
         corners = users.half_lw[row] * np.array([[1, 1], [1, -1], [-1, -1], [-1, 1]])
         cos, sin = math.cos(users.yaw[row]), math.sin(users.yaw[row])
-        found.append(shapely.Polygon(corners @ np.array([[cos, sin], [-sin, cos]]) + users.foot_m[row, :2]))
-    return tuple(found)
+        outlines.append(
+            shapely.Polygon(corners @ np.array([[cos, sin], [-sin, cos]]) + users.foot_m[row, :2])
+        )
+    return tuple(outlines)

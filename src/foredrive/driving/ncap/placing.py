@@ -53,8 +53,8 @@ def _with_actor(
     graph: SceneGraph, actor: DrawnActor, T_world_scene: Float64[Tensor, "4 4"], track_ids: Mapping[str, int]
 ) -> SceneGraph:
     if actor.name not in track_ids:
-        known = ", ".join(list(track_ids)[:8]) or "none"
-        raise InputError(f"the log has no actor {actor.name!r}; some of those that it has: {known}")
+        some_ids = ", ".join(list(track_ids)[:8]) or "none"
+        raise InputError(f"the log has no actor {actor.name!r}; some of those that it has: {some_ids}")
     copied = apply_edits(graph, [Duplicate(track_ids[actor.name], unused_id(graph))]).graph
     tracks = copied.tracks
     poses = way_poses(actor.way, actor.yaw_rad, tracks.t_s.double().cpu().numpy())

@@ -64,7 +64,7 @@ def propose(place: Place, scene: str) -> list[SafetyScenario]:
         InputError: no car that is an actor of its own was seen from near.
     """
     drive = LoggedDrive(place.vehicle, torch.eye(4))
-    models, found = _models(place, drive), list[SafetyScenario]()
+    models, proposals = _models(place, drive), list[SafetyScenario]()
     others_at = functools.cache(functools.partial(_others, place))
     # Starts on the grid of key frames, as long as the log covers the test
     first = math.ceil(drive.first_s / FRAME_DT_S) + 1
@@ -78,8 +78,8 @@ def propose(place: Place, scene: str) -> list[SafetyScenario]:
             actor = _actor(kind, path, speed_mps, begin_s, models)
             if actor is not None and _feasible(place, drive, others_at, actor, begin_s):
                 name = f"{scene}_{FRAME_DT_S * frame:g}s"
-                found.append(SafetyScenario(name, kind, scene, frame, length_s, (actor,), PRIMING_FRAMES))
-    return found
+                proposals.append(SafetyScenario(name, kind, scene, frame, length_s, (actor,), PRIMING_FRAMES))
+    return proposals
 
 
 def _models(place: Place, drive: LoggedDrive) -> tuple[str, ...]:

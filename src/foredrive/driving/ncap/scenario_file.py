@@ -38,7 +38,7 @@ def load_scenarios(path: Path) -> tuple[SafetyScenario, ...]:
     # Files that are named directly are read; those outside of the protocol are left out of folders
     outside = outside_protocol(path)
     files = sorted(path.rglob("*.yaml")) if path.is_dir() else [path]
-    scenarios = tuple(each for file in files if file not in outside for each in _read(file))
+    scenarios = tuple(entry for file in files if file not in outside for entry in _read(file))
     if not scenarios:
         raise InputError(f"{path}: there are no scenarios")
     labels = [scenario.label for scenario in scenarios]
@@ -166,22 +166,22 @@ def _neuro_ncap(written: Mapping[str, Any], file: Path) -> SafetyScenario:
         raise InputError(f"{file}: {error}") from error
 
 
-def _actor(there: _ActorThere) -> ScenarioActor:
+def _actor(stated: _ActorThere) -> ScenarioActor:
     # Without an angle, the shift has no direction and is not applied
-    shift = there.jitter if there.jitter.long_lat_angle is not None else None
+    shift = stated.jitter if stated.jitter.long_lat_angle is not None else None
     return ScenarioActor(
-        names=there.uuids or ((there.uuid,) if there.uuid else ()),
-        way=Polyline(there.times, there.positions),
-        yaw_rad=there.initial_yaw,
-        flipped=there.flip_uuids,
+        names=stated.uuids or ((stated.uuid,) if stated.uuid else ()),
+        way=Polyline(stated.times, stated.positions),
+        yaw_rad=stated.initial_yaw,
+        flipped=stated.flip_uuids,
         jitter=Jitter(
-            along_rad=there.jitter.long_lat_angle or 0.0,
+            along_rad=stated.jitter.long_lat_angle or 0.0,
             longitudinal_m=shift.longitudinal if shift else 0.0,
             lateral_m=shift.lateral if shift else 0.0,
-            yaw_rad=there.jitter.yaw_jitter,
-            uniform=there.jitter.uniform,
+            yaw_rad=stated.jitter.yaw_jitter,
+            uniform=stated.jitter.uniform,
         ),
-        group=there.exclusive_group,
+        group=stated.exclusive_group,
     )
 
 

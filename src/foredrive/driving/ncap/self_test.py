@@ -29,7 +29,7 @@ class SelfTest:
     """Reason for each scenario that is left out, by its label."""
 
     @property
-    def told(self) -> str:
+    def reasons(self) -> str:
         """Return the scenarios that are left out, each with its reason, in one line."""
         return "; ".join(f"{label}: {why}" for label, why in self.left_out.items())
 

@@ -63,7 +63,7 @@ class LoggedDrive:
         """
         # Speed and turn rate from poses before and after, within the log
         from_s, to_s = max(t_s - SPEED_OVER_S, self.first_s), min(t_s + SPEED_OVER_S, self.end_s)
-        before, now, after = (self.pose_at(at) for at in (from_s, t_s, to_s))
+        before, now, after = (self.pose_at(time_s) for time_s in (from_s, t_s, to_s))
         speed = float(np.hypot(*(after - before)[:2, 3])) / (to_s - from_s)
         turned = np.remainder(_yaw(after) - _yaw(before) + np.pi, 2 * np.pi) - np.pi
         # Curvature is turn per distance; at low speed it is not measurable
@@ -82,7 +82,7 @@ class LoggedDrive:
         # Near the log's ends: the nearest time at which both speeds are known
         middle_s = min(max(t_s, first_s), last_s)
         before, now, after = (
-            self.pose_at(at)[:2, 3] for at in (middle_s - over_s, middle_s, middle_s + over_s)
+            self.pose_at(time_s)[:2, 3] for time_s in (middle_s - over_s, middle_s, middle_s + over_s)
         )
         return float(np.hypot(*(after - now)) - np.hypot(*(now - before))) / over_s**2
 

@@ -102,9 +102,9 @@ class ReplayExpert:
         users = self._foreseen(_users(clip.boxes[clip.now]), T_world_ego)
         now = BicycleState(0.0, 0.0, 0.0, float(clip.ego_speed_mps[-1]))
         if self.world is not None:
-            told = self.world.ego()
+            state = self.world.ego()
             now = dataclasses.replace(
-                now, steering_rad=told.steering_rad, acceleration_mps2=told.acceleration_mps2
+                now, steering_rad=state.steering_rad, acceleration_mps2=state.acceleration_mps2
             )
         path = self.drive.path_ahead(T_world_ego)
         cruise_mps = max(MIN_CRUISE_MPS, self._logged_mps(T_world_ego))
@@ -173,13 +173,13 @@ def _driven(trajectory: Trajectory, now: BicycleState) -> list[BicycleState]:
 def _impact_mps(driven: Sequence[BicycleState], users: Sequence[RoadUsers], margin_m: float) -> float | None:
     """Return the relative speed of the first touch; None if there is none."""
     half_lw = 0.5 * np.array([EGO.length_m, EGO.width_m]) + margin_m
-    for state, there in zip(driven, users, strict=True):
+    for state, user in zip(driven, users, strict=True):
         forward = np.array([math.cos(state.yaw_rad), math.sin(state.yaw_rad)])
         foot = np.array([state.x_m, state.y_m, 0.0])
         foot[:2] += EGO.axle_to_centre_m * forward
-        hit = touched(Box(foot, state.yaw_rad, half_lw), there)
+        hit = touched(Box(foot, state.yaw_rad, half_lw), user)
         if hit.any():
-            against = state.speed_mps * forward - there.velocity_mps[hit]
+            against = state.speed_mps * forward - user.velocity_mps[hit]
             return float(np.linalg.norm(against, axis=1).max())
     return None
 

@@ -33,9 +33,9 @@ def annotations_at(
     points_world = _points_world(sweep, log.T_world_ego[frame])
     all_rows = np.arange(tracks.first_row[row], tracks.first_row[row + 1])
     annotations = []
-    for at, box in enumerate(all_rows[tracks.is_object[all_rows]].tolist()):
+    for index, box in enumerate(all_rows[tracks.is_object[all_rows]].tolist()):
         labels = (boxes.track_id, boxes.attribute, boxes.visibility, boxes.num_points)
-        track, attribute, level, points = (int(values[at]) for values in labels)
+        track, attribute, level, points = (int(values[index]) for values in labels)
         length, width, height = tracks.size_lwh[box].tolist()
         T_world_box = np.eye(4)
         T_world_box[:3, :3], T_world_box[:3, 3] = tracks.R_world_box[box], tracks.centre[box]
@@ -52,7 +52,7 @@ def annotations_at(
             "num_lidar_pts": points,
             "num_radar_pts": 0,
         }
-        annotations.append((track, Category(int(boxes.category[at])), annotation))
+        annotations.append((track, Category(int(boxes.category[index])), annotation))
     return annotations
 
 

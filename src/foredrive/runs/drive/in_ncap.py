@@ -83,7 +83,7 @@ class SafetyTests:
             for number in range(self.count)
         ]
         if not jobs:
-            raise InputError(f"{self.scenarios}: no scenario passes the self-test: {self.tested().told}")
+            raise InputError(f"{self.scenarios}: no scenario passes the self-test: {self.tested().reasons}")
         return jobs
 
     def tested(self) -> SelfTest:
@@ -160,7 +160,7 @@ def propose_scenarios(runs: Sequence[str], file: Path, rules: str, count: int) -
         raise InputError("no scenario is feasible in these logs: they are too short, too slow or too full")
     tested = self_test(proposals, lambda scenario: place_in(places[scenario.scene]), count, _rules(rules))
     if not tested.passed:
-        raise InputError(f"no scenario passes the self-test: {tested.told}")
+        raise InputError(f"no scenario passes the self-test: {tested.reasons}")
     save_scenarios(tested.passed, file)
     return tested
 

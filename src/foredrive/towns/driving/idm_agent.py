@@ -122,7 +122,7 @@ def true_view(boxes: Boxes, path: PathAhead, light: LightState, light_m: float) 
         light, light_m: the next light and its distance.
     """
     # The nearest user in the path now gives gap and speed; the cells say what is in the path over time
-    there, gap_m, speed_mps, _ = lead_of(boxes, path)
+    is_led, gap_m, speed_mps, _ = lead_of(boxes, path)
     t_s = LATER_DT_S * torch.arange(TIMES)
     moved = boxes.velocity.nan_to_num()[:, None] * t_s[:, None]
     occupied = occupied_by(
@@ -132,7 +132,7 @@ def true_view(boxes: Boxes, path: PathAhead, light: LightState, light_m: float) 
         boxes.valid[:, None].expand(-1, TIMES),
         path,
     )
-    lead = Obstacle(gap_m, max(speed_mps, 0.0)) if there else None
+    lead = Obstacle(gap_m, max(speed_mps, 0.0)) if is_led else None
     return PathView(light, light_m, lead, occupied.any(0).numpy())
 
 

@@ -112,16 +112,16 @@ def find_way(graph: LaneGraph, waypoints: Float64[np.ndarray, "W 3"]) -> tuple[l
     costs = [ASIDE_WEIGHT * place.aside_m for place in choices[0]]
     for number, (before, here) in enumerate(itertools.pairwise(choices), start=1):
         is_last = number == len(choices) - 1
-        found: list[tuple[float, int, list[Leg]]] = []
+        candidates: list[tuple[float, int, list[Leg]]] = []
         for end in here:  # of the last waypoint only the cheapest place counts
-            max_cost = min((total for total, *_ in found), default=np.inf) if is_last else np.inf
-            found.append(_best_onto(graph, before, costs, end, max_cost))
-        if not any(np.isfinite(total) for total, *_ in found):
+            max_cost = min((total for total, *_ in candidates), default=np.inf) if is_last else np.inf
+            candidates.append(_best_onto(graph, before, costs, end, max_cost))
+        if not any(np.isfinite(total) for total, *_ in candidates):
             raise InputError(f"no lanes lead from waypoint {number} to waypoint {number + 1}")
         # Extend the best way to the predecessor place that each place chose
-        ways = [joined(ways[b], legs) for _, b, legs in found]
-        places = [[*places[b], end] for (_, b, _), end in zip(found, here, strict=True)]
-        costs = [total for total, *_ in found]
+        ways = [joined(ways[b], legs) for _, b, legs in candidates]
+        places = [[*places[b], end] for (_, b, _), end in zip(candidates, here, strict=True)]
+        costs = [total for total, *_ in candidates]
     chosen = int(np.argmin(costs))
     return ways[chosen], places[chosen]
 
@@ -135,10 +135,10 @@ def _best_onto(
     infinite if no way costs less than `max_cost`. The most promising start places are searched first.
     """
     index, s_m = np.array([place.lane for place in (end, *starts)]), [place.s_m for place in (end, *starts)]
-    here, *there = graph.position(index, np.array(s_m))
+    here, *targets = graph.position(index, np.array(s_m))
     # Lower bound of each start: its cost plus the straight distance, so the search can stop early
     aside = ASIDE_WEIGHT * end.aside_m
-    promised = aside - BACK_M + np.array(costs) + np.linalg.norm(np.array(there) - here, axis=1)
+    promised = aside - BACK_M + np.array(costs) + np.linalg.norm(np.array(targets) - here, axis=1)
     best: tuple[float, int, list[Leg]] = (np.inf, 0, [])
     for b in np.argsort(promised).tolist():
         if promised[b] >= min(max_cost, best[0]):

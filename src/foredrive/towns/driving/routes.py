@@ -103,12 +103,12 @@ def route_line(graph: LaneGraph, legs: list[Leg]) -> tuple[Float64[np.ndarray, "
             continue
         # The shift to the new lane is spread over a window instead of a step at the leg's start
         for change, from_m, to_m in _windows(graph, legs, of_run, arc_m, leg_of):
-            at = int(np.argmax(leg_of == change))
-            aside_m = legs[change].changes * float(np.linalg.norm((points[at] - points[at - 1])[:2]))
+            index = int(np.argmax(leg_of == change))
+            aside_m = legs[change].changes * float(np.linalg.norm((points[index] - points[index - 1])[:2]))
             # Quintic 0 → 1 over the window, minus the step that the points make themselves
             x = np.clip((arc_m - from_m) / max(to_m - from_m, 1e-6), 0.0, 1.0)
             led = x**3 * (10 - 15 * x + 6 * x**2)
-            shift_m += aside_m * (led - (np.arange(len(points)) >= at))
+            shift_m += aside_m * (led - (np.arange(len(points)) >= index))
             sign = RouteOption.CHANGE_LEFT if aside_m > 0 else RouteOption.CHANGE_RIGHT
             option[(arc_m >= from_m) & (arc_m <= to_m) & on_run] = sign
     points[:, :2] += shift_m[:, None] * left

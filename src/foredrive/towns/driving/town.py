@@ -118,10 +118,10 @@ class TownSimulator:
         driven = self._driven(ego, z_m)
         middle = driven.axle_xyz + EGO.axle_to_centre_m * driven.forward
         nowhere = np.zeros(0, dtype=np.int64)
-        found = find_lane(self._traffic.lane_index, middle, driven.yaw_rad, nowhere, nowhere)
-        if found is None:
+        placed_lane = find_lane(self._traffic.lane_index, middle, driven.yaw_rad, nowhere, nowhere)
+        if placed_lane is None:
             raise InputError(f"the route begins on no lane of {scenario.town}: {scenario.route_xyz[0]}")
-        row = ego_vehicle(self._traffic.lanes, np.array([found[0]]), np.array([found[1]]))
+        row = ego_vehicle(self._traffic.lanes, np.array([placed_lane[0]]), np.array([placed_lane[1]]))
         lanes = np.array(scenario.lanes, dtype=np.int64) if scenario.lanes else None
         scenarios, traffic = self._director.set_up(
             self._traffic.start(row, lanes), self._seen(ego, RouteProgress(), z_m, 0.0), DECISION_S

@@ -130,8 +130,8 @@ class TownExpert:
             speed = min(speed + EDGES_MPS2 * DECISION_S, EDGES_MPS)
             way_m = min(way_m + speed * DECISION_S, max(max_m, way_m))
             # Position on the route and a point ahead, from which the heading is taken
-            at = now.progress.done_m + way_m + np.array([0.0, LOOK_M])
-            (x, ahead_x), (y, ahead_y) = (np.interp(at, arc_m, axis) for axis in xyz.T[:2])
+            along_m = now.progress.done_m + way_m + np.array([0.0, LOOK_M])
+            (x, ahead_x), (y, ahead_y) = (np.interp(along_m, arc_m, axis) for axis in xyz.T[:2])
             yaw = math.atan2(ahead_y - y, ahead_x - x)
             middle = np.array([x, y, here.axle_xyz[2]])
             middle[:2] += EGO.axle_to_centre_m * np.array([math.cos(yaw), math.sin(yaw)])
@@ -150,8 +150,8 @@ class TownExpert:
     def _gone_on(self, traffic: Traffic, state: TrafficState, here: EgoPose) -> TrafficState:
         """Keep the planned path and lane change, if the vehicle is where they lead."""
         # The imagined state of this very time from the last plan, if there is one
-        known = (then.traffic for then in self._imagined)
-        meant = next((then for then in known if abs(then.time_s - state.time_s) < 0.5 * DECISION_S), None)
+        imagined = (then.traffic for then in self._imagined)
+        meant = next((then for then in imagined if abs(then.time_s - state.time_s) < 0.5 * DECISION_S), None)
         if meant is None:
             return state
         poses = traffic.poses(meant)

@@ -51,11 +51,11 @@ class TownReplayRenderer:
         # Added actors are tracks of the scene that look like actors of the town
         rows = torch.tensor([tracks.index_of(number) for number in copied], dtype=torch.int64)
         self._added = tracks.map_tensors(lambda tensor: tensor.detach().cpu()).only(rows)
-        known = {actor.track_id: actor for moment in moments for actor in moment.actors}
-        known |= {actor.track_id: actor for actor in world.parked}
-        if missing := [number for number in copied.values() if number not in known]:
+        actors = {actor.track_id: actor for moment in moments for actor in moment.actors}
+        actors |= {actor.track_id: actor for actor in world.parked}
+        if missing := [number for number in copied.values() if number not in actors]:
             raise InputError(f"the town has no actors {missing} that others could look like")
-        self._models = [known[number] for number in copied.values()]
+        self._models = [actors[number] for number in copied.values()]
 
     @property
     def rig(self) -> CameraRig:

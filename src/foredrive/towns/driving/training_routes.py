@@ -57,10 +57,14 @@ def draw_routes(town: str, spec: RouteSetSpec, seed: int = 0) -> list[RouteWaypo
             for _ in range(CANDIDATES):
                 length_m = float(rng.uniform(spec.min_m, spec.max_m))
                 drawn = draw_route(graph, starts, rng, length_m, from_s=0.0, until_s=math.inf)
-                found = _checked(f"{town}-{len(chosen)}", town, graph, drawn, length_m, spec)
-                worth = -math.inf if found is None else _worth(found[1], [route for _, route in chosen], met)
+                candidate = _checked(f"{town}-{len(chosen)}", town, graph, drawn, length_m, spec)
+                worth = (
+                    -math.inf
+                    if candidate is None
+                    else _worth(candidate[1], [route for _, route in chosen], met)
+                )
                 if worth > best_worth:
-                    best, best_worth = found, worth
+                    best, best_worth = candidate, worth
         chosen.append(best)
         met.update(_manoeuvres(best[1]))
     return [waypoints for waypoints, _ in chosen]

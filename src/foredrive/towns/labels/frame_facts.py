@@ -108,24 +108,24 @@ class FactCollector:
             is_visible: returns whether the cameras see a point (ego frame).
         """
         T_ego_world = np.linalg.inv(snapshot.T_world_ego)
-        R, at = T_ego_world[:3, :3], snapshot.T_world_ego[:3, 3]
+        R, ego_xyz = T_ego_world[:3, :3], snapshot.T_world_ego[:3, 3]
         centre = np.array([actor.centre_m for actor in actors]).reshape(-1, 3)
         in_ego = centre @ R.T + T_ego_world[:3, 3]
         on_road = self._places.on_road(centre[:, :2])
         seen = zip(actors, in_ego, visibility.tolist(), on_road.tolist(), strict=True)
-        things = [_caption_actor(*each, R) for each in seen]
+        things = [_caption_actor(*entry, R) for entry in seen]
         # The nearest route point ahead of the last one: routes may cross themselves
         window = slice(self._passed, self._passed + 200)
-        self._passed += int(np.linalg.norm(self._line[window] - at, axis=1).argmin())
+        self._passed += int(np.linalg.norm(self._line[window] - ego_xyz, axis=1).argmin())
         lateral_mps = self._lateral_speed(snapshot)
         # While overtaking, the leader is searched along the vehicle's own lane, parallel to the route
-        beside = at - self._line[self._passed]  # the lane beside the route's, while overtaking
+        beside = ego_xyz - self._line[self._passed]  # the lane beside the route's, while overtaking
         leader, gap_m = self._leader(actors, centre - beside, visibility)
         now = self._conditions
         setting = Setting(
             time_of_day=TimeOfDay.at_hour(now.hour),
             weather=Weather.under(now),
-            place=self._places.classify(at),
+            place=self._places.classify(ego_xyz),
             doing=self._doing(snapshot, leader, gap_m, lateral_mps),
             speed_mps=float(snapshot.twist_ego[0]),
             leader=None if leader is None else object_kind(leader),
@@ -150,7 +150,7 @@ class FactCollector:
         way, arc_m = self._line[self._passed : end], self._arc_m[self._passed : end]
         if not len(way) or not len(centre):
             return None, np.inf
-        away_m, index = (np.asarray(found) for found in cKDTree(way).query(centre - [0.0, 0.0, MIDDLE_M]))
+        away_m, index = (np.asarray(column) for column in cKDTree(way).query(centre - [0.0, 0.0, MIDDLE_M]))
         # Distance along the route of the nearest point; vehicles beside it and too near ones do not lead
         ahead_m = arc_m[index] - arc_m[0]
         vehicle = [not (a.parked or a.category is Category.PEDESTRIAN) for a in actors]
@@ -292,11 +292,11 @@ def _ring_lanes(lanes: LaneGraph) -> Int[np.ndarray, "R"]:
     junctions."""
     # Lanes that turn left at least as tightly as `RING_RADIUS_M`; short ones may be straight
     bends = lanes.turn_rad > np.where(lanes.length_m < SHORT_M, -0.1, lanes.length_m / RING_RADIUS_M)
-    found: set[int] = set()
+    ring: set[int] = set()
     for start in np.flatnonzero(bends & (lanes.length_m >= SHORT_M)).tolist():
-        if start not in found:
-            found.update(_ring_from(lanes, start, bends))
-    rings = np.array(sorted(found), dtype=np.int64)
+        if start not in ring:
+            ring.update(_ring_from(lanes, start, bends))
+    rings = np.array(sorted(ring), dtype=np.int64)
     junctions = np.setdiff1d(lanes.junction[rings], [-1])
     return np.union1d(rings, np.flatnonzero(np.isin(lanes.junction, junctions)))
 

@@ -160,11 +160,11 @@ def _border_heights(pieces: list[Piece]) -> BorderHeights:
     samples, raises = [], []
     # Samples of both borders: the land and the walls take their heights from there
     for piece in pieces:
-        at = np.arange(piece.along_m[0], piece.along_m[-1], BORDER_SPACING_M)
-        at = np.append(at, piece.along_m[-1])
+        along_m = np.arange(piece.along_m[0], piece.along_m[-1], BORDER_SPACING_M)
+        along_m = np.append(along_m, piece.along_m[-1])
         for line in (piece.left_xyz, piece.right_xyz):
-            samples.append(np.column_stack([np.interp(at, piece.along_m, line[:, i]) for i in range(3)]))
-            raises.append(np.full(len(at), piece.raise_m))
+            samples.append(np.column_stack([np.interp(along_m, piece.along_m, line[:, i]) for i in range(3)]))
+            raises.append(np.full(len(along_m), piece.raise_m))
     xyz = np.concatenate(samples)
     return BorderHeights(cKDTree(xyz[:, :2]), xyz[:, 2], xyz[:, 2] + np.concatenate(raises))
 

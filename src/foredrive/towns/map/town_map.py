@@ -290,7 +290,7 @@ def _markings(helper: Any, marks: list[Any], swap: bool) -> tuple[Marking, ...]:
         return ()
     length = float(helper.s_range[1] - helper.s_range[0])
     ends = [mark.s_offset for mark in marks[1:]] + [length]
-    found = []
+    markings = []
     for mark, end_s in zip(marks, ends, strict=True):
         start_m, end_m = max(0.0, mark.s_offset), min(length, end_s)
         name = (mark.type or "none").lower()
@@ -302,8 +302,8 @@ def _markings(helper: Any, marks: list[Any], swap: bool) -> tuple[Marking, ...]:
             start_m, end_m = length - end_m, length - start_m
         yellow = (mark.color or "").lower() == "yellow"
         kind = _SWAPPED.get(kind, kind) if swap else kind
-        found.append(Marking(start_m, end_m, kind, yellow, mark.width or DEFAULT_LINE_WIDTH_M))
-    return tuple(sorted(found, key=lambda marking: marking.start_m))
+        markings.append(Marking(start_m, end_m, kind, yellow, mark.width or DEFAULT_LINE_WIDTH_M))
+    return tuple(sorted(markings, key=lambda marking: marking.start_m))
 
 
 def marking_at(markings: tuple[Marking, ...], along_m: float) -> Marking | None:

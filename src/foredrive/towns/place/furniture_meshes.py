@@ -202,9 +202,9 @@ def _board(
             )
         )
     thin = [(Surface.SIGN, plate(-0.05, y, z))]
-    for at in posts:
-        parts.append(frustum((0, at, -SINK_M), (0, at, z[1]), (0.05, 0.05), 6, mats.pole))
-        thin.append((Surface.POLE, upright(0.0, at, z[0])))
+    for post_m in posts:
+        parts.append(frustum((0, post_m, -SINK_M), (0, post_m, z[1]), (0.05, 0.05), 6, mats.pole))
+        thin.append((Surface.POLE, upright(0.0, post_m, z[0])))
     return FurnitureItem(join(parts), (0.4, 0.5 * wide + 0.1), tuple(thin))
 
 
@@ -251,9 +251,9 @@ def _billboard(mats: FurnitureMaterials) -> FurnitureItem:
         box((-0.16, 1.0, z[0] + 0.7), (-0.14, 2.2, z[0] + 2.0), c),
     ]
     thin: list[tuple[Surface, Float[np.ndarray, "_ 3"]]] = [(Surface.SIGN, plate(0.0, y, z))]
-    for at in (-1.8, 1.8):
-        parts.append(frustum((0.05, at, -2 * SINK_M), (0.05, at, z[1]), (0.14, 0.12), 8, mats.pole))
-        thin.append((Surface.POLE, upright(0.05, at, z[0])))
+    for post_m in (-1.8, 1.8):
+        parts.append(frustum((0.05, post_m, -2 * SINK_M), (0.05, post_m, z[1]), (0.14, 0.12), 8, mats.pole))
+        thin.append((Surface.POLE, upright(0.05, post_m, z[0])))
     return FurnitureItem(join(parts), (0.5, 3.2), tuple(thin))
 
 

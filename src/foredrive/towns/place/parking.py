@@ -92,16 +92,20 @@ def _pose_on(
 ) -> tuple[Float[np.ndarray, "3"], float, float]:
     """Return the point, heading and pitch on a strip."""
     # Heading and pitch from the points 2 m before and after
-    at, before, after = (points_at(middle, along, s + ds) for ds in (0.0, -2.0, 2.0))
+    middle_xyz, before, after = (points_at(middle, along, s + ds) for ds in (0.0, -2.0, 2.0))
     step = after - before
     # The pitch is positive with the nose down
-    return at, float(np.arctan2(step[1], step[0])), float(-np.arctan2(step[2], np.hypot(step[0], step[1])))
+    return (
+        middle_xyz,
+        float(np.arctan2(step[1], step[0])),
+        float(-np.arctan2(step[2], np.hypot(step[0], step[1]))),
+    )
 
 
 def _car(
     pose: tuple[Float[np.ndarray, "3"], float, float], across: bool, rng: np.random.Generator
 ) -> ActorState:
-    at, yaw, pitch = pose
+    xyz, yaw, pitch = pose
     van = rng.random() < 0.1
     size = np.array([rng.uniform(3.9, 4.8), rng.uniform(1.72, 1.86), rng.uniform(1.42, 1.7)])
     if van:
@@ -114,7 +118,7 @@ def _car(
     return ActorState(
         track_id=-1,
         category=Category.CAR,
-        centre_m=at + np.array([0.0, 0.0, 0.5 * size[2]]),
+        centre_m=xyz + np.array([0.0, 0.0, 0.5 * size[2]]),
         yaw=yaw,
         pitch=0.0 if across else pitch,
         size_lwh=size,

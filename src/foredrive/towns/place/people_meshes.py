@@ -92,8 +92,8 @@ def _arms(phase: float | None) -> list[Mesh]:
     return parts
 
 
-def _hand(at: tuple[float, float, float]) -> Mesh:
-    x, y, z = at
+def _hand(xyz: tuple[float, float, float]) -> Mesh:
+    x, y, z = xyz
     return box((x - 0.035, y - 0.025, z - 0.1), (x + 0.035, y + 0.025, z + 0.01), THIRD)
 
 

@@ -214,8 +214,8 @@ def _stop_lines(town: TownMap, mats: RoadMaterials) -> list[Mesh]:
 def _before_end(line: Float[np.ndarray, "N 3"], gap_m: float) -> Float[np.ndarray, "2 3"]:
     """Return the points at STOP_LINE_M + gap and at gap before the end of a line."""
     along = arc_lengths(line)
-    at = along[-1] - gap_m - np.array([STOP_LINE_M, 0.0])
-    return points_at(line, along, at)
+    border_m = along[-1] - gap_m - np.array([STOP_LINE_M, 0.0])
+    return points_at(line, along, border_m)
 
 
 def _bridges(plan: GroundPlan, mats: RoadMaterials) -> list[Mesh]:

@@ -208,9 +208,9 @@ def _paved_in_gaps(land: Mesh, plan: GroundPlan, material: int) -> Mesh:
     rings = [ring for part in shapely.get_parts(plan.ground) for ring in part.interiors]
     gaps = [gap for gap in map(shapely.Polygon, rings) if gap.area < GAP_M2]
     middle = land.xyz[..., :2].mean(axis=1)
-    found = shapely.STRtree(gaps).query(shapely.points(middle), predicate="intersects")[0]
+    inside = shapely.STRtree(gaps).query(shapely.points(middle), predicate="intersects")[0]
     materials = land.material.copy()
-    materials[found] = material
+    materials[inside] = material
     return Mesh(land.xyz, np.zeros_like(land.uvw), materials)
 
 

@@ -61,9 +61,9 @@ def at_junctions(road: RoadContext, stretches: list[Stretch]) -> Iterator[Scenar
                 ways.setdefault(kind, []).append(met)
         limit = float(graph.limit_mps[lane])
         # The first meeting point counts, with all ways that meet about there
-        for kind, found in ways.items():
-            first_m = min(at_m for at_m, _ in found)
-            nearest = tuple(way for at_m, way in found if at_m < first_m + MEET_M)
+        for kind, ways_of_kind in ways.items():
+            first_m = min(at_m for at_m, _ in ways_of_kind)
+            nearest = tuple(way for at_m, way in ways_of_kind if at_m < first_m + MEET_M)
             # Speed of the ego vehicle in its turn
             through = float(graph.speed_mps[graph.first[lane] : graph.first[lane] + graph.count[lane]].min())
             predictable = first_m > MIN_APPROACH_M and through > MIN_THROUGH_MPS

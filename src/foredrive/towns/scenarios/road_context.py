@@ -37,14 +37,14 @@ class RoadContext(NamedTuple):
 
 def stretches_of(road: RoadContext) -> list[Stretch]:
     """Return the route's legs with their start and end on the route."""
-    route, graph, at_m, found = road.route, road.graph, 0.0, []
+    route, graph, at_m, stretches = road.route, road.graph, 0.0, []
     for leg in route.legs:
         ends = graph.position(np.array([leg.lane, leg.lane]), np.array([leg.from_m, leg.to_m]))
         # Both ends of the leg on the route, searched from the end of the last one
         from_m = arc_m(route, ends[0], at_m)
         at_m = arc_m(route, ends[1], from_m + leg.to_m - leg.from_m)
-        found.append(Stretch(leg, from_m, at_m))
-    return found
+        stretches.append(Stretch(leg, from_m, at_m))
+    return stretches
 
 
 def arc_m(route: DriveRoute, xyz: Float64[np.ndarray, "3"], about_m: float) -> float:
@@ -58,9 +58,9 @@ def arc_m(route: DriveRoute, xyz: Float64[np.ndarray, "3"], about_m: float) -> f
 def pose(route: DriveRoute, at_m: float) -> tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "2"]]:
     """Return a point of the route, m, and the unit vector of its heading there."""
     # Heading from 1.5 m before to 1.5 m after
-    at, before, after = (points_at(route.xyz, route.arc_m, at_m + ds) for ds in (0.0, -1.5, 1.5))
+    xyz, before, after = (points_at(route.xyz, route.arc_m, at_m + ds) for ds in (0.0, -1.5, 1.5))
     step = (after - before)[:2]
-    return at, step / np.hypot(*step)
+    return xyz, step / np.hypot(*step)
 
 
 def onward(graph: LaneGraph, lane: int) -> list[int]:

@@ -214,10 +214,10 @@ def _is_free(context: ScenarioContext, slot: int) -> bool:
     left = np.array([-ahead[1], ahead[0]]) * (1.0 if context.scenario.side == 0 else -1.0)
     # Others in the frame of the cutting-in vehicle: beside it on the side of the change
     offset = poses.centre_m[:, :2] - poses.centre_m[slot, :2]
-    there = v.active & (np.abs(offset @ ahead) < BESIDE_M) & (offset @ left > ASIDE_M)
-    there &= offset @ left < 3 * ASIDE_M
-    there[[0, slot]] = False
-    return not there.any()
+    beside = v.active & (np.abs(offset @ ahead) < BESIDE_M) & (offset @ left > ASIDE_M)
+    beside &= offset @ left < 3 * ASIDE_M
+    beside[[0, slot]] = False
+    return not beside.any()
 
 
 def _order_meeting(context: ScenarioContext, lead_m: float) -> ScenarioContext:

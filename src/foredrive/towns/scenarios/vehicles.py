@@ -55,8 +55,8 @@ def _is_far(road: RoadContext, ahead_m: Float64[np.ndarray, "n"], behind_m: Floa
 
     Two points cannot be seen from each other if they are further apart than `SPAWN_MIN_M`.
     """
-    there, here = (points_at(road.route.xyz[:, :2], road.route.arc_m, m) for m in (ahead_m, behind_m))
-    return bool((np.hypot(*(there - here).T) > SPAWN_MIN_M).any())
+    ahead_xy, here = (points_at(road.route.xyz[:, :2], road.route.arc_m, m) for m in (ahead_m, behind_m))
+    return bool((np.hypot(*(ahead_xy - here).T) > SPAWN_MIN_M).any())
 
 
 def place_vehicles(context: ScenarioContext, at_start: bool) -> ScenarioContext:

@@ -53,7 +53,7 @@ def _visible_lamps(lamps, extinction_per_m, origin):
 
 @_kernel
 @no_type_check
-def add_beams(lamps, extinction_per_m, t, origin, direction, known, radiance):
+def add_beams(lamps, extinction_per_m, t, origin, direction, is_known, radiance):
     """Add to `radiance` [N 3] the light of lamps that the air scatters along rays.
 
     Args:
@@ -62,11 +62,11 @@ def add_beams(lamps, extinction_per_m, t, origin, direction, known, radiance):
         t: [N] distances at which the rays end, m.
         origin: [N 3] starts of the rays, within metres of one another.
         direction: [N 3] unit directions of the rays.
-        known: [N 3] not negative for rays that do not change; or [0 3].
+        is_known: [N 3] not negative for rays that do not change; or [0 3].
     """
     seen = _visible_lamps(lamps, extinction_per_m, origin)
     for i in range(len(t)):
-        if len(known) > 0 and known[i, 0] >= 0.0:
+        if len(is_known) > 0 and is_known[i, 0] >= 0.0:
             continue
         end = min(t[i], MAX_OPTICAL_DEPTH / extinction_per_m)
         dx, dy, dz = direction[i, 0], direction[i, 1], direction[i, 2]

@@ -130,37 +130,37 @@ class RayTracer:
         """
         # Hits, then surfaces there, then shadows: one ray to the sun for each surface that faces it
         hits = self.cast(rays)
-        found = shading.surfaces(self.scene, hits, rays.origin, rays.direction, ray_rad)
-        return hits, found, self.sunlit(found, hits, rays.dt_s)
+        surfaces = shading.surfaces(self.scene, hits, rays.origin, rays.direction, ray_rad)
+        return hits, surfaces, self.sunlit(surfaces, hits, rays.dt_s)
 
     def radiance(
         self,
         hits: shading.Hits,
-        found: shading.Surfaces,
+        surfaces: shading.Surfaces,
         lit: Bool[np.ndarray, "N"],
         rays: WorldRays,
         ray_rad: Float32[np.ndarray, "N"],
-        known: Float32[np.ndarray, "M 3"] = NOT_KNOWN,
+        given: Float32[np.ndarray, "M 3"] = NOT_KNOWN,
     ) -> Rays:
         """Return the radiance along rays.
 
         Where `known` is not negative, it is the result. It may have no rows.
         """
-        mirrored = self.mirrored(found, hits, rays, ray_rad)
+        mirrored = self.mirrored(surfaces, hits, rays, ray_rad)
         materials, light = self.scene.materials, self.light
-        out = shading.shade(materials, found, hits.t, rays.direction, lit, light, mirrored, known)
+        out = shading.shade(materials, surfaces, hits.t, rays.direction, lit, light, mirrored, given)
         if light.air.foggy and len(light.lamps.lamp_index) > 0:
             # Rays into the sky pass all fog lamps: their end is at infinity
-            t = np.where(found.material == shading.MISS, np.float32(np.inf), hits.t)
-            add_beams(light.lamps, light.air.extinction_per_m, t, rays.origin, rays.direction, known, out)
+            t = np.where(surfaces.material == shading.MISS, np.float32(np.inf), hits.t)
+            add_beams(light.lamps, light.air.extinction_per_m, t, rays.origin, rays.direction, given, out)
         return out
 
     def sunlit(
-        self, found: shading.Surfaces, hits: shading.Hits, dt_s: Times | None
+        self, surfaces: shading.Surfaces, hits: shading.Hits, dt_s: Times | None
     ) -> Bool[np.ndarray, "N"]:
         """Return whether the sun shines on each hit."""
-        start = np.empty_like(found.xyz)
-        facing = shading.sun_rays(found, hits.t, self.light.sun, start)
+        start = np.empty_like(surfaces.xyz)
+        facing = shading.sun_rays(surfaces, hits.t, self.light.sun, start)
         to_sun = np.ascontiguousarray(np.broadcast_to(self.light.sun, (len(facing), 3)))
         lit = np.zeros(len(hits.t), dtype=np.bool_)
         when = None if dt_s is None else dt_s[facing]
@@ -168,7 +168,11 @@ class RayTracer:
         return lit
 
     def mirrored(
-        self, found: shading.Surfaces, hits: shading.Hits, rays: WorldRays, ray_rad: Float32[np.ndarray, "N"]
+        self,
+        surfaces: shading.Surfaces,
+        hits: shading.Hits,
+        rays: WorldRays,
+        ray_rad: Float32[np.ndarray, "N"],
     ) -> Float32[np.ndarray, "M 3"]:
         """Return the radiance that water on the ground mirrors, -1 where there is no water.
 
@@ -180,12 +184,19 @@ class RayTracer:
         out = np.full((len(hits.t), 3), -1.0, np.float32)
         origin, direction = np.empty_like(out), np.empty_like(out)
         wetness, materials = self.light.air.wetness, self.scene.materials
-        wet = wet_ground.mirror_rays(materials, found, hits.t, rays.direction, wetness, origin, direction)
+        wet = wet_ground.mirror_rays(materials, surfaces, hits.t, rays.direction, wetness, origin, direction)
         dt_s = None if rays.dt_s is None else rays.dt_s[wet]
         mirrored_rays = WorldRays(origin[: len(wet)], direction[: len(wet)], dt_s)
-        met, there, lit = self.trace(mirrored_rays, ray_rad[wet])
+        met, mirrored_surfaces, lit = self.trace(mirrored_rays, ray_rad[wet])
         out[wet] = shading.shade(
-            materials, there, met.t, mirrored_rays.direction, lit, self.light, NOT_KNOWN, NOT_KNOWN
+            materials,
+            mirrored_surfaces,
+            met.t,
+            mirrored_rays.direction,
+            lit,
+            self.light,
+            NOT_KNOWN,
+            NOT_KNOWN,
         )
         return out
 
@@ -245,7 +256,7 @@ def _render_sharp(
     count, samples = len(buffer.material), sensors.samples_per_outline_pixel
     rolling = bool(sensors.rig.readout_s.any())
     rgb, normal = np.empty((count, 3), np.float32), np.empty((count, 3), np.float32)
-    known = ShadedPixels(rgb, normal, np.empty(count, np.bool_))
+    shaded = ShadedPixels(rgb, normal, np.empty(count, np.bool_))
 
     # Rows of a rolling shutter have their own times; else one pose serves all rays
     def to_world(rays: EgoRays, rows: Int64[np.ndarray, "n"]) -> WorldRays:
@@ -258,11 +269,11 @@ def _render_sharp(
     def trace_centres(start: int, stop: int) -> None:
         part = slice(start, stop)
         rays = to_world(sensors.pixel_rays, np.arange(start, stop))
-        hits, found, lit = tracer.trace(rays, sensors.pixel_rad[part])
-        radiance = tracer.radiance(hits, found, lit, rays, sensors.pixel_rad[part])
+        hits, surfaces, lit = tracer.trace(rays, sensors.pixel_rad[part])
+        radiance = tracer.radiance(hits, surfaces, lit, rays, sensors.pixel_rad[part])
         film.expose(part, radiance, 1)
-        record_hits(buffer, part, hits, found.material)
-        known.radiance[part], known.normal[part], known.lit[part] = radiance, found.normal, lit
+        record_hits(buffer, part, hits, surfaces.material)
+        shaded.radiance[part], shaded.normal[part], shaded.lit[part] = radiance, surfaces.normal, lit
 
     # First pass: one ray through each pixel's centre
     in_parallel(trace_centres, count, PIXEL_GRAIN)
@@ -270,17 +281,17 @@ def _render_sharp(
         return
     shape = (len(sensors.rig.names), *sensors.rig.size_hw)
     # Second pass: several rays for the pixels on edges, with correspondingly smaller footprints
-    pixels = np.flatnonzero(outlines(buffer, known, film.noise_free, shape))
+    pixels = np.flatnonzero(outlines(buffer, shaded, film.noise_free, shape))
 
     def trace_outlines(start: int, stop: int) -> None:
         some = pixels[start:stop]
         rows = (some[:, None] * samples + np.arange(samples)).ravel()
         rays = to_world(sensors.outline_rays, rows)
         ray_rad = np.repeat(sensors.pixel_rad[some], samples) / np.float32(samples**0.5)
-        hits, found, lit = tracer.trace(rays, ray_rad)
+        hits, surfaces, lit = tracer.trace(rays, ray_rad)
         # Rays that find the same as the centre take its result instead of being shaded
-        same = same_as_centre(some, samples, found, hits.actor, lit, buffer, known)
-        film.expose(some, tracer.radiance(hits, found, lit, rays, ray_rad, same), samples)
+        same = same_as_centre(some, samples, surfaces, hits.actor, lit, buffer, shaded)
+        film.expose(some, tracer.radiance(hits, surfaces, lit, rays, ray_rad, same), samples)
 
     in_parallel(trace_outlines, len(pixels), PIXEL_GRAIN // samples)
 
@@ -297,8 +308,8 @@ def _render_blurred(
         rays = ego.to_world_at_ray_times(EgoRays(*(column[part] for column in sensors.pixel_rays)))
         hits = tracer.cast(rays)
         ray_rad = sensors.pixel_rad[part]
-        found = shading.surfaces(tracer.scene, hits, rays.origin, rays.direction, ray_rad)
-        record_hits(buffer, part, hits, found.material)
+        surfaces = shading.surfaces(tracer.scene, hits, rays.origin, rays.direction, ray_rad)
+        record_hits(buffer, part, hits, surfaces.material)
         total = np.zeros((stop - start, 3), np.float32)
         # Each instant uses another of the pixel's sub-positions, so that edges are smooth too
         for k, dt_s in enumerate(optics.sub_exposure_dt_s):
@@ -341,16 +352,16 @@ def simulate_sweep(
         rays = ego.to_world(ego_rays, rows)._replace(dt_s=ego_rays.dt_s[rows])
         hits = tracer.cast(rays)
         ray_rad = np.full(len(hits.t), beam_rad)
-        found = shading.surfaces(tracer.scene, hits, rays.origin, rays.direction, ray_rad)
+        hit_surfaces = shading.surfaces(tracer.scene, hits, rays.origin, rays.direction, ray_rad)
         odds = chance[part]
         # Rays of one beam that end within a pulse's depth form one echo
         if n > 1:
-            t = np.where(found.material == shading.MISS, np.inf, hits.t).reshape(-1, n)
+            t = np.where(hit_surfaces.material == shading.MISS, np.inf, hits.t).reshape(-1, n)
             group, share = echoes.group_echoes(t, lidar.pulse_m)
             # Returns of the surfaces; then one echo for each beam
             odds = echoes.footprint_chance(odds, share)
-        material = found.material
-        echo = lidar_returns(tracer.scene.materials, found, hits.t, far_m, odds, air)
+        material = hit_surfaces.material
+        echo = lidar_returns(tracer.scene.materials, hit_surfaces, hits.t, far_m, odds, air)
         if n > 1:
             echo, picked = echoes.pick_echo(group, echo, lidar.echo == "last")
             hits, material = shading.Hits(*(column[picked] for column in hits)), material[picked]

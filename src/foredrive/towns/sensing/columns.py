@@ -156,10 +156,10 @@ def cast_columns(
     # State of each ray: number of solids that it is in, where the outermost began, and as what
     depth, opened, opened_as = np.zeros(count, int), np.zeros(count, np.float32), np.zeros(count, int)
     last_ground, last_solid = np.full(count, np.inf, np.float32), np.zeros(count, np.float32)
-    found: list[tuple[np.ndarray, ...]] = []
+    columns: list[tuple[np.ndarray, ...]] = []
 
     def emit(rays: np.ndarray, low: np.ndarray, high: np.ndarray, surface: np.ndarray) -> None:
-        found.append((rays, low, high, surface))
+        columns.append((rays, low, high, surface))
 
     # All rays advance together from layer to layer
     for _ in range(MAX_LAYERS):
@@ -197,7 +197,7 @@ def cast_columns(
         last_solid[ray] = np.where(solid, z, last_solid[ray])
         # Continue just below the hit
         origin[ray, 2] = z - STEP_M
-    rays, low, high, surface = (np.concatenate(parts) for parts in zip(*found, strict=True))
+    rays, low, high, surface = (np.concatenate(parts) for parts in zip(*columns, strict=True))
     return Intervals(origin[rays, 0], origin[rays, 1], low, high, surface), rays
 
 

@@ -64,27 +64,27 @@ def _pick(group, range_m, returned, intensity, last, out_range, out_returned, ou
     for b in range(beams):
         # Energy of each echo: sum of intensity over r²; groups are
         # numbered by range, so the last wins for `last`
-        best, found = -1.0, -1
+        best, picked = -1.0, -1
         for g in range(n):
             energy = 0.0
             for k in range(n):
                 if group[b, k] == g and returned[b, k]:
                     energy += intensity[b, k] / max(range_m[b, k], 1.0) ** 2
             if energy > 0.0 and (last or energy > best):
-                best, found = energy, g
-        out_returned[b] = found >= 0
+                best, picked = energy, g
+        out_returned[b] = picked >= 0
         # Without an echo take the nearest ray; else the weighted mean range and the strongest ray
         total, weighted, ray = 0.0, 0.0, 0
         for k in range(n):
-            if found < 0:
+            if picked < 0:
                 if range_m[b, k] < range_m[b, ray]:
                     ray = k
-            elif group[b, k] == found and returned[b, k]:
+            elif group[b, k] == picked and returned[b, k]:
                 if total == 0.0 or intensity[b, k] > intensity[b, ray]:
                     ray = k
                 total += intensity[b, k]
                 weighted += intensity[b, k] * range_m[b, k]
-        out_range[b] = range_m[b, ray] if found < 0 else weighted / total
+        out_range[b] = range_m[b, ray] if picked < 0 else weighted / total
         out_intensity[b] = total / n
         out_ray[b] = ray
 

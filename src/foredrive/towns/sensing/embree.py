@@ -62,9 +62,9 @@ def _load() -> ctypes.CDLL:
 
     It is a dependency of embreex' module or, on Windows, a file beside it.
     """
-    found = ctypes.CDLL(rtcore_scene.__file__)
-    if hasattr(found, "rtcNewDevice"):
-        return found
+    library = ctypes.CDLL(rtcore_scene.__file__)
+    if hasattr(library, "rtcNewDevice"):
+        return library
     folder = Path(embreex.__file__).parent
     for path in sorted([*folder.glob("*embree4*"), *folder.parent.glob("embreex.libs/*embree4*")]):
         return ctypes.CDLL(str(path))
@@ -116,9 +116,9 @@ def check_release(version: int) -> None:
         InputError: it is another minor release.
     """
     if version // 100 != EMBREE:
-        found = f"{version // 10000}.{version // 100 % 100}.{version % 100}"
+        release = f"{version // 10000}.{version // 100 % 100}.{version % 100}"
         raise InputError(
-            f"towns need the Embree of embreex {EMBREEX}, but {found} is installed: "
+            f"towns need the Embree of embreex {EMBREEX}, but {release} is installed: "
             f"pip install 'embreex=={EMBREEX}.*'"
         )
 

@@ -36,7 +36,7 @@ _kernel = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
 
 @_kernel
 @no_type_check
-def lidar_returns(materials, found, t, max_range_m, chance, air):
+def lidar_returns(materials, surfaces, t, max_range_m, chance, air):
     """Compute which beams return, their ranges and their intensities.
 
     The echo of a surface of reflectivity ρ at an angle of incidence θ is proportional to ρ cos θ exp(-2 α r)
@@ -45,7 +45,7 @@ def lidar_returns(materials, found, t, max_range_m, chance, air):
 
     Args:
         materials: `MaterialArrays`.
-        found: `Surfaces` that the beams hit.
+        surfaces: `Surfaces` that the beams hit.
         t: [N] distances of the hits, m.
         max_range_m: maximum range, m.
         chance: [N 2] uniform random numbers: for the loss, and for the depth within foliage.
@@ -62,22 +62,22 @@ def lidar_returns(materials, found, t, max_range_m, chance, air):
     intensity = np.zeros(count, np.float32)
     colour = np.empty(TEXTURE_WORDS, np.float32)
     for i in range(count):
-        material = found.material[i]
+        material = surfaces.material[i]
         range_m[i] = max_range_m
         if material == MISS or t[i] > max_range_m:
             continue
         # The material at the hit, filtered over the beam's footprint
-        texture(materials, material, found.xyz, found.uvw, found.extent, i, colour)
-        glass, paint, cosine = colour[3], colour[4], found.cosine[i]
+        texture(materials, material, surfaces.xyz, surfaces.uvw, surfaces.extent, i, colour)
+        glass, paint, cosine = colour[3], colour[4], surfaces.cosine[i]
         # Paint with glass beads is brighter; windows transmit or mirror most of the pulse
         reflectivity = materials.reflectivity[material] * (1.0 - paint) + PAINT_REFLECTIVITY * paint
         reflectivity *= 1.0 - GLASS_LOSS * glass
         # Wet surfaces return less, and level ones below water almost nothing
         if air.wetness > 0.0:
-            level = abs(found.normal[i, 2]) > LEVEL_COS and is_paved(materials.surface[material])
+            level = abs(surfaces.normal[i, 2]) > LEVEL_COS and is_paved(materials.surface[material])
             film = 0.0
             if level:
-                film = water_film(air.wetness, materials.surface[material], found.xyz, found.extent, i)
+                film = water_film(air.wetness, materials.surface[material], surfaces.xyz, surfaces.extent, i)
             reflectivity *= (1.0 - WET_LIDAR_LOSS * air.wetness) * (1.0 - FILM_LIDAR_LOSS * film)
         # The range is known whether the beam returns or not
         range_m[i] = t[i]
@@ -128,10 +128,10 @@ def air_returns(air, chance, pulse_m, max_range_m, range_m, returned, intensity)
         r = MIN_CLUTTER_M + CLUTTER_DEPTH_M * chance[i, 1] ** 2
         if r >= min(range_m[i], max_range_m):
             continue
-        there = reflectivity * math.exp(-2.0 * air.lidar_extinction_per_m * r)
+        power = reflectivity * math.exp(-2.0 * air.lidar_extinction_per_m * r)
         # Exponential fluctuation of the strength (speckle)
-        there *= -math.log(max(chance[i, 2], 1e-6))
-        echo = there * (LIDAR_REFERENCE_M / r) ** 2
+        power *= -math.log(max(chance[i, 2], 1e-6))
+        echo = power * (LIDAR_REFERENCE_M / r) ** 2
         if chance[i, 3] > echo / (echo + LIDAR_THRESHOLD):
             continue
         # The lidar reports the stronger of both echoes
@@ -139,5 +139,5 @@ def air_returns(air, chance, pulse_m, max_range_m, range_m, returned, intensity)
         if returned[i] and of_surface > echo:
             continue
         from_air[i] = returned[i] = True
-        range_m[i], intensity[i] = r, min(INTENSITY_OF_WHITE * there, 1.0)
+        range_m[i], intensity[i] = r, min(INTENSITY_OF_WHITE * power, 1.0)
     return from_air

@@ -59,7 +59,7 @@ def outlines(buffer, centre, rgb, shape):
 
 @_kernel
 @no_type_check
-def same_as_centre(pixels, samples, found, actor, lit, buffer, centre):
+def same_as_centre(pixels, samples, surfaces, actor, lit, buffer, centre):
     """Return the radiance [n·samples 3] of rays that find the same as their pixel's central ray, -1 for
     others.
 
@@ -67,15 +67,15 @@ def same_as_centre(pixels, samples, found, actor, lit, buffer, centre):
 
     Args:
         pixels: [n], with `samples` rays for each.
-        found: the `Surfaces` of the rays; `actor` and `lit` likewise.
+        surfaces: the `Surfaces` of the rays; `actor` and `lit` likewise.
     """
     out = np.full((len(pixels) * samples, 3), np.float32(-1.0))
     for i in range(len(out)):
         pixel = pixels[i // samples]
         # The same material, actor, light and direction of the surface give the same radiance
-        same = found.material[i] == buffer.material[pixel] and actor[i] == buffer.actor[pixel]
-        if same and found.material[i] != MISS:
-            same = lit[i] == centre.lit[pixel] and not _bends(found.normal, i, centre.normal, pixel)
+        same = surfaces.material[i] == buffer.material[pixel] and actor[i] == buffer.actor[pixel]
+        if same and surfaces.material[i] != MISS:
+            same = lit[i] == centre.lit[pixel] and not _bends(surfaces.normal, i, centre.normal, pixel)
         if same:
             out[i] = centre.radiance[pixel]
     return out

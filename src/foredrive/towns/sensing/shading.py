@@ -206,21 +206,21 @@ def _find_surfaces(static, shapes, actors, hits, origin, direction, ray_rad, out
 
 @_kernel
 @no_type_check
-def sun_rays(found, t, sun, out_origin):
+def sun_rays(surfaces, t, sun, out_origin):
     """Return the indices of the hits that face the sun, and fill out_origin with the starts of rays towards
     it."""
     index = np.empty(len(t), np.int64)
     count = 0
     for i in range(len(t)):
-        if found.material[i] == MISS:
+        if surfaces.material[i] == MISS:
             continue
-        nx, ny, nz = found.normal[i, 0], found.normal[i, 1], found.normal[i, 2]
+        nx, ny, nz = surfaces.normal[i, 0], surfaces.normal[i, 1], surfaces.normal[i, 2]
         if nx * sun[0] + ny * sun[1] + nz * sun[2] > 0.0:
             # Start off the surface, further at a distance, where coordinates are less precise
             offset = SHADOW_OFFSET_M + 2e-5 * t[i]
-            out_origin[count, 0] = found.xyz[i, 0] + offset * nx
-            out_origin[count, 1] = found.xyz[i, 1] + offset * ny
-            out_origin[count, 2] = found.xyz[i, 2] + offset * nz
+            out_origin[count, 0] = surfaces.xyz[i, 0] + offset * nx
+            out_origin[count, 1] = surfaces.xyz[i, 1] + offset * ny
+            out_origin[count, 2] = surfaces.xyz[i, 2] + offset * nz
             index[count] = i
             count += 1
     return index[:count]
@@ -277,18 +277,18 @@ def _gloss(gloss, glass, cosine):
 
 @_kernel
 @no_type_check
-def shade(materials, found, t, direction, lit, light, mirrored, known):
+def shade(materials, surfaces, t, direction, lit, light, mirrored, given):
     """Return the radiance [N 3] along rays.
 
     Args:
         materials: `MaterialArrays`.
-        found: `Surfaces` that the rays hit.
+        surfaces: `Surfaces` that the rays hit.
         t: [N] distances of the hits, m.
         direction: [N 3] unit directions of the rays.
         lit: [N] whether the sun shines on each hit.
         light: `LightArrays`.
         mirrored: [N 3] radiance from the direction in which water mirrors, or [0 3] to use the sky's.
-        known: [N 3] radiance of rays that need no shading, -1 for the others; or [0 3].
+        given: [N 3] radiance of rays that need no shading, -1 for the others; or [0 3].
     """
     out = np.empty((len(t), 3), np.float32)
     colour, lamp = np.empty(TEXTURE_WORDS, np.float32), np.zeros(6, np.float32)
@@ -296,19 +296,19 @@ def shade(materials, found, t, direction, lit, light, mirrored, known):
     by_lamps, wetness = len(light.lamps.lamp_index) > 0, light.air.wetness
     for i in range(len(t)):
         # Results of the central ray are taken over
-        if len(known) > 0 and known[i, 0] >= 0.0:
-            out[i, 0], out[i, 1], out[i, 2] = known[i, 0], known[i, 1], known[i, 2]
+        if len(given) > 0 and given[i, 0] >= 0.0:
+            out[i, 0], out[i, 1], out[i, 2] = given[i, 0], given[i, 1], given[i, 2]
             continue
-        material = found.material[i]
+        material = surfaces.material[i]
         dx, dy, dz = direction[i, 0], direction[i, 1], direction[i, 2]
         # Rays into the sky
         if material == MISS:
             sky(light, dx, dy, dz, colour)
             out[i, 0], out[i, 1], out[i, 2] = colour[0], colour[1], colour[2]
             continue
-        texture(materials, material, found.xyz, found.uvw, found.extent, i, colour)
-        kind, glass, cosine = materials.texture[material], colour[3], found.cosine[i]
-        nx, ny, nz = found.normal[i, 0], found.normal[i, 1], found.normal[i, 2]
+        texture(materials, material, surfaces.xyz, surfaces.uvw, surfaces.extent, i, colour)
+        kind, glass, cosine = materials.texture[material], colour[3], surfaces.cosine[i]
+        nx, ny, nz = surfaces.normal[i, 0], surfaces.normal[i, 1], surfaces.normal[i, 2]
         # Sunlight by the cosine to the sun; mirrors by gloss, glass and water
         facing = max(nx * light.sun[0] + ny * light.sun[1] + nz * light.sun[2], 0.0)
         direct = _direct_light(kind, facing, lit[i])
@@ -316,7 +316,7 @@ def shade(materials, found, t, direction, lit, light, mirrored, known):
         film = 0.0
         # Water on level ground: darker below, and a mirror on top
         if wetness > 0.0 and nz > LEVEL_COS and is_paved(materials.surface[material]):
-            film = water_film(wetness, materials.surface[material], found.xyz, found.extent, i)
+            film = water_film(wetness, materials.surface[material], surfaces.xyz, surfaces.extent, i)
             gloss = max(gloss, film * water_mirror(cosine))
             for c in range(3):
                 colour[c] *= 1.0 - WET_DARKENING * min(2.0 * wetness, 1.0)
@@ -326,7 +326,7 @@ def shade(materials, found, t, direction, lit, light, mirrored, known):
         elif gloss > 0.0:
             _mirrored_surroundings(light, gloss, dx, dy, dz, nx, ny, nz, cosine, mirror)
         if by_lamps:
-            x, y, z = found.xyz[i, 0], found.xyz[i, 1], found.xyz[i, 2]
+            x, y, z = surfaces.xyz[i, 0], surfaces.xyz[i, 1], surfaces.xyz[i, 2]
             lamp_light(light.lamps, x, y, z, nx, ny, nz, dx, dy, dz, WET_SHINE if film > 0.0 else 0.0, lamp)
         # Ambient light: from the sky above and from the ground below, by the normal's tilt
         up = 0.5 + 0.5 * nz

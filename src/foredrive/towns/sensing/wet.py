@@ -65,7 +65,7 @@ def water_mirror(cosine):
 
 @_kernel
 @no_type_check
-def mirror_rays(materials, found, t, direction, wetness, out_origin, out_direction):
+def mirror_rays(materials, surfaces, t, direction, wetness, out_origin, out_direction):
     """Return the indices of the hits whose water mirrors enough to be followed.
 
     Fill out_origin and out_direction with the mirrored rays. Ripples deflect each ray slightly.
@@ -73,18 +73,18 @@ def mirror_rays(materials, found, t, direction, wetness, out_origin, out_directi
     index = np.empty(len(t), np.int64)
     count = 0
     for i in range(len(t)):
-        material, nz = found.material[i], found.normal[i, 2]
+        material, nz = surfaces.material[i], surfaces.normal[i, 2]
         # Only level paved ground, and only films that mirror enough
         if material < 0 or nz < LEVEL_COS or not is_paved(materials.surface[material]):
             continue
-        film = water_film(wetness, materials.surface[material], found.xyz, found.extent, i)
-        if film * water_mirror(found.cosine[i]) < MIN_MIRROR:
+        film = water_film(wetness, materials.surface[material], surfaces.xyz, surfaces.extent, i)
+        if film * water_mirror(surfaces.cosine[i]) < MIN_MIRROR:
             continue
-        x, y, size = found.xyz[i, 0], found.xyz[i, 1], found.extent[i, 3]
+        x, y, size = surfaces.xyz[i, 0], surfaces.xyz[i, 1], surfaces.extent[i, 3]
         # Ripples tilt the normal a little
         rx = RIPPLES * noise(x * 4.0, y * 4.0, 2.0 * size, 94)
         ry = RIPPLES * noise(x * 4.0, y * 4.0, 2.0 * size, 95)
-        nx, ny = found.normal[i, 0] + rx, found.normal[i, 1] + ry
+        nx, ny = surfaces.normal[i, 0] + rx, surfaces.normal[i, 1] + ry
         scale = 1.0 / math.sqrt(nx * nx + ny * ny + nz * nz)
         nx, ny, nz = nx * scale, ny * scale, nz * scale
         dx, dy, dz = direction[i, 0], direction[i, 1], direction[i, 2]
@@ -95,7 +95,7 @@ def mirror_rays(materials, found, t, direction, wetness, out_origin, out_directi
         out_direction[count, 2] = max(dz - 2.0 * along * nz, 1e-3)
         out_origin[count, 0], out_origin[count, 1] = x, y
         # Start above the surface, further at a distance
-        out_origin[count, 2] = found.xyz[i, 2] + 0.01 + 0.02 * size
+        out_origin[count, 2] = surfaces.xyz[i, 2] + 0.01 + 0.02 * size
         index[count] = i
         count += 1
     return index[:count]

@@ -132,13 +132,15 @@ def perceive_ego(
     # Lanes are matched at the box centre, as the arc lengths of vehicles are
     centre = ego.axle_xyz + vehicles.axle_to_centre_m[0] * ego.forward
     # The lanes that it has driven towards so far are preferred, above all connectors within junctions
-    known = vehicles.path[0, BEHIND : BEHIND + PATH_LOOK]
-    found = find_lane(near, centre, ego.yaw_rad, known, known[graph.junction[known] >= 0])
-    if found is None:
+    route_lanes = vehicles.path[0, BEHIND : BEHIND + PATH_LOOK]
+    lane_place = find_lane(
+        near, centre, ego.yaw_rad, route_lanes, route_lanes[graph.junction[route_lanes] >= 0]
+    )
+    if lane_place is None:
         # Off all lanes: it is no vehicle of any lane, only its shadows remain
         placed = _with_ego(vehicles, active=False, speed_mps=0.0, granted=0)
     else:
-        lane, s_m = found
+        lane, s_m = lane_place
         route_passed, to_come = _remaining_route(graph, route, route_passed, lane)
         path, passed = _path_from(graph, vehicles.path[0], lane, to_come)
         placed = _with_ego(
@@ -172,7 +174,7 @@ def find_lane(
     near: LaneIndex,
     centre: Float64[np.ndarray, "3"],
     yaw_rad: float,
-    known: Int[np.ndarray, "k"],
+    route_lanes: Int[np.ndarray, "k"],
     inside: Int[np.ndarray, "j"],
 ) -> tuple[int, float] | None:
     """Find the lane that a vehicle follows and the arc length beside it.
@@ -196,7 +198,9 @@ def find_lane(
     offset = centre[:2] - near.xyz[samples, :2]
     cost = np.hypot(offset[:, 0], offset[:, 1]) + HEADING_ERROR_M * heading_error
     cost -= np.where(
-        surely, KNOWN_CONNECTOR_BONUS_M, KNOWN_LANE_BONUS_M * (near.lane[samples, None] == known).any(axis=1)
+        surely,
+        KNOWN_CONNECTOR_BONUS_M,
+        KNOWN_LANE_BONUS_M * (near.lane[samples, None] == route_lanes).any(axis=1),
     )
     best = int(np.argmin(cost))
     # Refine the arc length by the offset along the lane's heading
@@ -330,13 +334,13 @@ def _blocks_corridor(
     cos, sin = np.cos(yaw_rad), np.sin(yaw_rad)
     R_box_world = np.array([[cos, sin], [-sin, cos]])
     # Sample positions and the direction across the lane, in the frame of the box
-    at = (near.xyz[samples, :2] - centre[:2]) @ R_box_world.T
+    local = (near.xyz[samples, :2] - centre[:2]) @ R_box_world.T
     ahead = near.ahead[samples]
     across = np.stack([-ahead[:, 1], ahead[:, 0]], axis=1) @ R_box_world.T
     # Avoids a division by zero where the line is parallel to a side
     across = np.where(np.abs(across) < 1e-9, 1e-9, across)
     # Parameters (m along the line) at which it meets each pair of sides
-    a, b = (-half - at) / across, (half - at) / across
+    a, b = (-half - local) / across, (half - local) / across
     # Intersection of both spans with the corridor -w … w
     enters = np.minimum(a, b).max(axis=1).clip(-HALF_CORRIDOR_M)
     leaves = np.maximum(a, b).min(axis=1).clip(max=HALF_CORRIDOR_M)

@@ -386,8 +386,8 @@ def begin_change(graph: LaneGraph, vehicles: Vehicles, who: int, side: int) -> V
     # The offset from the new lane starts at the distance between the lanes and is steered to 0.
     s_m = project_to_neighbour(old[BEHIND], v.s_m[who], 1 if side == LEFT else -1, graph.sides)
     here = graph.position(old[BEHIND : BEHIND + 1], v.s_m[row])[0]
-    there = graph.position(path[BEHIND : BEHIND + 1], np.array([s_m]))[0]
-    apart_m = float(np.hypot(*(here - there)[:2]))
+    change_xy = graph.position(path[BEHIND : BEHIND + 1], np.array([s_m]))[0]
+    apart_m = float(np.hypot(*(here - change_xy)[:2]))
     changed = {
         "path": path,
         "s_m": s_m,

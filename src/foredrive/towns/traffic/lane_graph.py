@@ -182,7 +182,7 @@ def build_lane_graph(town: TownMap) -> LaneGraph:
         limit_mps=limit,
         width_m=np.array([lane.width_m for lane in lanes]),
         # Curvature 0 would be an infinite radius: clip at 1e6 m
-        min_radius_m=np.array([1 / np.abs(at).max().clip(1e-6) for at in curves]),
+        min_radius_m=np.array([1 / np.abs(curvature).max().clip(1e-6) for curvature in curves]),
         turn_rad=np.array([headings(line)[-1] - headings(line)[0] for line in lines]),
         successors=_padded(successors),
         successor_count=np.array([len(row) for row in successors]),

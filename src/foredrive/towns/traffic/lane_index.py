@@ -33,8 +33,8 @@ class LaneIndex:
         """Return the samples on the level of a point within a distance of it, seen from above, sorted by
         lane."""
         # return_sorted orders by sample index, and samples are stored lane by lane
-        found = np.array(self.tree.query_ball_point(xyz[:2], reach_m, return_sorted=True), dtype=np.int64)
-        return found[np.abs(self.xyz[found, 2] - xyz[2]) < LEVEL_M]
+        samples = np.array(self.tree.query_ball_point(xyz[:2], reach_m, return_sorted=True), dtype=np.int64)
+        return samples[np.abs(self.xyz[samples, 2] - xyz[2]) < LEVEL_M]
 
     def height_m(self, xy: Float64[np.ndarray, "n 2"], about_m: float) -> Float64[np.ndarray, "n"]:
         """Return the height of the road at points, on the level of the height `about_m`.
@@ -43,9 +43,9 @@ class LaneIndex:
         `about_m`.
         """
         # The nearest sample on the level among the nearest few: argmax gives the first that fits
-        found = np.asarray(self.tree.query(xy, HEIGHT_SAMPLES)[1])
-        level = np.abs(self.xyz[found, 2] - about_m) < LEVEL_M
-        nearest = found[np.arange(len(xy)), np.argmax(level, axis=1)]
+        samples = np.asarray(self.tree.query(xy, HEIGHT_SAMPLES)[1])
+        level = np.abs(self.xyz[samples, 2] - about_m) < LEVEL_M
+        nearest = samples[np.arange(len(xy)), np.argmax(level, axis=1)]
         # The height continues along the slope, at most a metre from the sample
         along_m = np.sum((xy - self.xyz[nearest, :2]) * self.ahead[nearest], axis=1)
         z = self.xyz[nearest, 2] + along_m.clip(-1.0, 1.0) * self.slope[nearest]
@@ -55,15 +55,15 @@ class LaneIndex:
 def build_lane_index(graph: LaneGraph) -> LaneIndex:
     """Build the search for the samples of a graph's lanes."""
     lane = np.repeat(np.arange(len(graph.ids)), graph.count)
-    at = np.arange(len(lane))
+    index = np.arange(len(lane))
     # Direction of the segment that begins at each sample; the last sample takes the one before
-    last = at == (graph.first + graph.count - 1)[lane]
-    step = graph.xyz[np.where(last, at, at + 1)] - graph.xyz[np.where(last, at - 1, at)]
+    last = index == (graph.first + graph.count - 1)[lane]
+    step = graph.xyz[np.where(last, index, index + 1)] - graph.xyz[np.where(last, index - 1, index)]
     flat_m = np.hypot(step[:, 0], step[:, 1]).clip(1e-9)
     return LaneIndex(
         xyz=graph.xyz,
         lane=lane,
-        along_m=(at - graph.first[lane]) * graph.step_m[lane],
+        along_m=(index - graph.first[lane]) * graph.step_m[lane],
         ahead=step[:, :2] / flat_m[:, None],
         heading=np.arctan2(step[:, 1], step[:, 0]),
         slope=step[:, 2] / flat_m,

@@ -285,13 +285,13 @@ def _may_cross(
         may[i] = walk[i] not in released
         for m in np.flatnonzero((graph.crossing == walk[i]) & may[i]):
             # Every vehicle whose path leads over the crossing, wherever the lane is on its path
-            there = vehicles.active[:, None] & (vehicles.path == graph.lane[m])
+            on_lane = vehicles.active[:, None] & (vehicles.path == graph.lane[m])
             to_go = starts_m + graph.lane_span_m[m, 0] - vehicles.front_m[:, None]
             passed = starts_m + graph.lane_span_m[m, 1] < vehicles.rear_m[:, None]
             speed = vehicles.speed_mps[:, None]
             # Distance to stop comfortably after the reaction time
             needed = speed**2 / (2 * ACCEPTED_BRAKING_MPS2) + REACTION_S * speed + IN_THE_WAY_M
-            may[i] &= not (there & ~passed & (to_go < needed + MARGIN_M * (speed > 0.1))).any()
+            may[i] &= not (on_lane & ~passed & (to_go < needed + MARGIN_M * (speed > 0.1))).any()
     return may
 
 
@@ -306,11 +306,11 @@ def _walks_into_vehicle(
         ahead = people.direction[i] * (graph.walk_span_m - people.s_m[i])
         about = (graph.crossing == people.walk[i]) & (ahead.min(axis=1) > 0) & (ahead.min(axis=1) < AT_LANE_M)
         for m in np.flatnonzero(about):
-            there = vehicles.active[:, None] & (vehicles.path == graph.lane[m])
+            on_lane = vehicles.active[:, None] & (vehicles.path == graph.lane[m])
             to_go = starts_m + graph.lane_span_m[m, 0] - vehicles.front_m[:, None]
             passed = starts_m + graph.lane_span_m[m, 1] < vehicles.rear_m[:, None]
             speed = vehicles.speed_mps[:, None]
             # The driver could not stop any more: wait at the edge of the lane
             too_sudden = speed**2 / (2 * YIELD_BRAKING_MPS2) + YIELD_S * speed
-            blocked[i] |= bool((there & ~passed & (to_go < np.maximum(too_sudden, IN_THE_WAY_M))).any())
+            blocked[i] |= bool((on_lane & ~passed & (to_go < np.maximum(too_sudden, IN_THE_WAY_M))).any())
     return blocked

@@ -311,7 +311,7 @@ def _inside_gap(motion, lanes, granted, rank):
                 to_go = starts[i, k] + conflicts.enter_m[m] - front[i]
                 entry = on.head[conflicts.other[m]] if -INSIDE_M < to_go < gap[i] else -1
                 while entry >= 0:
-                    j, at, rear_j = on.who[entry], on.where[entry], on.rear_m[entry]
+                    j, place, rear_j = on.who[entry], on.where[entry], on.rear_m[entry]
                     entry = on.following[entry]
                     # Way of the other to the place; negative if it is there already
                     to_go_j = conflicts.other_enter_m[m] + INSIDE_M - (rear_j + front[j] - rear[j])
@@ -320,7 +320,7 @@ def _inside_gap(motion, lanes, granted, rank):
                     yields = rank[j] < rank[i] and to_go >= to_stop[i] and not goes_before[j]
                     goes_first = in_the_way and (to_go_j < to_stop[j] or yields)
                     # A vehicle behind i on the same lanes is no reason to wait
-                    if goes_first and not _is_behind(j, at, i, path, starts, rear):
+                    if goes_first and not _is_behind(j, place, i, path, starts, rear):
                         gap[i] = to_go
     return gap
 
@@ -354,9 +354,9 @@ def _goes_before(i, granted, to_stop, motion, conflicts, on):
 
 @numba.njit(cache=True)
 @no_type_check
-def _is_behind(j, at, i, path, starts, rear):
-    """Return whether vehicle j passes the present position of vehicle i before it reaches its column `at`."""
-    for k in range(BEHIND, at + 1):
+def _is_behind(j, place, i, path, starts, rear):
+    """Return whether vehicle j passes the present position of vehicle i before its column `place`."""
+    for k in range(BEHIND, place + 1):
         if path[j, k] == path[i, BEHIND] and starts[j, k] + rear[i] > rear[j]:
             return True
     return False

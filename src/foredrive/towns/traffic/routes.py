@@ -50,18 +50,18 @@ class Route:
         begins = np.cumsum(length) - length
         s = np.arange(self.start_m, begins[-1] + length[-1], ROUTE_SPACING_M)
         # Stretch of each point, and the arc length on its lane
-        at = np.searchsorted(begins, s, side="right") - 1
-        lane, along = self.lanes[at], s - begins[at]
+        leg = np.searchsorted(begins, s, side="right") - 1
+        lane, along = self.lanes[leg], s - begins[leg]
         points = graph.position(lane, along)
         # Points on stretches with a lane change are moved from the old lane to the new one
-        for k in np.flatnonzero((self.lanes != self.entered)[at]):
-            old = int(self.entered[at[k]])
+        for k in np.flatnonzero((self.lanes != self.entered)[leg]):
+            old = int(self.entered[leg[k]])
             beside = 1 if graph.left[lane[k]] == old else -1
             before = graph.position(
                 np.array([old]), np.array([project_to_neighbour(lane[k], along[k], beside, graph.sides)])
             )
             # The change takes some seconds at the limit, but ends within the stretch
-            from_m = self.start_m if at[k] == 0 else 0.0
+            from_m = self.start_m if leg[k] == 0 else 0.0
             over_m = max(MIN_CHANGE_M, PLANNED_CHANGE_S * graph.limit_mps[old])
             over_m = min(over_m, graph.length_m[lane[k]] - from_m)
             x = np.clip((along[k] - from_m) / over_m, 0.0, 1.0)

@@ -23,16 +23,16 @@ CLEAR_M = 7.0
 def point_along(graph: LaneGraph, lanes: Sequence[int], along_m: float) -> tuple[int, float]:
     """Return the index of the lane at a distance along a row of lanes, and the arc length on it, m."""
     starts_m = np.append(0.0, np.cumsum(graph.length_m[list(lanes)]))
-    at = min(max(int(np.searchsorted(starts_m, along_m, side="right")) - 1, 0), len(lanes) - 1)
-    return at, along_m - float(starts_m[at])
+    place = min(max(int(np.searchsorted(starts_m, along_m, side="right")) - 1, 0), len(lanes) - 1)
+    return place, along_m - float(starts_m[place])
 
 
 def points_along(
     graph: LaneGraph, lanes: Sequence[int], along_m: Float64[np.ndarray, "n"]
 ) -> Float64[np.ndarray, "n 3"]:
     """Return points at distances along a row of lanes."""
-    at = [point_along(graph, lanes, m) for m in along_m.tolist()]
-    return graph.position(np.array([lanes[k] for k, _ in at]), np.array([s for _, s in at]))
+    places = [point_along(graph, lanes, m) for m in along_m.tolist()]
+    return graph.position(np.array([lanes[k] for k, _ in places]), np.array([s for _, s in places]))
 
 
 def add_vehicle(
@@ -46,10 +46,10 @@ def add_vehicle(
     drawn = draw_fleet(rng, np.full(CANDIDATES, state.next_track_id), no, no)
     car = int(np.argmax((drawn.category == Category.CAR) & (drawn.size_lwh[:, 0] < 5.0)))
     one = drawn.rows(np.array([car]))
-    at, s_m = point_along(graph, lanes, along_m)
-    one = place_vehicles(graph, one, np.array([lanes[at]]), np.array([s_m]))
+    place, s_m = point_along(graph, lanes, along_m)
+    one = place_vehicles(graph, one, np.array([lanes[place]]), np.array([s_m]))
     path = one.path.copy()
-    onward = list(lanes[at + 1 : at + 1 + AHEAD])
+    onward = list(lanes[place + 1 : place + 1 + AHEAD])
     # The path ahead is given; what lies beyond it is drawn at random
     path[0, BEHIND + 1 : BEHIND + 1 + len(onward)] = onward
     one = dataclasses.replace(

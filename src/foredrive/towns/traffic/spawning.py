@@ -182,9 +182,9 @@ class Spawner:
             ok = (distance >= beyond_m) & (distance <= PEOPLE_SPAWN_MAX_M)
         # The first try that fits; people without one wait for the next step
         chosen = np.argmax(ok, axis=1)
-        found = ok.any(axis=1)
-        each = np.arange(len(rows))
-        walk, s = tries[each, chosen][found], s_m[each, chosen][found]
-        ids = state.next_track_id + np.flatnonzero(found)
-        people = state.people.replace_rows(rows[found], draw_people(self._walks, rng, ids, walk, s))
+        has_place = ok.any(axis=1)
+        row_range = np.arange(len(rows))
+        walk, s = tries[row_range, chosen][has_place], s_m[row_range, chosen][has_place]
+        ids = state.next_track_id + np.flatnonzero(has_place)
+        people = state.people.replace_rows(rows[has_place], draw_people(self._walks, rng, ids, walk, s))
         return dataclasses.replace(state, people=people, next_track_id=state.next_track_id + len(rows))

@@ -144,7 +144,7 @@ class Traffic:
         if perceived is not None:
             route_passed = perceived.route_passed
             state = dataclasses.replace(state, vehicles=perceived.vehicles, route_passed=route_passed)
-        known = len(state.vehicles.active)
+        count = len(state.vehicles.active)
         # Shadows of scripted actors come after those of vehicle 0
         if state.scripted_actors:
             shadows = scripted_actor_shadows(self.lanes, self.lane_index, state.scripted_actors)
@@ -160,7 +160,7 @@ class Traffic:
         if orders.ignores_ego.any():
             active = state.vehicles.active.copy()
             # Rows from the slots up to `known` are the shadows of vehicle 0
-            active[[0, *range(self._slot_count, known)]] = False
+            active[[0, *range(self._slot_count, count)]] = False
             unseen = dataclasses.replace(state, vehicles=dataclasses.replace(state.vehicles, active=active))
             blindly = self._decide(unseen, starts_m, light, may_request, orders.runs_lights)
             decision = decision.where(orders.ignores_ego, blindly)
@@ -263,8 +263,8 @@ class Traffic:
         return Decision(right_of_way, desired_mps2, context)
 
     def _perceive_ego(self, state: TrafficState, ego: EgoPose) -> PerceivedEgo:
-        known = state.route, state.route_passed, state.time_s
-        return perceive_ego(self.lanes, self.lane_index, state.vehicles, ego, *known)
+        ego_route = state.route, state.route_passed, state.time_s
+        return perceive_ego(self.lanes, self.lane_index, state.vehicles, ego, *ego_route)
 
     def zone_lights(self, time_s: float) -> Int[np.ndarray, "Z"]:
         """Return the `LightState` of each of the town's stop zones."""

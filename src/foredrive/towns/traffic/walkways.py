@@ -110,7 +110,11 @@ def build_walk_graph(town: TownMap, lanes: LaneGraph) -> WalkGraph:
     lines = [shapely.LineString(walk[:, :2]) for walk in walks]
     for walk_index, point in ((i, p) for crossing in crossings for i, p in crossing.attached):
         cuts[walk_index].append(float(lines[walk_index].project(shapely.Point(point[:2]))))
-    pieces = [(piece, w) for walk, at, w in zip(walks, cuts, widths, strict=True) for piece in _cut(walk, at)]
+    pieces = [
+        (piece, w)
+        for walk, cuts_of_walk, w in zip(walks, cuts, widths, strict=True)
+        for piece in _cut(walk, cuts_of_walk)
+    ]
     every = [piece for piece, _ in pieces] + [c.xyz for c in crossings]
     # People keep half a metre from the edges
     half = np.array([max(0.1, 0.5 * w - 0.5) for _, w in pieces] + [1.0] * len(crossings))
@@ -157,7 +161,7 @@ def _crossings(
         if np.linalg.norm(marked - start, axis=1).min(initial=np.inf) > MARKED_NEARBY_M:
             lane = int(np.flatnonzero(lanes.zone == zone)[0])
             chords.append(_perpendicular(start, lanes.samples(lane)[:2], lines, widths_m))
-    found = []
+    crossings = []
     for chord in chords:
         if chord is None:
             continue
@@ -169,8 +173,8 @@ def _crossings(
         # The crossing includes the ways from the walkways to the kerb
         xyz = np.stack([a[1], chord[0], chord[1], b[1]])
         if _length(xyz) < MAX_CROSSING_M:
-            found.append(_Crossing(_without_repeats(xyz), (a, b)))
-    return found
+            crossings.append(_Crossing(_without_repeats(xyz), (a, b)))
+    return crossings
 
 
 def _chord(outline: Float64[np.ndarray, "_ 3"], walkways: shapely.STRtree) -> np.ndarray | None:
