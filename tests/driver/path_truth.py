@@ -3,7 +3,7 @@
 import torch
 
 from foredrive.driver.road_user_targets import USERS
-from foredrive.driver.route_cells import BESIDE_M
+from foredrive.driver.route_cells import BESIDE_M, LINE_CELLS
 from foredrive.driver.sight import Sight
 from foredrive.scene import VoxelSpec
 from foredrive.scene.affordances import CELLS, TIMES, Affordances
@@ -18,6 +18,7 @@ def sight_of(batch: int, light: torch.Tensor | None = None, size: tuple[int, int
         torch.zeros(batch, 4) if light is None else light,
         torch.zeros(batch, 2, 3, *size),
         torch.zeros(batch, 2, *size),
+        torch.nn.functional.one_hot(torch.full((batch,), LINE_CELLS + 1)) * 20.0,  # no line is seen
         torch.zeros(batch, TIMES, CELLS),
         torch.zeros(batch, 2, len(USERS), *size),
         torch.zeros(batch, len(USERS) + 2, CELLS, len(BESIDE_M)),

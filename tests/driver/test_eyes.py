@@ -9,7 +9,7 @@ from path_truth import SPEC, sight_of, truth
 
 from foredrive.driver.eyes import ACROSS_MPS, CameraEyes, CameraEyesConfig, FrameFeatures
 from foredrive.driver.losses import SightWeights, lamp_places, sight_losses
-from foredrive.driver.route_cells import BESIDE_M, HEIGHTS_M
+from foredrive.driver.route_cells import BESIDE_M, HEIGHTS_M, LINE_CELLS
 from foredrive.driver.sight import VELOCITY_SCALE_MPS, line_m, occupied_at_constant_velocity, scaled_line
 from foredrive.driver.volume_eyes import VolumeEyes, VolumeEyesConfig
 from foredrive.errors import InputError
@@ -115,6 +115,43 @@ def test_the_distance_of_a_line_is_read_at_the_lamp() -> None:
     lines[0, 1, 1, 0] = scaled_line(torch.tensor(17.0))
     sight = dataclasses.replace(sight_of(1, size=(2, 3)), lamp_logits=lamps, lamp_line=lines)
     torch.testing.assert_close(sight.light_m, torch.tensor([17.0]))
+
+
+def test_the_distance_of_a_line_is_read_on_the_ground_where_one_is_seen() -> None:
+    logits = torch.full((4, LINE_CELLS + 2), -20.0)
+    logits[0, 0] = 5.0  # behind the bumper
+    logits[1, 1] = 5.0  # in the first cell
+    logits[2, [8, 9]] = 5.0  # on the border of two cells, 8 m ahead
+    logits[3, [12, 13, 14]] = torch.tensor([0.25, 0.5, 0.25]).log() + 5
+    logits[3, -1] = 4.0  # maybe none
+    sight = dataclasses.replace(sight_of(4), line_logits=logits)
+    torch.testing.assert_close(sight.light_m, torch.tensor([-2.0, 0.5, 8.0, 12.5]), atol=1e-3, rtol=0)
+
+
+def test_the_line_is_learned_where_it_is(make_example: Callable[..., Example]) -> None:
+    clip = make_example(spec=SPEC, batch=2, past=1, future=0, cameras=2).clip
+    known = truth(5)
+    known = dataclasses.replace(
+        known,
+        light=torch.tensor([1, 2, 3, 0, 1]),
+        light_m=torch.tensor([5.5, -3.0, 50.0, 0.0, 5.5]),
+        light_known=torch.tensor([True, True, True, True, False]),
+    )
+    sight = dataclasses.replace(sight_of(5), line_logits=torch.zeros(5, LINE_CELLS + 2, requires_grad=True))
+    clip = clip[torch.tensor([0, 1, 0, 1, 0])]
+    sight_losses(sight, known, clip, SightWeights())["line"].backward()
+    grad = sight.line_logits.grad
+    assert (grad < 0).nonzero().tolist() == [[0, 6], [1, 0], [2, LINE_CELLS + 1], [3, LINE_CELLS + 1]]
+
+
+@torch.no_grad()
+def test_the_ground_is_read_along_the_route(make_example: Callable[..., Example]) -> None:
+    clip = make_example(spec=SPEC, batch=2, past=1, future=0, cameras=2).clip
+    network = eyes()
+    black = dataclasses.replace(clip, images=torch.zeros_like(clip.images))
+    assert not torch.allclose(network(clip).line_logits, network(black).line_logits)
+    turned = dataclasses.replace(clip, route_xy=clip.route_xy.flip(0))
+    assert not torch.allclose(network(clip).line_logits, network(turned).line_logits)
 
 
 def test_lamps_are_learned_in_place_and_unknown_cells_not_at_all(

@@ -1,6 +1,7 @@
 """Eyes of a driver: a small convolutional network on two cameras and some key frames."""
 
 import dataclasses
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
@@ -9,7 +10,7 @@ import torch.nn.functional as F
 from jaxtyping import Float, UInt8
 from torch import Tensor, nn
 
-from foredrive.driver.route_cells import HEIGHTS_M, route_cells, sample_cameras
+from foredrive.driver.route_cells import HEIGHTS_M, line_cells, route_cells, sample_cameras
 from foredrive.driver.sight import RouteReader, Sight, conv_block
 from foredrive.errors import InputError
 from foredrive.geometry.se3 import compose_se3, inverse_se3, transform_points
@@ -101,9 +102,15 @@ class CameraEyes(nn.Module):
         self.narrow = nn.ModuleList([nn.Conv2d(FINE, FINE_READ, 1) for _ in range(config.cameras)])
         views = config.cameras + config.frames - 1
         # Per view: coarse and fine features at each height, and whether the camera sees the place
-        of_view = len(HEIGHTS_M) * (COARSE + FINE_READ + 1)
+        of_place = COARSE + FINE_READ + 1
         of_motion = (config.frames - 1) * len(HEIGHTS_M) * len(ACROSS_MPS)
-        self.reader = RouteReader(views * of_view + of_motion, FINE + COARSE, COARSE, config.cameras)
+        self.reader = RouteReader(
+            views * len(HEIGHTS_M) * of_place + of_motion,
+            views * of_place,
+            FINE + COARSE,
+            COARSE,
+            config.cameras,
+        )
 
     def forward(self, clip: Clip) -> Sight:
         """Return what is seen of the route at now.
@@ -122,7 +129,9 @@ class CameraEyes(nn.Module):
         cells = torch.cat(
             [self._read(frames, places, features), self._motion(frames, places, features)], dim=1
         )
-        sight: Sight = self.reader(clip, cells, torch.cat([fine, wide], dim=2), coarse.mean((-2, -1)))
+        ground = self._read(frames, line_cells(clip.route_xy, clip.route_valid), features, (0.0,))
+        at_4 = torch.cat([fine, wide], dim=2)
+        sight: Sight = self.reader(clip, cells, ground, at_4, coarse.mean((-2, -1)))
         return sight
 
     def _features(self, frames: Clip) -> list[FrameFeatures]:
@@ -147,10 +156,14 @@ class CameraEyes(nn.Module):
         return fine, coarse
 
     def _read(
-        self, frames: Clip, cells: Float[Tensor, "b G L 2"], features: list[FrameFeatures]
+        self,
+        frames: Clip,
+        cells: Float[Tensor, "b G L 2"],
+        features: list[FrameFeatures],
+        heights_m: Sequence[float] = HEIGHTS_M,
     ) -> Float[Tensor, "b _N G L"]:
-        """Return the features of all frames and cameras in the cells."""
-        count, points = len(HEIGHTS_M), _at_heights(cells)
+        """Return the features of all frames and cameras in the cells, at some heights above the road."""
+        count, points = len(heights_m), _at_heights(cells, heights_m)
         # Places of now in the ego frame of each key frame: features are read where the cameras were then.
         T_frame_now = _from_now(frames)
         read = []
@@ -202,10 +215,12 @@ class CameraEyes(nn.Module):
         return torch.cat(cosines, dim=1) if cosines else points.new_zeros(len(points), 0, *shape)
 
 
-def _at_heights(cells: Float[Tensor, "b G L 2"]) -> Float[Tensor, "b N 3"]:
-    """Return the cells at each of `HEIGHTS_M` above the road, one height after the other."""
-    z = cells.new_tensor(HEIGHTS_M)[:, None, None, None].expand(-1, *cells.shape[1:3], 1)
-    xy = cells[:, None].expand(-1, len(HEIGHTS_M), -1, -1, -1)
+def _at_heights(
+    cells: Float[Tensor, "b G L 2"], heights_m: Sequence[float] = HEIGHTS_M
+) -> Float[Tensor, "b N 3"]:
+    """Return the cells at each height above the road, one height after the other."""
+    z = cells.new_tensor(heights_m)[:, None, None, None].expand(-1, *cells.shape[1:3], 1)
+    xy = cells[:, None].expand(-1, len(heights_m), -1, -1, -1)
     return torch.cat([xy, z.expand(len(cells), -1, -1, -1, -1)], dim=-1).flatten(1, 3)
 
 

@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from foredrive.driver.road_user_targets import USERS, road_user_cells, road_user_pixels
+from foredrive.driver.route_cells import LINE_CELL_M, LINE_CELLS
 from foredrive.driver.sight import VELOCITY_SCALE_MPS, Sight, scaled_line
 from foredrive.geometry.projection import project
 from foredrive.geometry.se3 import inverse_se3, transform_points
@@ -24,6 +25,7 @@ class SightWeights:
     light: float = 1.0
     lamps: float = 0.5
     light_m: float = 1.0
+    line: float = 1.0
     occupied: float = 5.0
     occupied_cells: float = 2.5
     """Weight of occupied cells in the last term: a missed road user is worse than a false one."""
@@ -57,7 +59,8 @@ def sight_losses(
     losses = {
         "light": weights.light * masked_mean(error, judged),
         "lamps": weights.lamps * _lamp_loss(sight, truth, lamps),
-        "light_m": weights.light_m * _line_loss(sight, truth, lamps),
+        "light_m": weights.light_m * _lamp_line_loss(sight, truth, lamps),
+        "line": weights.line * masked_mean(_line_error(sight, truth), truth.light_known),
         "occupied": weights.occupied * _occupancy_loss(sight, truth, weights),
         **_user_losses(sight, clip, weights),
     }
@@ -103,7 +106,16 @@ def _lamp_loss(sight: Sight, truth: Affordances, lamps: LampPlaces) -> Float[Ten
     return (wrong.square() * error * of_item).sum() / target.sum().clamp_min(1)
 
 
-def _line_loss(sight: Sight, truth: Affordances, lamps: LampPlaces) -> Float[Tensor, ""]:
+def _line_error(sight: Sight, truth: Affordances) -> Float[Tensor, "b"]:
+    """Return the cross-entropy of the cell in which the stop line is."""
+    cell = (truth.light_m / LINE_CELL_M).floor().long()
+    # Class 0 is behind the bumper, the last one is no line in any cell
+    seen = (truth.light != LightState.NONE) & (cell < LINE_CELLS)
+    target = torch.where(seen, (cell + 1).clamp_min(0), LINE_CELLS + 1)
+    return F.cross_entropy(sight.line_logits, target, reduction="none")
+
+
+def _lamp_line_loss(sight: Sight, truth: Affordances, lamps: LampPlaces) -> Float[Tensor, ""]:
     """Return the error of the stop line's distance, read at each lamp, in `Sight.lamp_line`'s scale."""
     item, camera, lamp = lamps.inside.nonzero(as_tuple=True)
     read = sight.lamp_line[item, camera, lamps.row[item, camera, lamp], lamps.column[item, camera, lamp]]

@@ -1,5 +1,7 @@
 """Cells along and beside the route, where a driver looks, and the image features there."""
 
+from collections.abc import Sequence
+
 import torch
 import torch.nn.functional as F
 from jaxtyping import Bool, Float
@@ -17,14 +19,29 @@ BESIDE_M = (-12.0, -8.5, -6.0, -4.0, -2.2, -0.8, 0.8, 2.2, 4.0, 6.0, 8.5, 12.0)
 HEIGHTS_M = (0.4, 1.3)
 """Heights above the road at which images are read: wheels and legs, bodies."""
 
+LINE_CELLS, LINE_CELL_M = 48, 1.0
+LINE_BESIDE_M = (-2.4, -0.8, 0.8, 2.4)
+"""Cells of the ground in which the stop line of the next light is looked for: a line is 0.4 m wide."""
+
 
 def route_cells(
-    route_xy: Float[Tensor, "b R 2"], route_valid: Bool[Tensor, "b R"]
+    route_xy: Float[Tensor, "b R 2"],
+    route_valid: Bool[Tensor, "b R"],
+    count: int = CELLS,
+    size_m: float = CELL_M,
+    beside_m: Sequence[float] = BESIDE_M,
 ) -> Float[Tensor, "b G L 2"]:
-    """Return the middles of the cells along a route, at the distances `BESIDE_M` from it, ego frame, m.
+    """Return the middles of the cells along a route from the front bumper on, ego frame, m.
 
     The route is straight between its points, and begins at the rear axle. Beyond its last valid point it goes
     straight on.
+
+    Args:
+        route_xy: points of the route at the distances `ROUTE_M`, ego frame, m.
+        route_valid: which of them exist.
+        count: number of cells along the route.
+        size_m: length of a cell.
+        beside_m: distances of the cells from the route, positive to the left.
     """
     given_m = route_xy.new_tensor((0.0, *ROUTE_M))
     # The route's points with the rear axle as the first one
@@ -41,7 +58,7 @@ def route_cells(
         along.append(torch.where(valid, points[:, k], along[-1] + (given_m[k] - given_m[k - 1]) * ahead))
     line = torch.stack(along, dim=1)
     # Middles lie on the straight piece between the two points around them.
-    middle_m = FRONT_M + CELL_M * (torch.arange(CELLS, device=line.device) + 0.5)
+    middle_m = FRONT_M + size_m * (torch.arange(count, device=line.device) + 0.5)
     # Distances are the nominal ones, so the piece of each middle is the same in the whole batch
     before = (torch.searchsorted(given_m, middle_m) - 1).clamp(0, len(given_m) - 2)
     share = (middle_m - given_m[before]) / (given_m[before + 1] - given_m[before])
@@ -49,8 +66,15 @@ def route_cells(
     middle = line[:, before] + share[:, None] * step
     # To the left of the way: (-y, x).
     left = _unit(step)[..., [1, 0]] * step.new_tensor([-1.0, 1.0])
-    beside = step.new_tensor(BESIDE_M)
+    beside = step.new_tensor(beside_m)
     return middle[:, :, None] + beside[:, None] * left[:, :, None]
+
+
+def line_cells(
+    route_xy: Float[Tensor, "b R 2"], route_valid: Bool[Tensor, "b R"]
+) -> Float[Tensor, "b N S 2"]:
+    """Return the middles of the cells in which the stop line is looked for, as `route_cells`."""
+    return route_cells(route_xy, route_valid, LINE_CELLS, LINE_CELL_M, LINE_BESIDE_M)
 
 
 def _unit(step: Float[Tensor, "*n 2"]) -> Float[Tensor, "*n 2"]:

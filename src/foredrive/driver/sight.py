@@ -3,11 +3,12 @@
 from dataclasses import dataclass
 
 import torch
+import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
 from foredrive.driver.road_user_targets import USERS
-from foredrive.driver.route_cells import BESIDE_M, route_cells
+from foredrive.driver.route_cells import BESIDE_M, LINE_BESIDE_M, LINE_CELL_M, LINE_CELLS, route_cells
 from foredrive.scene import Clip
 from foredrive.scene.affordances import CELL_M, CELLS, HALF_WIDTH_M, LATER_DT_S, TIMES, PathEstimate
 from foredrive.scene.clip import ROUTE_M
@@ -21,7 +22,9 @@ FADES_M = 1.5
 """Distance beyond half the width of the path over which a road user beside it counts less, m."""
 RARE_LOGIT, NONE_LOGIT = -4.0, -2.0
 LIGHT_SCALE_M, LINE_BEFORE_LAMP_M = 20.0, 4.0
-"""The distance of a stop line is read at the lamp, as a logarithm from some metres before the line."""
+"""Where no line is seen, its distance is read at the lamp: a logarithm from some metres before the line."""
+CROSSED_M = -2.0
+"""Distance of a stop line that the front bumper has crossed."""
 
 
 @dataclass(frozen=True)
@@ -34,6 +37,9 @@ class Sight(Record):
     """Whether a red, yellow or green lamp of the light on the route is at a place of an image."""
     lamp_line: Float[Tensor, "b C h w"]
     """The distance of the stop line as it is read at each place: log((m + 4) / 20)."""
+    line_logits: Float[Tensor, f"b {LINE_CELLS + 2}"]
+    """Where the stop line of the next light is: behind the front bumper, in each of the `LINE_CELLS`, or in
+    none of them."""
     occupied_logits: Float[Tensor, "b T G"]
     user_pixels: Float[Tensor, "b C K h w"]
     """Whether a road user of each kind is at a place of an image. It is used in training only, so that the
@@ -44,10 +50,18 @@ class Sight(Record):
 
     @property
     def light_m(self) -> Float[Tensor, "b"]:
-        """Return the distance of the stop line, read where a lamp is most probable, m."""
-        place = self.lamp_logits.amax(2).flatten(1).argmax(1, keepdim=True)
-        # The most probable place of a lamp in all cameras and colours
-        return line_m(self.lamp_line.flatten(1).gather(1, place)[:, 0])
+        """Return the distance of the stop line, m: seen on the ground, or else read at the likeliest lamp."""
+        p = self.line_logits.softmax(-1)
+        at_lamp = self.lamp_logits.amax(2).flatten(1).argmax(1, keepdim=True)
+        far_m = line_m(self.lamp_line.flatten(1).gather(1, at_lamp)[:, 0])
+        # The mean of the likeliest cell and its neighbours
+        cells = F.pad(p[:, 1:-1], (1, 1))
+        likeliest = cells[:, 1:-1].argmax(1, keepdim=True)
+        near = cells.gather(1, likeliest + torch.arange(3, device=p.device))
+        offset = (near[:, 2] - near[:, 0]) / near.sum(1).clamp_min(1e-6)
+        seen_m = LINE_CELL_M * (likeliest[:, 0] + 0.5 + offset)
+        seen_m = torch.where(p[:, 0] > near.sum(1), CROSSED_M, seen_m)
+        return torch.where(p[:, -1] > 0.5, far_m, seen_m)
 
     def estimate(self) -> PathEstimate:
         """Return probabilities and distances."""
@@ -73,17 +87,19 @@ class RouteReader(nn.Module):
 
     Args:
         cells: channels of the features in the cells along and beside the route.
+        ground: channels of the features of the ground along the route.
         fine: channels of the fine image features, in which lamps are read.
         wide: channels of the features whose mean tells that there is no light.
         cameras: number of cameras.
     """
 
-    def __init__(self, cells: int, fine: int, wide: int, cameras: int) -> None:
+    def __init__(self, cells: int, ground: int, fine: int, wide: int, cameras: int) -> None:
         super().__init__()
         self.context = nn.Sequential(
             nn.Linear(3 * len(ROUTE_M), CONTEXT), nn.ReLU(), nn.Linear(CONTEXT, CONTEXT), nn.ReLU()
         )
         self.lamps = LampHead(fine, wide, CONTEXT, cameras)
+        self.line = LineHead(ground, CONTEXT)
         self.occupancy = OccupancyHead(cells + 3)
         # Biases for rare events: training begins with small probabilities
         self.users = nn.Conv2d(fine, len(USERS), 1)
@@ -94,6 +110,7 @@ class RouteReader(nn.Module):
         self,
         clip: Clip,
         cells: Float[Tensor, "b F G L"],
+        ground: Float[Tensor, "b E N S"],
         fine: Float[Tensor, "b C K h w"],
         mean: Float[Tensor, "b C W"],
     ) -> Sight:
@@ -102,6 +119,7 @@ class RouteReader(nn.Module):
         Args:
             clip: its route is read.
             cells: features in the cells of `route_cells`.
+            ground: features in the cells of `line_cells`.
             fine: image features at now.
             mean: mean image features at now.
         """
@@ -109,6 +127,7 @@ class RouteReader(nn.Module):
         route = torch.cat([route, clip.route_valid[..., None].to(route)], dim=-1)
         context = self.context(route.flatten(1))
         light, lamps, lines = self.lamps(fine, mean, context)
+        line = self.line(ground, context)
         # Where each cell is: its place, and its distance beside the route
         middles = route_cells(clip.route_xy, clip.route_valid)
         place = torch.cat(
@@ -120,7 +139,7 @@ class RouteReader(nn.Module):
         )
         occupied, user_cells = self.occupancy(torch.cat([cells.to(place), place], dim=1))
         pixels = self.users(fine.flatten(0, 1)).unflatten(0, fine.shape[:2])
-        return Sight(light, lamps, lines, occupied, pixels.float(), user_cells)
+        return Sight(light, lamps, lines, line, occupied, pixels.float(), user_cells)
 
 
 class LampHead(nn.Module):
@@ -173,6 +192,47 @@ def _lamp_layers(hidden: int) -> nn.Sequential:
     assert last.bias is not None
     nn.init.constant_(last.bias[: len(COLOURS)], RARE_LOGIT - 1)
     return nn.Sequential(nn.Conv2d(hidden, 32, 3, padding=1), nn.ReLU(), last)
+
+
+class LineHead(nn.Module):
+    """Reads where the stop line of the next light crosses the route, from features of the ground.
+
+    Lamps do not tell: they hang 10 to 35 m beyond the line, across the junction.
+
+    Args:
+        channels: channels of each cell.
+        context: length of the vector of the route.
+        width: width of the convolutions along the route.
+    """
+
+    def __init__(self, channels: int, context: int, width: int = 48) -> None:
+        super().__init__()
+        self.ground = nn.Conv1d(channels * len(LINE_BESIDE_M) + 1, width, 1)
+        # Each layer sees twice as far along the route, in the end 28 m
+        self.along = nn.Sequential(
+            nn.ReLU(),
+            *(
+                layer
+                for dilation in (1, 2, 4)
+                for layer in (
+                    nn.Conv1d(width, width, 5, padding=2 * dilation, dilation=dilation),
+                    nn.ReLU(),
+                )
+            ),
+        )
+        self.line = nn.Conv1d(width, 1, 1)
+        self.outside = nn.Linear(width + context, 2)
+
+    def forward(
+        self, ground: Float[Tensor, "b E N S"], context: Float[Tensor, "b V"]
+    ) -> Float[Tensor, f"b {LINE_CELLS + 2}"]:
+        """Return `Sight.line_logits`."""
+        # What lies beside the route at one distance becomes channels; one more is the distance
+        columns = ground.permute(0, 1, 3, 2).flatten(1, 2)
+        place = torch.linspace(-1, 1, columns.shape[-1]).to(columns).expand(len(columns), 1, -1)
+        features = self.along(self.ground(torch.cat([columns, place], dim=1)))
+        outside = self.outside(torch.cat([features.amax(-1), context], dim=-1))
+        return torch.cat([outside[:, :1], self.line(features)[:, 0], outside[:, 1:]], dim=-1).float()
 
 
 class OccupancyHead(nn.Module):

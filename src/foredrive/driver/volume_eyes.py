@@ -1,5 +1,6 @@
 """Eyes of a driver that read the volume and the image features of NeMo."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -9,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from foredrive.driver.eyes import blacked, seen_frames
-from foredrive.driver.route_cells import route_cells
+from foredrive.driver.route_cells import line_cells, route_cells
 from foredrive.driver.sight import RouteReader, Sight
 from foredrive.geometry.se3 import compose_se3, inverse_se3, transform_points
 from foredrive.methods.blocks.lifting import lift_frames
@@ -53,9 +54,8 @@ class VolumeEyes(nn.Module):
         )
         self.backbone, self.encoder, channels = world.backbone, world.encoder, world.channels
         # Per frame and height: the volume's channels, and whether the cell is in the volume
-        self.reader = RouteReader(
-            config.frames * len(HEIGHTS_M) * (channels + 1), channels, channels, config.cameras
-        )
+        of_place = config.frames * (channels + 1)
+        self.reader = RouteReader(len(HEIGHTS_M) * of_place, of_place, channels, channels, config.cameras)
         if config.frozen:
             self.backbone.requires_grad_(False)
             self.encoder.requires_grad_(False)
@@ -82,16 +82,21 @@ class VolumeEyes(nn.Module):
             volumes, images = lift_frames(seen, self.backbone, self.encoder)
         fine = images.permute(0, 1, 4, 2, 3)
         cells = self._read(frames, route_cells(clip.route_xy, clip.route_valid), volumes)
-        sight: Sight = self.reader(clip, cells, fine, fine.mean((-2, -1)))
+        ground = self._read(frames, line_cells(clip.route_xy, clip.route_valid), volumes, (0.0,))
+        sight: Sight = self.reader(clip, cells, ground, fine, fine.mean((-2, -1)))
         return sight
 
     def _read(
-        self, frames: Clip, cells: Float[Tensor, "b G L 2"], volumes: Float[Tensor, "b T D Z Y X"]
+        self,
+        frames: Clip,
+        cells: Float[Tensor, "b G L 2"],
+        volumes: Float[Tensor, "b T D Z Y X"],
+        heights_m: Sequence[float] = HEIGHTS_M,
     ) -> Float[Tensor, "b _N G L"]:
         """Return the features of all frames in the cells, and whether a cell is in the volume."""
-        count, spec = len(HEIGHTS_M), self.config.voxels
+        count, spec = len(heights_m), self.config.voxels
         # Cells at each height, in the ego frame of every key frame
-        z = cells.new_tensor(HEIGHTS_M)[:, None, None, None].expand(count, *cells.shape[1:3], 1)
+        z = cells.new_tensor(heights_m)[:, None, None, None].expand(count, *cells.shape[1:3], 1)
         points = torch.cat(
             [cells[:, None].expand(-1, count, -1, -1, -1), z.expand(len(cells), *z.shape)], dim=-1
         ).flatten(1, 3)
