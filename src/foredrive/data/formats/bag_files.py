@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from foredrive.errors import InputError
+from foredrive.plain_yaml import read_yaml
 
 KINDS = {
     "sensor_msgs/msg/Image": "image",
@@ -84,6 +85,8 @@ def open_bag(path: Path) -> Iterator[Bag]:
     ros2_folder = path.is_dir() and (path / "metadata.yaml").is_file()
     if not ros2_folder and path.suffix not in (".bag", ".db3", ".mcap"):
         raise InputError(f"{path}: neither a .bag, .db3 or .mcap nor the folder of a ROS 2 bag")
+    if ros2_folder:  # the reader of rosbags would follow aliases of aliases for ever
+        read_yaml(path / "metadata.yaml", "the metadata of a bag")
     with _open_foxglove(path) if _is_foxglove(path) else _open_ros(path) as bag:
         yield bag
 
