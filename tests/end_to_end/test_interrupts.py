@@ -101,6 +101,7 @@ def test_record(programs: Programs, tmp_path: Path) -> None:
     assert "logs/town_train/Town02_seed0/sync.arrow" in all_files(tmp_path)
 
 
+@pytest.mark.slow
 def test_a_campaign_of_recordings(programs: Programs, tmp_path: Path) -> None:
     arguments = ("record", "--town", "Town02", "--seeds", "1..3", "--seconds", "1", "--rate", "2")
     arguments = (*arguments, "--image-size", "36", "64", "--workers", "2", "--out", tmp_path)
@@ -142,6 +143,7 @@ def test_train(programs: Programs, log: LogPath, trained: Run, tmp_path: Path) -
     assert len(expected) == miniature().finetune.schedule.steps
 
 
+@pytest.mark.slow
 def test_evaluate(programs: Programs, log: LogPath, tmp_path: Path) -> None:
     """While labels are made, and while the report is drawn."""
     run = train_run(miniature(), [log], tmp_path / "run").folder

@@ -62,6 +62,7 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ProgramServer]:
     server.close()
 
 
+@pytest.mark.slow
 def test_train(server: ProgramServer, log: LogPath, tmp_path: Path) -> None:
     arguments = ("train", "miniature", "--logs", str(log.folder), "--out", str(tmp_path / "run"))
     command = Command("train", arguments, tmp_path / "run")

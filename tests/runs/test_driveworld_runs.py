@@ -85,6 +85,7 @@ def test_an_interrupted_run_goes_on_exactly(
         assert losses(tmp_path / "run", stage) == losses(run.folder, stage)
 
 
+@pytest.mark.slow
 def test_it_is_judged_beside_copies_of_the_present_and_by_its_futures(
     run: Run, log: LogPath, tmp_path: Path
 ) -> None:
@@ -235,6 +236,7 @@ def test_whose_recipe_it_is_shows_in_what_is_written(tmp_path: Path) -> None:
             load_recipe(tmp_path / "config.yaml")
 
 
+@pytest.mark.slow
 def test_it_is_exported_as_it_runs_here(run: Run, log: LogPath, tmp_path: Path) -> None:
     facts = export_run(run, [log], tmp_path, clips=1)
     for program in ("model.pt2", "model.onnx"):

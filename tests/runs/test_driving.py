@@ -100,6 +100,7 @@ def driven(suite: DriveSuite, out: Path) -> SuiteResult:
     return drive_suite(suite, out, workers=1)
 
 
+@pytest.mark.slow
 def test_a_demonstration_has_the_plans_of_the_expert(routes: Path, tmp_path: Path) -> None:
     source = TownRoutes(str(routes), seed=5, conditions="any", vehicles=4, people=2)
     suite = DriveSuite("disturbed", source, sensors=False)
@@ -132,6 +133,7 @@ def test_a_route_whose_id_cannot_name_a_file_is_refused(name: str, routes: Path,
     assert [path.name for path in tmp_path.rglob("*")] == ["deep", "routes.xml"]
 
 
+@pytest.mark.slow
 def test_a_log_has_the_sensors_that_were_asked_for(suite: DriveSuite, tmp_path: Path) -> None:
     """Images do not depend on whether a lidar turns beside them."""
     images = {}

@@ -129,7 +129,7 @@ def figures(folder: Path, held_out: Any) -> dict[str, Any]:
     return {"losses": losses, "images": images, "sweeps": sweeps, "actors": graph.tracks.track_id.tolist()}
 
 
-@pytest.mark.parametrize("name", GAUSSIANS)
+@pytest.mark.parametrize("name", ["tiny", pytest.param("published", marks=pytest.mark.slow)])
 def test_a_rebuilt_log_is_what_it_was(name: str, log: LogPath, tmp_path: Path) -> None:
     run = reconstruct(recipe(name), log, tmp_path / "run")
     found = figures(run.folder, run.held_out)

@@ -45,6 +45,7 @@ def test_a_joint_run_is_trained_end_to_end_and_evaluated(trained: Run, log: LogP
     assert "motion.uniad.car.min_ade_m" in summary
 
 
+@pytest.mark.slow
 def test_tracks_are_learned_jointly_and_by_a_probe(trained: Run, log: LogPath, tmp_path: Path) -> None:
     """Either way the evaluation follows the drive, beside a tracker of the same detections."""
     tasks = ("detection", "tracking")
@@ -88,6 +89,7 @@ def test_an_interrupted_joint_run_goes_on_to_the_same_bits(
     assert all(torch.equal(value, two[name]) for name, value in one.items())
 
 
+@pytest.mark.slow
 def test_a_planner_attends_to_frozen_heads_of_a_probe(trained: Run, log: LogPath, tmp_path: Path) -> None:
     """World model and heads stay as they are, statistics of norms too; the plan depends on what is found."""
     logs = [with_map(log, tmp_path)]

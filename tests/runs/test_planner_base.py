@@ -64,6 +64,7 @@ def test_fine_tuning_leaves_what_it_starts_from(run: Run, log: LogPath, tmp_path
     assert not torch.equal(before["planner.path.place.0.weight"], after["planner.path.place.0.weight"])
 
 
+@pytest.mark.slow
 def test_what_is_read_along_the_path_is_fitted_first_and_read_once(log: LogPath, tmp_path: Path) -> None:
     fitted = recipe(lr=0.0, path=PathFit(stride_s=0.5, steps=20))
     fitted = dataclasses.replace(fitted, pretrain=miniature().pretrain)  # which leaves planners out
@@ -78,6 +79,7 @@ def test_what_is_read_along_the_path_is_fitted_first_and_read_once(log: LogPath,
     assert one["planner.path.mean"].abs().max() > 0
 
 
+@pytest.mark.slow
 def test_what_the_decoder_says_is_not_said_twice(log: LogPath, tmp_path: Path) -> None:
     """What the correction is fitted to is all that is planned but itself."""
     fitted = recipe(lr=1e-2, path=PathFit(stride_s=0.5, steps=20))
@@ -98,6 +100,7 @@ def test_what_the_decoder_says_is_not_said_twice(log: LogPath, tmp_path: Path) -
     assert not torch.equal(other.values, again.values)  # of other weights
 
 
+@pytest.mark.slow
 def test_it_can_be_exported(run: Run, log: LogPath, tmp_path: Path) -> None:
     pytest.importorskip("onnxruntime")
     facts = export_run(run, [log], tmp_path, clips=2)

@@ -307,6 +307,7 @@ def test_a_log_of_one_frame_is_said_not_to_be_evaluated(
     assert "psnr_db" not in json.loads((tmp_path / "run" / "summary.json").read_text())
 
 
+@pytest.mark.slow
 def test_several_logs_have_a_run_each_and_a_bad_one_stops_no_other(
     log: LogPath, run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

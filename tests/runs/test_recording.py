@@ -35,6 +35,7 @@ def recorded(root: Path) -> RecordingResult:
     return record_drives([LOST, *PLANS], root, RIG, workers=2)
 
 
+@pytest.mark.slow
 def test_side_by_side_gives_the_bytes_of_one_after_another(
     recorded: RecordingResult, root: Path, tmp_path: Path
 ) -> None:

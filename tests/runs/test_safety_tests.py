@@ -115,6 +115,7 @@ def test_the_expert_hits_nobody(rebuilt: Path, scenarios: Path, tmp_path: Path) 
     assert outcomes <= {Outcome.PASSED, Outcome.STOPPED_SHORT}
 
 
+@pytest.mark.slow
 def test_workers_drive_as_one_process_does(rebuilt: Path, scenarios: Path, tmp_path: Path) -> None:
     threats = []
     for spread in (False, True):

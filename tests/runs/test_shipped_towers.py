@@ -53,6 +53,7 @@ def test_they_look_at_the_whole_image() -> None:
         assert float((towers.embed_images(changed) - towers.embed_images(images)).norm()) > 0.01
 
 
+@pytest.mark.slow
 def test_they_tell_night_from_day(drives: dict[str, LogPath], tmp_path: Path) -> None:
     towers = find_towers(EMBEDDED)
     views = gather_views(list(drives.values()), 0.5, towers.image_side_px, towers.crop, tmp_path)
@@ -61,6 +62,7 @@ def test_they_tell_night_from_day(drives: dict[str, LogPath], tmp_path: Path) ->
     assert (named.numpy() == true).mean() >= 0.9
 
 
+@pytest.mark.slow
 def test_searching_works_with_nothing_else(
     drives: dict[str, LogPath], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -74,6 +76,7 @@ def test_searching_works_with_nothing_else(
     assert main(["search", "a car close by", "--modality", "lidar", "--index", index]) == 0
 
 
+@pytest.mark.slow
 def test_they_say_whether_it_is_night(drives: dict[str, LogPath]) -> None:
     towers = find_towers(EMBEDDED)
     decoder = load_captions(SHIPPED / CAPTIONS, towers)

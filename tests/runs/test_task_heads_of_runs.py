@@ -64,6 +64,7 @@ def test_a_probe_needs_the_truth_of_its_tasks(trained: Run, log: LogPath, tmp_pa
     assert not (run.folder / TASKS).exists()
 
 
+@pytest.mark.slow
 def test_instances_of_agents_that_are_carried_on(trained: Run, log: LogPath, tmp_path: Path) -> None:
     """Heads that follow a drive read one clip at a time; their instances stand together in a batch."""
     run = probe_run(trained.recipe, [log], tmp_path / "probe", trained.cache_dir, trained.folder)
@@ -135,6 +136,7 @@ def with_other_prompts(agent: PlanningAgent, names: Sequence[str]) -> PlanningAg
     return other
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("recipe", "volume_of", "volumes"),
     [

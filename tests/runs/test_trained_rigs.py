@@ -90,6 +90,7 @@ def test_a_damaged_file_is_one_line(tmp_path: Path) -> None:
         read_rigs(tmp_path)
 
 
+@pytest.mark.slow
 def test_cameras_that_a_log_lacks_are_left_out(tmp_path: Path) -> None:
     few = RigPlan(RIG.image_hw, {name: RIG.cameras[name] for name in ("PCAM_F0", "PCAM_L0")})
     one = RigPlan(RIG.image_hw, {"PCAM_F0": RIG.cameras["PCAM_F0"]})

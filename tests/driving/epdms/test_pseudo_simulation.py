@@ -96,6 +96,7 @@ def test_who_drives_on_along_the_lane_has_nearly_all_points() -> None:
     assert len(found.second) == 2 * 2
 
 
+@pytest.mark.slow
 def test_who_stops_has_no_progress_and_who_hits_somebody_no_score() -> None:
     stops = run(lambda simulator: StraightAgent(0.0)).score(2.0)
     assert stops.first.nc == 1.0

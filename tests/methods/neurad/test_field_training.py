@@ -59,6 +59,7 @@ def no_tracks() -> ActorTracks:
     )
 
 
+@pytest.mark.slow
 def test_what_was_trained_on_several_cameras_is_rendered(tmp_path: Path) -> None:
     """One camera sees the sky, one the ground, one both and two boxes: their features have other means.
 

@@ -206,6 +206,7 @@ def test_what_a_log_lacks_trains_nothing() -> None:
     losses["loss"].backward()  # a step with such a batch is possible
 
 
+@pytest.mark.slow
 def test_heads_learn_one_scene() -> None:
     """Boxes, futures, lines, raster and voxels of one frame, after 120 steps."""
     batch, heads = stack_records([scene()]), small_heads()

@@ -62,6 +62,7 @@ def test_boxes_go_on_at_constant_velocity() -> None:
     assert np.argwhere(view.occupied).tolist() == [[2, 4], [2, 5], [3, 4], [3, 5]]
 
 
+@pytest.mark.slow
 def test_it_waits_at_a_red_light_of_a_town_and_goes_on() -> None:
     """40 m of a lane up to its light, which is red when the vehicle comes, and 12 m behind the line."""
     lane, seed = 10, 3

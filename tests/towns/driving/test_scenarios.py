@@ -138,6 +138,7 @@ def test_the_expert_foresees_it(
     assert driven.score.driving_score_1_0 == 100.0
 
 
+@pytest.mark.slow
 def test_the_expert_waits_for_who_runs_a_light(simulator: TownSimulator) -> None:
     route, scenario = town05_place(ScenarioKind.RED_LIGHT_RUNNER, "5")
     driven = drive_route(simulator, town_scenario(route, (scenario,)), TownExpert(simulator), route="r")
