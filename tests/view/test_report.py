@@ -13,6 +13,8 @@ from PIL import Image
 from foredrive.errors import InputError
 from foredrive.runs import ExamplePrediction
 from foredrive.scene import Example
+from foredrive.tasks.evaluation import metrics
+from foredrive.tasks.evaluation.metric import EvaluationContext, Shown
 from foredrive.tasks.planning.protocols import PROTOCOLS
 from foredrive.view import palette
 from foredrive.view.example_panel import (
@@ -318,3 +320,17 @@ def test_figures_of_tasks_stand_beside_their_baselines() -> None:
         ["UniAD, IoU of lanes", "0.250", "prior of the training logs", "0.125"],
     ]
     assert task_table({}) is None
+
+
+def test_a_new_metric_shows_its_main_figures_without_an_edit_here(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Heading:
+        name, title = "heading", "Heading"
+        shown = (Shown("error, rad", "error_rad", "straight_on", digits=2),)
+
+        def __init__(self, context: EvaluationContext) -> None:
+            pass
+
+    monkeypatch.setattr(metrics, "METRICS", (*metrics.METRICS, Heading))
+    table = task_table({"heading.error_rad": 0.125, "heading.error_rad.straight_on": 0.5})
+    assert cells_of(table) == [["error, rad", "0.12", "straight on", "0.50"]]
+    assert [section.title for section in table.sections] == ["Heading"]

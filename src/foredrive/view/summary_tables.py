@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from rich.console import Console
 
 from foredrive.engine.summary import Summary
+from foredrive.tasks.evaluation.metric import PRIOR, EvaluationContext
 from foredrive.tasks.occupancy.scores import ABOVE_GROUND_M
 from foredrive.tasks.planning.protocols import HORIZON_NAMES, PROTOCOLS
 from foredrive.view.table import (
@@ -40,7 +41,6 @@ AGENT_TITLES = {MODEL: "this model", "ego_mlp": "ego-only MLP"}
 WHENS = (*HORIZON_NAMES, "avg")
 SCOPE_TITLES = {"": "all voxels", "above_ground.": "above the ground"}
 OCCUPANCY_TITLES = {"iou": "IoU", "precision": "precision", "recall": "recall"}
-PRIOR = "best_constant"
 BASELINE_TITLES = {
     PRIOR: "occupancy prior",
     "copy": "persistence",
@@ -48,32 +48,6 @@ BASELINE_TITLES = {
     "continued_copy": "persistence, motion continued",
 }
 """Titles of the baselines by their keys in summary.json."""
-TASK_FIGURES = (
-    ("Detection", "nuScenes mAP", "detection.nuscenes.map", "nothing_detected"),
-    ("Detection", "NDS", "detection.nuscenes.nds", "nothing_detected"),
-    ("Detection", "AP of cars, 2 m, within 30 m", "detection.car_ap_2m_30m", "nothing_detected"),
-    ("Tracking", "AMOTA", "tracking.nuscenes.amota", "greedy_association"),
-    ("Tracking", "changed identities", "tracking.nuscenes.ids", "greedy_association"),
-    ("Motion", "UniAD, minADE of cars, m", "motion.uniad.car.min_ade_m", "constant_velocity"),
-    ("Motion", "UniAD, EPA of cars", "motion.uniad.car.epa", "constant_velocity"),
-    ("Motion", "UniAD, minADE of people, m", "motion.uniad.pedestrian.min_ade_m", "constant_velocity"),
-    ("Map", "MapTR mAP", "map.maptr.map", "nothing_detected"),
-    ("Map", "UniAD, IoU of lanes", "map.uniad.iou_lanes", PRIOR),
-    ("Map", "UniAD, IoU of the drivable area", "map.uniad.iou_drivable", PRIOR),
-    ("Voxels", "mIoU, camera mask, %", "occupancy.occ3d.miou_pct", PRIOR),
-    ("Voxels", "mIoU, lidar mask, %", "occupancy.occ3d_lidar.miou_pct", PRIOR),
-    ("Voxels", "mIoU, all voxels, %", "occupancy.occ3d_unmasked.miou_pct", PRIOR),
-    ("Voxels", "RayIoU, %", "occupancy.occ3d.rayiou_pct", PRIOR),
-    ("Voxels", "RayIoU at 1 m, %", "occupancy.occ3d.rayiou_1m_pct", PRIOR),
-    ("Voxels", "RayIoU at 2 m, %", "occupancy.occ3d.rayiou_2m_pct", PRIOR),
-    ("Voxels", "RayIoU at 4 m, %", "occupancy.occ3d.rayiou_4m_pct", PRIOR),
-    ("Voxels", "OpenOcc's OccScore", "occupancy.openocc.occ_score", PRIOR),
-    ("Instances", "UniAD, IoU near, %", "occupancy.uniad.iou_near_pct", "constant_velocity"),
-    ("Instances", "UniAD, IoU far, %", "occupancy.uniad.iou_far_pct", "constant_velocity"),
-    ("Instances", "UniAD, VPQ near, %", "occupancy.uniad.vpq_near_pct", "constant_velocity"),
-    ("Instances", "UniAD, VPQ far, %", "occupancy.uniad.vpq_far_pct", "constant_velocity"),
-)
-"""Main figures of the task heads: task, title, key, and the baseline beside it."""
 _BASELINE = re.compile(r"occupancy\.iou_\w+\.(\w+)")
 _PLANNING = re.compile(rf"planning\.(?:(\w+)\.)?({'|'.join(PROTOCOLS)})\.\w+")
 _OCCUPANCY = re.compile(r"occupancy\.iou_(\w+)")
@@ -214,15 +188,22 @@ def image_table(summary: Summary) -> Table | None:
 
 
 def task_table(summary: Summary) -> Table | None:
-    """Compare the main figures of detection, motion, map and semantic occupancy with their baselines."""
-    sections = []
-    for task in dict.fromkeys(task for task, *_ in TASK_FIGURES):
-        rows = [
-            Row((title, summary.get(key), _baseline(name), summary.get(f"{key}.{name}")))
-            for of, title, key, name in TASK_FIGURES
-            if of == task and (key in summary or f"{key}.{name}" in summary)
-        ]
-        sections += [Section(rows, task)] if rows else []
+    """Compare the main figures that metrics state with their baselines."""
+    from foredrive.tasks.evaluation.metrics import METRICS  # they bring PyTorch along
+
+    rows: dict[str, list[Row]] = {}
+    for metric in (start(EvaluationContext(frame_dt_s=1.0)) for start in METRICS):
+        for figure in metric.shown:
+            key = f"{metric.name}.{figure.key}"
+            value, beside = summary.get(key), summary.get(f"{key}.{figure.baseline}")
+            if key in summary or f"{key}.{figure.baseline}" in summary:
+                cells = (
+                    number(value, figure.digits),
+                    _baseline(figure.baseline),
+                    number(beside, figure.digits),
+                )
+                rows.setdefault(metric.title, []).append(Row((figure.title, *cells)))
+    sections = [Section(of_metric, title) for title, of_metric in rows.items()]
     left = Column(align="left")
     columns = [left, Column("this model"), Column("baseline", align="left"), Column("its figure")]
     return Table(columns, sections, "Tasks at now") if sections else None

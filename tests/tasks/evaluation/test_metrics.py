@@ -10,7 +10,7 @@ import torch
 
 from foredrive.methods.planner.baselines import ConstantVelocity, StandStill
 from foredrive.scene import Clip, Example
-from foredrive.tasks.evaluation.metric import EvaluationContext, Figures
+from foredrive.tasks.evaluation.metric import EvaluationContext, Figures, Shown
 from foredrive.tasks.evaluation.metrics import METRICS
 from foredrive.tasks.evaluation.predictor import Part, Prediction
 from foredrive.tasks.evaluation.run import evaluate
@@ -23,6 +23,8 @@ class HeadingError:
     """Mean |planned - driven heading| at the plan's last step."""
 
     name = "heading"
+    title = "Heading"
+    shown = (Shown("error, rad", "error_rad", "straight_on", digits=2),)
     needs: frozenset[Part] = frozenset({"plan"})
 
     def __init__(self, context: EvaluationContext) -> None:

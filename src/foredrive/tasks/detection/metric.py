@@ -6,7 +6,7 @@ import numpy as np
 
 from foredrive.scene import Example
 from foredrive.tasks.detection.protocols import CLASSES, DETECTION_PROTOCOLS, evaluate_detections
-from foredrive.tasks.evaluation.metric import EvaluationContext, Figures
+from foredrive.tasks.evaluation.metric import EvaluationContext, Figures, Shown
 from foredrive.tasks.evaluation.predictor import Part, Prediction
 from foredrive.tasks.tracking.in_world import agent_rows, box_rows, likely, stacked
 from foredrive.tasks.tracking.object_rows import ObjectRows, Region
@@ -29,6 +29,12 @@ class DetectionMetric:
     """
 
     name = "detection"
+    title = "Detection"
+    shown: tuple[Shown, ...] = (
+        Shown("nuScenes mAP", "nuscenes.map", "nothing_detected"),
+        Shown("NDS", "nuscenes.nds", "nothing_detected"),
+        Shown("AP of cars, 2 m, within 30 m", "car_ap_2m_30m", "nothing_detected"),
+    )
     needs: frozenset[Part] = frozenset({"agents"})
 
     def __init__(self, context: EvaluationContext) -> None:

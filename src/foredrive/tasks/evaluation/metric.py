@@ -29,6 +29,24 @@ class EvaluationContext:
         return ["now", *(f"future_{ms}ms" if ms % 1000 else f"future_{ms // 1000}s" for ms in milliseconds)]
 
 
+PRIOR, STEADY = "best_constant", "constant_velocity"
+"""Baselines of several metrics, as the last part of their keys: the fixed answer that scores best on the
+training logs, and road users that go on as they drive."""
+
+
+@dataclass(frozen=True)
+class Shown:
+    """A main figure of a metric, as terminal and report show it."""
+
+    title: str
+    """With the unit, if it has one."""
+    key: str
+    """Key in the summary, without the metric's `name`."""
+    baseline: str
+    """Last part of the key of the figure beside it."""
+    digits: int = 3
+
+
 class Metric(Protocol):
     """Accumulates over the predictions of one model.
 
@@ -38,6 +56,10 @@ class Metric(Protocol):
 
     name: str
     """First part of its keys in the summary; metrics of one subject share it."""
+    title: str
+    """Heading above its main figures."""
+    shown: tuple[Shown, ...]
+    """Its main figures; () where a table of its own shows them (`view.summary_tables`)."""
     needs: frozenset[Part]
     """Parts of a prediction that it reads. `update` is called only where none of them is None."""
 

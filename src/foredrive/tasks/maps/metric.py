@@ -13,7 +13,7 @@ from numpy import ndarray
 
 from foredrive.scene import Example, VoxelSpec
 from foredrive.scene.map_elements import ElementKind, PlaneSpec, RasterLayer
-from foredrive.tasks.evaluation.metric import EvaluationContext, Figures
+from foredrive.tasks.evaluation.metric import PRIOR, EvaluationContext, Figures, Shown
 from foredrive.tasks.evaluation.predictor import Part, Prediction
 from foredrive.tasks.maps.lines import CLASSES, LineSet
 from foredrive.tasks.maps.precision import mean_precision, score_maps
@@ -61,7 +61,6 @@ def _figure_masks(masks: Bool[ndarray, "F 4 H W"]) -> tuple[Bool[ndarray, "F H W
     return divider | crossing | boundary, drivable, divider, crossing, boundary
 
 
-PRIOR = ".best_constant"
 AREA: Area = "60x30"
 """Area in which lines are compared."""
 
@@ -73,6 +72,8 @@ class MapLinesMetric:
     """
 
     name = "map"
+    title = "Map"
+    shown = (Shown("MapTR mAP", "maptr.map", "nothing_detected"),)
     needs: frozenset[Part] = frozenset({"map_lines"})
 
     def __init__(self, context: EvaluationContext) -> None:
@@ -133,6 +134,11 @@ class MapRasterMetric:
     """
 
     name = "map"
+    title = "Map"
+    shown: tuple[Shown, ...] = (
+        Shown("UniAD, IoU of lanes", "uniad.iou_lanes", PRIOR),
+        Shown("UniAD, IoU of the drivable area", "uniad.iou_drivable", PRIOR),
+    )
     needs: frozenset[Part] = frozenset({"map_layers"})
 
     def __init__(self, context: EvaluationContext) -> None:
@@ -149,7 +155,7 @@ class MapRasterMetric:
         true = raster.layers[raster.known].cpu().numpy()
         shown = {"": (layers[raster.known] > 0.5).cpu().numpy()}
         if self._prior is not None:
-            shown[PRIOR] = self._prior.cpu().expand(len(true), -1, -1, -1).numpy()
+            shown[f".{PRIOR}"] = self._prior.cpu().expand(len(true), -1, -1, -1).numpy()
         # All cells, and those above the voxels, which a model with a small grid can see
         areas = {"uniad": np.array(True), "uniad_covered": _covered(raster.spec, truth.occupancy.spec)}
         for suffix, mask in shown.items():

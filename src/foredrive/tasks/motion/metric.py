@@ -9,14 +9,13 @@ from numpy import ndarray
 from torch import Tensor
 
 from foredrive.scene import Example
-from foredrive.tasks.evaluation.metric import EvaluationContext, Figures
+from foredrive.tasks.evaluation.metric import STEADY, EvaluationContext, Figures, Shown
 from foredrive.tasks.evaluation.predictor import Part, Prediction
 from foredrive.tasks.motion.agents import PredictedAgents, TrueAgents
 from foredrive.tasks.motion.protocols import PROTOCOLS, STEP_S
 from foredrive.tasks.motion.scores import score_motion
 from foredrive.tasks.tracking.in_world import futures_in_world, levelled
 
-STEADY = ".constant_velocity"
 FIGURES = ("min_ade_m", "min_fde_m", "miss_rate", "epa")
 _PREDICTED = tuple(field.name for field in dataclasses.fields(PredictedAgents))
 _TRUE = tuple(field.name for field in dataclasses.fields(TrueAgents))
@@ -30,6 +29,12 @@ class MotionMetric:
     """
 
     name = "motion"
+    title = "Motion"
+    shown: tuple[Shown, ...] = (
+        Shown("UniAD, minADE of cars, m", "uniad.car.min_ade_m", STEADY),
+        Shown("UniAD, EPA of cars", "uniad.car.epa", STEADY),
+        Shown("UniAD, minADE of people, m", "uniad.pedestrian.min_ade_m", STEADY),
+    )
     needs: frozenset[Part] = frozenset({"agents"})
 
     def __init__(self, context: EvaluationContext) -> None:
@@ -96,7 +101,7 @@ class MotionMetric:
         for name, protocol in PROTOCOLS.items():
             if protocol.steps > horizon:
                 continue
-            for suffix, forecasts in (("", predicted), (STEADY, steady)):
+            for suffix, forecasts in (("", predicted), (f".{STEADY}", steady)):
                 for kind, scores in score_motion(forecasts, true, protocol).items():
                     out |= {f"{name}.{kind}.{key}{suffix}": getattr(scores, key) for key in FIGURES}
                     if not suffix:

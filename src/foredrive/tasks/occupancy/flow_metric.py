@@ -1,7 +1,7 @@
 """Flow of moving voxels, beside predicting no motion."""
 
 from foredrive.scene import Example
-from foredrive.tasks.evaluation.metric import EvaluationContext, Figures, labels_from_now
+from foredrive.tasks.evaluation.metric import EvaluationContext, Figures, Shown, labels_from_now
 from foredrive.tasks.evaluation.predictor import Part, Prediction
 from foredrive.tasks.occupancy.scores import FlowErrors, flow_errors
 
@@ -10,6 +10,8 @@ class FlowMetric:
     """End-point errors. Keys: `epe_moving_now_mps` and `epe_moving_now_mps.no_motion`."""
 
     name = "flow"
+    title = "Flow"
+    shown: tuple[Shown, ...] = ()
     needs: frozenset[Part] = frozenset({"flow_mps"})
 
     def __init__(self, context: EvaluationContext) -> None:

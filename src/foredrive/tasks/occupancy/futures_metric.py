@@ -1,7 +1,7 @@
 """Sampled futures: the best of K, the mean of all, and their spread."""
 
 from foredrive.scene import Example
-from foredrive.tasks.evaluation.metric import EvaluationContext, Figures, labels_from_now
+from foredrive.tasks.evaluation.metric import EvaluationContext, Figures, Shown, labels_from_now
 from foredrive.tasks.evaluation.predictor import Part, Prediction
 from foredrive.tasks.occupancy.forecasts import FuturesCounts, count_futures
 from foredrive.tasks.occupancy.scores import above_ground
@@ -14,6 +14,8 @@ class FuturesMetric:
     """
 
     name = "occupancy"
+    title = "Occupancy"
+    shown: tuple[Shown, ...] = ()
     needs: frozenset[Part] = frozenset({"futures"})
 
     def __init__(self, context: EvaluationContext) -> None:

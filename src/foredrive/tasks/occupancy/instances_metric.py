@@ -19,7 +19,7 @@ from foredrive.scene import Example
 from foredrive.scene.agents import Agents
 from foredrive.scene.boxes import VEHICLES
 from foredrive.scene.map_elements import InstanceRaster
-from foredrive.tasks.evaluation.metric import EvaluationContext, Figures
+from foredrive.tasks.evaluation.metric import STEADY, EvaluationContext, Figures, Shown
 from foredrive.tasks.evaluation.predictor import Part, Prediction
 from foredrive.tasks.occupancy.protocols import UNIAD_INSTANCES, InstanceProtocol
 
@@ -169,7 +169,7 @@ def _ious(
     )
 
 
-STEADY, PERSISTENCE = ".constant_velocity", ".persistence"
+PERSISTENCE = "persistence"
 MIN_SCORE = 0.3
 """Score of the detections that the baselines draw, the same as that of the head's agents."""
 
@@ -182,6 +182,13 @@ class InstanceMetric:
     """
 
     name = "occupancy"
+    title = "Instances"
+    shown: tuple[Shown, ...] = (
+        Shown("UniAD, IoU near, %", "uniad.iou_near_pct", STEADY),
+        Shown("UniAD, IoU far, %", "uniad.iou_far_pct", STEADY),
+        Shown("UniAD, VPQ near, %", "uniad.vpq_near_pct", STEADY),
+        Shown("UniAD, VPQ far, %", "uniad.vpq_far_pct", STEADY),
+    )
     needs: frozenset[Part] = frozenset({"instances", "agents"})
 
     def __init__(self, context: EvaluationContext) -> None:
@@ -196,9 +203,9 @@ class InstanceMetric:
         true, agents = true.to("cpu"), prediction.agents.to("cpu")
         shown = {"": prediction.instances.cpu()}
         # Baselines: the same detections, moved or left where they are
-        for suffix, moves in ((STEADY, 1.0), (PERSISTENCE, 0.0)):
+        for name, moves in ((STEADY, 1.0), (PERSISTENCE, 0.0)):
             drawn = [drawn_boxes(agents[item], true, moves) for item in range(len(true.valid))]
-            shown[suffix] = torch.from_numpy(np.stack(drawn))
+            shown[f".{name}"] = torch.from_numpy(np.stack(drawn))
         past = UNIAD_INSTANCES.past_frames
         for suffix, raster in shown.items():
             for name, counts in count_rasters(raster, true, past, UNIAD_INSTANCES).items():

@@ -8,7 +8,7 @@ from foredrive.errors import InputError
 from foredrive.geometry.se3 import inverse_se3
 from foredrive.scene import Clip, Example, VoxelSpec, last_frames
 from foredrive.scene.ego_motion import continued_motion
-from foredrive.tasks.evaluation.metric import EvaluationContext, Figures, labels_from_now
+from foredrive.tasks.evaluation.metric import PRIOR, EvaluationContext, Figures, Shown, labels_from_now
 from foredrive.tasks.evaluation.predictor import Part, Prediction
 from foredrive.tasks.occupancy.forecasts import ego_compensated
 from foredrive.tasks.occupancy.scores import OccupancyCounts, above_ground, count_occupancy
@@ -17,7 +17,6 @@ PERSISTENCE, EGO_COMPENSATED, CONTINUED = ".copy", ".carried_copy", ".continued_
 """Suffixes of persistence: the predicted present in place of the future, the same moved along the driven
 path, and the same moved as if the vehicle went on as measured. The last uses all that a model knows."""
 PERSISTENT = (PERSISTENCE, EGO_COMPENSATED, CONTINUED)
-PRIOR = ".best_constant"
 
 
 class OccupancyMetric:
@@ -27,6 +26,8 @@ class OccupancyMetric:
     """
 
     name = "occupancy"
+    title = "Occupancy"
+    shown: tuple[Shown, ...] = ()
     needs: frozenset[Part] = frozenset({"occupancy_logit"})
 
     def __init__(self, context: EvaluationContext) -> None:
@@ -62,7 +63,7 @@ class OccupancyMetric:
         # All voxels, and those above the ground
         for scope, region in self._regions.items():
             if scope in self._priors:
-                shown[PRIOR] = self._priors[scope][0].to(predicted.device).expand_as(predicted)
+                shown[f".{PRIOR}"] = self._priors[scope][0].to(predicted.device).expand_as(predicted)
             for suffix, occupied in shown.items():
                 counts = count_occupancy(occupied, labels, region)
                 key = (scope, suffix)
@@ -93,7 +94,7 @@ class OccupancyMetric:
         for scope, (_, thresholds) in self._priors.items():
             names = self._context.frame_names(len(thresholds))
             for name, value in zip(names, thresholds.tolist(), strict=True):
-                out[f"{scope}iou_{name}{PRIOR}_threshold"] = value
+                out[f"{scope}iou_{name}.{PRIOR}_threshold"] = value
         return out
 
 

@@ -1,11 +1,10 @@
 """Semantic voxels under the protocols of Occ3D and OpenOcc, beside the commonest class of each voxel."""
 
 from foredrive.scene import Example
-from foredrive.tasks.evaluation.metric import EvaluationContext, Figures
+from foredrive.tasks.evaluation.metric import PRIOR, EvaluationContext, Figures, Shown
 from foredrive.tasks.evaluation.predictor import Part, Prediction
 from foredrive.tasks.occupancy.of_logs import LogVoxelCounts
 
-PRIOR = ".best_constant"
 BESIDE_PRIOR = ("miou_pct", "rayiou_pct", "rayiou_1m_pct", "rayiou_2m_pct", "rayiou_4m_pct", "occ_score")
 """Figures that the prior has, too."""
 
@@ -19,6 +18,17 @@ class SemanticVoxelMetric:
     """
 
     name = "occupancy"
+    title = "Voxels"
+    shown: tuple[Shown, ...] = (
+        Shown("mIoU, camera mask, %", "occ3d.miou_pct", PRIOR),
+        Shown("mIoU, lidar mask, %", "occ3d_lidar.miou_pct", PRIOR),
+        Shown("mIoU, all voxels, %", "occ3d_unmasked.miou_pct", PRIOR),
+        Shown("RayIoU, %", "occ3d.rayiou_pct", PRIOR),
+        Shown("RayIoU at 1 m, %", "occ3d.rayiou_1m_pct", PRIOR),
+        Shown("RayIoU at 2 m, %", "occ3d.rayiou_2m_pct", PRIOR),
+        Shown("RayIoU at 4 m, %", "occ3d.rayiou_4m_pct", PRIOR),
+        Shown("OpenOcc's OccScore", "openocc.occ_score", PRIOR),
+    )
     needs: frozenset[Part] = frozenset({"semantics"})
 
     def __init__(self, context: EvaluationContext) -> None:
@@ -39,7 +49,7 @@ class SemanticVoxelMetric:
             shown = {"": (predicted[item].cpu().numpy(), flow)}
             # The prior stands still
             if self._prior is not None:
-                shown[PRIOR] = (self._prior, None)
+                shown[f".{PRIOR}"] = (self._prior, None)
             for suffix, (voxels, velocity_mps) in shown.items():
                 counts = self._counts.setdefault(suffix, LogVoxelCounts(true.taxonomy, true.spec))
                 counts.add(voxels, velocity_mps, true, rays)

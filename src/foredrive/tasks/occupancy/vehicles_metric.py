@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from foredrive.scene import Boxes, Category, Example, VoxelGrid, VoxelSpec
-from foredrive.tasks.evaluation.metric import EvaluationContext, Figures, labels_from_now
+from foredrive.tasks.evaluation.metric import EvaluationContext, Figures, Shown, labels_from_now
 from foredrive.tasks.evaluation.predictor import Part, Prediction
 from foredrive.tasks.occupancy.scores import above_ground
 
@@ -98,6 +98,8 @@ class VehicleMetric:
     """
 
     name = "vehicles"
+    title = "Vehicles"
+    shown: tuple[Shown, ...] = ()
     needs: frozenset[Part] = frozenset({"occupancy_logit"})
 
     def __init__(self, context: EvaluationContext) -> None:

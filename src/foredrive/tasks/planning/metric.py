@@ -4,7 +4,7 @@ import torch
 from torch import Tensor
 
 from foredrive.scene import Example
-from foredrive.tasks.evaluation.metric import EvaluationContext, Figures
+from foredrive.tasks.evaluation.metric import EvaluationContext, Figures, Shown
 from foredrive.tasks.evaluation.predictor import Part, Prediction
 from foredrive.tasks.planning.obstacles import future_obstacles
 from foredrive.tasks.planning.protocols import HORIZON_NAMES, PROTOCOLS, STEP_S, STEPS
@@ -20,6 +20,8 @@ class PlanningMetric:
     """
 
     name = "planning"
+    title = "Planning"
+    shown: tuple[Shown, ...] = ()
     needs: frozenset[Part] = frozenset({"plan"})
 
     def __init__(self, context: EvaluationContext) -> None:

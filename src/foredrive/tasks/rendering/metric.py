@@ -4,7 +4,7 @@ import torch
 from torch import Tensor
 
 from foredrive.scene import Example
-from foredrive.tasks.evaluation.metric import EvaluationContext, Figures
+from foredrive.tasks.evaluation.metric import EvaluationContext, Figures, Shown
 from foredrive.tasks.evaluation.predictor import Part, Prediction
 from foredrive.tasks.rendering.image_scores import psnr_db, ssim
 
@@ -13,6 +13,8 @@ class ImageMetric:
     """PSNR and SSIM, averaged over images. Keys: `psnr_db` and `ssim` at now, then `future_1s.psnr_db`."""
 
     name = "image"
+    title = "Images"
+    shown: tuple[Shown, ...] = ()
     needs: frozenset[Part] = frozenset({"images"})
 
     def __init__(self, context: EvaluationContext) -> None:

@@ -9,7 +9,7 @@ from numpy import ndarray
 
 from foredrive.scene import Example
 from foredrive.tasks.evaluation.frame_keys import continues, time_of
-from foredrive.tasks.evaluation.metric import EvaluationContext, Figures
+from foredrive.tasks.evaluation.metric import EvaluationContext, Figures, Shown
 from foredrive.tasks.evaluation.predictor import Part, Prediction
 from foredrive.tasks.tracking.in_world import agent_rows, box_rows, likely, stacked
 from foredrive.tasks.tracking.object_rows import Frames, ObjectRows
@@ -146,6 +146,11 @@ class TrackingMetric:
     """
 
     name = "tracking"
+    title = "Tracking"
+    shown: tuple[Shown, ...] = (
+        Shown("AMOTA", "nuscenes.amota", "greedy_association"),
+        Shown("changed identities", "nuscenes.ids", "greedy_association"),
+    )
     needs: frozenset[Part] = frozenset({"agents"})
 
     def __init__(self, context: EvaluationContext) -> None:
