@@ -194,15 +194,11 @@ def task_table(summary: Summary) -> Table | None:
     rows: dict[str, list[Row]] = {}
     for metric in (start(EvaluationContext(frame_dt_s=1.0)) for start in METRICS):
         for figure in metric.shown:
-            key = f"{metric.name}.{figure.key}"
-            value, beside = summary.get(key), summary.get(f"{key}.{figure.baseline}")
-            if key in summary or f"{key}.{figure.baseline}" in summary:
-                cells = (
-                    number(value, figure.digits),
-                    _baseline(figure.baseline),
-                    number(beside, figure.digits),
-                )
-                rows.setdefault(metric.title, []).append(Row((figure.title, *cells)))
+            keys = (f"{metric.name}.{figure.key}", f"{metric.name}.{figure.key}.{figure.baseline}")
+            if keys[0] in summary or keys[1] in summary:
+                own, beside = (number(summary.get(key), figure.digits) for key in keys)
+                row = Row((figure.title, own, _baseline(figure.baseline), beside))
+                rows.setdefault(metric.title, []).append(row)
     sections = [Section(of_metric, title) for title, of_metric in rows.items()]
     left = Column(align="left")
     columns = [left, Column("this model"), Column("baseline", align="left"), Column("its figure")]

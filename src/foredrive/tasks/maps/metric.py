@@ -73,7 +73,7 @@ class MapLinesMetric:
 
     name = "map"
     title = "Map"
-    shown = (Shown("MapTR mAP", "maptr.map", "nothing_detected"),)
+    shown: tuple[Shown, ...] = (Shown("MapTR mAP", "maptr.map", "nothing_detected"),)
     needs: frozenset[Part] = frozenset({"map_lines"})
 
     def __init__(self, context: EvaluationContext) -> None:
