@@ -31,6 +31,8 @@ NEAR_M, OTHER_M = 7.0, 12.0
 by more than the second is that of another light: at once if it is nearer, else when it is read again."""
 CONFIRMED = 3
 """Readings in a row that make a farther light the next one."""
+AHEAD_M = 3.0
+"""A line that is read nearer than this is no new one, which would be seen from afar, but the one just crossed."""
 NEARER, FARTHER, BEFORE_LINE_M = 0.5, 0.15, 2.5
 """Shares by which a line that is seen nearer or farther than remembered moves it, and how far before it the
 vehicle stops: at the line itself half of the lamps are out of view."""
@@ -72,6 +74,7 @@ class LightMemory:
         """Logarithm of the odds that the light stops the vehicle."""
         self._line_m: float | None = None
         self._unseen, self._farther, self._yellow = 0, 0, False
+        self._has_moved = False
 
     def update(self, view: PathEstimate, moved_m: float) -> PathEstimate:
         """Return the view with the light that is seen or remembered.
@@ -81,11 +84,14 @@ class LightMemory:
             moved_m: distance driven since the plan before.
         """
         p, line_m = view.light[0].tolist(), float(view.light_m[0])
+        self._has_moved = self._has_moved or moved_m > STILL_M
+        # A drive may begin at a line; later a line comes into view ahead
+        is_new = self._line_m is None and self._has_moved
         # The remembered line comes nearer by the distance driven
         if self._line_m is not None:
             self._line_m -= moved_m
         stops = p[LightState.RED] + p[LightState.YELLOW]
-        if 1 - p[LightState.NONE] > SEEN:
+        if 1 - p[LightState.NONE] > SEEN and not (is_new and line_m < AHEAD_M):
             # Odds given that there is a light: the probability of NONE is no evidence for green
             odds = float(np.log((stops + 0.02) / (p[LightState.GREEN] + 0.02)))
             self._evidence = float(np.clip(FADES * self._evidence + odds, -LONGEST, LONGEST))
@@ -117,8 +123,8 @@ class LightMemory:
         self._farther = self._farther + 1 if beyond_m > OTHER_M else 0
         if self._line_m is None or beyond_m < -OTHER_M or self._farther >= CONFIRMED:
             self._line_m, self._farther = line_m, 0
-        elif self._farther == 0:
-            # Lamps are read too far away more often than too near, and to stop too early costs less.
+        elif self._farther == 0 and not (self._line_m < 0 and line_m < AHEAD_M):
+            # A line that has been crossed does not come back. Of the others too far a reading costs more
             self._line_m += (NEARER if beyond_m < 0 else FARTHER) * beyond_m
 
     def forget(self) -> None:
