@@ -32,7 +32,7 @@ by more than the second is that of another light: at once if it is nearer, else 
 CONFIRMED = 3
 """Readings in a row that make a farther light the next one."""
 AHEAD_M = 3.0
-"""A line that is read nearer than this is no new one, which would be seen from afar, but the one just crossed."""
+"""A line that is read nearer than this is the one just crossed: a new one is seen from afar."""
 NEARER, FARTHER, BEFORE_LINE_M = 0.5, 0.15, 2.5
 """Shares by which a line that is seen nearer or farther than remembered moves it, and how far before it the
 vehicle stops: at the line itself half of the lamps are out of view."""
