@@ -46,6 +46,7 @@ from foredrive.scene.clip import ROUTE_M  # noqa: E402
 if TYPE_CHECKING:
     from foredrive.data import LogPath
     from foredrive.runs import Run
+    from foredrive.runs.rebuild.reconstruct import Reconstruction
     from foredrive.towns.map.town_map import TownMap
     from foredrive.towns.world import World
 
@@ -203,6 +204,14 @@ def trained(log: "LogPath", tmp_path_factory: pytest.TempPathFactory) -> "Run":
     from foredrive.runs import train_run
 
     return train_run(miniature(), [log], tmp_path_factory.mktemp("runs") / "trained")
+
+
+@pytest.fixture(scope="session")
+def briefly_rebuilt(tmp_path_factory: pytest.TempPathFactory) -> "Reconstruction":
+    """Five frames of one camera, rebuilt. Tests do not change its folder."""
+    from builders import ONE_CAMERA, rebuilt_log
+
+    return rebuilt_log(tmp_path_factory.mktemp("rebuilt"), frames=5, recipe=ONE_CAMERA)
 
 
 @pytest.fixture(scope="session")

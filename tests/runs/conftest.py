@@ -8,16 +8,9 @@ import pytest
 @pytest.fixture(scope="session")
 def rebuilt(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A small log that was rebuilt, in `run` beside the log."""
-    import synthetic_log as world
-    from small_rebuild import SMALLEST
+    from builders import rebuilt_log
 
-    from foredrive.data import find_logs
-    from foredrive.runs.rebuild.reconstruct import reconstruct
-
-    folder = tmp_path_factory.mktemp("tested_in")
-    (log,) = find_logs(world.write(folder, frames=67))
-    reconstruct(SMALLEST, log, folder / "run")
-    return folder / "run"
+    return rebuilt_log(tmp_path_factory.mktemp("tested_in"), frames=67).folder
 
 
 @pytest.fixture(scope="session")

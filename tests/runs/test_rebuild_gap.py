@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from small_rebuild import SMALLEST
+from builders import SMALLEST
 
 from foredrive.cli.main import main
 from foredrive.data import ClipDataset, LogPath

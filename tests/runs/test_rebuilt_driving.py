@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 import synthetic_log as world
 import torch
-from small_rebuild import SMALLEST
+from builders import SMALLEST
 
 from foredrive.cli.main import main
 from foredrive.data import ClipConfig, ClipDataset, LogPath, find_logs
@@ -19,7 +19,6 @@ from foredrive.runs import Run, evaluate_run
 from foredrive.runs.drive.in_rebuilt import REPLAY, RebuiltRoutes
 from foredrive.runs.drive.suite import DriveSuite, drive_suite
 from foredrive.runs.rebuild.rebuilt_run import open_rebuilt
-from foredrive.runs.rebuild.reconstruct import reconstruct
 from foredrive.scene import Renderer, VoxelSpec
 from foredrive.view.drive_report import write_drive_report
 
@@ -27,27 +26,19 @@ VOXELS = VoxelSpec(lower_m=(-8.0, -8.0, -1.0), voxel_m=2.0, shape_zyx=(2, 8, 8))
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("driven_in")
-    (log,) = find_logs(world.write(folder, frames=67))
-    reconstruct(SMALLEST, log, folder / "run")
-    return folder / "run"
-
-
-@pytest.fixture(scope="module")
-def out(run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def out(rebuilt: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("drives")
-    drive_suite(DriveSuite(REPLAY, RebuiltRoutes(str(run))), folder)
+    drive_suite(DriveSuite(REPLAY, RebuiltRoutes(str(rebuilt))), folder)
     return folder
 
 
-def test_a_renderer_shows_what_was_recorded(run: Path) -> None:
+def test_a_renderer_shows_what_was_recorded(rebuilt: Path) -> None:
     """As near as two steps of learning bring it: the boxes' colours, and the ground under the lidar."""
-    opened = open_rebuilt(run)
+    opened = open_rebuilt(rebuilt)
     renderer = RebuiltRenderer(opened.scene, opened.scene.graph, opened.vehicle)
     assert isinstance(renderer, Renderer)
     assert renderer.rig.names == ("ahead", "left")
-    log = read_log(find_logs(run.parent)[0], SMALLEST.image_hw)
+    log = read_log(find_logs(rebuilt.parent)[0], SMALLEST.image_hw)
     twist = torch.tensor([world.EGO_SPEED_MPS, 0.0, 0.0, 0.0, 0.0, 0.0])
     seen = renderer.render(log.T_world_ego[5], twist, float(log.t_s[5]))
     off = (seen.images.float() - log.images[5].float()).abs().mean()
@@ -78,9 +69,9 @@ def test_a_drive_is_kept_and_is_a_log_like_any_other(out: Path) -> None:
 
 
 def test_a_trained_run_drives_and_is_judged_on_what_was_driven(
-    trained: Run, run: Path, out: Path, tmp_path: Path
+    trained: Run, rebuilt: Path, out: Path, tmp_path: Path
 ) -> None:
-    suite = DriveSuite(str(trained.folder), RebuiltRoutes(str(run)))
+    suite = DriveSuite(str(trained.folder), RebuiltRoutes(str(rebuilt)))
     (drive,) = drive_suite(suite, tmp_path / "drives").drives.values()
     assert drive.error == ""
     assert drive.score.duration_s > 1
@@ -89,8 +80,8 @@ def test_a_trained_run_drives_and_is_judged_on_what_was_driven(
     assert result.summary["command_source"] == "route"
 
 
-def test_what_lies_there_is_not_driven_again(run: Path, out: Path) -> None:
-    suite = DriveSuite(REPLAY, RebuiltRoutes(str(run)))
+def test_what_lies_there_is_not_driven_again(rebuilt: Path, out: Path) -> None:
+    suite = DriveSuite(REPLAY, RebuiltRoutes(str(rebuilt)))
     file = out / "drives" / "from0.5s.json"
     before = file.stat().st_mtime_ns
     drive_suite(suite, out)
@@ -106,10 +97,19 @@ def test_a_report_has_the_drive_and_its_film(out: Path) -> None:
 
 
 def test_the_verb_drives_against_a_threat(
-    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    rebuilt: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """From 3 s on the log is too short to meet anybody."""
-    command = ["drive", "--agent", "stop", "--out", str(tmp_path / "suite"), "--in", str(run), "--no-sensors"]
+    command = [
+        "drive",
+        "--agent",
+        "stop",
+        "--out",
+        str(tmp_path / "suite"),
+        "--in",
+        str(rebuilt),
+        "--no-sensors",
+    ]
     assert main([*command, "--start", "3", "--threat", "side"]) == 2
     assert "the log ends at 6.6 s, too early for an impact at 7.0 s" in capsys.readouterr().err
     assert main([*command, "--start", "0.7"]) == 0
@@ -122,8 +122,8 @@ def test_the_verb_drives_against_a_threat(
     assert "do not go with --in: the cameras are the log's" in capsys.readouterr().err
 
 
-def test_scores_of_threats_stand_in_the_summary(run: Path, tmp_path: Path) -> None:
-    suite = DriveSuite(REPLAY, RebuiltRoutes(str(run), threats=(Threat.STATIONARY,)), sensors=False)
+def test_scores_of_threats_stand_in_the_summary(rebuilt: Path, tmp_path: Path) -> None:
+    suite = DriveSuite(REPLAY, RebuiltRoutes(str(rebuilt), threats=(Threat.STATIONARY,)), sensors=False)
     (drive,) = drive_suite(suite, tmp_path).drives.values()
     assert drive.threat is not None
     assert drive.threat.reference_mps == pytest.approx(world.EGO_SPEED_MPS, abs=0.1)

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import synthetic_log as world
 import torch
-from small_rebuild import SMALLEST
+from builders import ONE_CAMERA
 
 from foredrive.data import find_logs
 from foredrive.errors import InputError
@@ -19,28 +19,22 @@ from foredrive.runs.rebuild.rebuilt_run import edited_scene, open_rebuilt
 from foredrive.runs.rebuild.reconstruct import Reconstruction, reconstruct
 from foredrive.runs.rebuild.render import plan_frames, render_frame
 
-ONE_CAMERA = dataclasses.replace(SMALLEST, cameras=("ahead",))
 
-
-@pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> Reconstruction:
-    folder = tmp_path_factory.mktemp("opened")
-    (log,) = find_logs(world.write(folder, frames=5))
-    return reconstruct(ONE_CAMERA, log, folder / "run")
+@torch.no_grad()
+def test_an_opened_scene_shows_the_same(briefly_rebuilt: Reconstruction) -> None:
+    scene = open_rebuilt(briefly_rebuilt.folder).scene
+    view = briefly_rebuilt.held_out.cameras[0]
+    assert torch.equal(
+        scene.camera(scene.graph, view).rgb,
+        briefly_rebuilt.scene.camera(briefly_rebuilt.scene.graph, view).rgb,
+    )
 
 
 @torch.no_grad()
-def test_an_opened_scene_shows_the_same(run: Reconstruction) -> None:
-    scene = open_rebuilt(run.folder).scene
-    view = run.held_out.cameras[0]
-    assert torch.equal(scene.camera(scene.graph, view).rgb, run.scene.camera(run.scene.graph, view).rgb)
-
-
-@torch.no_grad()
-def test_a_view_that_is_asked_for_is_the_recorded_one(run: Reconstruction) -> None:
+def test_a_view_that_is_asked_for_is_the_recorded_one(briefly_rebuilt: Reconstruction) -> None:
     """The vehicle drives at a constant speed, so that its poses between frames are known as well."""
-    opened = open_rebuilt(run.folder)
-    vehicle, recorded = opened.vehicle, run.held_out.cameras[1]
+    opened = open_rebuilt(briefly_rebuilt.folder)
+    vehicle, recorded = opened.vehicle, briefly_rebuilt.held_out.cameras[1]
     assert vehicle.rig.names == ("ahead",)
     view = novel_camera_view(vehicle.rig, vehicle.camera("ahead"), vehicle.at(recorded.t_s))
     assert torch.allclose(view.T_scene_cam, recorded.T_scene_cam, atol=1e-4)
@@ -56,15 +50,15 @@ def test_a_view_that_is_asked_for_is_the_recorded_one(run: Reconstruction) -> No
 
 
 @torch.no_grad()
-def test_a_lidar_by_its_description_meets_what_the_recorded_one_met(run: Reconstruction) -> None:
+def test_a_lidar_by_its_description_meets_what_the_recorded_one_met(briefly_rebuilt: Reconstruction) -> None:
     """Its channels, columns and reach are told from the recorded beams."""
-    opened = open_rebuilt(run.folder)
+    opened = open_rebuilt(briefly_rebuilt.folder)
     lidar = opened.vehicle.lidar
     assert lidar is not None
     assert torch.allclose(torch.tensor(lidar.elevation_rad), torch.linspace(-25, 5, 16).deg2rad(), atol=1e-4)
     assert lidar.azimuth_steps == 120
     assert lidar.rate_hz == pytest.approx(10)
-    farthest_m = max(float(v.beams.range_m[v.beams.returned].max()) for v in run.held_out.sweeps)
+    farthest_m = max(float(v.beams.range_m[v.beams.returned].max()) for v in briefly_rebuilt.held_out.sweeps)
     assert lidar.max_range_m == opened.vehicle.reach_m == pytest.approx(farthest_m, abs=1.0)
     view = novel_sweep_view(lidar, opened.vehicle.at(0.2))
     scene = opened.scene
@@ -75,9 +69,9 @@ def test_a_lidar_by_its_description_meets_what_the_recorded_one_met(run: Reconst
 
 
 @torch.no_grad()
-def test_nothing_beyond_a_lidars_reach_returns(run: Reconstruction) -> None:
-    opened = open_rebuilt(run.folder)
-    scene, view = opened.scene, run.held_out.sweeps[0]
+def test_nothing_beyond_a_lidars_reach_returns(briefly_rebuilt: Reconstruction) -> None:
+    opened = open_rebuilt(briefly_rebuilt.folder)
+    scene, view = opened.scene, briefly_rebuilt.held_out.sweeps[0]
     points = scene.prepare_sweep(view)
     far = scene.sweep(scene.graph, points, view.t_s)
     scene.reach_m = 10.0
@@ -114,21 +108,23 @@ def test_what_stands_belongs_to_the_static_part_and_is_an_obstacle(tmp_path: Pat
 
 
 @torch.no_grad()
-def test_an_actor_of_another_run_is_where_one_of_this_was(run: Reconstruction) -> None:
-    edits = [Insert(str(run.folder), actor=7, copy=70, follows=11), Remove(11)]
-    edited = edited_scene(run.scene, edits)
+def test_an_actor_of_another_run_is_where_one_of_this_was(briefly_rebuilt: Reconstruction) -> None:
+    edits = [Insert(str(briefly_rebuilt.folder), actor=7, copy=70, follows=11), Remove(11)]
+    edited = edited_scene(briefly_rebuilt.scene, edits)
     assert edited.graph.tracks.track_id.tolist() == [7, 70]
-    view = run.held_out.cameras[0]
-    before, after = (run.scene.camera(graph, view).rgb for graph in (run.scene.graph, edited.graph))
+    view = briefly_rebuilt.held_out.cameras[0]
+    before, after = (
+        briefly_rebuilt.scene.camera(graph, view).rgb for graph in (briefly_rebuilt.scene.graph, edited.graph)
+    )
     changed = (before - after).abs().amax(0) > 0.02
     assert 0 < float(changed.float().mean()) < 0.5  # the moving box, and nothing else
     assert float(changed[:, :24].float().mean()) < 0.02  # it is to the right
 
 
-def test_what_is_no_finished_run_is_told(run: Reconstruction, tmp_path: Path) -> None:
+def test_what_is_no_finished_run_is_told(briefly_rebuilt: Reconstruction, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="not a reconstruction folder"):
         open_rebuilt(tmp_path)
-    (tmp_path / "config.yaml").write_bytes((run.folder / "config.yaml").read_bytes())
+    (tmp_path / "config.yaml").write_bytes((briefly_rebuilt.folder / "config.yaml").read_bytes())
     with pytest.raises(InputError, match="not finished"):
         open_rebuilt(tmp_path)
     (tmp_path / "model.safetensors").write_bytes(b"")
@@ -137,6 +133,6 @@ def test_what_is_no_finished_run_is_told(run: Reconstruction, tmp_path: Path) ->
     (tmp_path / "vehicle.json").write_text("{}")
     with pytest.raises(InputError, match="does not describe a vehicle"):
         open_rebuilt(tmp_path)
-    (tmp_path / "vehicle.json").write_bytes((run.folder / "vehicle.json").read_bytes())
+    (tmp_path / "vehicle.json").write_bytes((briefly_rebuilt.folder / "vehicle.json").read_bytes())
     with pytest.raises(InputError, match="not the weights of a scene"):
         open_rebuilt(tmp_path)

@@ -8,10 +8,8 @@ import pytest
 import synthetic_log as world
 import torch
 from PIL import Image
-from small_rebuild import SMALLEST
 
 from foredrive.cli.main import main
-from foredrive.data import find_logs
 from foredrive.methods.rebuilding.edits import (
     Insert,
     Move,
@@ -23,21 +21,13 @@ from foredrive.methods.rebuilding.edits import (
 )
 from foredrive.runs.rebuild import render as rebuilt_render
 from foredrive.runs.rebuild.rebuilt_run import edited_scene, open_rebuilt
-from foredrive.runs.rebuild.reconstruct import Reconstruction, reconstruct
+from foredrive.runs.rebuild.reconstruct import Reconstruction
 from foredrive.runs.rebuild.render import edits_from_arguments, plan_frames, render_frame
 from foredrive.view import rebuilt_video, video
 
 FRAMES = 5
 ONE_WH = (480 + 2 * 8, 270 - 30 + 8 + 240 + 2 * 26 + 8)
 """Of a film of one camera, whose images are twice as wide as high, over a view from above as high as that."""
-
-
-@pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> Reconstruction:
-    folder = tmp_path_factory.mktemp("filmed")
-    (log,) = find_logs(world.write(folder, frames=FRAMES))
-    recipe = dataclasses.replace(SMALLEST, cameras=("ahead",))
-    return reconstruct(recipe, log, folder / "run")
 
 
 def film(path: Path) -> list[np.ndarray]:
@@ -50,10 +40,10 @@ def film(path: Path) -> list[np.ndarray]:
 
 
 def test_the_verb_films_edited_beside_unedited(
-    run: Reconstruction, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    briefly_rebuilt: Reconstruction, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out, saved = tmp_path / "new" / "film.webp", tmp_path / "edits.json"
-    args = ["render", str(run.folder), "--out", str(out), "--remove", "11", "--shift-left", "1.5"]
+    args = ["render", str(briefly_rebuilt.folder), "--out", str(out), "--remove", "11", "--shift-left", "1.5"]
     assert main([*args, "--save-edits", str(saved), "--start", "0.2", "--seconds", "0.1"]) == 0
     assert f"wrote {out}: 2 frames" in capsys.readouterr().out
     frames = film(out)
@@ -69,15 +59,15 @@ def test_the_verb_films_edited_beside_unedited(
     assert greenness(left) > greenness(right) + 0.3
     assert load_edits(saved) == [Remove(11), ShiftEgo((0.0, 1.5, 0.0))]
     again = tmp_path / "again.webp"
-    args = ["render", str(run.folder), "--out", str(again), "--edits", str(saved)]
+    args = ["render", str(briefly_rebuilt.folder), "--out", str(again), "--edits", str(saved)]
     assert main([*args, "--start", "0.2", "--seconds", "0.1"]) == 0
     assert all((a == b).all() for a, b in zip(film(again), frames, strict=True))
 
 
-def test_without_edits_there_is_one_picture(run: Reconstruction, tmp_path: Path) -> None:
+def test_without_edits_there_is_one_picture(briefly_rebuilt: Reconstruction, tmp_path: Path) -> None:
     """As an MP4, at a rate that is no whole number."""
     out = tmp_path / "film.mp4"
-    args = ["render", str(run.folder), "--out", str(out), "--colour", "height"]
+    args = ["render", str(briefly_rebuilt.folder), "--out", str(out), "--colour", "height"]
     assert main([*args, "--rate-hz", "7.5"]) == 0
     av = pytest.importorskip("av")
     with av.open(str(out)) as container:
@@ -87,21 +77,21 @@ def test_without_edits_there_is_one_picture(run: Reconstruction, tmp_path: Path)
         assert stream.average_rate == 7.5
 
 
-def test_a_recorded_time_is_filmed_as_it_was_judged(run: Reconstruction) -> None:
-    opened = open_rebuilt(run.folder)
-    judged = run.held_out.cameras[0]
+def test_a_recorded_time_is_filmed_as_it_was_judged(briefly_rebuilt: Reconstruction) -> None:
+    opened = open_rebuilt(briefly_rebuilt.folder)
+    judged = briefly_rebuilt.held_out.cameras[0]
     plan = plan_frames(opened.vehicle, start_s=judged.t_s, seconds=0.0)
     shot = render_frame(opened.scene, opened.vehicle, apply_edits(opened.scene.graph, []), plan, 0)
     with torch.no_grad():
-        rgb = run.scene.camera(run.scene.graph, judged).rgb.clamp(0, 1)
+        rgb = briefly_rebuilt.scene.camera(briefly_rebuilt.scene.graph, judged).rgb.clamp(0, 1)
     assert torch.allclose(shot.images[0].float(), 255 * rgb, atol=1.0)
     assert shot.boxes.track_id.tolist() == [7, 11]
     there = torch.tensor(world.PARKED["centre"] - world.driven(judged.t_s)).float()
     assert torch.allclose(shot.boxes.centre[0], there, atol=0.05)
 
 
-def test_another_lidar_is_put_where_the_logs_was(run: Reconstruction) -> None:
-    opened = open_rebuilt(run.folder)
+def test_another_lidar_is_put_where_the_logs_was(briefly_rebuilt: Reconstruction) -> None:
+    opened = open_rebuilt(briefly_rebuilt.folder)
     plan = plan_frames(opened.vehicle, lidar="vlp16", start_s=0.2, seconds=0.0)
     assert plan.lidar is not None
     shot = render_frame(opened.scene, opened.vehicle, apply_edits(opened.scene.graph, []), plan, 0)
@@ -112,24 +102,24 @@ def test_another_lidar_is_put_where_the_logs_was(run: Reconstruction) -> None:
     assert torch.allclose(shot.sweep.origin_ego[last], mounted.expand(int(last.sum()), 3), atol=1e-3)
 
 
-def test_times_are_those_that_are_asked_for(run: Reconstruction) -> None:
-    vehicle = open_rebuilt(run.folder).vehicle
+def test_times_are_those_that_are_asked_for(briefly_rebuilt: Reconstruction) -> None:
+    vehicle = open_rebuilt(briefly_rebuilt.folder).vehicle
     assert plan_frames(vehicle).t_s == pytest.approx([0, 0.1, 0.2, 0.3, 0.4])
     twice = plan_frames(vehicle, start_s=0.1, seconds=0.2, rate_hz=20.0)
     assert twice.t_s == pytest.approx([0.1, 0.15, 0.2, 0.25, 0.3])
     assert twice.step_s == pytest.approx(0.05)
 
 
-def test_what_is_inserted_has_an_id_of_its_own(run: Reconstruction) -> None:
-    tracks = run.scene.tracks
+def test_what_is_inserted_has_an_id_of_its_own(briefly_rebuilt: Reconstruction) -> None:
+    tracks = briefly_rebuilt.scene.tracks
     edits = edits_from_arguments(tracks, [Insert("a", 1, 30, 7)], 0.0, [7], ["C:/x:7@11", "b:11@7"])
     assert edits == [Insert("C:/x", 7, 31, 11), Insert("b", 11, 32, 7), Remove(7)]
-    own = edits_from_arguments(tracks, [], 0.0, [11], [f"{run.folder}:7@11"])
-    assert edited_scene(run.scene, own).graph.tracks.track_id.tolist() == [7, 12]
+    own = edits_from_arguments(tracks, [], 0.0, [11], [f"{briefly_rebuilt.folder}:7@11"])
+    assert edited_scene(briefly_rebuilt.scene, own).graph.tracks.track_id.tolist() == [7, 12]
 
 
-def test_a_camera_has_all_names_by_which_a_log_has_it(run: Reconstruction) -> None:
-    vehicle = open_rebuilt(run.folder).vehicle
+def test_a_camera_has_all_names_by_which_a_log_has_it(briefly_rebuilt: Reconstruction) -> None:
+    vehicle = open_rebuilt(briefly_rebuilt.folder).vehicle
     for name in ("ahead", "AHEAD", "pcam_f0", "PCAM_F0"):
         assert plan_frames(vehicle, (name,)).cameras == (0,)
     nameless = dataclasses.replace(vehicle, other_names=())
@@ -157,12 +147,16 @@ def test_captions_say_what_was_changed() -> None:
     ],
 )
 def test_what_cannot_be_filmed_is_one_line(
-    run: Reconstruction, args: list[str], said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    briefly_rebuilt: Reconstruction,
+    args: list[str],
+    said: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
-    args = [arg.format(tmp=tmp_path, run=run.folder) for arg in args]
+    args = [arg.format(tmp=tmp_path, run=briefly_rebuilt.folder) for arg in args]
     if "--out" not in args:
         args += ["--out", str(tmp_path / "film.webp")]
-    assert main(["render", str(run.folder), *args]) == 2
+    assert main(["render", str(briefly_rebuilt.folder), *args]) == 2
     error = capsys.readouterr().err
     assert error.count("\n") == 1
     assert said.format(tmp=tmp_path) in error
@@ -170,7 +164,10 @@ def test_what_cannot_be_filmed_is_one_line(
 
 
 def test_an_interrupted_film_leaves_nothing(
-    run: Reconstruction, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    briefly_rebuilt: Reconstruction,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     """Ctrl-C while the video is written, over one that is there already."""
 
@@ -181,14 +178,16 @@ def test_an_interrupted_film_leaves_nothing(
     out = tmp_path / "film.mp4"
     out.write_bytes(b"the film before")
     monkeypatch.setattr(video, "_write_mp4", write_some)
-    assert main(["render", str(run.folder), "--out", str(out), "--seconds", "0.1"]) == 130
+    assert main(["render", str(briefly_rebuilt.folder), "--out", str(out), "--seconds", "0.1"]) == 130
     assert out.read_bytes() == b"the film before"
     assert list(tmp_path.iterdir()) == [out]
 
 
-def test_a_saved_edit_is_not_written_before_it_is_known_to_work(run: Reconstruction, tmp_path: Path) -> None:
+def test_a_saved_edit_is_not_written_before_it_is_known_to_work(
+    briefly_rebuilt: Reconstruction, tmp_path: Path
+) -> None:
     save_edits([Remove(3)], tmp_path / "bad.json")
-    args = ["render", str(run.folder), "--out", str(tmp_path / "film.webp")]
+    args = ["render", str(briefly_rebuilt.folder), "--out", str(tmp_path / "film.webp")]
     assert (
         main([*args, "--edits", str(tmp_path / "bad.json"), "--save-edits", str(tmp_path / "new.json")]) == 2
     )

@@ -9,29 +9,24 @@ import numpy as np
 import pytest
 import synthetic_log as world
 import torch
-from small_rebuild import SMALLEST
 
 from foredrive.cli.main import main
-from foredrive.data import find_logs
 from foredrive.errors import InputError
 from foredrive.methods.rebuilding.edits import Move, Remove, ShiftEgo, load_edits, move_between
 from foredrive.methods.rebuilding.tracks import states_at
 from foredrive.methods.splatad import Gaussians
 from foredrive.runs.rebuild.rebuilt_run import OpenedReconstruction, open_rebuilt
-from foredrive.runs.rebuild.reconstruct import reconstruct
+from foredrive.runs.rebuild.reconstruct import Reconstruction
 from foredrive.view.job_runner import JobRunner
 from foredrive.view.rebuilt_nodes import thin_out
 from foredrive.view.rebuilt_viewer import RebuiltViewer
 
 PARKED, MOVING = 7, 11
-ONE_CAMERA = dataclasses.replace(SMALLEST, cameras=("ahead",))
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> OpenedReconstruction:
-    folder = tmp_path_factory.mktemp("viewed")
-    (log,) = find_logs(world.write(folder, frames=5))
-    return open_rebuilt(reconstruct(ONE_CAMERA, log, folder / "run").folder)
+def run(briefly_rebuilt: Reconstruction) -> OpenedReconstruction:
+    return open_rebuilt(briefly_rebuilt.folder)
 
 
 class Page(RebuiltViewer):

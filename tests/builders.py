@@ -1,10 +1,17 @@
-"""A log rebuilt in seconds: hardly any Gaussians, hardly trained. What stands is an actor too."""
+"""What tests of several folders build: logs that are rebuilt in seconds."""
 
+import dataclasses
+from pathlib import Path
+
+import synthetic_log
+
+from foredrive.data import find_logs
 from foredrive.methods.rebuilding.decoders import CameraDecoderConfig
 from foredrive.methods.splatad.initial import InitialGaussians
 from foredrive.methods.splatad.recipes import GaussianRecipe
 from foredrive.methods.splatad.scene_config import GaussianSceneConfig
 from foredrive.methods.splatad.training import GaussianSchedule
+from foredrive.runs.rebuild.reconstruct import Reconstruction, reconstruct
 from foredrive.runs.recipes.rebuilding import RebuildRecipe
 
 SMALLEST = RebuildRecipe(
@@ -24,3 +31,13 @@ SMALLEST = RebuildRecipe(
         scene=GaussianSceneConfig(CameraDecoderConfig(width=8)),
     ),
 )
+"""Hardly any Gaussians, hardly trained. What stands is an actor too."""
+ONE_CAMERA = dataclasses.replace(SMALLEST, cameras=("ahead",))
+
+
+def rebuilt_log(
+    folder: Path, frames: int, recipe: RebuildRecipe[GaussianRecipe] = SMALLEST
+) -> Reconstruction:
+    """A made-up log that is rebuilt, in `run` beside the log."""
+    (log,) = find_logs(synthetic_log.write(folder, frames=frames))
+    return reconstruct(recipe, log, folder / "run")
