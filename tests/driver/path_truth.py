@@ -18,7 +18,7 @@ def sight_of(batch: int, light: torch.Tensor | None = None, size: tuple[int, int
         torch.zeros(batch, 4) if light is None else light,
         torch.zeros(batch, 2, 3, *size),
         torch.zeros(batch, 2, *size),
-        torch.nn.functional.one_hot(torch.full((batch,), LINE_CELLS + 1)) * 20.0,  # no line is seen
+        torch.nn.functional.one_hot(torch.full((batch,), LINE_CELLS)) * 20.0,  # no line is seen
         torch.zeros(batch, TIMES, CELLS),
         torch.zeros(batch, 2, len(USERS), *size),
         torch.zeros(batch, len(USERS) + 2, CELLS, len(BESIDE_M)),

@@ -79,23 +79,20 @@ def test_a_vehicle_stops_before_the_line_but_is_told_truly_how_far_beyond_it_is(
     assert float(view.light_m) == pytest.approx(stop_m)
 
 
-def test_a_line_that_was_crossed_does_not_stop_the_vehicle_in_the_junction() -> None:
+def test_lamps_do_not_move_a_line_that_was_seen_itself() -> None:
     memory = LightMemory()
-    for line_m, moved_m in ((6.0, 0.0), (4.0, 2.0), (1.0, 3.0)):
-        view = memory.update(estimate(LightState.GREEN, line_m), moved_m)
-    for gone_m in range(1, 4):  # the line is read at the bumper, with the lamps of somebody else
-        view = memory.update(estimate(LightState.RED, 0.6), 1.0)
-        assert float(view.light_m) == pytest.approx(1.0 - gone_m, abs=0.3)
-    for _ in range(10):
-        view = memory.update(estimate(LightState.RED, 0.6), 1.0)
-    assert state(view) is LightState.NONE
-    view = memory.update(estimate(LightState.RED, 20.0), 1.0)
-    assert (state(view), float(view.light_m)) == (LightState.RED, pytest.approx(20.0 - BEFORE_LINE_M))
-
-
-def test_a_drive_may_begin_at_a_line() -> None:
-    memory = LightMemory()
-    assert state(memory.update(estimate(LightState.RED, 1.0), 0.0)) is LightState.RED
+    memory.update(estimate(LightState.RED, 20.0), 0.0)
+    view = memory.update(estimate(LightState.RED, 9.0), 1.0, line_seen=True)
+    assert float(view.light_m) == pytest.approx(9.0 - BEFORE_LINE_M)
+    for moved_m in (1.0, 1.0, 1.0):
+        view = memory.update(estimate(LightState.RED, 25.0), moved_m)
+    assert float(view.light_m) == pytest.approx(6.0 - BEFORE_LINE_M)
+    view = memory.update(estimate(LightState.RED, 8.0), 0.0, line_seen=True)
+    assert float(view.light_m) == pytest.approx(7.0 - BEFORE_LINE_M)
+    for count in range(3):  # the line of the next light, beyond this one
+        assert float(view.light_m) == pytest.approx(7.0 - BEFORE_LINE_M), count
+        view = memory.update(estimate(LightState.RED, 30.0), 0.0, line_seen=True)
+    assert float(view.light_m) == pytest.approx(30.0 - BEFORE_LINE_M)
 
 
 def test_a_light_that_was_seen_far_away_and_vanishes_fades() -> None:

@@ -118,14 +118,16 @@ def test_the_distance_of_a_line_is_read_at_the_lamp() -> None:
 
 
 def test_the_distance_of_a_line_is_read_on_the_ground_where_one_is_seen() -> None:
-    logits = torch.full((4, LINE_CELLS + 2), -20.0)
-    logits[0, 0] = 5.0  # behind the bumper
-    logits[1, 1] = 5.0  # in the first cell
-    logits[2, [8, 9]] = 5.0  # on the border of two cells, 8 m ahead
-    logits[3, [12, 13, 14]] = torch.tensor([0.25, 0.5, 0.25]).log() + 5
-    logits[3, -1] = 4.0  # maybe none
-    sight = dataclasses.replace(sight_of(4), line_logits=logits)
-    torch.testing.assert_close(sight.light_m, torch.tensor([-2.0, 0.5, 8.0, 12.5]), atol=1e-3, rtol=0)
+    logits = torch.full((4, LINE_CELLS + 1), -20.0)
+    logits[0, 0] = 5.0  # in the first cell
+    logits[1, [7, 8]] = 5.0  # on the border of two cells, 8 m ahead
+    logits[2, [11, 12, 13]] = torch.tensor([0.25, 0.5, 0.25]).log() + 5
+    logits[2, -1] = 4.0  # maybe none
+    logits[3, 5], logits[3, -1] = 4.0, 5.0
+    lamp_line = torch.full((4, 2, 8, 16), float(scaled_line(torch.tensor(30.0))))
+    sight = dataclasses.replace(sight_of(4), line_logits=logits, lamp_line=lamp_line)
+    assert sight.line_seen.tolist() == [True, True, True, False]
+    torch.testing.assert_close(sight.light_m, torch.tensor([0.5, 8.0, 12.5, 30.0]), atol=1e-3, rtol=0)
 
 
 def test_the_line_is_learned_where_it_is(make_example: Callable[..., Example]) -> None:
@@ -134,14 +136,14 @@ def test_the_line_is_learned_where_it_is(make_example: Callable[..., Example]) -
     known = dataclasses.replace(
         known,
         light=torch.tensor([1, 2, 3, 0, 1]),
-        light_m=torch.tensor([5.5, -3.0, 50.0, 0.0, 5.5]),
+        light_m=torch.tensor([5.5, 1.5, 50.0, 0.0, 5.5]),
         light_known=torch.tensor([True, True, True, True, False]),
     )
-    sight = dataclasses.replace(sight_of(5), line_logits=torch.zeros(5, LINE_CELLS + 2, requires_grad=True))
+    sight = dataclasses.replace(sight_of(5), line_logits=torch.zeros(5, LINE_CELLS + 1, requires_grad=True))
     clip = clip[torch.tensor([0, 1, 0, 1, 0])]
     sight_losses(sight, known, clip, SightWeights())["line"].backward()
     grad = sight.line_logits.grad
-    assert (grad < 0).nonzero().tolist() == [[0, 6], [1, 0], [2, LINE_CELLS + 1], [3, LINE_CELLS + 1]]
+    assert (grad < 0).nonzero().tolist() == [[0, 5], [1, LINE_CELLS], [2, LINE_CELLS], [3, LINE_CELLS]]
 
 
 @torch.no_grad()
@@ -152,6 +154,8 @@ def test_the_ground_is_read_along_the_route(make_example: Callable[..., Example]
     assert not torch.allclose(network(clip).line_logits, network(black).line_logits)
     turned = dataclasses.replace(clip, route_xy=clip.route_xy.flip(0))
     assert not torch.allclose(network(clip).line_logits, network(turned).line_logits)
+    then = dataclasses.replace(clip, images=torch.cat([clip.images[:, :1] * 0, clip.images[:, 1:]], dim=1))
+    assert torch.equal(network(clip).line_logits, network(then).line_logits)  # which tells who stands
 
 
 def test_lamps_are_learned_in_place_and_unknown_cells_not_at_all(

@@ -31,8 +31,8 @@ NEAR_M, OTHER_M = 7.0, 12.0
 by more than the second is that of another light: at once if it is nearer, else when it is read again."""
 CONFIRMED = 3
 """Readings in a row that make a farther light the next one."""
-AHEAD_M = 3.0
-"""A line that is read nearer than this is the one just crossed: a new one is seen from afar."""
+SEEN_OTHER_M, SEEN_SHARE = 4.0, 0.5
+"""The same for a line that is seen itself, and the share by which such a reading moves it."""
 NEARER, FARTHER, BEFORE_LINE_M = 0.5, 0.15, 2.5
 """Shares by which a line that is seen nearer or farther than remembered moves it, and how far before it the
 vehicle stops: at the line itself half of the lamps are out of view."""
@@ -74,29 +74,27 @@ class LightMemory:
         """Logarithm of the odds that the light stops the vehicle."""
         self._line_m: float | None = None
         self._unseen, self._farther, self._yellow = 0, 0, False
-        self._has_moved = False
+        self._was_seen = False
 
-    def update(self, view: PathEstimate, moved_m: float) -> PathEstimate:
+    def update(self, view: PathEstimate, moved_m: float, *, line_seen: bool = False) -> PathEstimate:
         """Return the view with the light that is seen or remembered.
 
         Args:
             view: of a batch of one.
             moved_m: distance driven since the plan before.
+            line_seen: whether the distance of the line is of the line itself, and not of its lamps.
         """
         p, line_m = view.light[0].tolist(), float(view.light_m[0])
-        self._has_moved = self._has_moved or moved_m > STILL_M
-        # A drive may begin at a line; later a line comes into view ahead
-        is_new = self._line_m is None and self._has_moved
         # The remembered line comes nearer by the distance driven
         if self._line_m is not None:
             self._line_m -= moved_m
         stops = p[LightState.RED] + p[LightState.YELLOW]
-        if 1 - p[LightState.NONE] > SEEN and not (is_new and line_m < AHEAD_M):
+        if 1 - p[LightState.NONE] > SEEN:
             # Odds given that there is a light: the probability of NONE is no evidence for green
             odds = float(np.log((stops + 0.02) / (p[LightState.GREEN] + 0.02)))
             self._evidence = float(np.clip(FADES * self._evidence + odds, -LONGEST, LONGEST))
             self._unseen, self._yellow = 0, p[LightState.YELLOW] > p[LightState.RED]
-            self._move_line(line_m)
+            self._move_line(line_m, line_seen)
         else:
             # Unseen plans count only while the vehicle moves
             self._unseen += moved_m > STILL_M  # a standing vehicle waits for the light
@@ -116,20 +114,27 @@ class LightMemory:
         stop_m = max(self._line_m - BEFORE_LINE_M, min(self._line_m, 0.0))
         return PathEstimate(light[None].to(view.light), torch.full_like(view.light_m, stop_m), view.occupied)
 
-    def _move_line(self, line_m: float) -> None:
+    def _move_line(self, line_m: float, line_seen: bool) -> None:
         """Take in a reading of the distance of the line."""
-        # Difference of the reading from memory: a much farther line must be confirmed several times
+        # Lamps tell roughly where a line is, so they move none that has been seen itself
+        if self._was_seen and not line_seen:
+            return
         beyond_m = 0.0 if self._line_m is None else line_m - self._line_m
-        self._farther = self._farther + 1 if beyond_m > OTHER_M else 0
-        if self._line_m is None or beyond_m < -OTHER_M or self._farther >= CONFIRMED:
-            self._line_m, self._farther = line_m, 0
-        elif self._farther == 0 and not (self._line_m < 0 and line_m < AHEAD_M):
-            # A line that has been crossed does not come back. Of the others too far a reading costs more
-            self._line_m += (NEARER if beyond_m < 0 else FARTHER) * beyond_m
+        other_m = SEEN_OTHER_M if self._was_seen else OTHER_M
+        # A much farther line must be confirmed several times
+        self._farther = self._farther + 1 if beyond_m > other_m else 0
+        is_first = self._line_m is None or (line_seen and not self._was_seen)
+        if is_first or beyond_m < -other_m or self._farther >= CONFIRMED:
+            self._line_m, self._farther, self._was_seen = line_m, 0, line_seen
+        elif self._farther == 0 and self._line_m is not None:
+            # Lamps are read too far away more often than too near, and to stop too early costs less
+            share = SEEN_SHARE if line_seen else NEARER if beyond_m < 0 else FARTHER
+            self._line_m += share * beyond_m
 
     def forget(self) -> None:
         """Forget the light."""
         self._evidence, self._line_m, self._unseen, self._farther = 0.0, None, 0, 0
+        self._was_seen = False
 
 
 class Perception:
@@ -148,11 +153,12 @@ class Perception:
 
     def __call__(self, observation: Clip) -> PathEstimate:
         """Return what is on the route of an observation of a batch of one."""
-        view = self._driver.see(observation).estimate()
+        sight = self._driver.see(observation)
+        view, line_seen = sight.estimate(), bool(sight.line_seen[0])
         here = observation.T_world_ego[0, observation.now, :3, 3]
         moved_m = 0.0 if self._before is None else float((here - self._before).norm())
         self._before = here
-        view = self._lights.update(view, moved_m)
+        view = self._lights.update(view, moved_m, line_seen=line_seen)
         return self._patient(view, float(ego_speeds(observation)[0, observation.now]))
 
     def _patient(self, view: PathEstimate, speed_mps: float) -> PathEstimate:

@@ -106,7 +106,7 @@ class CameraEyes(nn.Module):
         of_motion = (config.frames - 1) * len(HEIGHTS_M) * len(ACROSS_MPS)
         self.reader = RouteReader(
             views * len(HEIGHTS_M) * of_place + of_motion,
-            views * of_place,
+            config.cameras * of_place,
             FINE + COARSE,
             COARSE,
             config.cameras,
@@ -129,7 +129,8 @@ class CameraEyes(nn.Module):
         cells = torch.cat(
             [self._read(frames, places, features), self._motion(frames, places, features)], dim=1
         )
-        ground = self._read(frames, line_cells(clip.route_xy, clip.route_valid), features, (0.0,))
+        now, line = frames.frames([frames.now]), line_cells(clip.route_xy, clip.route_valid)
+        ground = self._read(now, line, features[-1:], (0.0,))
         at_4 = torch.cat([fine, wide], dim=2)
         sight: Sight = self.reader(clip, cells, ground, at_4, coarse.mean((-2, -1)))
         return sight

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from foredrive.driver.road_user_targets import USERS, road_user_cells, road_user_pixels
-from foredrive.driver.route_cells import LINE_CELL_M, LINE_CELLS
+from foredrive.driver.route_cells import LINE_CELL_M, LINE_CELLS, LINE_FROM_M
 from foredrive.driver.sight import VELOCITY_SCALE_MPS, Sight, scaled_line
 from foredrive.geometry.projection import project
 from foredrive.geometry.se3 import inverse_se3, transform_points
@@ -109,9 +109,9 @@ def _lamp_loss(sight: Sight, truth: Affordances, lamps: LampPlaces) -> Float[Ten
 def _line_error(sight: Sight, truth: Affordances) -> Float[Tensor, "b"]:
     """Return the cross-entropy of the cell in which the stop line is."""
     cell = (truth.light_m / LINE_CELL_M).floor().long()
-    # Class 0 is behind the bumper, the last one is no line in any cell
-    seen = (truth.light != LightState.NONE) & (cell < LINE_CELLS)
-    target = torch.where(seen, (cell + 1).clamp_min(0), LINE_CELLS + 1)
+    # The last class is no line in any cell
+    seen = (truth.light != LightState.NONE) & (truth.light_m >= LINE_FROM_M) & (cell < LINE_CELLS)
+    target = torch.where(seen, cell, LINE_CELLS)
     return F.cross_entropy(sight.line_logits, target, reduction="none")
 
 

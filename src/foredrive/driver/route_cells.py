@@ -22,6 +22,8 @@ HEIGHTS_M = (0.4, 1.3)
 LINE_CELLS, LINE_CELL_M = 48, 1.0
 LINE_BESIDE_M = (-2.4, -0.8, 0.8, 2.4)
 """Cells of the ground in which the stop line of the next light is looked for: a line is 0.4 m wide."""
+LINE_FROM_M = 2.0
+"""A line that is nearer to the front bumper is below the image."""
 
 
 def route_cells(

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from foredrive.driver.road_user_targets import USERS
@@ -23,8 +23,6 @@ FADES_M = 1.5
 RARE_LOGIT, NONE_LOGIT = -4.0, -2.0
 LIGHT_SCALE_M, LINE_BEFORE_LAMP_M = 20.0, 4.0
 """Where no line is seen, its distance is read at the lamp: a logarithm from some metres before the line."""
-CROSSED_M = -2.0
-"""Distance of a stop line that the front bumper has crossed."""
 
 
 @dataclass(frozen=True)
@@ -37,9 +35,8 @@ class Sight(Record):
     """Whether a red, yellow or green lamp of the light on the route is at a place of an image."""
     lamp_line: Float[Tensor, "b C h w"]
     """The distance of the stop line as it is read at each place: log((m + 4) / 20)."""
-    line_logits: Float[Tensor, f"b {LINE_CELLS + 2}"]
-    """Where the stop line of the next light is: behind the front bumper, in each of the `LINE_CELLS`, or in
-    none of them."""
+    line_logits: Float[Tensor, f"b {LINE_CELLS + 1}"]
+    """Where the stop line of the next light is seen: in each of the `LINE_CELLS`, or in none of them."""
     occupied_logits: Float[Tensor, "b T G"]
     user_pixels: Float[Tensor, "b C K h w"]
     """Whether a road user of each kind is at a place of an image. It is used in training only, so that the
@@ -49,19 +46,22 @@ class Sight(Record):
     in `VELOCITY_SCALE_MPS`."""
 
     @property
+    def line_seen(self) -> Bool[Tensor, "b"]:
+        """Return whether the stop line is seen on the ground."""
+        return self.line_logits.softmax(-1)[:, -1] < 0.5
+
+    @property
     def light_m(self) -> Float[Tensor, "b"]:
         """Return the distance of the stop line, m: seen on the ground, or else read at the likeliest lamp."""
-        p = self.line_logits.softmax(-1)
         at_lamp = self.lamp_logits.amax(2).flatten(1).argmax(1, keepdim=True)
         far_m = line_m(self.lamp_line.flatten(1).gather(1, at_lamp)[:, 0])
         # The mean of the likeliest cell and its neighbours
-        cells = F.pad(p[:, 1:-1], (1, 1))
+        cells = F.pad(self.line_logits.softmax(-1)[:, :-1], (1, 1))
         likeliest = cells[:, 1:-1].argmax(1, keepdim=True)
-        near = cells.gather(1, likeliest + torch.arange(3, device=p.device))
+        near = cells.gather(1, likeliest + torch.arange(3, device=cells.device))
         offset = (near[:, 2] - near[:, 0]) / near.sum(1).clamp_min(1e-6)
         seen_m = LINE_CELL_M * (likeliest[:, 0] + 0.5 + offset)
-        seen_m = torch.where(p[:, 0] > near.sum(1), CROSSED_M, seen_m)
-        return torch.where(p[:, -1] > 0.5, far_m, seen_m)
+        return torch.where(self.line_seen, seen_m, far_m)
 
     def estimate(self) -> PathEstimate:
         """Return probabilities and distances."""
@@ -119,7 +119,7 @@ class RouteReader(nn.Module):
         Args:
             clip: its route is read.
             cells: features in the cells of `route_cells`.
-            ground: features in the cells of `line_cells`.
+            ground: features in the cells of `line_cells`, at now.
             fine: image features at now.
             mean: mean image features at now.
         """
@@ -197,7 +197,8 @@ def _lamp_layers(hidden: int) -> nn.Sequential:
 class LineHead(nn.Module):
     """Reads where the stop line of the next light crosses the route, from features of the ground.
 
-    Lamps do not tell: they hang 10 to 35 m beyond the line, across the junction.
+    Lamps do not tell: they hang 10 to 35 m beyond the line, across the junction. Frames before now are not
+    read: they show whether the vehicle stands, and who stands mostly stands at a line.
 
     Args:
         channels: channels of each cell.
@@ -221,18 +222,18 @@ class LineHead(nn.Module):
             ),
         )
         self.line = nn.Conv1d(width, 1, 1)
-        self.outside = nn.Linear(width + context, 2)
+        self.none = nn.Linear(width + context, 1)
 
     def forward(
         self, ground: Float[Tensor, "b E N S"], context: Float[Tensor, "b V"]
-    ) -> Float[Tensor, f"b {LINE_CELLS + 2}"]:
+    ) -> Float[Tensor, f"b {LINE_CELLS + 1}"]:
         """Return `Sight.line_logits`."""
         # What lies beside the route at one distance becomes channels; one more is the distance
         columns = ground.permute(0, 1, 3, 2).flatten(1, 2)
         place = torch.linspace(-1, 1, columns.shape[-1]).to(columns).expand(len(columns), 1, -1)
         features = self.along(self.ground(torch.cat([columns, place], dim=1)))
-        outside = self.outside(torch.cat([features.amax(-1), context], dim=-1))
-        return torch.cat([outside[:, :1], self.line(features)[:, 0], outside[:, 1:]], dim=-1).float()
+        none = self.none(torch.cat([features.amax(-1), context], dim=-1))
+        return torch.cat([self.line(features)[:, 0], none], dim=-1).float()
 
 
 class OccupancyHead(nn.Module):

@@ -54,8 +54,8 @@ class VolumeEyes(nn.Module):
         )
         self.backbone, self.encoder, channels = world.backbone, world.encoder, world.channels
         # Per frame and height: the volume's channels, and whether the cell is in the volume
-        of_place = config.frames * (channels + 1)
-        self.reader = RouteReader(len(HEIGHTS_M) * of_place, of_place, channels, channels, config.cameras)
+        of_cell = config.frames * len(HEIGHTS_M) * (channels + 1)
+        self.reader = RouteReader(of_cell, channels + 1, channels, channels, config.cameras)
         if config.frozen:
             self.backbone.requires_grad_(False)
             self.encoder.requires_grad_(False)
@@ -82,7 +82,8 @@ class VolumeEyes(nn.Module):
             volumes, images = lift_frames(seen, self.backbone, self.encoder)
         fine = images.permute(0, 1, 4, 2, 3)
         cells = self._read(frames, route_cells(clip.route_xy, clip.route_valid), volumes)
-        ground = self._read(frames, line_cells(clip.route_xy, clip.route_valid), volumes, (0.0,))
+        now, line = frames.frames([frames.now]), line_cells(clip.route_xy, clip.route_valid)
+        ground = self._read(now, line, volumes[:, -1:], (0.0,))
         sight: Sight = self.reader(clip, cells, ground, fine, fine.mean((-2, -1)))
         return sight
 
