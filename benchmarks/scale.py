@@ -20,6 +20,8 @@ import torch
 
 from benchmarks.loading import BATCH_SIZE, CLIPS, WORKERS, load_clips
 from foredrive.data import ClipDataset, LogPath, find_logs
+from foredrive.data.disk_cache import entry_file
+from foredrive.data.logs import Log
 from foredrive.engine.bench import Benchmark
 from foredrive.runs.evaluate.run import evaluate_run
 from foredrive.runs.recipes.known import find_recipe
@@ -114,19 +116,16 @@ def _link_cache(dataset: ClipDataset, logs: list[LogPath]) -> None:
     """Give all logs the cache entries of the first one, as if each had been read once."""
     cameras = [dataset._cameras[0][name] for name in dataset.camera_names]
     opened = {log.path.folder: log for log in dataset.logs}
+
+    def entries(log: Log, frame: int) -> Iterator[Path]:
+        frames = (dataset._frames._key(log, cameras), frame)
+        yield entry_file(ROOT / "cache" / "frames", frames, "frame")
+        yield entry_file(ROOT / "cache" / "labels", dataset._labels._key(log, frame), "labels")
+
     first = opened[logs[0].folder]
     for frame in range(len(first)):
         for log in logs[1:]:
-            copy = opened[log.folder]
-            for source, entry in (
-                (
-                    dataset._frames._file(ROOT / "cache" / "frames", first, frame, cameras),
-                    dataset._frames._file(ROOT / "cache" / "frames", copy, frame, cameras),
-                ),
-                (dataset._labels._file(first, frame), dataset._labels._file(copy, frame)),
-            ):
-                assert source is not None
-                assert entry is not None
+            for source, entry in zip(entries(first, frame), entries(opened[log.folder], frame), strict=True):
                 if source.is_file():
                     entry.parent.mkdir(parents=True, exist_ok=True)
                     os.link(source, entry)

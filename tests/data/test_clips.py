@@ -272,7 +272,7 @@ def test_kept_frames_are_the_same_and_made_anew_when_damaged(flat_root: Path, tm
             for name, value in vars(getattr(plain, part)).items():
                 same = getattr(getattr(kept_clip, part), name)
                 assert torch.equal(same, value) if isinstance(value, torch.Tensor) else same == value
-    kept = sorted(tmp_path.rglob("*.safetensors"))
+    kept = sorted(tmp_path.rglob("*.frame"))
     assert len(kept) == 5
     sizes = [file.stat().st_size for file in kept]
     kept[0].write_bytes(b"not a frame")
@@ -286,17 +286,17 @@ def test_kept_frames_are_the_same_and_made_anew_when_damaged(flat_root: Path, tm
 def test_a_kept_frame_is_of_its_log_its_cameras_and_its_size(flat_log: Path, tmp_path: Path) -> None:
     path, cache = copy_of(flat_log, tmp_path), tmp_path / "cache"
     before = ClipDataset([path], config(), cache)[0].clip
-    count = len(list(cache.rglob("*.safetensors")))
+    count = len(list(cache.rglob("*.frame")))
     one = ClipDataset([path], config(cameras=before.rig.names[1:]), cache)[0].clip
     assert torch.equal(one.images[:, 0], before.images[:, 1])
     small = ClipDataset([path], config(image_hw=(12, 24)), cache)[0].clip
     assert small.images.shape[-2:] == (12, 24)
-    assert len(list(cache.rglob("*.safetensors"))) == 3 * count
+    assert len(list(cache.rglob("*.frame"))) == 3 * count
     os.utime(path.folder / "camera.pcam_f0.arrow", (1, 1))  # written anew
     ClipDataset([path], config(), cache)[0]
-    assert len(list(cache.rglob("*.safetensors"))) == 4 * count
+    assert len(list(cache.rglob("*.frame"))) == 4 * count
 
 
 def test_frames_that_need_no_shrinking_are_not_kept(flat_root: Path, tmp_path: Path) -> None:
     ClipDataset(find_logs(flat_root), config(image_hw=(48, 96)), tmp_path)[0]
-    assert not list(tmp_path.rglob("*.safetensors"))
+    assert not list(tmp_path.rglob("*.frame"))

@@ -1,8 +1,6 @@
 """All cameras and boxes of a log at one frame, with a disk cache."""
 
 import dataclasses
-import hashlib
-import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,22 +9,19 @@ import safetensors.torch
 import torch
 from jaxtyping import Bool, UInt8
 from py123d.datatypes import PinholeCameraMetadata
-from safetensors import SafetensorError
 from torch import Tensor
 
 from foredrive.data.boxes import no_boxes, read_boxes, with_counted_points
 from foredrive.data.cameras import read_camera
+from foredrive.data.disk_cache import DiskCache
 from foredrive.data.lidar import read_sweep
 from foredrive.data.logs import Log
-from foredrive.files import atomic_path
 from foredrive.scene import Boxes, CameraRig
 from foredrive.scene.boxes import UNKNOWN
 from foredrive.scene.record import Record
 
 FRAME_VERSION = 2
 """Version in every cache key. Increase it when the images, rigs or boxes change."""
-
-_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -45,10 +40,8 @@ class FrameData(Record):
 class FrameStore:
     """A reader of frames with a cache of those whose images were downsized.
 
-    The name of an entry is a hash of everything that it depends on: the log's files (name, size, modification
-    time), the cameras, the frame, the image size and `FRAME_VERSION`. Entries are written atomically. Damaged
-    entries are replaced. One file holds a whole frame, and reading it opens no table of the log, so frames of
-    many logs in random order are read as fast as those of one.
+    One file holds a whole frame, and reading it opens no table of the log, so frames of many logs in random
+    order are read as fast as those of one.
 
     Args:
         cache_dir: folder of the cache. None disables it.
@@ -57,8 +50,8 @@ class FrameStore:
     """
 
     def __init__(self, cache_dir: Path | None, image_hw: tuple[int, int], names: tuple[str, ...]) -> None:
-        self._folder = None if cache_dir is None else Path(cache_dir) / "frames"
-        self._keys: dict[Path, bytes] = {}
+        self._cache = DiskCache(None if cache_dir is None else Path(cache_dir) / "frames", "frame")
+        self._keys: dict[Path, str] = {}
         self.image_hw, self.names = image_hw, names
 
     def read(
@@ -84,16 +77,14 @@ class FrameStore:
         present = [camera for camera in cameras if camera is not None]
         small = self.image_hw[0] * self.image_hw[1]
         shrinks = any(camera.width * camera.height > small for camera in present)
-        if self._folder is None or not (with_images and with_points and shrinks):
+        if not (with_images and with_points and shrinks):
             return self._read(log, frame, cameras, with_images, with_points)
-        file = self._file(self._folder, log, frame, present)
-        kept = self._read_entry(file)
-        if kept is None:
-            _log.debug("frame %d of %s is not in the cache", frame, log.path.name)
-            kept = self._read(log, frame, cameras, with_images, with_points)
-            with atomic_path(file, durable=False) as temporary:
-                safetensors.torch.save_file(_flat(kept), temporary)
-        return kept
+        return self._cache.get(
+            (self._key(log, present), frame),
+            lambda: self._read(log, frame, cameras, with_images, with_points),
+            lambda data: safetensors.torch.save(_flat(data)),
+            self._decode,
+        )
 
     def _read(
         self,
@@ -121,25 +112,17 @@ class FrameStore:
         annotated = torch.tensor(boxes is not None)
         return FrameData(images, image_valid, rig, no_boxes() if boxes is None else boxes, annotated)
 
-    def _file(self, folder: Path, log: Log, frame: int, cameras: Sequence[PinholeCameraMetadata]) -> Path:
-        key = self._keys.get(log.path.folder)
-        if key is None:
+    def _key(self, log: Log, cameras: Sequence[PinholeCameraMetadata]) -> str:
+        """Return what all frames of a log depend on; its files are looked at once."""
+        folder = log.path.folder
+        if folder not in self._keys:
             files = [log.file(camera.modality_key) for camera in cameras]
             sources = [(str(file), file.stat().st_size, file.stat().st_mtime_ns) for file in files]
-            parts = (FRAME_VERSION, log.fingerprint, sources, self.names, self.image_hw)
-            key = hashlib.blake2b(repr(parts).encode(), digest_size=16).digest()
-            self._keys[log.path.folder] = key
-        name = hashlib.blake2b(key + frame.to_bytes(8, "little"), digest_size=16).hexdigest()
-        return folder / name[:2] / f"{name}.safetensors"
+            self._keys[folder] = repr((FRAME_VERSION, log.fingerprint, sources, self.names, self.image_hw))
+        return self._keys[folder]
 
-    def _read_entry(self, file: Path) -> FrameData | None:
-        try:
-            tensors = safetensors.torch.load(file.read_bytes())
-        except FileNotFoundError:
-            return None
-        except (OSError, SafetensorError) as error:  # it can be made again
-            _log.warning("%s is damaged (%s) and is made anew", file, error)
-            return None
+    def _decode(self, data: bytes) -> FrameData:
+        tensors = safetensors.torch.load(data)
 
         def fields(part: str) -> dict[str, Tensor]:
             return {name.removeprefix(part): t for name, t in tensors.items() if name.startswith(part)}

@@ -1,9 +1,6 @@
 """A disk cache of voxel labels."""
 
 import dataclasses
-import hashlib
-import logging
-import zlib
 from pathlib import Path
 from typing import Literal
 
@@ -14,6 +11,7 @@ from py123d.common.utils.msgpack_utils import msgpack_decode_with_numpy, msgpack
 
 from foredrive.data.beam_casting import FREE, OCCUPIED, UNKNOWN
 from foredrive.data.boxes import read_boxes
+from foredrive.data.disk_cache import DiskCache
 from foredrive.data.labels import (
     Beams,
     VoxelLabels,
@@ -26,7 +24,6 @@ from foredrive.data.labels import (
 from foredrive.data.lidar import read_sweep
 from foredrive.data.logs import Log
 from foredrive.data.modalities import expand_array, squeeze_array
-from foredrive.files import atomic_path
 from foredrive.geometry.se3 import transform_points
 from foredrive.scene import VoxelSpec
 
@@ -93,15 +90,10 @@ LABEL_VERSION = 2
 """Version in every cache key. Increase it when the labels change."""
 
 _MAKERS = {"lidar": make_labels, "accumulated": accumulated_labels}
-_log = logging.getLogger(__name__)
 
 
 class LabelStore:
     """A disk cache of the labels of a log's frames.
-
-    The name of an entry is a hash of everything that the labels depend on: the log's files (name, size,
-    modification time), the frame's time, the grid, their source and `LABEL_VERSION`. Entries are written
-    atomically. Damaged entries are replaced.
 
     Args:
         cache_dir: folder of the cache. None disables it.
@@ -112,36 +104,24 @@ class LabelStore:
     def __init__(
         self, cache_dir: Path | None, spec: VoxelSpec, source: Literal["lidar", "accumulated"] = "lidar"
     ) -> None:
-        self._folder = None if cache_dir is None else Path(cache_dir) / "labels"
+        self._cache = DiskCache(None if cache_dir is None else Path(cache_dir) / "labels", "labels")
         self._spec, self._source = spec, source
 
     def labels(self, log: Log, frame: int) -> VoxelLabels:
         """Return the labels of one frame. All voxels are unknown if the log has no sweep there."""
-        file = self._file(log, frame)
-        if file is not None:
-            kept = _read_entry(file, self._spec)
-            if kept is not None:
-                return kept
-        labels = _MAKERS[self._source](log, frame, self._spec)
-        if file is None:
-            return labels
-        entry = _encode(labels)
-        with atomic_path(file, durable=False) as temporary:
-            temporary.write_bytes(entry)
-        return _decode(entry, self._spec)  # velocities are rounded here as in later reads
+        return self._cache.get(
+            self._key(log, frame),
+            lambda: _MAKERS[self._source](log, frame, self._spec),
+            _encode,
+            lambda body: _decode(body, self._spec),
+        )
 
-    def _file(self, log: Log, frame: int) -> Path | None:
-        if self._folder is None:
-            return None
-        key: tuple[object, ...] = (LABEL_VERSION, log.fingerprint, int(log.t_us[frame]), self._spec)
-        if self._source != "lidar":
-            key += (self._source,)
-        name = hashlib.blake2b(repr(key).encode(), digest_size=16).hexdigest()
-        return self._folder / name[:2] / f"{name}.labels"
+    def _key(self, log: Log, frame: int) -> tuple[object, ...]:
+        return (LABEL_VERSION, log.fingerprint, int(log.t_us[frame]), self._spec, self._source)
 
 
 def _encode(labels: VoxelLabels) -> bytes:
-    """Encode bit masks of the grids and velocities of moving voxels, with a checksum in front."""
+    """Encode bit masks of the grids and velocities of moving voxels."""
     occupied = labels.occupied.numpy()
     moving = np.flatnonzero(labels.flow_mps.numpy().any(0))
     arrays: dict[str, np.ndarray] = {
@@ -152,13 +132,11 @@ def _encode(labels: VoxelLabels) -> bytes:
         "velocity_mps": labels.flow_mps.numpy().reshape(3, -1)[:, moving].astype(np.float16),
     }
     body: bytes = msgpack_encode_with_numpy({name: squeeze_array(array) for name, array in arrays.items()})
-    return zlib.crc32(body).to_bytes(4, "little") + body
+    return body
 
 
 def _decode(data: bytes, spec: VoxelSpec) -> VoxelLabels:
-    if zlib.crc32(data[4:]).to_bytes(4, "little") != data[:4]:
-        raise ValueError("checksum")
-    arrays = {name: expand_array(packed) for name, packed in msgpack_decode_with_numpy(data[4:]).items()}
+    arrays = {name: expand_array(packed) for name, packed in msgpack_decode_with_numpy(data).items()}
     count = int(np.prod(spec.shape_zyx))
     occupied = np.unpackbits(arrays["occupied"], count=count).astype(bool)
     flow_known = np.zeros(count, dtype=bool)
@@ -172,15 +150,3 @@ def _decode(data: bytes, spec: VoxelSpec) -> VoxelLabels:
         flow_mps=torch.from_numpy(flow.reshape(3, *grid)),
         flow_known=torch.from_numpy(flow_known.reshape(grid)),
     )
-
-
-def _read_entry(file: Path, spec: VoxelSpec) -> VoxelLabels | None:
-    try:
-        data = file.read_bytes()
-    except FileNotFoundError:
-        return None
-    try:
-        return _decode(data, spec)
-    except Exception as error:  # any damaged entry can be computed again
-        _log.warning("%s is damaged (%s) and is made anew", file, error)
-        return None

@@ -1,7 +1,6 @@
 """Clips packed for fast reading: one file of a log, so that images are decoded and truth is read once."""
 
 import dataclasses
-import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +14,7 @@ from torch.utils.data import Dataset
 
 from foredrive.data import ClipDataset
 from foredrive.data.batches import stack_records
-from foredrive.data.maps import map_file
+from foredrive.data.disk_cache import entry_file, map_fingerprint
 from foredrive.errors import InputError
 from foredrive.files import atomic_path
 from foredrive.scene import Clip
@@ -125,12 +124,9 @@ class PackedClips(Dataset[RouteExample]):
         """Return the file of the clips of a log."""
         log, dataset = self._dataset.logs[number], self._dataset
         frames = [dataset.frames_of(index)[1] for index in clips]
-        road = map_file(log)
-        stat = None if road is None else (str(road), road.stat().st_size, road.stat().st_mtime_ns)
-        key = (PACK_VERSION, log.fingerprint, stat, dataset.config, dataset.camera_names, frames)
-        # The name changes with everything that the content depends on, so that a stale file is never read
-        name = hashlib.blake2b(repr(key).encode(), digest_size=16).hexdigest()
-        return self._folder / name[:2] / f"{name}.safetensors"
+        road = map_fingerprint(log)
+        key = (PACK_VERSION, log.fingerprint, road, dataset.config, dataset.camera_names, frames)
+        return entry_file(self._folder, key, "safetensors")
 
     def _write(self, file: Path, clips: list[int]) -> None:
         examples = [self._read(index) for index in clips]

@@ -1,9 +1,6 @@
 """Ground truth of detection, mapping, motion and occupancy tasks at the now of a clip, with a disk cache."""
 
 import dataclasses
-import hashlib
-import logging
-import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,15 +12,14 @@ from py123d.common.utils.msgpack_utils import msgpack_decode_with_numpy, msgpack
 from py123d.datatypes import PinholeCameraMetadata
 from torch import Tensor
 
+from foredrive.data.disk_cache import DiskCache, map_fingerprint
 from foredrive.data.logs import Log
-from foredrive.data.maps import map_file
 from foredrive.data.modalities import expand_array, squeeze_array
 from foredrive.data.truth.affordances import read_affordances
 from foredrive.data.truth.agent_futures import read_futures, read_instances
 from foredrive.data.truth.map_elements import read_map_elements, read_map_raster
 from foredrive.data.truth.rays import read_rays
 from foredrive.data.truth.semantic_labels import read_semantics
-from foredrive.files import atomic_path
 from foredrive.scene import VoxelSpec
 from foredrive.scene.map_elements import InstanceRaster, MapElements, MapRaster, PlaneSpec
 from foredrive.scene.semantics import SemanticVoxels, Taxonomy
@@ -37,8 +33,6 @@ NOT_CACHED = ("rays", "affordances")
 UNIAD_RASTER = PlaneSpec((-51.2, -51.2), 0.512, (200, 200))
 UNIAD_INSTANCES = PlaneSpec((-50.0, -50.0), 0.5, (200, 200))
 """UniAD's grids, but centred on the rear axle."""
-
-_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -69,15 +63,10 @@ class TaskTruthConfig:
 
 
 class TaskTruthStore:
-    """A reader of task truth with a disk cache of most parts. The others are faster to read anew.
-
-    The name of an entry is a hash of everything that it depends on: the log's files and its map (name, size,
-    modification time), the frame's time, the cameras, the configuration, the voxel grid and `TRUTH_VERSION`.
-    Entries are written atomically. Damaged entries are replaced.
-    """
+    """A reader of task truth with a disk cache of most parts. The others are faster to read anew."""
 
     def __init__(self, cache_dir: Path | None, config: TaskTruthConfig, voxels: VoxelSpec) -> None:
-        self._folder = None if cache_dir is None else Path(cache_dir) / "truth"
+        self._cache = DiskCache(None if cache_dir is None else Path(cache_dir) / "truth", "truth")
         self.config, self.voxels = config, voxels
 
     def read(self, log: Log, frame: int, cameras: Sequence[PinholeCameraMetadata | None]) -> TaskTruth:
@@ -87,14 +76,9 @@ class TaskTruthStore:
             InputError: data cannot be read.
         """
         present = [camera for camera in cameras if camera is not None]
-        file = self._file(log, frame, present)
-        truth = None if file is None else self._read_entry(file)
-        # A part of the truth comes from the cache, or is made and stored
-        if truth is None:
-            truth = self._make(log, frame, present)
-            if file is not None:
-                with atomic_path(file, durable=False) as temporary:
-                    temporary.write_bytes(_encode(truth))
+        truth = self._cache.get(
+            self._key(log, frame, present), lambda: self._make(log, frame, present), _encode, self._decode
+        )
         futures = read_futures(log, frame, self.config.future_steps, self.config.future_dt_s)
         rays = read_rays(log, frame, self.voxels) if self.config.rays else None
         affordances = read_affordances(log, frame) if self.config.affordances else None
@@ -118,37 +102,15 @@ class TaskTruthStore:
             made = dataclasses.replace(made, instances=instances)
         return made
 
-    def _file(self, log: Log, frame: int, cameras: Sequence[PinholeCameraMetadata]) -> Path | None:
-        if self._folder is None:
-            return None
-        # The shared map can change without the log
-        shared = map_file(log)
-        stat = None if shared is None else (str(shared), shared.stat().st_size, shared.stat().st_mtime_ns)
-        names = [camera.modality_key for camera in cameras]
-        now_us = int(log.t_us[frame])
+    def _key(self, log: Log, frame: int, cameras: Sequence[PinholeCameraMetadata]) -> tuple[object, ...]:
         # Parts that are not cached do not change the entry's name
         kept = {name: value for name, value in vars(self.config).items() if name not in NOT_CACHED}
-        # Everything that the entry depends on
-        key = (TRUTH_VERSION, log.fingerprint, stat, now_us, names, kept, self.voxels)
-        name = hashlib.blake2b(repr(key).encode(), digest_size=16).hexdigest()
-        return self._folder / name[:2] / f"{name}.truth"
-
-    def _read_entry(self, file: Path) -> TaskTruth | None:
-        try:
-            data = file.read_bytes()
-        except FileNotFoundError:
-            return None
-        try:
-            return self._decode(data)
-        except Exception as error:  # any damaged entry can be computed again
-            _log.warning("%s is damaged (%s) and is made anew", file, error)
-            return None
+        names, now_us = [camera.modality_key for camera in cameras], int(log.t_us[frame])
+        # The shared map can change without the log
+        return (TRUTH_VERSION, log.fingerprint, map_fingerprint(log), now_us, names, kept, self.voxels)
 
     def _decode(self, data: bytes) -> TaskTruth:
-        # The checksum finds entries that were cut off
-        if zlib.crc32(data[4:]).to_bytes(4, "little") != data[:4]:
-            raise ValueError("checksum")
-        stored = msgpack_decode_with_numpy(data[4:])
+        stored = msgpack_decode_with_numpy(data)
         config = self.config
         constants: dict[str, tuple[type, dict[str, Any]]] = {
             "elements": (MapElements, {}),
@@ -165,14 +127,14 @@ class TaskTruthStore:
 
 
 def _encode(truth: TaskTruth) -> bytes:
-    """Encode the tensors of all parts, with a checksum in front."""
+    """Encode the tensors of all parts."""
     parts = {name: vars(part) for name, part in vars(truth).items() if part is not None}
     stored = {
         name: {field: _packed(value) for field, value in part.items() if isinstance(value, Tensor)}
         for name, part in parts.items()
     }
     body: bytes = msgpack_encode_with_numpy(stored)
-    return zlib.crc32(body).to_bytes(4, "little") + body
+    return body
 
 
 def _packed(tensor: Tensor) -> dict[str, Any]:
