@@ -69,7 +69,7 @@ def reconstruct(
         lpips_weights: Evaluate LPIPS too, with this file of torchvision's AlexNet (.pth or .safetensors).
         fid_weights: Evaluate FID too, with this file of the Inception of 2015 that pytorch-fid publishes.
         set: Entries of the recipe to replace, such as representation.schedule.steps=2000; `foredrive recipes
-            RECIPE` prints all entries.
+            RECIPE` prints every entry with its meaning.
         workers: Number of logs reconstructed at a time, if there are several. On Ray it is the size of a
             cluster that is started here.
         ray: Reconstruct on Ray: on the cluster at RAY_ADDRESS, or on a cluster that is started here.

@@ -59,8 +59,8 @@ def train(
             "ddp", each holds the whole model; "fsdp", each holds a shard of its weights, gradients and
             optimizer state.
         set: Entries of the recipe to replace, such as finetune.schedule.lr=1e-3; `foredrive recipes RECIPE`
-            prints all entries. With --tasks, tasks.weights.raster=2 and others for the heads; with
-            --probe, tasks.schedule.steps=100 too (tasks/config.yaml in the run's folder has all).
+            prints every entry with its meaning. With --tasks, tasks.weights.raster=2 and others for the
+            heads; with --probe, tasks.schedule.steps=100 too (tasks/config.yaml in the run's folder has all).
     """
     check_out_folder(out)
     if start is not None:

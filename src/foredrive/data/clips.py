@@ -42,18 +42,23 @@ class ClipConfig:
     image_hw: tuple[int, int]
     """Height and width of the resized images, px."""
     voxels: VoxelSpec
+    """Grid of the voxel labels and of a world model's volume."""
     frame_dt_s: float = 0.5
     """Time between key frames, s."""
     horizon_steps: int = 6
+    """Number of steps of the future trajectory and of plans."""
     horizon_dt_s: float = 0.5
+    """Time between the steps of the future trajectory and of plans, s."""
     cameras: tuple[str, ...] | None = None
-    """Camera names, the log's own or 123D's ("pcam_f0"), in this order. None selects all cameras."""
+    """Camera names, the log's own or 123D's ("pcam_f0"), in this order; None selects all cameras."""
     now_stride_s: float = 0.5
     """Time between the nows of successive clips, s."""
     future_images: bool = True
+    """Read the images of the key frames after now too. If False, they are masked."""
     lidar: bool = False
     """Read lidar sweeps into the clip."""
     map: bool = False
+    """Read the patch of the road map around the vehicle at now."""
     occupancy_source: Literal["lidar", "accumulated", "recorded"] = "lidar"
     """Source of the voxel labels: "lidar" for beams of the frame's own sweep, "accumulated" for those of the
     frames within 3 s too, or "recorded" for the exact occupancy and flow in recordings of towns, which
@@ -62,10 +67,10 @@ class ClipConfig:
     """Source of the future trajectory: "driven" for the recorded path, or "expert" for the expert's plan in
     DAgger demonstrations. Clips without such a plan use the driven path."""
     tasks: TaskTruthConfig | None = None
-    """Ground truth of detection, mapping, motion and occupancy heads to read for each now. None: nothing."""
+    """Ground truth of detection, mapping, motion and occupancy heads to read for each now; None: nothing."""
     part_s: tuple[float, float] | None = None
-    """Part of each log, (start, end) in s since its start, end exclusive. Only clips with now and all later
-    frames inside it are used. None is the whole log."""
+    """Part of each log, (start, end) in s since its start, end exclusive; None: all of it. Only clips with
+    now and all later frames inside it are used."""
 
     @property
     def judged(self) -> "ClipConfig":

@@ -30,6 +30,7 @@ class CameraEyesConfig:
     frames: int = 2
     """Key frames that are read, now included."""
     cameras: int = 2
+    """Number of cameras that are read."""
     blind: bool = False
     """Images are black, to measure what follows from the route alone."""
     kind: Literal["cameras"] = "cameras"

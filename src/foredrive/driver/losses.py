@@ -20,20 +20,29 @@ from foredrive.scene.traffic_light import LightState
 
 @dataclass(frozen=True)
 class SightWeights:
-    """Weights of the terms."""
+    """Weights of the terms of `sight_losses`."""
 
     light: float = 1.0
+    """Weight of the state of the next light on the route, cross-entropy."""
     lamps: float = 0.5
+    """Weight of the places of that light's lamps in the images, focal loss."""
     light_m: float = 1.0
+    """Weight of the distance of the stop line as read at each lamp, L1 of its logarithm."""
     line: float = 1.0
+    """Weight of the cell of the route in which the stop line is, cross-entropy."""
     occupied: float = 5.0
+    """Weight of the occupancy of the path over time, cross-entropy."""
     occupied_cells: float = 2.5
-    """Weight of occupied cells in the last term: a missed road user is worse than a false one."""
+    """Factor for occupied cells in `occupied` and `user_cells`: a missed road user is worse than a false
+    one."""
     crossing: float = 2.0
-    """Factor for cells that are free now and occupied later: who crosses or cuts in."""
+    """Factor for cells in `occupied` that are free now and occupied later: who crosses or cuts in."""
     user_pixels: float = 4.0
+    """Weight of the places of road users in the images, cross-entropy."""
     user_cells: float = 4.0
+    """Weight of the cells along and beside the route where road users are, cross-entropy."""
     user_velocity: float = 2.0
+    """Weight of the velocities of road users, squared error in units of `VELOCITY_SCALE_MPS`."""
     vulnerable: float = 4.0
     """Factor for the velocity of people and those on two wheels."""
 

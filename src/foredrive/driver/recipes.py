@@ -31,6 +31,8 @@ class DriverRecipe:
     emphasis: float = 3.0
     """How often clips are drawn in which the driver that the training starts from is wrong; others: 1."""
     precision: Literal["32-true", "bf16-mixed"] = "bf16-mixed"
+    """Numbers in training: "32-true" for 32 bits, or "bf16-mixed" for bfloat16 autocast where it saves
+    time."""
     kind: Literal["driver"] = "driver"
     about: str = field(default="", compare=False)
     """One line for lists of recipes."""

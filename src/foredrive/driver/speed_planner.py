@@ -38,6 +38,7 @@ class SpeedPlannerConfig:
     """Sizes of a `SpeedPlanner`."""
 
     hidden: int = 64
+    """Width of both hidden layers."""
 
 
 def profile_progress(

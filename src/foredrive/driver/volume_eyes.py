@@ -27,12 +27,15 @@ class VolumeEyesConfig:
 
     world: NemoConfig
     voxels: VoxelSpec
+    """Grid of the volume."""
     frames: int = 2
+    """Key frames that are read, now included."""
     cameras: int = 2
+    """Number of cameras that are read."""
     frozen: bool = False
     """The backbone and the encoder stay as they were pre-trained; what reads them is trained."""
     blind: bool = False
-    """Images are black."""
+    """Images are black, to measure what follows from the route alone."""
     kind: Literal["volume"] = "volume"
 
 

@@ -1,8 +1,14 @@
 """Configurations as plain values: read from YAML, validated, changed by settings, written."""
 
+import ast
 import difflib
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+import inspect
+import re
+import textwrap
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, is_dataclass
+from functools import cache
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +18,9 @@ from pydantic import TypeAdapter, ValidationError
 from foredrive.errors import InputError
 from foredrive.files import atomic_path
 from foredrive.plain_yaml import parse_yaml, read_yaml
+
+LINE = 110
+"""Characters of a line of an explained recipe."""
 
 
 def save_recipe(recipe: Any, path: Path) -> None:
@@ -24,6 +33,85 @@ def recipe_yaml(recipe: Any) -> str:
     """Return a recipe of any kind as YAML."""
     plain = _plain(asdict(recipe))
     return yaml.safe_dump(plain, sort_keys=False, allow_unicode=True, default_flow_style=None, width=100)
+
+
+def explained_yaml(recipe: Any) -> str:
+    """Return the YAML of a recipe of any kind with an entry a line and comments that say what each means.
+
+    The comments are the first sentences of the fields' docstrings, see `field_helps`.
+    """
+    return "\n".join(_explained(recipe, _plain(asdict(recipe)), "")) + "\n"
+
+
+def _explained(recipe: Any, values: Mapping[str, Any], indent: str) -> Iterator[str]:
+    """Yield the lines of a recipe or a part of it. `values` are its plain values."""
+    helps = field_helps(recipe.__class__)  # mypy takes no type(…) for hashable
+    for key, value in values.items():
+        part = getattr(recipe, key)
+        nested = is_dataclass(part) and bool(value)
+        lines = [f"{key}:"] if nested else _entry(key, value)
+        about = helps.get(key) or _summary(part)
+        behind = f"{indent}{lines[0]}  # {about}"
+        if about and len(lines) == 1 and len(behind) <= LINE:
+            yield behind
+        else:
+            comment = f"{indent}# "
+            yield from textwrap.wrap(
+                about, LINE, initial_indent=comment, subsequent_indent=comment, break_on_hyphens=False
+            )
+            yield from (indent + line if line else line for line in lines)
+        if nested:
+            yield from _explained(part, value, indent + "  ")
+
+
+def _entry(key: str, value: Any) -> list[str]:
+    """Return the lines of an entry that is no dataclass. Lists of numbers or words take one."""
+    flow = None if isinstance(value, (list, dict)) else False
+    text = yaml.safe_dump(
+        {key: value}, sort_keys=False, allow_unicode=True, default_flow_style=flow, width=100
+    )
+    return text.rstrip("\n").split("\n")
+
+
+@cache
+def field_helps(kind: type) -> dict[str, str]:
+    """Return the first sentence about each field of a dataclass that has one.
+
+    It is in the docstring below the field, or under "Args:" in the docstring of the class or of a base.
+    """
+    helps: dict[str, str] = {}
+    for base in reversed(kind.__mro__):
+        if not is_dataclass(base):
+            continue
+        section = re.search(r"^Args:\n((?: .*\n?|\n)+)", inspect.cleandoc(base.__doc__ or ""), re.MULTILINE)
+        listed = re.findall(r"^    (\w+): (.*(?:\n {5,}.*)*)", section[1] if section else "", re.MULTILINE)
+        helps |= {name: _first_sentence(text) for name, text in listed}
+        for entry, below in pairwise(_statements(base)):
+            match entry, below:
+                case ast.AnnAssign(target=ast.Name(id=name)), ast.Expr(value=ast.Constant(value=str(text))):
+                    helps[name] = _first_sentence(text)
+    return helps
+
+
+def _statements(kind: type) -> list[ast.stmt]:
+    """Return the statements in the body of a class."""
+    try:
+        parsed = ast.parse(textwrap.dedent(inspect.getsource(kind))).body[0]
+    except (OSError, TypeError):  # a frozen program has no sources
+        return []
+    assert isinstance(parsed, ast.ClassDef)
+    return parsed.body
+
+
+def _first_sentence(text: str) -> str:
+    """Return the first sentence of a docstring on one line."""
+    return re.split(r"(?<=[.!?])(?<!\beq\.) (?=[A-Z0-9`\"])", " ".join(text.split()))[0]
+
+
+def _summary(part: Any) -> str:
+    """Return the first line of the docstring of a part of a recipe. Empty: it is a plain value."""
+    doc = type(part).__doc__ if is_dataclass(part) else None
+    return "" if doc is None or doc.startswith(f"{type(part).__name__}(") else doc.strip().split("\n")[0]
 
 
 def is_recipe_file(name: str) -> bool:

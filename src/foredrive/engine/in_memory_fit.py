@@ -16,9 +16,13 @@ class FitSchedule:
     """Schedule of a fit: AdamW, with a cosine learning rate down to 0."""
 
     steps: int
+    """Number of steps of the fit."""
     batch_size: int
+    """Rows of one step, drawn with replacement."""
     lr: float
+    """Learning rate of the first step."""
     weight_decay: float
+    """Decay of weight matrices and filters, see `parameter_groups`."""
 
     def __post_init__(self) -> None:
         """Check the numbers' ranges."""

@@ -15,6 +15,7 @@ class Rate:
     final: float = 0.1
     """Rate at the end, as a fraction of `first`."""
     warmup_steps: int = 0
+    """Steps in which the rate rises from 0 to `first`."""
     until_step: int | None = None
     """Step of the final rate, which stays until the end; None: the last step of the training."""
 

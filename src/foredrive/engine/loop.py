@@ -64,17 +64,27 @@ class Schedule:
     batch_size: int
     """Items of one step, of all processes together."""
     lr: float
+    """Maximum of the learning rate."""
     steps: int | None = None
+    """Number of steps; None: `epochs` gives the length."""
     epochs: int | None = None
+    """Number of passes over the data; None: `steps` gives the length."""
     weight_decay: float = 1e-2
     """Decay of weight matrices and filters, see `parameter_groups`."""
     warmup_steps: int = 0
+    """Steps in which the learning rate rises linearly to `lr`."""
     final_lr_fraction: float = 0.0
+    """Learning rate at the end of the cosine, as a fraction of `lr`."""
     clip_grad_norm: float = 35.0
+    """Maximum norm of the gradient of a step; longer gradients are scaled down to it."""
     checkpoint_every: int = 200
+    """Steps between checkpoints."""
     workers: int = 0
+    """Processes that read the items of a training process; 0: it reads them itself."""
     seed: int = 0
+    """Seed of the order of the items and of random numbers."""
     one_cycle: OneCycle | None = None
+    """1cycle policy of learning rate and momentum; None: warm-up and cosine."""
     accumulate: int = 1
     """Parts of a step, one after the other or in several processes; their gradients are accumulated. More
     processes make more parts. The same number of parts gives the same losses, on any number of processes."""

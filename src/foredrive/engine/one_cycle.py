@@ -17,7 +17,9 @@ class OneCycle:
     rise_share: float = 0.1
     """Share of the steps in which the learning rate rises."""
     initial_div: float = 25.0
+    """Maximum of the learning rate divided by the rate at the beginning."""
     final_div: float = 1e4
+    """Learning rate at the beginning divided by the rate at the end."""
     betas: tuple[float, float] = (0.85, 0.95)
     """Adam's first beta at the maximum of the learning rate, and at both ends."""
 

@@ -27,8 +27,9 @@ class Recipe(Generic[M, S]):
     model: M
     planner: PlannerConfig
     pretrain: S | None
-    """None: fine-tuning starts from scratch or from given weights."""
+    """Stage of pre-training; None: fine-tuning starts from scratch or from given weights."""
     finetune: S
+    """Stage of fine-tuning."""
     pretrained_model: M | None = None
     """World model of pre-training if it is another than `model`. Both have the same encoder."""
     transfer: Literal["world_model", "encoder", "frozen"] = "world_model"
@@ -40,11 +41,13 @@ class Recipe(Generic[M, S]):
     """Task heads that are part of the agent; fine-tuning trains them with the world model, unless that is
     frozen. Their truth is `clips.tasks`."""
     path: PathFit | None = None
-    """Separate fit of the planner's `PathCorrection` after fine-tuning, which then does not train it. None
+    """Separate fit of the planner's `PathCorrection` after fine-tuning, which then does not train it; None
     trains it in fine-tuning."""
     ego_mlp: EgoMLPFit = field(default_factory=EgoMLPFit)
     """Fit of the ego MLP: the baseline in the evaluation and, with `planner.ego_mlp`, the planner's base."""
     precision: Literal["32-true", "bf16-mixed"] = "32-true"
+    """Numbers in training: "32-true" for 32 bits, or "bf16-mixed" for bfloat16 autocast where it saves
+    time."""
     about: str = field(default="", compare=False)
     """One line for lists of recipes."""
 

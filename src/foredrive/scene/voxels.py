@@ -18,6 +18,7 @@ class VoxelSpec:
     voxel_m: float
     """Edge length of the cubic voxels, m."""
     shape_zyx: tuple[int, int, int]
+    """Number of voxels along z, y and x."""
 
     @property
     def upper_m(self) -> tuple[float, float, float]:

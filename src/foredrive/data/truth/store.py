@@ -42,6 +42,7 @@ class TaskTruthConfig:
     future_steps: int = 12
     """Number of steps of the agents' futures."""
     future_dt_s: float = 0.5
+    """Time between the steps of the agents' futures, s."""
     elements_lw_m: tuple[float, float] | None = (60.0, 30.0)
     """Extent of the patch of map elements along x and along y, m: MapTR's by default, and (100, 50) is the
     wide one."""
@@ -54,8 +55,9 @@ class TaskTruthConfig:
     instances: PlaneSpec | None = UNIAD_INSTANCES
     """Grid of the vehicles over time: UniAD's by default, but centred on the rear axle."""
     instance_steps: int = 4
-    """Number of steps after now."""
+    """Number of steps of `instances` after now."""
     instance_dt_s: float = 0.5
+    """Time between the steps of `instances`, s."""
     rays: bool = False
     """Read the lidar's places and the velocities of voxels, which metrics of rays need."""
     affordances: bool = False

@@ -39,7 +39,9 @@ class BackboneConfig:
     """Channels of the stages. `hidden_sizes`, `depths` and `layer_type` are those of
     `transformers.ResNetConfig`."""
     depths: tuple[int, ...]
+    """Number of residual blocks of each stage."""
     layer_type: Literal["basic", "bottleneck"]
+    """Residual blocks of the stages: "basic" ones of two convolutions, or "bottleneck" ones of three."""
     stages: tuple[str, ...]
     """Stages that feed the pyramid, e.g. ("stage2", "stage3")."""
     stem_stride: Literal[2, 4] = 4
@@ -48,8 +50,8 @@ class BackboneConfig:
     """Number of levels that the encoder reads, finest first; None: all. The pyramid hands the coarse stages
     down to them."""
     weights: str | None = None
-    """Hub name or local folder of a `transformers` ResNet. Its sizes then replace the ones given here. None
-    starts from random weights."""
+    """Hub name or local folder of a `transformers` ResNet; None starts from random weights. Its sizes
+    replace the ones given here."""
     checkpoint: bool = False
     """Keep only the images for the backward pass and recompute the rest. From random weights, the running
     statistics of batch normalisation then count every batch twice."""

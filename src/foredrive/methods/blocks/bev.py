@@ -27,6 +27,7 @@ class BevConfig:
     width: int
     """W, the channels of a cell."""
     heads: int
+    """Heads of the deformable attention to images and among cells."""
     points: int
     """Points read per head, level and height."""
     pillars: int

@@ -18,9 +18,13 @@ class LiftSplatConfig:
     """Depth range of a `LiftSplatEncoder` (4 to 45 m in steps of 1 m in the paper)."""
 
     near_m: float
+    """First depth, m."""
     far_m: float
+    """Depths are less than this, m."""
     step_m: float
+    """Distance between depths, m."""
     norm_groups: int = 4
+    """Groups of the group normalisation."""
     kind: Literal["lift_splat"] = "lift_splat"
 
 

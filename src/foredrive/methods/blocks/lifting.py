@@ -66,6 +66,7 @@ class LiftingConfig:
     """Sizes of a `LiftingEncoder`."""
 
     heads: int
+    """Heads of the deformable attention to images and among voxels."""
     points: int
     """Points read per head and per level of image features."""
     layers: int

@@ -28,19 +28,24 @@ class DriveWorldWeights:
     """
 
     kl: float = 1e-3
+    """Weight of the divergence of posterior and prior states, see `balanced_kl`."""
     balance: float = 0.75
     """Share of the divergence that moves the prior (see `balanced_kl`)."""
     occ: float = 1.0
+    """Weight of the occupancy loss."""
     action: float = 1.0
-    """L1 in units of the model's scales of speed and steering."""
+    """Weight of the policy's actions, L1 in units of the model's scales of speed and steering."""
     flow: float = 0.1
-    """L2, where labels have flow."""
+    """Weight of the flow, L2, where labels have flow."""
     velocity: float = 0.1
-    """L1 of the velocities of moving objects, where boxes are known, in units of the scale of speed."""
+    """Weight of the velocities of moving objects, L1 in units of the scale of speed, where boxes are
+    known."""
     scal: float = 0.0
+    """Weight of the scene-class affinity within the occupancy loss, as for NeMo; eq. 3 has none."""
     bce: float = 1.0
+    """Weight of the binary cross-entropy within the occupancy loss (eq. 3)."""
     occupied: float = 1.0
-    """Weights within the occupancy loss, as for NeMo. The defaults are eq. 3's cross-entropy."""
+    """Weight of occupied voxels within the BCE, as for NeMo; eq. 3 has 1."""
     wpts: float = 0.0
     """Weight of the waypoints. With 0 the planner is not trained."""
     over_frames: Literal["mean", "sum"] = "mean"

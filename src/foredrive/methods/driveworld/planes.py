@@ -35,6 +35,7 @@ class PlaneToVectorConfig:
     hidden: int
     """Channels of the first convolution. The second has twice as many."""
     norm_groups: int = 4
+    """Groups of the group normalisation."""
     pool_yx: tuple[int, int] = (4, 4)
     """Size of the plane that is flattened."""
 
@@ -120,6 +121,7 @@ class StaticSceneConfig:
     channels: int
     """Channels of the latent statics."""
     norm_groups: int = 4
+    """Groups of the group normalisation."""
 
 
 class StaticScene(nn.Module):

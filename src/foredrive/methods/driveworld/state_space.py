@@ -41,8 +41,9 @@ class StateSpaceConfig:
     """Minimum standard deviation of a state. It keeps the divergence between two states finite, as in
     MILE."""
     speed_scale_mps: float = 10.0
+    """Scale of speeds, m/s: inputs are divided by it and outputs multiplied by it."""
     steering_scale_rad: float = 0.1
-    """Scales of actions and velocities: inputs are divided by them and outputs multiplied by them."""
+    """Scale of steering, rad: inputs are divided by it and outputs multiplied by it."""
 
 
 @dataclass(frozen=True)

@@ -29,11 +29,17 @@ class NemoWeights:
     """
 
     wpts: float
+    """λ_wpts: weight of the distance between planned and driven waypoints (eq. 14)."""
     recon: float
+    """λ_recon: weight of the reconstruction of images, L1 of colours and the perceptual loss (eq. 9)."""
     occ: float
+    """λ_occ: weight of the occupancy loss (eq. 10-11)."""
     scal: float = 10.0
+    """λ_scal: weight of the scene-class affinity within the occupancy loss (eq. 11)."""
     bce: float = 1.0
+    """λ_BCE: weight of the binary cross-entropy within the occupancy loss (eq. 11)."""
     perc: float = 0.1
+    """Weight of the perceptual loss within the reconstruction (eq. 9)."""
     occupied: float = 1.0
     """Weight of occupied voxels within the BCE. Above the road, only a few percent are occupied."""
     future: float = 1.0
@@ -58,7 +64,7 @@ class NemoStage:
     """Truth of a ray: its own pixel, or the mean of the `ray_stride`² pixels around it."""
     perceptual: str | None = None
     """Network of the perceptual loss: "vgg16" (its weights are downloaded), a file of VGG-16 weights, or
-    "tower", the image tower that comes with the package. None disables that loss (weight 0)."""
+    "tower", the image tower that comes with the package; None disables that loss (weight 0)."""
     imagine: bool = True
     """Imagine the future key frames and supervise them. If False, only the present is trained."""
     imagined: ImaginationSampling = field(default_factory=ImaginationSampling)

@@ -17,9 +17,11 @@ class RendererConfig:
     """Sizes of a `VolumeRenderer`."""
 
     near_m: float
-    """Ray samples are stratified between `near_m` and `far_m`."""
+    """Ray samples are stratified from this distance to `far_m`, m."""
     far_m: float
+    """Distance of the end of a ray, m."""
     samples: int
+    """Number of samples on a ray."""
     hidden: int
     """Width of f_recon."""
 

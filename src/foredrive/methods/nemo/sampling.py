@@ -19,7 +19,7 @@ class ImaginationSampling:
 
     items: int | None = None
     """Number of items of each batch, or of each part of a step, that are imagined, with their pasts and
-    futures. The other items train the present alone, at a fraction of the cost. None: all items."""
+    futures; None: all items. The other items train the present alone, at a fraction of the cost."""
     every: int = 1
     """Imagine in one step of so many, from the first step on. The steps between train the present alone."""
     past_gradient: bool = True

@@ -11,10 +11,15 @@ class GridConfig:
     """A hash grid (see `ops.hash_grid.grid_levels`)."""
 
     levels: int
+    """Number of levels."""
     features: int
+    """Number of features of a level."""
     coarsest: int
+    """Cells along a side of the first level."""
     finest: int
+    """Cells along a side of the last level."""
     log2_rows: int
+    """Binary logarithm of the maximum number of rows of a level."""
 
 
 @dataclass(frozen=True)
@@ -22,7 +27,9 @@ class GridsConfig:
     """The grid of what stands and the grid that all actors share. Levels of actors are the first levels."""
 
     static: GridConfig
+    """Grid of what stands."""
     actors: GridConfig
+    """Grid that all actors share."""
 
     def __post_init__(self) -> None:
         """Check that actors have no more features than what stands."""
@@ -62,14 +69,14 @@ class FieldConfig:
     spacing_m: float = 20.0
     """The first samples are uniform in t / (t + spacing): the power spacing of Zip-NeRF with λ = -1."""
     sky_m: float = 20_000.0
-    """End of every ray. What the ray has left there is given to its last sample."""
+    """End of every ray, m. What the ray has left there is given to its last sample."""
     scale_m: float | None = None
-    """Half side of the cube about the path's middle that is not contracted. None: it holds all places up to
-    80 m ahead of and behind the path and 60 m beside it, as in the reference implementation."""
+    """Half side of the cube about the path's middle that is not contracted, m; None: it holds all places up
+    to 80 m ahead of and behind the path and 60 m beside it, as in the reference implementation."""
     actor_scale_m: float = 10.0
-    """The same for the boxes of actors, about the box' centre."""
+    """The same as `scale_m` for the boxes of actors, about the box' centre."""
     actor_margin_m: tuple[float, float, float] = (0.25, 0.25, 0.1)
-    """The boxes are this much larger at each end: along, across, up."""
+    """The boxes of actors are this much larger at each end, m: along, across, up."""
     surface: Literal["sdf", "density"] = "sdf"
     """The field's geometry: a signed distance, with opacity 1 / (1 + exp(β s)), or a density."""
     shading: Literal["samples", "rays"] = "samples"
@@ -81,7 +88,9 @@ class FieldConfig:
     width: int = 32
     """Channels of hidden layers and of the field's features."""
     geometry_layers: int = 2
+    """Number of layers from the grid's features to the geometry."""
     feature_layers: int = 3
+    """Number of layers from there, with directions, to the field's features."""
     appearance: int = 16
     """Size of a sensor's appearance code."""
 

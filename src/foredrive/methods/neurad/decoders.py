@@ -20,11 +20,15 @@ class PatchDecoderConfig:
     width: int = 32
     """Channels before the image is enlarged."""
     fine_width: int = 32
-    """Channels after it."""
+    """Channels after the image is enlarged."""
     kernel: int = 7
+    """Side of the convolutions of the blocks, px; odd."""
     coarse_blocks: int = 2
+    """Residual blocks before the image is enlarged."""
     fine_blocks: int = 2
+    """Residual blocks after the image is enlarged."""
     batch_norm: bool = True
+    """Batch normalisation after each convolution of the blocks."""
 
     def __post_init__(self) -> None:
         """Check that images keep their size."""

@@ -37,17 +37,23 @@ class FieldWeights:
     """Weights of the losses. The defaults are those of NeuRAD's reference implementation."""
 
     rgb: float = 5.0
-    """Mean squared error of colours."""
+    """Weight of the mean squared error of colours."""
     perceptual: float = 0.05
-    """L1 of VGG-19's features; needs `FieldSchedule.perceptual`."""
+    """Weight of L1 of VGG-19's features; needs `FieldSchedule.perceptual`."""
     depth: float = 0.01
+    """Weight of the error of expected ranges of beams, L1 in m."""
     carving: float = 0.01
+    """Weight of the squared weights of a beam's samples where nothing should be."""
     hit: float = 0.0
-    """Negative logarithm of the share of a beam that ends near its return; not in the paper."""
+    """Weight of the negative logarithm of the share of a beam that ends near its return; not in the paper."""
     intensity: float = 0.1
+    """Weight of the mean squared error of intensities."""
     drop: float = 0.01
+    """Weight of the cross-entropy of lost beams."""
     interlevel: float = 0.001
+    """Weight of what the proposals' weights lack to cover the field's (Zip-NeRF)."""
     distortion: float = 0.002
+    """Weight of the spread of the weights along a ray (Mip-NeRF 360, eq. 15)."""
     proposal: float = 0.1
     """Factor of depth, carving and hit for the proposals."""
     lost: float = 0.1
@@ -59,13 +65,20 @@ class FieldRates:
     """Learning rates. The defaults are those of NeuRAD's reference implementation."""
 
     grids: Rate = field(default_factory=lambda: Rate(1e-2, warmup_steps=500))
+    """Rate of the tables of the hash grids."""
     layers: Rate = field(default_factory=lambda: Rate(1e-2, warmup_steps=500))
+    """Rate of the field's layers, the decoder of beams and the appearance codes."""
     decoder: Rate = field(default_factory=lambda: Rate(1e-3, warmup_steps=2_500))
-    """The CNN for images; appearance codes are among the layers, as in the reference implementation."""
+    """Rate of the CNN for images; appearance codes are among the layers, as in the reference
+    implementation."""
     actor_offset: Rate = field(default_factory=lambda: Rate(1e-3, warmup_steps=2_500))
+    """Rate of the offsets of the actors' poses."""
     camera_offset: Rate = field(default_factory=lambda: Rate(0.0))
+    """Rate of the offsets of the cameras' mounts."""
     camera_twist: Rate = field(default_factory=lambda: Rate(0.0))
+    """Rate of the corrections of the cameras' velocities and turn rates."""
     camera_late_s: Rate = field(default_factory=lambda: Rate(0.0))
+    """Rate of the delays of the cameras' exposures."""
 
 
 @dataclass(frozen=True)
@@ -73,6 +86,7 @@ class FieldSchedule:
     """Length of the training of a field, and what a step looks at."""
 
     steps: int
+    """Number of steps, each on patches of images and beams of sweeps."""
     patches: int = 40
     """Patches of images in a step, of any of the images."""
     patch: int = 32
@@ -100,7 +114,9 @@ class FieldSchedule:
     mirror_share: float = 0.5
     """Probability that a left-right symmetric actor is mirrored in a step."""
     checkpoint_every: int = 500
+    """Steps between checkpoints."""
     seed: int = 0
+    """Seed of the weights, of the views and of random numbers."""
 
     def __post_init__(self) -> None:
         """Check the numbers' ranges, and that a step looks at something."""

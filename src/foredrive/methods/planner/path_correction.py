@@ -21,15 +21,17 @@ class PathCorrectionConfig:
     """Sizes of a `PathCorrection`."""
 
     distances_m: tuple[float, ...]
-    """Distances along the path. Beyond its end, the path continues straight."""
+    """Distances along the path, m. Beyond its end, the path continues straight."""
     lateral_m: tuple[float, ...] = (-3.0, 0.0, 3.0)
-    """Lateral offsets that are sampled: on the path and in the lanes beside it."""
+    """Lateral offsets that are sampled, m: on the path and in the lanes beside it."""
     width: int
+    """Width of the hidden layers."""
     hidden: int
     """Channels kept for each distance."""
     dropout: float = 0.2
+    """Dropout after the first layers."""
     place_scale_m: float = 20.0
-    """Scale by which positions are divided."""
+    """Scale by which positions are divided, m."""
 
 
 class PathSamples(NamedTuple):

@@ -32,6 +32,7 @@ class PlannerConfig:
     layers: int
     """Layers of the decoder (3 in the paper)."""
     heads: int
+    """Attention heads of the decoder."""
     pool: tuple[int, int, int]
     """Block of voxels (z, y, x) that shares a key and a value in the attention within the future volume."""
     future: Literal["attention", "concatenation", "none"] = "attention"
@@ -43,7 +44,7 @@ class PlannerConfig:
     """Add the target point of the route (20 m ahead) to the query, as agents on CARLA's leaderboards
     do. The paper uses only the command."""
     ego_mlp: EgoMLPConfig | None = None
-    """MLP whose plan is corrected, fitted to the demonstrations before fine-tuning. None corrects the plan
+    """MLP whose plan is corrected, fitted to the demonstrations before fine-tuning; None corrects the plan
     that goes straight on at the present speed."""
     attends: tuple[Attended, ...] = ()
     """Outputs of the task heads that the decoder attends to beside the plane, as in VAD and UniAD."""
@@ -57,11 +58,13 @@ class PlannerConfig:
     """Normalise the output of the decoder, as pre-norm decoders do. False in runs from before there was a
     choice."""
     speed_scale_mps: float = 10.0
+    """Scale by which speeds are divided, m/s."""
     past_scale_m: float = 5.0
+    """Scale by which past positions are divided, m."""
     target_scale_m: float = 20.0
-    """Scales by which inputs are divided."""
+    """Scale by which the target point is divided, m."""
     step_scale_m: float = 1.0
-    """Length of a step for an output of 1. With outputs of order 1, the last layer does not have to grow
+    """Length of a step for an output of 1, m. With outputs of order 1, the last layer does not have to grow
     first."""
 
 

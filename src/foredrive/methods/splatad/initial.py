@@ -113,23 +113,30 @@ class InitialGaussians:
     actor_points: int = 500
     """Minimum number of points per actor. Where lidar saw fewer, random points in its box are added."""
     max_actor_points: int = 5000
+    """Maximum number of lidar points per actor."""
     features: int = 8
     """Number of features besides albedo."""
     opacity: float = 0.5
+    """Opacity of all points except those that `near_opacity` is for."""
     near_opacity: float = 0.1
+    """Opacity of random points in the boxes of actors and, if there is lidar, of points along pixels at any
+    range."""
     scale: float = 0.5
     """Standard deviation in units of the mean distance to the nearest neighbours."""
     pixel_scale: float = 0.6
     """Standard deviation of points along pixels, in units of the distance between the drawn pixels of a
     camera."""
     near_m: float = 2.0
+    """Minimum range of `near_points`, m."""
     far_from_m: float = 500.0
-    """Far points lie in a thin shell from here to `far_m`. It then stays closed for a vehicle on another
+    """Far points lie in a thin shell from here to `far_m`, m. It then stays closed for a vehicle on another
     path."""
     far_m: float = 2000.0
+    """Maximum range of points along pixels, m."""
     random_far_points: int = 0
+    """Points of random colours above and around the drive, see `random_points`."""
     random_near_points: int = 0
-    """Points of random colours, see `random_points`."""
+    """Points of random colours within the bounds of the drive, see `random_points`."""
     random_features: bool = False
     """Draw features from a normal distribution. If False, they are 0."""
     random_rotations: bool = False

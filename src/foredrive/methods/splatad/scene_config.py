@@ -18,11 +18,12 @@ class GaussianSceneConfig:
     """Colour where no Gaussian covers a pixel: a grey albedo, which is decoded, or a colour that is added to
     the decoded image. The latter is random in every step of training."""
     drop_from_alpha: bool = True
-    """See `LidarDecoder`."""
+    """Multiply the decoder's probability of a return by alpha, see `LidarDecoder`. If False, the decoder
+    alone decides."""
     camera_near_m: float = NEAR_M
     """Minimum depth of the Gaussians that a camera sees, m."""
     lidar_reach_m: float | None = None
-    """Range beyond which nothing stops a beam, m. None: the reach of the log's lidar."""
+    """Range beyond which nothing stops a beam, m; None: the reach of the log's lidar."""
     frame_velocities: bool = False
     """Learn corrections of the velocity and turn rate of each training image and sweep. They are not used for
     other views."""

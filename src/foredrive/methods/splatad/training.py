@@ -119,16 +119,23 @@ class GaussianWeights:
     ssim: float = 0.2
     """Weight of 1 - SSIM; L1 has the rest."""
     depth: float = 0.1
+    """Weight of the error of ranges, L1 in m."""
     intensity: float = 1.0
+    """Weight of the error of intensities, squared."""
     drop: float = 0.1
+    """Weight of the cross-entropy of lost beams."""
     line_of_sight: float = 0.1
+    """Weight of the share of light that is stopped before a beam's return."""
     depth_quantile: float = 0.95
     """Share of the returned beams that count for `depth`. The worst hit something thin or moving."""
     scale: float = 1e-3
+    """Weight of the mean standard deviation of the Gaussians, m."""
     opacity: float = 5e-3
+    """Weight of the mean opacity of the Gaussians."""
     frame_velocity: float = 1e-6
+    """Weight of the mean length of the corrections of the frames' velocities, if they are learned."""
     frame_turn: float = 1e-5
-    """Weights of the mean length of the corrections of the frames' velocities, if they are learned."""
+    """Weight of the mean length of the corrections of the frames' turn rates, if they are learned."""
 
 
 @dataclass(frozen=True)
@@ -136,19 +143,26 @@ class GaussianSchedule:
     """Length of the training of a scene of Gaussians, and its growth."""
 
     steps: int
+    """Number of steps, each on one image or one sweep."""
     max_gaussians: int
+    """Number of Gaussians up to which the scene grows."""
     rates: LearningRates = field(default_factory=LearningRates)
     weights: GaussianWeights = field(default_factory=GaussianWeights)
     images_per_sweep: int = 1
+    """Number of steps on images for each step on a sweep."""
     beam_stride: int = 1
     """Stride of the beams used from a sweep."""
     shrink_steps: tuple[int, ...] = ()
     """Steps until which images are shrunk. With two entries: by 4 until the first step, by 2 until the
     second."""
     grow_from: int = 500
+    """Step after which the scene grows: dead Gaussians are relocated and new ones added."""
     grow_until: int = 15_000
+    """Last step in which the scene may grow."""
     grow_every: int = 100
+    """Steps between those in which the scene grows."""
     growth: float = 0.05
+    """New Gaussians of each growth, as a share of those there are."""
     walk: float = 5e5
     """λ_noise: noise of the centres in units of their learning rate."""
     mirror_share: float = 0.5
@@ -156,9 +170,11 @@ class GaussianSchedule:
     before_hit_m: float = 0.8
     """Light that is stopped more than this distance before a lidar return is penalised, m."""
     lidar_losses: Literal["ours", "published"] = "ours"
-    """"published": those of SplatAD's reference implementation, see `published_lidar_losses`."""
+    """Losses of sweeps: ours, or those of SplatAD's reference implementation, `published_lidar_losses`."""
     checkpoint_every: int = 500
+    """Steps between checkpoints."""
     seed: int = 0
+    """Seed of the initial scene, of the order of views and of random numbers."""
 
     def __post_init__(self) -> None:
         """Check the numbers' ranges."""

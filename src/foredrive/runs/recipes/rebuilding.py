@@ -34,6 +34,7 @@ class RebuildRecipe(Generic[R]):
 
     name: str
     image_hw: tuple[int, int]
+    """Height and width of the resized images, px."""
     representation: R
     """Recipe of the scene's content and of its training; its kind is a row of `REPRESENTATIONS`."""
     cameras: tuple[str, ...] | None = None
@@ -43,8 +44,8 @@ class RebuildRecipe(Generic[R]):
     actors: bool = True
     """Moving objects are parts of their own, the actors. If False, everything is static."""
     moves_m: float = MOVES_M
-    """Standard deviation of the position of what moves, m. Tracks that move less belong to the static part.
-    0: all tracks are actors, so that parked vehicles can be removed and moved too."""
+    """Minimum standard deviation of the position of what moves, m. Tracks that move less belong to the static
+    part. 0: all tracks are actors, so that parked vehicles can be removed and moved too."""
     nonrigid: bool = True
     """Pedestrians and animals that move are actors. If False, they belong to the static part."""
     drop: bool = True
