@@ -19,7 +19,8 @@ from foredrive.runs.drive.agent_inputs import inputs_of, rig_of
 from foredrive.runs.drive.agents import make_agent
 from foredrive.runs.drive.in_towns import TownRoutes
 from foredrive.runs.model_card import find_card, read_card, shipped_weights
-from foredrive.runs.recipes.known import find_driver_recipe, find_recipe
+from foredrive.runs.recipes.known import find_recipe
+from foredrive.runs.recipes.rebuilding import RebuildRecipe
 from foredrive.runs.ship import ship_driver
 from foredrive.runs.shipped import DRIVER, run_folder
 from foredrive.runs.train.driver import load_driver, open_driver, train_driver
@@ -182,11 +183,11 @@ def test_eyes_that_read_a_volume_start_from_a_pretrained_run(logs: list[LogPath]
 def test_recipes_of_drivers_are_found_by_name_and_file(tmp_path: Path) -> None:
     from foredrive.engine.config import save_recipe
 
-    assert find_driver_recipe("nemo_tiny") is None
-    changed = find_driver_recipe("driver_small", ["see.epochs=1"])
-    assert changed is not None
+    with pytest.raises(InputError, match="driver_small: this recipe is for `foredrive train`"):
+        find_recipe("driver_small", (), RebuildRecipe)
+    changed = find_recipe("driver_small", ["see.epochs=1"], DriverRecipe)
     assert changed.see.epochs == 1
     save_recipe(changed, tmp_path / "mine.yaml")
-    assert find_driver_recipe(str(tmp_path / "mine.yaml")) == changed
+    assert find_recipe(str(tmp_path / "mine.yaml"), (), DriverRecipe) == changed
     with pytest.raises(InputError, match="driver_small"):
         find_recipe("driver_smal")

@@ -12,8 +12,8 @@ import yaml
 from foredrive.cli.main import main
 from foredrive.driver.recipes import DRIVER_RECIPES
 from foredrive.engine.config import explained_yaml, field_helps, recipe_yaml
-from foredrive.runs.recipes.known import RECIPES, find_driver_recipe, find_recipe
-from foredrive.runs.recipes.rebuilding import REBUILD_RECIPES, find_rebuild_recipe
+from foredrive.runs.recipes.known import KINDS, RECIPES, find_recipe
+from foredrive.runs.recipes.rebuilding import REBUILD_RECIPES
 
 ALL: dict[str, Any] = {**RECIPES, **DRIVER_RECIPES, **REBUILD_RECIPES}
 
@@ -156,12 +156,8 @@ def test_every_entry_has_a_help_line(name: str) -> None:
 
 def test_a_printed_recipe_can_be_used(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     own = tmp_path / "own.yaml"
-    for name, find in (
-        ("nemo_tiny", find_recipe),
-        ("driver_small", find_driver_recipe),
-        ("gaussians_tiny", find_rebuild_recipe),
-    ):
+    for name in ("nemo_tiny", "driver_small", "gaussians_tiny"):
         main(["recipes", name])
         own.write_text(capsys.readouterr().out)
         assert "  # " in own.read_text()
-        assert find(str(own)) == ALL[name]
+        assert find_recipe(str(own), (), *KINDS) == ALL[name]

@@ -12,7 +12,7 @@ from foredrive.engine.config import save_recipe
 from foredrive.errors import InputError
 from foredrive.methods.recipe import with_occupancy_source
 from foredrive.runs.recipes.known import RECIPES, find_recipe
-from foredrive.runs.recipes.rebuilding import find_rebuild_recipe
+from foredrive.runs.recipes.rebuilding import RebuildRecipe
 from foredrive.runs.recipes.world_models import load_recipe
 
 
@@ -128,14 +128,13 @@ def test_a_setting_that_does_not_fit_is_one_line(setting: str, said: str) -> Non
 
 def test_recipes_of_reconstructions_take_files_and_settings(tmp_path: Path) -> None:
     own = tmp_path / "own.yaml"
-    save_recipe(find_rebuild_recipe("gaussians_tiny"), own)
-    chosen = find_rebuild_recipe(
-        str(own), ("representation.schedule.steps=7", "representation.scene.rolling=false")
-    )
+    save_recipe(find_recipe("gaussians_tiny", (), RebuildRecipe), own)
+    settings = ("representation.schedule.steps=7", "representation.scene.rolling=false")
+    chosen = find_recipe(str(own), settings, RebuildRecipe)
     gaussians = chosen.representation
     assert (gaussians.schedule.steps, gaussians.scene.rolling) == (7, False)
-    assert gaussians.initial == find_rebuild_recipe("gaussians_tiny").representation.initial
+    assert gaussians.initial == find_recipe("gaussians_tiny", (), RebuildRecipe).representation.initial
     with pytest.raises(InputError, match=r"no entry 'schedule'; did you mean representation\.schedule"):
-        find_rebuild_recipe("gaussians_tiny", ("schedule.steps=7",))
+        find_recipe("gaussians_tiny", ("schedule.steps=7",), RebuildRecipe)
     with pytest.raises(InputError, match="near: gaussians_tiny"):
-        find_rebuild_recipe("gaussian_tiny")
+        find_recipe("gaussian_tiny", (), RebuildRecipe)

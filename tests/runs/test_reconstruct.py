@@ -35,9 +35,9 @@ from foredrive.runs.rebuild.reconstruct import (
     read_reconstruction_data,
     reconstruct,
 )
+from foredrive.runs.recipes.known import find_recipe
 from foredrive.runs.recipes.rebuilding import (
     RebuildRecipe,
-    find_rebuild_recipe,
     gaussians_base,
     gaussians_published,
     gaussians_tiny,
@@ -192,9 +192,9 @@ def test_too_little_memory_is_said_before(
 
 
 def test_named_recipes() -> None:
-    assert find_rebuild_recipe("gaussians_tiny") == gaussians_tiny()
+    assert find_recipe("gaussians_tiny", (), RebuildRecipe) == gaussians_tiny()
     with pytest.raises(InputError, match="near: gaussians_"):
-        find_rebuild_recipe("gaussians_huge")
+        find_recipe("gaussians_huge", (), RebuildRecipe)
     assert memory_needed_gib(gaussians_tiny(), frames=56, cameras=6) < 3
     assert 8 < memory_needed_gib(gaussians_base(), frames=80, cameras=6) < 40
 

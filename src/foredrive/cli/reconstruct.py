@@ -81,9 +81,10 @@ def reconstruct(
 
     with importing():
         from foredrive.methods.rebuilding.perceptual import PerceptualWeights
-        from foredrive.runs.recipes.rebuilding import find_rebuild_recipe
+        from foredrive.runs.recipes.known import find_recipe
+        from foredrive.runs.recipes.rebuilding import RebuildRecipe
 
-    chosen = find_rebuild_recipe(recipe or f"{method or 'gaussians'}_tiny", set)
+    chosen = find_recipe(recipe or f"{method or 'gaussians'}_tiny", set, RebuildRecipe)
     kind = chosen.representation.kind
     if method not in (None, kind):
         raise InputError(f"--method {method} does not go with the recipe {chosen.name}, which is {kind}")

@@ -72,13 +72,14 @@ def train(
     log_paths = find_all_logs(logs)
 
     with importing():
-        from foredrive.runs.recipes.known import find_driver_recipe
+        from foredrive.driver.recipes import DriverRecipe
+        from foredrive.methods.recipe import Recipe
+        from foredrive.runs.recipes.known import find_recipe
 
-    driver = find_driver_recipe(recipe, set)
-    if driver is not None:
+    if isinstance(find_recipe(recipe, (), Recipe, DriverRecipe), DriverRecipe):
         if tasks or rank() is not None:
-            raise InputError(f"{driver.name} trains a driver: leave out --tasks and torchrun")
-        _train_driver(driver, log_paths, out, cache, start)
+            raise InputError(f"{recipe} trains a driver: leave out --tasks and torchrun")
+        _train_driver(find_recipe(recipe, set, DriverRecipe), log_paths, out, cache, start)
     elif probe:
         chosen, heads = _with_heads(recipe, occupancy, tasks, set)
         _probe(chosen, heads, tasks, log_paths, out, cache, start)

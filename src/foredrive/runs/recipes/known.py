@@ -1,9 +1,9 @@
 """The named recipes."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple, TypeVar, overload
 
 from foredrive.driver.recipes import DRIVER_RECIPES, DriverRecipe
 from foredrive.engine.config import is_recipe_file, nearest_name, overridden, read_values, validated
@@ -13,7 +13,8 @@ from foredrive.methods.driveworld.recipes import driveworld_base, driveworld_tin
 from foredrive.methods.nemo.ablations import nemo_ablations
 from foredrive.methods.nemo.recipes import BASE_BEV, TOWN_BEV, nemo_base, nemo_drive, nemo_tiny, nemo_town
 from foredrive.methods.recipe import Recipe
-from foredrive.runs.recipes.world_models import load_recipe, recipe_from
+from foredrive.runs.recipes.rebuilding import REBUILD_RECIPES, RebuildRecipe, rebuild_recipe_from
+from foredrive.runs.recipes.world_models import recipe_from
 
 RECIPES: dict[str, Recipe[Any, Any]] = {
     "nemo_tiny": nemo_tiny(),
@@ -26,38 +27,69 @@ RECIPES: dict[str, Recipe[Any, Any]] = {
 }
 
 
-def find_recipe(name: str, settings: Sequence[str] = ()) -> Recipe[Any, Any]:
+AnyRecipe = Recipe[Any, Any] | DriverRecipe | RebuildRecipe[Any]
+T = TypeVar("T", bound=AnyRecipe)
+
+
+class _Kind(NamedTuple):
+    """A kind of recipe."""
+
+    verb: str
+    """What `foredrive` does with it."""
+    recipes: Mapping[str, AnyRecipe]
+    read: Callable[[Any, str], AnyRecipe]
+    """Validates plain values from a named source."""
+    fits: Callable[[Mapping[str, Any]], bool]
+    """Whether the values of a file are of this kind."""
+
+
+KINDS: dict[type, _Kind] = {
+    DriverRecipe: _Kind(
+        "train",
+        DRIVER_RECIPES,
+        lambda values, source: validated(DriverRecipe, values, source),
+        lambda values: values.get("kind") == "driver",
+    ),
+    RebuildRecipe: _Kind(
+        "reconstruct", REBUILD_RECIPES, rebuild_recipe_from, lambda values: "representation" in values
+    ),
+    Recipe: _Kind("train", RECIPES, recipe_from, lambda _: True),
+}
+"""The kinds of recipes; a file is of the first that fits."""
+
+
+@overload
+def find_recipe(name: str, settings: Sequence[str] = ()) -> Recipe[Any, Any]: ...
+
+
+@overload
+def find_recipe(name: str, settings: Sequence[str] = (), *kinds: type[T]) -> T: ...
+
+
+def find_recipe(name: str, settings: Sequence[str] = (), *kinds: type) -> Any:
     """Return a recipe by its name or from a YAML file.
 
     Args:
-        name: a key of `RECIPES`, or the path of a file.
+        name: name of a recipe, or the path of a file.
         settings: entries KEY.KEY=VALUE to replace in the recipe.
+        kinds: kinds that are wanted, keys of `KINDS`; by default that of world models.
 
     Raises:
-        InputError: there is no such recipe, or a setting does not fit it.
+        InputError: there is no such recipe, it is of another kind, or a setting does not fit it.
     """
-    if is_recipe_file(name):
-        recipe = load_recipe(Path(name))
-    elif name in RECIPES:
-        recipe = RECIPES[name]
-    else:
-        raise InputError(f"no recipe {name!r}{nearest_name(name, [*RECIPES, *DRIVER_RECIPES])}")
-    return recipe_from(overridden(asdict(recipe), settings), name) if settings else recipe
-
-
-def find_driver_recipe(name: str, settings: Sequence[str] = ()) -> DriverRecipe | None:
-    """Return the recipe of a driver as `find_recipe` does. None: the name is that of another recipe.
-
-    Raises:
-        InputError: the file cannot be read, or a setting does not fit.
-    """
+    wanted = kinds or (Recipe,)
     if is_recipe_file(name):
         values = read_values(Path(name))
-        if not isinstance(values, dict) or values.get("kind") != "driver":
-            return None
-    elif name in DRIVER_RECIPES:
-        values = asdict(DRIVER_RECIPES[name])
+        fields = values if isinstance(values, Mapping) else {}
+        kind = next(kind for kind, row in KINDS.items() if row.fits(fields))
     else:
-        return None
-    recipe: DriverRecipe = validated(DriverRecipe, overridden(values, settings), name)
-    return recipe
+        kinds_with_name = [kind for kind, row in KINDS.items() if name in row.recipes]
+        if not kinds_with_name:
+            verbs = {KINDS[kind].verb for kind in wanted}
+            names = [known for row in KINDS.values() if row.verb in verbs for known in row.recipes]
+            raise InputError(f"no recipe {name!r}{nearest_name(name, names)}")
+        kind = kinds_with_name[0]
+        values = asdict(KINDS[kind].recipes[name])
+    if kind not in wanted:
+        raise InputError(f"{name}: this recipe is for `foredrive {KINDS[kind].verb}`")
+    return KINDS[kind].read(overridden(values, settings) if settings else values, name)

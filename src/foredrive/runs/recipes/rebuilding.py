@@ -1,11 +1,11 @@
 """Recipes for rebuilding logs: what is common to all representations of a scene."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
-from foredrive.engine.config import is_recipe_file, nearest_name, overridden, read_values, validated
+from foredrive.engine.config import read_values, validated
 from foredrive.engine.ranges import check_at_least
 from foredrive.errors import InputError
 from foredrive.methods.neurad.recipes import FieldRecipe, base_field, tiny_field
@@ -129,10 +129,11 @@ REBUILD_RECIPES: dict[str, RebuildRecipe[Any]] = {
 
 def load_rebuild_recipe(path: Path) -> RebuildRecipe[Any]:
     """Read a recipe from YAML. Raises the errors of `load_recipe`."""
-    return _recipe_from(read_values(path), str(path))
+    return rebuild_recipe_from(read_values(path), str(path))
 
 
-def _recipe_from(written: Any, source: str) -> RebuildRecipe[Any]:
+def rebuild_recipe_from(written: Any, source: str) -> RebuildRecipe[Any]:
+    """Validate the plain values of a recipe. Arguments and errors are those of `recipe_from`."""
     representation = written.get("representation") if isinstance(written, Mapping) else None
     kind = representation.get("kind") if isinstance(representation, Mapping) else None
     if kind not in REPRESENTATIONS:
@@ -141,14 +142,3 @@ def _recipe_from(written: Any, source: str) -> RebuildRecipe[Any]:
     row = REPRESENTATIONS[kind]
     recipe: RebuildRecipe[Any] = validated(RebuildRecipe[row], written, source)  # type: ignore[valid-type]
     return recipe
-
-
-def find_rebuild_recipe(name: str, settings: Sequence[str] = ()) -> RebuildRecipe[Any]:
-    """Return a recipe by its name or from a YAML file. Arguments and errors are those of `find_recipe`."""
-    if is_recipe_file(name):
-        recipe = load_rebuild_recipe(Path(name))
-    elif name in REBUILD_RECIPES:
-        recipe = REBUILD_RECIPES[name]
-    else:
-        raise InputError(f"no recipe {name!r} to rebuild logs{nearest_name(name, REBUILD_RECIPES)}")
-    return _recipe_from(overridden(asdict(recipe), settings), name) if settings else recipe
