@@ -199,7 +199,7 @@ def test_an_unknown_verb_is_told_the_known_ones(capsys: pytest.CaptureFixture[st
             "--out {file}: this is a file",
         ),
         (["reconstruct", "{tmp}", "--out", "{file}"], "--out {file}: this is a file"),
-        (["convert", "lyft", "{tmp}", "--out", "{tmp}/out"], "there are: pandaset, av2, nuscenes-keyframe"),
+        (["convert", "lyft", "{tmp}", "--out", "{tmp}/out"], "there are: pandaset, av2, nuscenes"),
     ],
 )
 def test_each_verb_names_what_it_cannot_use(

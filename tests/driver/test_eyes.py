@@ -123,7 +123,7 @@ def test_the_distance_of_a_line_is_read_on_the_ground_where_one_is_seen() -> Non
     logits[1, [7, 8]] = 5.0  # on the border of two cells, 8 m ahead
     logits[2, [11, 12, 13]] = torch.tensor([0.25, 0.5, 0.25]).log() + 5
     logits[2, -1] = 4.0  # maybe none
-    logits[3, 5], logits[3, -1] = 4.0, 5.0
+    logits[3, [5, 20, 40]] = 5.0  # not in one place
     lamp_line = torch.full((4, 2, 8, 16), float(scaled_line(torch.tensor(30.0))))
     sight = dataclasses.replace(sight_of(4), line_logits=logits, lamp_line=lamp_line)
     assert sight.line_seen.tolist() == [True, True, True, False]

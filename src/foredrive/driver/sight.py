@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from foredrive.driver.road_user_targets import USERS
@@ -47,8 +47,8 @@ class Sight(Record):
 
     @property
     def line_seen(self) -> Bool[Tensor, "b"]:
-        """Return whether the stop line is seen on the ground."""
-        return self.line_logits.softmax(-1)[:, -1] < 0.5
+        """Return whether the stop line is seen on the ground, in one place."""
+        return self._likeliest_line()[1].sum(1) > 0.5
 
     @property
     def light_m(self) -> Float[Tensor, "b"]:
@@ -56,12 +56,15 @@ class Sight(Record):
         at_lamp = self.lamp_logits.amax(2).flatten(1).argmax(1, keepdim=True)
         far_m = line_m(self.lamp_line.flatten(1).gather(1, at_lamp)[:, 0])
         # The mean of the likeliest cell and its neighbours
+        cell, near = self._likeliest_line()
+        offset = (near[:, 2] - near[:, 0]) / near.sum(1).clamp_min(1e-6)
+        return torch.where(self.line_seen, LINE_CELL_M * (cell + 0.5 + offset), far_m)
+
+    def _likeliest_line(self) -> tuple[Int[Tensor, "b"], Float[Tensor, "b 3"]]:
+        """Return the likeliest cell of the line, and its probability between those of its neighbours."""
         cells = F.pad(self.line_logits.softmax(-1)[:, :-1], (1, 1))
         likeliest = cells[:, 1:-1].argmax(1, keepdim=True)
-        near = cells.gather(1, likeliest + torch.arange(3, device=cells.device))
-        offset = (near[:, 2] - near[:, 0]) / near.sum(1).clamp_min(1e-6)
-        seen_m = LINE_CELL_M * (likeliest[:, 0] + 0.5 + offset)
-        return torch.where(self.line_seen, seen_m, far_m)
+        return likeliest[:, 0], cells.gather(1, likeliest + torch.arange(3, device=cells.device))
 
     def estimate(self) -> PathEstimate:
         """Return probabilities and distances."""

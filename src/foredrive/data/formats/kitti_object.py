@@ -38,6 +38,7 @@ from py123d.parser.registry import NuScenesBoxDetectionLabel
 from foredrive.data.category_names import category_or_other
 from foredrive.data.formats.guard import PartReader
 from foredrive.data.formats.point_files import KITTI, IntensityScale, read_points
+from foredrive.data.formats.raw_log import RawLog, folders_with
 from foredrive.data.images import is_image, read_rgb
 from foredrive.data.logs import imu_from_ego
 from foredrive.data.modalities import attributes_modality
@@ -235,3 +236,13 @@ def _rigid(rows: Float64[np.ndarray, "3 _"]) -> Float64[np.ndarray, "4 4"]:
 
 def _pose(T: Float64[np.ndarray, "4 4"]) -> PoseSE3:
     return PoseSE3.from_transformation_matrix(T)
+
+
+def find_kitti_object(source: Path) -> Iterator[RawLog]:
+    """Yield the raw logs of a folder: of its root, of one log, or of one or two levels above them."""
+    for folder in folders_with(source, "calib"):
+        split = "kitti_test" if folder.name == "testing" else "kitti_train"
+        sensed = {file.stem for file in folder.glob("velodyne/*.bin")}
+        sensed |= {file.stem for file in folder.glob("image_2/*") if is_image(file)}
+        for frame in sorted(name for name in sensed if not name.startswith(".")):
+            yield RawLog(folder, KittiObjectParser(folder, frame, split))

@@ -38,6 +38,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from foredrive.data.formats.guard import PartReader
 from foredrive.data.formats.point_files import KITTI, IntensityScale, read_points
+from foredrive.data.formats.raw_log import RawLog, folders_with
 from foredrive.data.images import is_image, read_rgb
 from foredrive.data.notices import note
 from foredrive.errors import InputError
@@ -342,3 +343,9 @@ def _transformed(T: Float64[np.ndarray, "4 4"], points: Float64[np.ndarray, "P 3
 
 def _pose(T: Float64[np.ndarray, "4 4"]) -> PoseSE3:
     return PoseSE3.from_transformation_matrix(T)
+
+
+def find_kitti_raw(source: Path) -> Iterator[RawLog]:
+    """Yield the raw logs of a folder: of its root, of one log, or of one or two levels above them."""
+    for folder in folders_with(source, "velodyne_points/data"):
+        yield RawLog(folder, KittiRawParser(folder, "kitti-raw_train"))

@@ -44,6 +44,7 @@ from foredrive.data.formats.nuscenes_tables import (
     pose_of_matrix,
     visible_share,
 )
+from foredrive.data.formats.raw_log import RawLog, folders_with
 from foredrive.data.modalities import attributes_modality, visibility_modality
 from foredrive.data.safe_pickle import load_pickle
 from foredrive.data.written_boxes import LABEL_OF_CATEGORY
@@ -189,3 +190,9 @@ def _yaw_matrix(yaw: float, xyz: list[float]) -> np.ndarray:
     T[:2, :2] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
     T[:3, 3] = xyz
     return T
+
+
+def find_keyframes(source: Path) -> Iterator[RawLog]:
+    """Yield the raw logs of a folder: of its root, of one log, or of one or two levels above them."""
+    for folder in folders_with(source, "v1.0-*/sample_data.json"):
+        yield RawLog(folder, NuScenesKeyframeParser(folder, "nuscenes_val"))

@@ -27,6 +27,7 @@ from py123d.parser.pandaset.utils.pandaset_constants import (
 from py123d.parser.pandaset.utils.pandaset_utils import extrinsic_to_imu, pandaset_pose_dict_to_pose_se3
 from pydantic import FiniteFloat, TypeAdapter, ValidationError
 
+from foredrive.data.formats.raw_log import RawLog, folders_with
 from foredrive.data.modalities import attributes_modality
 from foredrive.data.notices import note
 from foredrive.data.safe_pickle import load_table
@@ -253,3 +254,9 @@ def _attributes(cuboids: Path) -> dict[str, int]:
 
 
 pandaset_sensor_io.read_json = _by_number  # it reads the poses of the front camera and nothing else
+
+
+def find_pandaset(source: Path) -> Iterator[RawLog]:
+    """Yield the raw logs of a folder: of its root, of one log, or of one or two levels above them."""
+    for folder in folders_with(source, "annotations/cuboids"):
+        yield RawLog(folder, PandasetParser(folder, folder.name, "pandaset_train"))

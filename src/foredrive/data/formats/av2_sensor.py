@@ -31,7 +31,7 @@ from py123d.geometry import BoundingBoxSE3, PoseSE3
 from py123d.geometry.transform import rel_to_abs_se3_array
 from py123d.geometry.transform.transform_se3 import rel_to_abs_se3
 from py123d.parser.av2 import av2_sensor_parser
-from py123d.parser.av2.av2_map_parser import get_av2_map_metadata
+from py123d.parser.av2.av2_map_parser import Av2MapParser, get_av2_map_metadata
 from py123d.parser.av2.utils.av2_constants import (
     AV2_SENSOR_BOX_DETECTIONS_SE3_METADATA,
     AV2_SENSOR_EGO_STATE_SE3_METADATA,
@@ -39,6 +39,7 @@ from py123d.parser.av2.utils.av2_constants import (
 from py123d.parser.base_dataset_parser import BaseLogParser, ModalitiesSync, ParsedCamera, ParsedLidar
 from py123d.parser.registry import AV2SensorBoxDetectionLabel
 
+from foredrive.data.formats.raw_log import RawLog, folders_with
 from foredrive.data.notices import note
 
 _POSE = ["tx_m", "ty_m", "tz_m", "qw", "qx", "qy", "qz"]
@@ -232,3 +233,11 @@ def _boxes(rows: pa.Table, ego: PoseSE3, timestamp: Timestamp) -> BoxDetectionsS
 
 def _columns(table: pa.Table, names: list[str]) -> Float64[np.ndarray, "N K"]:
     return np.stack([table[name].to_numpy().astype(np.float64) for name in names], axis=-1)
+
+
+def find_av2(source: Path) -> Iterator[RawLog]:
+    """Yield the raw logs of a folder: of its root, of one log, or of one or two levels above them."""
+    for folder in folders_with(source, "city_SE3_egovehicle.feather"):
+        kind = folder.parent.name if folder.parent.name in ("train", "val", "test") else "val"
+        split = f"av2-sensor_{kind}"
+        yield RawLog(folder, Av2SensorParser(folder, split), Av2MapParser(folder, split))
