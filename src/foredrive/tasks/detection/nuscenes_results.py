@@ -202,15 +202,29 @@ def _detections(
     )
 
 
-def _by_frame(content: Mapping[str, Any], path: Path) -> dict[str, Sequence[Box]]:
+def boxes_by_frame(path: Path, content: Mapping[str, Any]) -> dict[str, Sequence[Box]]:
+    """Return the boxes of a file by sample token.
+
+    Raises:
+        InputError: it has none.
+    """
     boxes = content.get("results", content)
     if not isinstance(boxes, dict) or not all(
         isinstance(frame_boxes, list) for frame_boxes in boxes.values()
     ):
         raise InputError(f"{path}: there must be a list of boxes by sample token, under `results` or alone")
+    for name, frame_boxes in boxes.items():
+        for n, box in enumerate(frame_boxes):
+            if not isinstance(box, dict):
+                raise InputError(f"{path}: frame {name}, box {n} is no object")
+    return boxes
+
+
+def _by_frame(content: Mapping[str, Any], path: Path) -> dict[str, Sequence[Box]]:
+    boxes = boxes_by_frame(path, content)
     for token, frame_boxes in boxes.items():
         for n, box in enumerate(frame_boxes):
-            if not isinstance(box, dict) or not isinstance(box.get("detection_name"), str):
+            if not isinstance(box.get("detection_name"), str):
                 raise InputError(f"{path}: frame {token}, box {n} has no detection_name")
     return boxes
 

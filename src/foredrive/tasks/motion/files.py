@@ -33,6 +33,7 @@ from foredrive.errors import InputError
 from foredrive.scene import Boxes, Category
 from foredrive.scene.agent_futures import AgentFutures
 from foredrive.tasks.detection.frames import read_number_rows, read_numbers
+from foredrive.tasks.detection.nuscenes_results import boxes_by_frame
 from foredrive.tasks.evaluation.frames_of_results import check_known_frames, log_frames
 from foredrive.tasks.motion.agents import PredictedAgents, TrueAgents
 from foredrive.tasks.motion.protocols import STEP_S
@@ -87,11 +88,11 @@ def read_agents(results: Path, truth: Path) -> AgentFiles:
     Raises:
         InputError: a file cannot be read, or an entry is wrong. The message names both.
     """
-    boxes = _by_token(read_object(results), results)
+    boxes = boxes_by_frame(results, read_object(results))
     if truth.is_dir():
         return _against_logs(boxes, results, truth)
     true_content = read_object(truth)
-    true_boxes = _by_token(true_content, truth)
+    true_boxes = boxes_by_frame(truth, true_content)
     check_known_frames(results, boxes, truth, list(true_boxes))
     if not true_boxes:
         raise InputError(f"{truth}: holds no frames")
@@ -192,19 +193,6 @@ class _Ego:
         x, y = offset[..., 0], offset[..., 1]
         # Rotation by -yaw; without a heading, yaw counts as 0
         return np.stack([cos * x + sin * y, cos * y - sin * x], axis=-1)
-
-
-def _by_token(content: Mapping[str, Any], path: Path) -> Mapping[str, Sequence[Box]]:
-    boxes = content.get("results", content)
-    if not isinstance(boxes, dict) or not all(
-        isinstance(frame_boxes, list) for frame_boxes in boxes.values()
-    ):
-        raise InputError(f"{path}: there must be a list of boxes by sample token, under `results` or alone")
-    for token, frame_boxes in boxes.items():
-        for n, box in enumerate(frame_boxes):
-            if not isinstance(box, dict):
-                raise InputError(f"{path}: frame {token}, box {n} is no object")
-    return boxes
 
 
 def _rows(boxes: Mapping[str, Sequence[Box]], tokens: Sequence[str], path: Path) -> _Rows:

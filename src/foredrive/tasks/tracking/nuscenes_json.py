@@ -25,7 +25,7 @@ from numpy import ndarray
 from foredrive.errors import InputError
 from foredrive.scene.boxes import UNKNOWN, Attribute
 from foredrive.tasks.detection.frames import read_number_rows, read_numbers, tell_left_out
-from foredrive.tasks.detection.nuscenes_results import read_geometry
+from foredrive.tasks.detection.nuscenes_results import boxes_by_frame, read_geometry
 from foredrive.tasks.detection.protocols import CLASSES
 from foredrive.tasks.evaluation.frames_of_results import check_known_frames
 from foredrive.tasks.evaluation.plain_files import read_plain
@@ -238,24 +238,6 @@ def make_truth(
     times = np.array([samples[name].time_us or 0 for name in content], dtype=np.int64)
     frames = Frames(number_names(samples[name].scene or name for name in content), times)
     return ObjectTruth(list(content), boxes, rack_boxes, frames, ego, lacking(boxes))
-
-
-def boxes_by_frame(path: Path, content: Mapping[str, Any]) -> dict[str, Sequence[Box]]:
-    """Return the boxes of a file by sample token.
-
-    Raises:
-        InputError: it has none.
-    """
-    boxes = content.get("results", content)
-    if not isinstance(boxes, dict) or not all(
-        isinstance(frame_boxes, list) for frame_boxes in boxes.values()
-    ):
-        raise InputError(f"{path}: there must be a list of boxes by sample token, under `results` or alone")
-    for name, frame_boxes in boxes.items():
-        for n, box in enumerate(frame_boxes):
-            if not isinstance(box, dict):
-                raise InputError(f"{path}: frame {name}, box {n} is no object")
-    return boxes
 
 
 def read_object(path: Path) -> Mapping[str, Any]:

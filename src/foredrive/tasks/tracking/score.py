@@ -9,6 +9,7 @@ import numpy as np
 from foredrive.data.boxes import read_boxes
 from foredrive.engine.summary import Figures
 from foredrive.errors import InputError
+from foredrive.tasks.detection.nuscenes_results import boxes_by_frame
 from foredrive.tasks.detection.protocols import (
     DETECTION_PROTOCOLS,
     ERRORS,
@@ -19,7 +20,6 @@ from foredrive.tasks.evaluation.frames_of_results import log_frames
 from foredrive.tasks.tracking.in_world import box_rows, stacked
 from foredrive.tasks.tracking.nuscenes_json import (
     ObjectTask,
-    boxes_by_frame,
     read_json_truth,
     read_object,
     read_results,
