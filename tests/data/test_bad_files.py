@@ -33,6 +33,7 @@ from foredrive.data.cameras import pinhole_cameras, read_camera
 from foredrive.data.clip_list import ListedClip, clip_list, read_clip_list, write_clip_list
 from foredrive.data.formats.bag_topics import propose_topics, topics_file
 from foredrive.data.formats.convert import convert
+from foredrive.data.formats.nuscenes_names import read_table
 from foredrive.data.lidar import read_sweep
 from foredrive.data.log_paths import LogPath
 from foredrive.data.logs import Log
@@ -49,7 +50,6 @@ from foredrive.search.rows import SCORES
 from foredrive.search.scores import read_scores
 from foredrive.sensors.rigs import SURROUND, find_rig
 from foredrive.tasks.occupancy.files import read_poses
-from foredrive.tasks.tracking.nuscenes_tables import _table
 
 TOO_LONG_S = 20
 
@@ -302,7 +302,7 @@ READERS: dict[str, Reader] = {
         lambda root: load_scenarios(root / "stationary" / "0101.yaml"),
         ("stationary/0101.yaml",),
     ),
-    "tables": Reader(write_table, lambda root: _table(root, "sample"), ("sample.json",)),
+    "tables": Reader(write_table, lambda root: read_table(root / "sample.json"), ("sample.json",)),
     "suite": Reader(write_suite, read_suite, ("suite.json",)),
     "run": Reader(write_run, open_run, ("config.yaml", "logs.json")),
     "scores": Reader(

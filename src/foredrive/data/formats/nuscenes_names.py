@@ -1,9 +1,14 @@
 """nuScenes' names of cameras and categories. They are those of py123d's tables for reading nuScenes."""
 
+import json
+from pathlib import Path
+from typing import Any
+
 from py123d.datatypes import CameraID, PinholeCameraMetadata
 from py123d.parser.nuscenes.utils.nuscenes_constants import NUSCENES_CAMERA_IDS, NUSCENES_DETECTION_NAME_DICT
 
 from foredrive.data.written_boxes import LABEL_OF_CATEGORY
+from foredrive.errors import InputError
 from foredrive.scene import Category
 
 _NAME_OF_LABEL = {label: name for name, label in NUSCENES_DETECTION_NAME_DICT.items()}
@@ -32,3 +37,20 @@ def camera_of_channel(channel: str) -> CameraID | None:
     own = {name: camera for camera, name in NUSCENES_CAMERA_IDS.items()}
     named: CameraID | None = CameraID.__members__.get(_PINHOLE + channel.removeprefix(_OTHER_CAMERA))
     return own.get(channel, named)
+
+
+def read_table(file: Path) -> dict[str, dict[str, Any]]:
+    """Read a table of nuScenes by the token of its rows.
+
+    Raises:
+        InputError: the file cannot be read, or is none.
+    """
+    try:
+        rows = json.loads(file.read_bytes())  # bytes may begin with a byte order mark
+        if not isinstance(rows, list):
+            raise TypeError("not a list of rows")
+        return {row["token"]: row for row in rows}
+    except OSError as error:
+        raise InputError(f"{file}: {error.strerror or error}") from error
+    except (ValueError, TypeError, KeyError, RecursionError) as error:
+        raise InputError(f"{file}: not a table of nuScenes") from error

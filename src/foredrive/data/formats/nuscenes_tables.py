@@ -5,7 +5,6 @@ any folder v1.0-NAME, such as those of `foredrive export nuscenes`, with the cam
 """
 
 import functools
-import json
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -40,7 +39,7 @@ from py123d.parser.nuscenes.utils.nuscenes_constants import (
 from foredrive.data.camera_streams import CameraSpec, camera_ids
 from foredrive.data.category_names import category_or_other
 from foredrive.data.formats.guard import reading_raw
-from foredrive.data.formats.nuscenes_names import camera_of_channel
+from foredrive.data.formats.nuscenes_names import camera_of_channel, read_table
 from foredrive.data.modalities import attributes_modality, visibility_modality
 from foredrive.data.notices import note
 from foredrive.data.written_boxes import LABEL_OF_CATEGORY
@@ -84,7 +83,7 @@ class NuScenesTables:
 def nuscenes_tables(folder: Path) -> NuScenesTables:
     """Read the tables of a data set. Those of the last two are kept: scenes are read one after the other."""
     rows = {
-        file.stem: _read_table(file) for file in sorted(folder.glob("*.json")) if file.name != "splits.json"
+        file.stem: read_table(file) for file in sorted(folder.glob("*.json")) if file.name != "splits.json"
     }
     tables = NuScenesTables(rows, {}, {})
     # Readings of each scene and channel in order of time
@@ -256,13 +255,6 @@ class NuScenesTablesParser(BaseLogParser):
         # The export moved the global frame: undo it
         T[:2, 3] += self._tables.log(self._scene).get("world_offset_m", (0.0, 0.0))
         return T
-
-
-def _read_table(file: Path) -> dict[str, Row]:
-    rows = json.loads(file.read_bytes())  # bytes may begin with a byte order mark
-    if not isinstance(rows, list):
-        raise TypeError(f"{file.name} is not a list of rows")
-    return {row["token"]: row for row in rows}
 
 
 def attribute_of_row(row: Row | None, names: dict[str, str]) -> int:

@@ -4,13 +4,13 @@ Source: nuscenes-devkit 1.2.0, eval/common/loaders.py (load_gt, add_center_dist)
 nuscenes.py (box_velocity).
 """
 
-import json
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from foredrive.data.formats.nuscenes_names import read_table
 from foredrive.errors import InputError
 from foredrive.tasks.evaluation.frames_of_results import check_known_frames
 from foredrive.tasks.tracking.nuscenes_json import ObjectTask, Sample, make_truth
@@ -61,7 +61,7 @@ def read_tables_truth(
     Raises:
         InputError: a table cannot be read, or a sample is unknown.
     """
-    samples = _table(folder, "sample")
+    samples = read_table(folder / "sample.json")
     check_known_frames(path, list(listed := list(listed)), folder, list(samples))
     # All samples of every scene that the results touch
     scenes = {samples[token]["scene_token"] for token in listed}
@@ -75,13 +75,13 @@ def read_tables_truth(
 
 def _boxes(folder: Path, samples: Mapping[str, Row], wanted: Mapping[str, Row]) -> dict[str, list[Row]]:
     """Return annotations by sample, in nuScenes' format for results."""
-    annotations = _table(folder, "sample_annotation")
-    category = {token: row["name"] for token, row in _table(folder, "category").items()}
+    annotations = read_table(folder / "sample_annotation.json")
+    category = {token: row["name"] for token, row in read_table(folder / "category.json").items()}
     class_of = {
         token: _CLASS_OF_CATEGORY.get(category[row["category_token"]])
-        for token, row in _table(folder, "instance").items()
+        for token, row in read_table(folder / "instance.json").items()
     }
-    attribute = {token: row["name"] for token, row in _table(folder, "attribute").items()}
+    attribute = {token: row["name"] for token, row in read_table(folder / "attribute.json").items()}
     content: dict[str, list[Row]] = {token: [] for token in wanted}
     for token, row in annotations.items():
         name = class_of[row["instance_token"]]
@@ -124,26 +124,17 @@ def _velocity(token: str, annotations: Mapping[str, Row], samples: Mapping[str, 
 def _ego_places(folder: Path, wanted: Mapping[str, Row]) -> dict[str, np.ndarray]:
     """Return the place of the ego vehicle over ground at each sample's lidar sweep."""
     # Places are those of the ego vehicle at the sweep of the top lidar
-    lidars = {token for token, row in _table(folder, "sensor").items() if row["channel"] == "LIDAR_TOP"}
-    mounted = {
-        token for token, row in _table(folder, "calibrated_sensor").items() if row["sensor_token"] in lidars
+    lidars = {
+        token for token, row in read_table(folder / "sensor.json").items() if row["channel"] == "LIDAR_TOP"
     }
-    poses = _table(folder, "ego_pose")
+    mounted = {
+        token
+        for token, row in read_table(folder / "calibrated_sensor.json").items()
+        if row["sensor_token"] in lidars
+    }
+    poses = read_table(folder / "ego_pose.json")
     return {
         row["sample_token"]: np.array(poses[row["ego_pose_token"]]["translation"][:2], dtype=np.float64)
-        for row in _table(folder, "sample_data").values()
+        for row in read_table(folder / "sample_data.json").values()
         if row["is_key_frame"] and row["sample_token"] in wanted and row["calibrated_sensor_token"] in mounted
     }
-
-
-def _table(folder: Path, name: str) -> dict[str, Row]:
-    path = folder / f"{name}.json"
-    try:
-        rows = json.loads(path.read_text("utf-8-sig"))
-        if not isinstance(rows, list):
-            raise TypeError("not a list of rows")
-        return {row["token"]: row for row in rows}
-    except OSError as error:
-        raise InputError(f"{path}: {error.strerror or error}") from error
-    except (ValueError, TypeError, KeyError, RecursionError) as error:
-        raise InputError(f"{path}: not a table of nuScenes") from error
