@@ -110,7 +110,7 @@ def _record_egos(
     workers: int,
     ray: bool,
 ) -> None:
-    """Record virtual egos of each town and seed, and print what became of them.
+    """Record virtual egos of each town and seed, and print the results.
 
     Raises:
         InputError: some failed.

@@ -113,6 +113,7 @@ def _train_agent(
         from foredrive.runs import train_run
 
     run = train_run(recipe, logs, out, cache, start, strategy)
+    # Without torchrun, or in its first process
     if not rank():
         print(f"trained {run.recipe.name}: {run.weights}")
         print(f"next: foredrive evaluate {out} --logs ...")
@@ -127,7 +128,7 @@ def _probe(
     cache: Path | None,
     start: Path | None,
 ) -> None:
-    """Train heads on a frozen world model: that of another run, or one that is trained first."""
+    """Train heads on a frozen world model, either of another run or of a run that is trained first."""
     with importing():
         from foredrive.runs import train_run
         from foredrive.runs.train.tasks import TASKS, probe_run, train_heads
@@ -143,7 +144,7 @@ def _probe(
 
 
 def _plain(recipe: str, occupancy: Occupancy, settings: Settings) -> "Recipe[Any, Any]":
-    """Return the recipe that is named."""
+    """Return the recipe of a name."""
     with importing():
         from foredrive.methods.recipe import with_occupancy_source
         from foredrive.runs.recipes.known import find_recipe
@@ -154,7 +155,7 @@ def _plain(recipe: str, occupancy: Occupancy, settings: Settings) -> "Recipe[Any
 def _with_heads(
     recipe: str, occupancy: Occupancy, tasks: str, settings: Settings
 ) -> "tuple[Recipe[Any, Any], TaskHeadsRecipe]":
-    """Return the recipe that is named, and that of its heads; settings of `tasks.` are theirs."""
+    """Return the recipe of a name and the recipe of its heads. Settings with `tasks.` belong to the heads."""
     with importing():
         from foredrive.runs.recipes.task_heads import heads_for, with_settings
 
