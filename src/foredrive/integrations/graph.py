@@ -104,7 +104,9 @@ MEANING = {
 
 
 class AgentGraph(nn.Module):
-    """An agent between plain tensors. No step depends on the values of the data, so it can be traced.
+    """An agent with plain tensors as inputs and outputs.
+
+    No operation depends on the values of the data, so that it can be traced.
 
     Args:
         agent: in evaluation mode.
@@ -156,6 +158,7 @@ class AgentGraph(nn.Module):
             speed_valid=frame_speed_valid,
         )
         now = model.encode(frames)
+        # The planner may need more imagined frames than the graph returns; these are dropped below
         beliefs = [now, *model.imagine(now, max(self.steps, planner.imagined_frames))]
         volume = self.agent.planner_volume
         future = volume(beliefs[1]) if planner.imagined_frames else None
