@@ -1,4 +1,4 @@
-"""Making a trained run part of the package (`runs.shipped`)."""
+"""Add a trained run to the models of the package (`runs.shipped`)."""
 
 import dataclasses
 import json
@@ -91,6 +91,7 @@ def ship(run: Run, name: str, test: Sequence[LogPath], data: str, limits: str, m
                 shutil.copyfile(run.folder / file, temporary / file)
         save_recipe(run.recipe, temporary / CONFIG)
         (temporary / LOGS).write_text(json.dumps({"logs": [], "cache_dir": "cache", "start": None}))
+        # Evaluate the model from the files that are shipped, before they appear in the package
         small = dataclasses.replace(run, folder=temporary, logs=())
         with tempfile.TemporaryDirectory() as folder:
             evaluate_run(small, test, Path(folder), views=False)
@@ -112,14 +113,14 @@ def ship_driver(
 ) -> Path:
     """Write a trained driver as a model of the package; return its folder.
 
-    Both the run and the model, whose weights have 8 bits, see the test logs and drive the routes; their
-    figures are on the card.
+    Both the run and the model, whose weights have 8 bits, are evaluated on the test logs and drive the
+    routes. The card shows the figures of both.
 
     Args:
         name: name of the model.
         test: logs with lights and boxes.
         routes: what is driven.
-        work: folder of drives and caches, where an interrupted call goes on.
+        work: folder of drives and caches, from which an interrupted call continues.
         data: the training and test data, in one sentence.
         limits: what the driver cannot do, in a sentence or two.
         models: folder of all models.
@@ -148,6 +149,7 @@ def ship_driver(
                 for title, (key, count) in DRIVE_FIGURES.items()
             }
         )
+    # Per figure: the run as trained, then the model as shipped
     figures = {title: (both[0][title], both[1][title]) for title in both[0]}
     commit = str(collect_provenance()["commit"])
     card = ModelCard(name, run.recipe.name, commit, data, len(clips), 0, figures, limits)
