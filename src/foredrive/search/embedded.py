@@ -204,6 +204,7 @@ def _load_weights(model: nn.Module, file: Path) -> dict[str, Tensor]:
     """Load weights into a model. Return the other entries of the file."""
     try:
         state = load_file(file)
+        # Entries that are not the model's own, such as the mean of the texts; the rest has to fit exactly
         rest = {name: state.pop(name) for name in state.keys() - model.state_dict().keys()}
         model.load_state_dict(state)
     except (OSError, SafetensorError, RuntimeError) as error:

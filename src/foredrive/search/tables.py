@@ -37,6 +37,7 @@ def find_table(uri: str, name: str) -> "Table | None":
     Raises:
         InputError: the table cannot be read.
     """
+    # Opening a database in a local folder would create the folder
     if "://" not in uri and not (Path(uri) / f"{name}.lance").exists():
         return None
     try:
