@@ -128,6 +128,7 @@ def draw_drive_path(ax: Axes, log: Log) -> None:
     """Draw the driven path over the map, north up, with a dot at its start."""
     xy = log.T_world_ego[:, :2, 3]
     start_path_map(ax, xy, MARGIN_M, MIN_HALF_WIDTH_M)
+    # Map patches have this radius, so their centres need not be closer
     for frame in _frames_every(xy, RADIUS_M):
         patch = read_map_patch(log, frame)
         for kind, width in MAP_LINES.items():

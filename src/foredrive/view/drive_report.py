@@ -104,6 +104,7 @@ def write_drive_report(out: Path, shown: int | None = None, safety: Table | None
     Raises:
         InputError: the folder holds no suite whose drives are all complete.
     """
+    # The metrics may not be in place yet: they can be held back to appear with this report
     if not latest(out / SUMMARY).is_file():
         raise InputError(f"{out}: not a suite of drives (no {SUMMARY})")
     title = suite_title(out)

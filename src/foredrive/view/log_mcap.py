@@ -88,6 +88,7 @@ def _write_sensors(mcap: _Mcap, log: Log, frame: int) -> None:
             continue
         size_hw = (camera.height, camera.width)
         read = read_camera(log, frame, camera, size_hw, with_image=False)
+        # Image and calibration carry the time of exposure; the message is logged at its frame's time
         exposed_us = t_us + round(read.exposed_dt_s * 1e6)
         mounted = torch.from_numpy(camera_mount(log, camera))
         own = foxglove.camera_frame(name)
