@@ -96,6 +96,7 @@ def camera_ids(cameras: list[CameraSpec]) -> list[tuple[CameraSpec, CameraID]]:
     taken = {by_name[camera.name]: camera for camera in cameras if camera.name in by_name}
     unnamed = [camera for camera in cameras if camera.name not in by_name]
     left_over = []
+    # From front to back, so that side cameras are numbered in this order
     for camera in sorted(unnamed, key=lambda c: abs(azimuth[c.name])):
         angle = azimuth[camera.name]
         if abs(angle) <= _AHEAD_RAD:
