@@ -21,7 +21,7 @@ WHILE_WRITING = "while writing "
 
 _HOST = re.sub(r"\W", "_", socket.gethostname())
 _SCRATCH = re.compile(rf"\.(?P<final>.+)\.{_HOST}-(?P<process>\d+)-[^.]*\.part")
-"""Name of a scratch folder of this machine: what is written, and the process that writes it."""
+"""Name of a scratch folder of this machine, with the final name and the process that writes."""
 _TOGETHER, _CLAIMED = "together", " (claimed)"
 """Name of the scratch folder of files that appear together, and end of the name of one that is a claim."""
 _REPLACED = "replaced"
@@ -116,6 +116,7 @@ def together(folder: Path) -> Iterator[None]:
     """
     make_folder(folder)
     scratch, lock = _new_scratch(folder / _TOGETHER, alone=False)
+    # From here `atomic_path` collects the files of this folder in the scratch folder
     held_back = _HeldBack(folder.absolute(), scratch)
     before = _held_back.set(held_back)
     try:
@@ -258,7 +259,7 @@ def _folders_below(folder: Path) -> Iterator[Path]:
 
 
 def _new_scratch(final: Path, alone: bool) -> tuple[Path, int | None]:
-    """Make a scratch folder; return it and its lock, which tells others that its process lives."""
+    """Create a scratch folder. Return it and its lock, which shows other processes that its owner lives."""
     among = None
     # The parent is locked until the new folder has its own lock. Otherwise another process could take the
     # new folder for abandoned. A scratch folder as parent is locked by this process already

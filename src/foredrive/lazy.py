@@ -1,4 +1,4 @@
-"""Packages that import their modules on first use, so that a command imports only what it needs."""
+"""Packages that import their modules on first use, so that a command imports only the modules it needs."""
 
 import contextlib
 import gc

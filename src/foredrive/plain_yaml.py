@@ -69,7 +69,7 @@ def parse_yaml(text: str, *, as_text: bool = False) -> Any:
 
 
 def _count_values(node: yaml.Node, counts: dict[int, int]) -> int:
-    """Return how many values a node stands for once all aliases are replaced by what they name.
+    """Return the number of values of a node when all aliases are replaced by their values.
 
     Args:
         node: the node.

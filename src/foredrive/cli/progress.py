@@ -25,7 +25,7 @@ def progress_lines(
     """Write a line with a text and the time since the beginning, repeatedly until the block ends.
 
     Args:
-        text: what is being done, and how far it is.
+        text: returns the activity and its progress.
         every_s: time between two lines, s.
         write: receives a line; by default it is printed on stderr.
     """

@@ -46,10 +46,10 @@ def train(
             that towns record, visible or not. A run with recorded labels is evaluated with them, others with
             those of the frame's sweep.
         start: Another run's folder, or a model that comes with the package (embedded:nemo_town): use its
-            pre-trained weights and begin with fine-tuning. For a driver, the run of another: go on from its
-            weights, and draw clips in which it is wrong more often. With --probe, use its world model and
-            planner as they are. With --set transfer=frozen, keep its world model and its heads as they are
-            and train the planner alone.
+            pre-trained weights and begin with fine-tuning. For a driver, the run of another driver: continue
+            from its weights, and draw clips in which it is wrong more often than others. With --probe, use
+            its world model and planner unchanged. With --set transfer=frozen, keep its world model and its
+            heads unchanged and train only the planner.
         tasks: Tasks to train heads for, separated by commas: detection, tracking, map, motion, occupancy.
             Fine-tuning trains them together with the world model. With --probe also instances: the vehicles'
             cells now and in imagined key frames.
@@ -159,6 +159,7 @@ def _with_heads(
     with importing():
         from foredrive.runs.recipes.task_heads import heads_for, with_settings
 
+    # Settings of the heads apply to the recipe of the heads, which depends on the chosen recipe
     of_recipe, of_heads = _split(settings)
     chosen = _plain(recipe, occupancy, of_recipe)
     return chosen, with_settings(heads_for(chosen, tasks.split(",")), of_heads)

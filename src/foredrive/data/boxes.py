@@ -192,6 +192,7 @@ def _recorded_labels(log: Log, frame: int, kept: Bool[np.ndarray, "K"]) -> dict[
     if attribute is not None:
         out["attribute"] = _of_boxes(log, frame, "attributes", attribute, kept)
     if share is not None:
+        # From the visible share to nuScenes' levels 1 to 4
         level = torch.bucketize(share, torch.tensor(LEVELS_FROM), right=True) + Visibility.V0_40
         level = level.where(share.isfinite(), UNKNOWN)
         out["visibility"] = _of_boxes(log, frame, "visibilities", level, kept)

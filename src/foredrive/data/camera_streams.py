@@ -93,6 +93,7 @@ def camera_ids(cameras: list[CameraSpec]) -> list[tuple[CameraSpec, CameraID]]:
     if len(azimuth) < len(cameras):
         raise InputError(f"camera names are not unique: {[c.name for c in cameras]}")
     by_name = CameraID.__members__
+    # Cameras with a name of 123D keep that id; the others share what is left
     taken = {by_name[camera.name]: camera for camera in cameras if camera.name in by_name}
     unnamed = [camera for camera in cameras if camera.name not in by_name]
     left_over = []

@@ -25,7 +25,7 @@ _MORE_NAMES = {
     Category.OTHER: "tram misc unknown debris static_object movable_object emergency_other",
 }
 """Names of KITTI, Lyft Level 5, ONCE, A2D2, ApolloScape, BDD100K and others that py123d's labels lack. A
-rider stands for the cycle, as in KITTI."""
+rider counts as the cycle, as in KITTI."""
 
 
 @functools.cache

@@ -109,6 +109,7 @@ class ClipDataset(Dataset[Example]):
                 check_recorded_occupancy(log)
         frames = [self._sensed_now(number, _clip_frames(log, config)) for number, log in enumerate(self.logs)]
         self._clip_frames = np.concatenate(frames)
+        # For each clip the number of its log
         self._clip_logs = np.repeat(np.arange(len(self.logs)), [len(of_log) for of_log in frames])
         if not len(self):
             raise InputError(f"{logs[0].folder}: none of the selected parts is long enough for a clip")
@@ -200,7 +201,7 @@ class ClipDataset(Dataset[Example]):
         return float(np.nan_to_num(log.speed_mps[now])), self._future(log, now)
 
     def truth(self, index: int) -> TaskTruth | None:
-        """Read the truth of a clip alone. Return None if none was asked for.
+        """Read only the ground truth of a clip. Return None if the configuration requests none.
 
         Raises:
             InputError: data cannot be read.

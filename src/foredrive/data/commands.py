@@ -33,6 +33,7 @@ def command_at(log: Log, frame: int, future: Trajectory) -> tuple[Command | None
         InputError: the route cannot be read.
     """
     lateral_m = _route_offset_m(log, frame)
+    # A provided route comes first; the driven future tells an agent where the vehicle will go
     if lateral_m is not None:
         return command_of(lateral_m), "route"
     valid = future.valid[0].numpy()

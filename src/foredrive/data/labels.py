@@ -146,6 +146,7 @@ def _flow(
     flow = np.zeros((3, *occupied.shape), dtype=np.float32)
     if boxes is None:
         return flow, np.zeros_like(occupied)
+    # In an annotated frame, occupied voxels outside of all boxes are static
     known = occupied.copy()
     boxes = boxes[boxes.valid]
     box = box_of_points(

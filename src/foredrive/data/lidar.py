@@ -102,6 +102,7 @@ def _returns(log: Log, frame: int, lidar: Lidar, origins: Float[np.ndarray, "N 3
         since = lidar.timestamps - log.t_us[frame]
         if (np.abs(since) <= _MAX_SWEEP_US).all():  # Some data sets use another clock for point times
             dt_us = since.astype(np.float64)
+    # Recorded origins are exact; otherwise they follow from the mount and the driven path
     if origins is None:
         origins = _origins(log, frame, lidar, dt_us)
     if len(origins) != count:

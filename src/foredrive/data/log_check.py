@@ -260,6 +260,7 @@ def _ground_level(points_m: Float[np.ndarray, "N 3"]) -> float | None:
     near_m = points_m[(distance_m > NEAR_GROUND_M[0]) & (distance_m < NEAR_GROUND_M[1])]
     if len(near_m) <= MIN_GROUND_POINTS:
         return None
+    # Cells of one metre cover the square around the circle of the largest distance
     side = 2 * int(NEAR_GROUND_M[1]) + 2
     # The lowest point of each square metre, in a flat table of cells
     cell = np.floor(near_m[:, :2]).astype(np.int64) + side // 2

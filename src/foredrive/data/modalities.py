@@ -64,6 +64,7 @@ def pack_beams(sweep: LidarSweep) -> dict[str, Any]:
             f"a lidar sweep has {len(origins)} different beam origins, at most 65535 can be stored"
         )
     which = which.reshape(-1).astype(np.uint16)
+    # Origins are indexed over all valid beams, then split into returns and misses
     is_return = returned[returned | missed]
     return {
         "origin_steps": squeeze_array(origins),

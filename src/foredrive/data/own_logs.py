@@ -116,8 +116,8 @@ def write_log(
         lidar_position_m: of the lidar, in the ego frame.
         boxes: labels at each frame. None where a frame is not annotated, empty where nothing is there.
         vehicle: size of the recording vehicle.
-        path: times [P] and poses [P, 4, 4] of the vehicle at a higher rate. They tell where it was when
-            images and points between the frames were measured. Default: those of the frames.
+        path: times [P] and poses [P, 4, 4] of the vehicle at a higher rate. They give its pose at the times
+            of images and points between the frames. Default: those of the frames.
         split: a name that ends in _train, _val or _test.
         tick: called after each frame.
 
@@ -131,6 +131,7 @@ def write_log(
     if path is not None:
         denser = _Drive.of(f"{name}, path", *(np.asarray(values, np.float64) for values in path))
         drive = dataclasses.replace(drive, denser=denser)
+    # All checks that need no file come before the first frame is written
     _check_cameras(name, cameras)
     images, image_t_s = images or {}, image_t_s or {}
     given: dict[str, Sequence[Any] | np.ndarray | None] = {"sweeps": sweeps, "boxes": boxes, **image_t_s}
@@ -155,6 +156,7 @@ def write_log(
                 sweep=None if points is None else _sweep(points, drive, frame, lidar_position_m, where),
                 boxes=None if labels is None else _boxes(labels, where),
                 exposed={camera: times[frame] for camera, times in exposed.items()},
+                # The beams that did not return are unknown
                 misses_known=False,
             )
             writer.write(sensed)

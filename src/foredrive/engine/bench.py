@@ -37,7 +37,7 @@ class Benchmark:
     measured and stored separately, and its figures are reported as figures of ARM."""
     seeds: tuple[int, ...] = (0, 1, 2)
     config: Mapping[str, Any] | None = None
-    """Values that the figures depend on beside the code, JSON-able; other values start the benchmark anew."""
+    """Values that the figures depend on besides the code, JSON-able. Changed values restart the benchmark."""
     decided_by: tuple[str, ...] | None = None
     """Modules and packages whose code decides the figures of a study of quality, by full name. None: the
     figures are speeds, which depend on commit and machine."""

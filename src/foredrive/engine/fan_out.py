@@ -39,7 +39,7 @@ LAST_WORDS_S = 60.0
 """Maximum time for Ray's tasks to remove their unfinished files, s."""
 
 _DEATHS_ON_RAY = ("WorkerCrashedError", "OutOfMemoryError", "NodeDiedError", "LocalRayletDiedError")
-"""Names of ray.exceptions that stand for the death of a task's process; Ray is slow to import."""
+"""Names of the ray.exceptions that report the death of a task's process. Ray itself is slow to import."""
 _log = logging.getLogger(__name__)
 J = TypeVar("J")
 R = TypeVar("R")
@@ -82,7 +82,7 @@ def fan_out(
 
 
 def reason(name: str, error: BaseException) -> str:
-    """Return in one line why a job failed.
+    """Return the reason of a job's failure in one line.
 
     Raises:
         BaseException: the error itself, if the job did not cause it: a full disk, an interruption.
@@ -141,7 +141,7 @@ def _start_worker(stop: Connection) -> None:
     """Set up a worker: stop when the parent closes its end of the pipe, and by Ctrl-C and SIGTERM.
 
     The worker removes its unfinished files when it stops. The pool ends the workers, unless the parent was
-    killed: then a worker ends by itself.
+    killed: then each worker ends on its own.
     """
     rich.get_console().quiet = True  # The parent shows the progress
     main = threading.get_ident()

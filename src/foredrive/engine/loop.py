@@ -200,6 +200,7 @@ def train(
         steps = _Steps(
             model, fabric.setup_optimizers(optimizer), StepBuffers(objective), schedule, total, fabric
         )
+        # The loader yields the parts of all steps of this process one after the other
         examples = iter(loader)
         with step_counter(
             folder,
@@ -289,7 +290,7 @@ def _loader(
 
 @dataclass(frozen=True)
 class _Steps:
-    """What a step needs besides its data."""
+    """The model, optimizer and settings that a step needs besides its data."""
 
     model: "_FabricModule"
     optimizer: Any
@@ -387,7 +388,7 @@ def check_finite(losses: dict[str, Tensor], step: int, source: str) -> None:
 
 
 def _not_finite(losses: dict[str, Tensor], step: int, source: str) -> str | None:
-    """Return what is wrong with the losses of a step; None if they are finite."""
+    """Return a message if a loss of a step is not finite, else None."""
     if bool(torch.stack([value.detach() for value in losses.values()]).isfinite().all()):
         return None
     values = ", ".join(f"{name} = {value.item():g}" for name, value in losses.items())

@@ -40,7 +40,7 @@ def gathered(value: T, fabric: "Fabric") -> list[T]:
 
 @contextlib.contextmanager
 def entered_by_first(context: AbstractContextManager[None], fabric: "Fabric") -> Iterator[None]:
-    """Enter a context in the first process alone. The others go on when it has been entered.
+    """Enter a context in the first process only. The others continue when it has been entered.
 
     Raises:
         InputError: the context raised it; every process does.

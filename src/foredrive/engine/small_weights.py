@@ -40,7 +40,7 @@ def _in_8_bits(value: Float[Tensor, "..."]) -> tuple[Int8[Tensor, "..."], Float[
 
 
 def full_precision(saved: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Return the weights of a file in 32 bits. Those of other files are returned as they are."""
+    """Return 8-bit weights of a file as 32-bit values. All other weights are returned unchanged."""
     return {
         name: value.float() * saved[name + SCALE] if name + SCALE in saved else value
         for name, value in saved.items()

@@ -1,4 +1,4 @@
-"""Messages of Foxglove's schemas (protocol buffers), made of the types of `scene`.
+"""Messages of Foxglove's schemas (protocol buffers), converted from the types of `scene`.
 
 Source: docs.foxglove.dev/docs/visualization/message-schemas. The package `foxglove-schemas-protobuf` has the
 compiled messages. Frames: "world", "ego", and "camera/NAME" with z ahead. Pixel centres are at whole numbers

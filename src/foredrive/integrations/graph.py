@@ -144,6 +144,7 @@ class AgentGraph(nn.Module):
             K=K,
             T_ego_cam=T_ego_cam,
             dist=dist,
+            # The graph has no input for the readout time: a global shutter
             readout_s=torch.zeros_like(dist[..., 0]),
             names=self.camera_names,
             size_hw=self.image_hw,
@@ -162,6 +163,7 @@ class AgentGraph(nn.Module):
         beliefs = [now, *model.imagine(now, max(self.steps, planner.imagined_frames))]
         volume = self.agent.planner_volume
         future = volume(beliefs[1]) if planner.imagined_frames else None
+        # The same arguments as in `PlanningAgent.forward`, from plain tensors in place of a clip
         plan = planner(
             volume(now),
             future,

@@ -59,7 +59,7 @@ DRIVE_FIGURES = {
     "red lights in 100 routes": ("red_lights", 100),
     "collisions in 100 routes": ("collisions", 100),
 }
-"""Rows of a driver's card by their keys, of what it sees, and of its drives with a factor."""
+"""Rows of a driver's card by their keys: those of its perception, and those of its drives with a factor."""
 
 
 def ship(run: Run, name: str, test: Sequence[LogPath], data: str, limits: str, models: Path = MODELS) -> Path:
@@ -83,6 +83,7 @@ def ship(run: Run, name: str, test: Sequence[LogPath], data: str, limits: str, m
     with atomic_path(models / name) as temporary:
         weights = temporary / run.weights.relative_to(run.folder)
         _save(load_agent(run), weights)
+        # The baselines are shipped, because they are fitted to training logs, which are not
         baselines = Baselines(*run_baselines(run.folder, run.logs, run.recipe, run.cache_dir, past))
         save_small(baselines, temporary / baselines_file(past))
         for file in (RIGS, f"{TASKS}/{PRIORS}"):
@@ -119,7 +120,7 @@ def ship_driver(
     Args:
         name: name of the model.
         test: logs with lights and boxes.
-        routes: what is driven.
+        routes: the routes to drive.
         work: folder of drives and caches, from which an interrupted call continues.
         data: the training and test data, in one sentence.
         limits: what the driver cannot do, in a sentence or two.

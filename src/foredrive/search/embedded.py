@@ -143,6 +143,7 @@ def load_towers(folder: Path) -> Towers:
     base = _load_base(folder, card)
     if card.lidar is None:
         return base
+    # A lidar tower fits only the embeddings of the image tower that it was trained with
     if base.fingerprint != card.base_fingerprint:
         raise InputError(
             f"{folder}: the lidar tower was trained beside {card.text} with other weights or another crop of "

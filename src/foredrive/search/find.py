@@ -215,6 +215,7 @@ def _rank(rows: pa.Table, query: Query, target: Target | None) -> Float[ndarray,
     score = np.zeros(len(rows)) if target is None else _likeness(rows, query, target)
     if query.by is None:
         return score
+    # Similarities and the column have different scales, so both are mixed as ranks
     wanted = _column(rows, query.by).astype(float)
     mix = query.mix if target is not None else 1.0
     return (1 - mix) * _by_rank(score) + mix * _by_rank(wanted)

@@ -43,7 +43,7 @@ def mean_of_groups(
 
 
 def draw_sequences(sequences: int, draws: int, seed: int) -> Int[np.ndarray, "B S"]:
-    """Return all sequences as they are, then draws with replacement (Efron & Tibshirani 1993, chapter 6)."""
+    """Return each sequence once, then draws with replacement (Efron & Tibshirani 1993, chapter 6)."""
     drawn = np.random.default_rng(seed).integers(sequences, size=(draws, sequences))
     return np.concatenate([np.arange(sequences)[None], drawn])
 

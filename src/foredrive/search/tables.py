@@ -19,7 +19,7 @@ _TROUBLE = (ValueError, RuntimeError, OSError)
 
 
 def connect(uri: str) -> "DBConnection":
-    """Connect to the tables in a folder or on object storage ("s3://…"), which has its own credentials.
+    """Connect to the tables in a folder or on object storage ("s3://…"), whose credentials are set elsewhere.
 
     Raises:
         InputError: LanceDB is not installed.

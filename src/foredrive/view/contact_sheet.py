@@ -52,6 +52,7 @@ def write_contact_sheet(path: Path, drives: Sequence[tuple[LogPath, str]]) -> No
     width = TEXT_PX + THUMBNAILS * (cell_w + GAP_PX) + cell_h + 2 * GAP_PX
     height = HEAD_PX + len(chosen) * row_h
     sheet = Sheet(width, height)
+    # All names get one font size, at which the longest fits into its column
     longest = max(len(drives[index][0].folder.name) for index in chosen)
     name_pt = min(MAX_NAME_PT, PT_PER_PX * TEXT_PX / longest)
     commanded: Counter[str] = Counter()

@@ -69,6 +69,7 @@ def draw_example(shown: ExamplePrediction) -> ExamplePanel:
         plan=_plan(shown),
         tasks=task_pictures(shown, front_camera(clip)),
         cameras=cameras,
+        # Two or four images make full rows of two, other numbers look better in rows of three
         camera_columns="two" if len(next(iter(cameras.values()), [])) in (2, 4) else "three",
         occupancy=[
             picture(predicted_voxels(shown, 0), f"Predicted occupancy, {_content_text(shown, 0)}"),

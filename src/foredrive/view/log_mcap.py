@@ -111,6 +111,7 @@ def _write_labels(mcap: _Mcap, log: Log, frames: LogFrames, index: int, frame: i
     driven = log.driven_future(frame, DRIVEN_STEPS, DRIVEN_S)
     mcap.write("/driven", t_us, foxglove.path_message(t_us, driven))
     here = log.T_world_ego[frame, :3, 3]
+    # A map patch is written only where the vehicle has left the middle of the last one
     if mcap.map_at is None or np.linalg.norm(here - mcap.map_at) > MAP_STEP_M:
         mcap.map_at = here
         _write_map(mcap, log, frame)

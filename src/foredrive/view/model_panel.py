@@ -150,6 +150,7 @@ def show_flow(
 def arrows(start: Float[Tensor, "N 3"], end: Float[Tensor, "N 3"]) -> Float[Tensor, "N3 2 3"]:
     """Return three segments for each of N arrows with flat heads, the shaft first."""
     along = end - start
+    # Horizontally across the arrow, as long as the arrow seen from above
     across = torch.stack([-along[:, 1], along[:, 0], torch.zeros_like(along[:, 0])], dim=-1)
     back = end - HEAD_SHARE * along
     heads = [back + 0.5 * HEAD_SHARE * across, back - 0.5 * HEAD_SHARE * across]

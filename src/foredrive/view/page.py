@@ -93,7 +93,7 @@ def _bounded() -> Iterator[None]:
 
 
 def _open_server(label: str, host: str, port: int) -> viser.ViserServer:
-    """Serve an empty dark page, seen from behind and above the ego vehicle; it has its own threads."""
+    """Serve an empty dark page in threads of the server, seen from behind and above the ego vehicle."""
     port = free_port(host, port)  # With a host that does not exist, viser would wait
     with contextlib.redirect_stdout(io.StringIO()), _bounded():  # viser prints a greeting
         server = viser.ViserServer(host=host, port=port, label=label, verbose=False)

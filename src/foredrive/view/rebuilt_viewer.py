@@ -113,6 +113,7 @@ class RebuiltPictures:
     def _show_own_view(self, client: viser.ClientHandle) -> None:
         assert self._shown is not None
         camera, shown = client.camera, self._shown
+        # All nodes of the page are in the ego frame, so the browser's camera is too
         T_ego_cam = np.eye(4)
         T_ego_cam[:3, :3], T_ego_cam[:3, 3] = SO3(camera.wxyz).as_matrix(), camera.position
         rig = pinhole(T_ego_cam, camera.fov, camera.aspect, OWN_HEIGHT_PX)
@@ -136,9 +137,9 @@ NOTE_S = 8.0
 class RebuiltViewer(Page):
     """A page with a slider for time, sensors rendered at that time, and edits.
 
-    The browser draws the Gaussians' albedo by itself. Sensor images are rendered in the background, the
-    newest time first, so that the slider never waits. All nodes are in the ego frame at the time shown. The
-    server runs in its own threads until `close`.
+    The browser itself draws the Gaussians' albedo. Sensor images are rendered in the background, the newest
+    time first, so that the slider never waits. All nodes are in the ego frame at the time shown. The server
+    runs in its own threads until `close`.
 
     Args:
         run: the shown reconstruction.

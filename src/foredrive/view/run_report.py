@@ -34,7 +34,7 @@ COMMAND_SOURCES = {
     "none": "Unknown commands",
 }
 REFERENCES = ("ego_mlp", "constant_velocity")
-"""Baselines of planning: the first that was evaluated stands beside the model in the tiles."""
+"""Baselines of planning. The tiles compare the model with the first one that was evaluated."""
 MAX_NAMED_FAILURES = 5
 
 

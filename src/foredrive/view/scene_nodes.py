@@ -80,6 +80,7 @@ def show_camera(scene: viser.SceneApi, rig: CameraRig, index: int, image: UInt8[
     pose = rig.T_ego_cam[index].double().numpy()
     scene.add_camera_frustum(
         f"{CAMERAS}/{rig.names[index]}",
+        # The vertical field of view, for a principal point in the middle
         fov=2 * float(np.arctan(height / 2 / float(rig.K[index, 1, 1]))),
         aspect=width / height,
         scale=FRUSTUM_M,

@@ -140,6 +140,7 @@ def occupancy_table(summary: Summary) -> Table | None:
             rows.append(Row([time_title(when), *cells]))
         sections.append(Section(rows, title))
     notes = [ABOVE_NOTE, BASELINES_NOTE]
+    # Other columns than baselines are best and mean of sampled futures
     if not set(others) <= BASELINE_TITLES.keys():
         notes.append(FUTURES_NOTE)
     return Table(columns, sections, "Occupancy on known voxels", notes)

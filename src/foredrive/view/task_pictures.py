@@ -121,6 +121,7 @@ def found_agents(agents: Agents) -> SeenAgents:
     if agents.future_xy is not None and agents.log_prob is not None:
         for n, (modes, log_prob) in enumerate(zip(agents.future_xy, agents.log_prob, strict=True)):
             alternatives = zip(modes.numpy(), log_prob.exp().tolist(), strict=True)
+            # The likeliest future is kept however small its probability is
             likeliest = float(log_prob.exp().max())
             futures[n] = [(mode, p) for mode, p in alternatives if p >= min(MIN_PROBABILITY, likeliest)]
     return SeenAgents(boxes, names, futures)
@@ -178,6 +179,7 @@ def scene_picture(scene: SeenScene, spec: VoxelSpec) -> UInt8[ndarray, "H W 3"]:
     """Draw road users with names and futures, and map elements, from above; the model's grid is framed."""
     figure = Figure(figsize=FIGURE_IN, dpi=DPI, facecolor=palette.GROUND)
     ax = figure.add_axes((0.125, 0.17, 0.855, 0.79))
+    # The view is square and centred on the ego vehicle, the grid may not be
     reach_m = max(*(abs(corner) for corner in (*spec.lower_m[:2], *spec.upper_m[:2]))) + 2.0
     start_bev(ax, reach_m)
     (x0, y0, _), (x1, y1, _) = spec.lower_m, spec.upper_m

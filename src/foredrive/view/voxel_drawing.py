@@ -46,6 +46,7 @@ class Viewpoint:
 
     def axes(self) -> Float[np.ndarray, "3 3"]:
         """Return the rows right, down and forward in the ego frame."""
+        # Right is level; down is across both
         forward = np.subtract(self.target_m, self.position_m)
         forward = forward / np.linalg.norm(forward)
         right = np.cross(forward, [0.0, 0.0, 1.0])
