@@ -1,8 +1,9 @@
 """The bounds of every page and server: connections, threads, and the time in which a request has to arrive.
 
-A client that is silent, or sends a byte at a time, costs a thread and a file. So a server has a largest
-number of connections. When it is reached, the connection that has kept the server waiting longest is closed
-for the next one: a client that sends its request without delay is answered beside any number of others.
+A client that is silent, or sends one byte at a time, holds a thread and a file descriptor. So the number of
+connections is limited. At the limit, the connection that has kept the server waiting longest is closed to
+make room for the next one. A client that sends its request without delay is therefore answered, however many
+slow clients there are.
 """
 
 import contextlib
@@ -24,7 +25,7 @@ REQUEST_S = 30.0
 SEND_S = 60.0
 """Time in which a client has to take the whole answer, s."""
 THREAD_S = 1.0
-"""Time in which the thread of a connection that was closed ends, s."""
+"""Time to wait for the thread of a closed connection to end, s."""
 BACKLOG = 512
 """Connections that the operating system keeps until they are accepted. Others try again after a second."""
 PART_BYTES = 2**16
@@ -35,10 +36,10 @@ _log = logging.getLogger(__name__)
 
 
 def refusal(headers: Mapping[str, str] | Message, host: str) -> str | None:
-    """Return why a request is refused that a page of another site makes through a browser; None if it is not.
+    """Return why a request is refused that a browser sends for a page of another site; None: it is allowed.
 
-    Such a page has its own name in Origin. A name that its owner points to this machine (DNS rebinding)
-    stands in Host.
+    The Origin header of such a request names the other site. With DNS rebinding, a name of the other site
+    resolves to this machine; then the Host header holds that name.
 
     Args:
         headers: the request's headers.
@@ -100,6 +101,7 @@ class BoundedServer(ThreadingHTTPServer):
         with self._lock:
             self._check_open(connection)
             self._held_bytes[connection] = size
+            # This connection may be the one that is closed, so it is checked again afterwards
             while sum(self._held_bytes.values()) > self._max_bytes and self._close_longest_waited_for():
                 pass
             self._check_open(connection)
@@ -107,16 +109,17 @@ class BoundedServer(ThreadingHTTPServer):
     def process_request(self, request: Any, client_address: Any) -> None:
         """Answer a connection in a thread of its own, or refuse it if all others are being worked for."""
         with self._lock:
+            # At the limit, close the slowest client. If no connection can be closed, refuse the new one
             is_full = len(self._held_bytes) >= MAX_CONNECTIONS and not self._close_longest_waited_for()
             if not is_full:
                 self._held_bytes[request] = 0
                 self._waited_for[request] = None
-        if not is_full and self._thread_slots.acquire(
-            timeout=THREAD_S
-        ):  # that of a closed connection ends at once
+        # A connection that was closed above still has its thread, which ends at once
+        if not is_full and self._thread_slots.acquire(timeout=THREAD_S):
             super().process_request(request, client_address)
             return
         with contextlib.suppress(OSError):
+            # Never wait for a refused client: this is the thread that accepts connections
             request.setblocking(False)
             request.send(_BUSY)
         self.shutdown_request(request)
@@ -135,7 +138,7 @@ class BoundedServer(ThreadingHTTPServer):
         super().shutdown_request(request)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """Log a mistake in the program; that a client has gone is none."""
+        """Log an error of the program. A client that disconnects is not an error."""
         error = sys.exc_info()[1]
         if not isinstance(error, OSError):
             _log.error("while answering %s", client_address, exc_info=error)
@@ -147,6 +150,7 @@ class BoundedServer(ThreadingHTTPServer):
             return False
         self._forget(connection)
         with contextlib.suppress(OSError):
+            # Only the connection is closed. Its thread, which may wait in recv, closes the socket itself
             connection.shutdown(socket.SHUT_RDWR)
         return True
 
@@ -167,16 +171,17 @@ class BoundedHandler(BaseHTTPRequestHandler):
     def setup(self) -> None:
         """Read from the connection until the time is over."""
         super().setup()
+        # Replace the reader of the base class, which has no deadline
         self.rfile.close()
         arriving = _UntilLate(self.connection, time.monotonic() + REQUEST_S)
         self.rfile = io.BufferedReader(arriving, PART_BYTES)
 
     def log_message(self, format: str, *args: Any) -> None:
-        """Log requests for debugging alone."""
+        """Log requests at the debug level only."""
         _log.debug(format, *args)
 
     def read_body(self, length: int) -> bytes:
-        """Return the body of a request; memory is taken for what has arrived."""
+        """Return the body of a request. Memory is allocated only for the bytes that have arrived."""
         body = bytearray()
         while len(body) < length:
             part = self.rfile.read1(min(length - len(body), PART_BYTES))
@@ -198,7 +203,7 @@ class BoundedHandler(BaseHTTPRequestHandler):
 
 
 class _UntilLate(io.RawIOBase):
-    """Reader of a connection up to a deadline. A time-out of the socket would begin anew with each byte."""
+    """Reader of a connection up to a deadline. A timeout of the socket alone would restart with each byte."""
 
     def __init__(self, connection: socket.socket, until_s: float) -> None:
         self._connection, self._until_s = connection, until_s
@@ -210,5 +215,6 @@ class _UntilLate(io.RawIOBase):
         left_s = self._until_s - time.monotonic()
         if left_s <= 0:
             raise TimeoutError("the request did not arrive in time")
+        # The timeout is what is left of the time of the whole request
         self._connection.settimeout(left_s)
         return self._connection.recv_into(buffer)

@@ -21,11 +21,11 @@ WHILE_WRITING = "while writing "
 
 _HOST = re.sub(r"\W", "_", socket.gethostname())
 _SCRATCH = re.compile(rf"\.(?P<final>.+)\.{_HOST}-(?P<process>\d+)-[^.]*\.part")
-"""Name of a scratch folder of this machine: what is written, and the process that writes it."""
+"""Name of a scratch folder of this machine, with the final name and the process that writes."""
 _TOGETHER, _CLAIMED = "together", " (claimed)"
 """Name of the scratch folder of files that appear together, and end of the name of one that is a claim."""
 _REPLACED = "replaced"
-"""Folder in a scratch folder into which the folders are moved that are replaced by what lies beside it."""
+"""Folder in a scratch folder. It takes the old folders that are replaced by the new ones beside it."""
 _writing: set[Path] = set()
 """Scratch folders of this process."""
 _tidied: set[Path] = set()
@@ -74,9 +74,9 @@ def atomic_path(final: Path, *, alone: bool = False, durable: bool = True) -> It
     Args:
         final: path of the file or folder.
         alone: whether to refuse if another process of this machine is writing the same path. It is for what
-            takes long to write; of small files the last one written stays.
-        durable: whether `final` is whole after a power cut too, once the block has ended. Entries of caches
-            need not be: they are many, and what is damaged is made anew.
+            takes long to write. Otherwise the version that is finished last remains.
+        durable: whether `final` is complete even after a power failure that follows the block. Entries of
+            caches need not be: they are many, and damaged ones are computed again.
 
     Raises:
         InputError: the parent folder cannot be created, or another process is writing `final`.
@@ -84,6 +84,7 @@ def atomic_path(final: Path, *, alone: bool = False, durable: bool = True) -> It
     final = Path(final)
     held_back = _held_back.get()
     with naming(final):
+        # In a block of `together` the file waits in the scratch folder of that block
         if held_back is not None and final.parent.absolute() == held_back.folder:
             with held_back.written(final.name) as temporary:
                 yield temporary
@@ -94,6 +95,7 @@ def atomic_path(final: Path, *, alone: bool = False, durable: bool = True) -> It
         try:
             yield temporary
             if durable:
+                # The content is on the disk before its final name is, and the name before the block ends
                 _flush(temporary)
             _put_in_place(scratch, final)
             if durable:
@@ -114,10 +116,12 @@ def together(folder: Path) -> Iterator[None]:
     """
     make_folder(folder)
     scratch, lock = _new_scratch(folder / _TOGETHER, alone=False)
+    # From here `atomic_path` collects the files of this folder in the scratch folder
     held_back = _HeldBack(folder.absolute(), scratch)
     before = _held_back.set(held_back)
     try:
         yield
+        # Find what cannot be put in place before anything is: all appear, or none
         for final in held_back.names:
             if (folder / final).is_dir() and not (scratch / final).is_dir():
                 raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(folder / final))
@@ -139,6 +143,8 @@ def latest(final: Path) -> Path:
 
 def _put_in_place(scratch: Path, final: Path) -> None:
     """Move what was written from its scratch folder to its final name. A folder replaces a folder."""
+    # A rename cannot replace a folder that has entries, so the old folder is moved away first.
+    # If the process is killed between the two renames, `_remove_abandoned` completes the replacement
     if (scratch / final.name).is_dir() and final.is_dir():
         (scratch / _REPLACED).mkdir(exist_ok=True)
         final.rename(scratch / _REPLACED / final.name)
@@ -157,6 +163,7 @@ class _HeldBack:
     @contextlib.contextmanager
     def written(self, name: str) -> Iterator[Path]:
         """Yield a path for a file or folder, which is held back if the block succeeds."""
+        # Written in a folder of its own, so that a failed second version leaves the first one in place
         half = Path(tempfile.mkdtemp(dir=self.scratch))
         try:
             yield half / name
@@ -168,6 +175,7 @@ class _HeldBack:
             shutil.rmtree(half, ignore_errors=True)
 
 
+# A context variable is not passed on to new threads: they write at once
 _held_back: ContextVar[_HeldBack | None] = ContextVar("held_back", default=None)
 
 
@@ -211,11 +219,12 @@ def _flush(path: Path) -> None:
 
 def _flush_entry(path: Path) -> None:
     """Flush one file, or the names in one folder."""
+    # O_NONBLOCK: opening a named pipe does not wait for its other end
     opened = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
     try:
         os.fsync(opened)
     except OSError as error:
-        if error.errno not in (errno.EINVAL, errno.ENOTSUP):  # the file system or device cannot
+        if error.errno not in (errno.EINVAL, errno.ENOTSUP):  # Not supported there
             raise
     finally:
         os.close(opened)
@@ -244,17 +253,21 @@ def remove_abandoned(folder: Path, *, below: bool = False) -> None:
 
 def _folders_below(folder: Path) -> Iterator[Path]:
     for parent, folders, _ in os.walk(folder):
+        # Do not walk into scratch folders: they belong to their writers
         folders[:] = [name for name in folders if _SCRATCH.fullmatch(name) is None]
         yield Path(parent)
 
 
 def _new_scratch(final: Path, alone: bool) -> tuple[Path, int | None]:
-    """Make a scratch folder; return it and its lock, which tells others that its process lives."""
+    """Create a scratch folder. Return it and its lock, which shows other processes that its owner lives."""
     among = None
-    if not _SCRATCH.fullmatch(final.parent.name):  # the lock of a scratch folder is this process' own
-        among = _lock(final.parent, wait=True)  # nobody takes the new folder for abandoned before its lock
+    # The parent is locked until the new folder has its own lock. Otherwise another process could take the
+    # new folder for abandoned. A scratch folder as parent is locked by this process already
+    if not _SCRATCH.fullmatch(final.parent.name):
+        among = _lock(final.parent, wait=True)
     try:
         _remove_abandoned(final.parent, again=alone)
+        # Folders of dead processes have just been removed, so what is left has a living writer
         for _, name in _scratch_folders(final.parent) if alone else ():
             if name["final"] == final.name:
                 written = str(final).removesuffix(_CLAIMED)
@@ -277,12 +290,14 @@ def _remove_abandoned(folder: Path, *, again: bool = False) -> None:
     for scratch, name in _scratch_folders(folder):
         try:
             lock = _lock(scratch)
-        except (BlockingIOError, FileNotFoundError):  # it is being written, or has just been finished
+        except (BlockingIOError, FileNotFoundError):  # Being written, or just finished
             continue
+        # A lock that can be taken has no owner. Without locks, the process number has to do
         if lock is not None or not _lives(int(name["process"])):
             for replaced in (scratch / _REPLACED).glob("*"):
                 final = folder / replaced.name
-                if not final.exists():  # killed between two renames
+                # Killed between two renames: the new folder is complete, so it takes its place
+                if not final.exists():
                     os.replace(scratch / replaced.name, final)
             shutil.rmtree(scratch, ignore_errors=True)
         _unlock(lock)
@@ -296,7 +311,7 @@ def _scratch_folders(folder: Path) -> list[tuple[Path, re.Match[str]]]:
 def _lock(folder: Path, *, wait: bool = False) -> int | None:
     """Lock a folder until the returned descriptor is closed, at the latest when this process ends in any way.
 
-    A process number would not do: in containers the next process often has that of the killed one.
+    A process number is no substitute: in containers the next process often has that of the killed one.
 
     Returns:
         None if the file system does not lock folders.
@@ -313,7 +328,7 @@ def _lock(folder: Path, *, wait: bool = False) -> int | None:
         if isinstance(error, BlockingIOError):
             raise
         return None
-    except BaseException:  # Ctrl-C while it waits
+    except BaseException:  # Ctrl-C during the wait
         os.close(lock)
         raise
     return lock
@@ -330,6 +345,6 @@ def _lives(process: int) -> bool:
         os.kill(process, 0)
     except ProcessLookupError:
         return False
-    except OSError:  # it belongs to someone else
+    except OSError:  # It belongs to another user
         pass
     return True

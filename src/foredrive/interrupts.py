@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM, which act alike, and are not lost in code that drops exceptions."""
+"""Ctrl-C and SIGTERM. Both interrupt, and neither is lost in code that drops exceptions."""
 
 import _thread
 import signal
@@ -42,9 +42,11 @@ class LastingInterrupt:
 
     def __call__(self, number: int, frame: "FrameType | None") -> None:
         """Handle a signal."""
+        # Repetitions, and with `once` further signals too, do not interrupt the handling of an exception
         again, self._asks_again = self._asks_again, False
         if (again or (self._once and self.pressed)) and sys.exc_info()[1] is not None:
             return
+        # From the first signal on, a thread repeats it in case that its exception is dropped
         if not self.pressed:
             self.pressed, self._number, self._main = True, number, threading.get_ident()
             threading.Thread(target=self._ask_again, daemon=True).start()
@@ -52,12 +54,15 @@ class LastingInterrupt:
             raise KeyboardInterrupt
 
     def _ask_again(self) -> None:
-        is_blocked = self._number in signal.pthread_sigmask(signal.SIG_BLOCK, ())  # as in the main thread
+        # A thread inherits the signal mask of the thread that starts it, here the main thread
+        is_blocked = self._number in signal.pthread_sigmask(signal.SIG_BLOCK, ())
         while not self._over.wait(PATIENCE_S):
             self._asks_again = True
+            # A blocked signal is not delivered, so Python's handler is called without one. A real signal
+            # is better where possible: it also wakes a main thread that sleeps or waits
             if is_blocked:
                 _thread.interrupt_main(signal.Signals(self._number))
-            else:  # also wakes a sleeping main thread
+            else:
                 signal.pthread_kill(self._main, self._number)
 
     def __enter__(self) -> "LastingInterrupt":
@@ -68,6 +73,7 @@ class LastingInterrupt:
             ]
         for number in self._installed:
             signal.signal(number, self)
+            # Python reports an exception that it drops here. A dropped KeyboardInterrupt is repeated instead
             sys.unraisablehook = self._ignored
         return self
 

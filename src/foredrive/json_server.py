@@ -86,7 +86,7 @@ class JsonServer:
 
     @property
     def address(self) -> Address:
-        """Return the address; its port is the one that was found if 0 was asked for."""
+        """Return the address. Its port is the one that the operating system chose if port 0 was requested."""
         host, port = self._server.server_address[:2]
         return Address(str(host), int(port))
 
@@ -107,7 +107,7 @@ class JsonServer:
             self.close()
 
     def close(self) -> None:
-        """Give up the port."""
+        """Release the port."""
         self._server.server_close()
 
 
@@ -139,12 +139,14 @@ def _handler(
                 served = ", ".join(" ".join(key) for key in answers)
                 return 404, _detail(f"no {self.command} {path[:100]}; there are: {served}")
             try:
+                # The body is read before its turn: a slow client does not hold up the others
                 body = b"" if self.command == "GET" else self.read_body(_length(self.headers, max_bytes))
+                # A request that waits for its turn is not closed for another connection
                 with self.server.working_for(self.connection), turn:
                     return 200, _content(answer(_fields(query) if self.command == "GET" else _values(body)))
             except InputError as error:
                 return 422, _detail(str(error))
-            except (ConnectionError, TimeoutError):  # the client has gone, or is too slow
+            except (ConnectionError, TimeoutError):  # The client has disconnected, or is too slow
                 raise
             except Exception:
                 _log.exception("%s failed", path)
@@ -169,14 +171,16 @@ def _length(headers: Message, max_bytes: int) -> int:
     """Return the length of a body of JSON.
 
     Raises:
-        InputError: it is not told or too large, or the body is of another type.
+        InputError: it is missing or too large, or the body is of another type.
     """
     length = headers.get("Content-Length", "")
     if not length.isascii() or not length.isdecimal():
         raise InputError("a request needs a Content-Length")
+    # The number of digits is checked first: Python converts long numbers in quadratic time
     if len(length) > 12 or int(length) > max_bytes:
         raise InputError(f"a request may have {max_bytes:,} bytes, not {length[:20]}")
-    if headers.get_content_type() != "application/json":  # a page in a browser cannot send it
+    # A page of another site can send forms and plain text through a browser, but not this type
+    if headers.get_content_type() != "application/json":
         raise InputError("a request has to be application/json")
     return int(length)
 
@@ -187,6 +191,7 @@ def _values(body: bytes) -> Any:
     Raises:
         InputError: it is not JSON, or has too many values.
     """
+    # Each value but the first follows one of these characters. Characters in strings count too
     if sum(map(body.count, (b",", b"[", b"{"))) > MAX_VALUES:
         raise InputError(f"a request may have {MAX_VALUES:,} values")
     try:

@@ -1,4 +1,4 @@
-"""Packages that import their modules on first use, so that a command imports only what it needs."""
+"""Packages that import their modules on first use, so that a command imports only the modules it needs."""
 
 import contextlib
 import gc
@@ -41,6 +41,7 @@ def defer_imports(package: str, homes: Mapping[str, tuple[str, ...]]) -> None:
     spec = importlib.util.find_spec(package)
     assert spec is not None, f"{package} is not installed"
     module = importlib.util.module_from_spec(spec)
+    # The module is registered without being executed: its `__init__` does not run
     module.__getattr__ = on_demand(package, homes)  # type: ignore[method-assign]
     sys.modules[package] = module
 
@@ -57,9 +58,11 @@ def defer_package(package: str) -> None:
     assert spec.loader is not None
     loader = spec.loader
     module = importlib.util.module_from_spec(spec)
-    path = vars(module).pop("__path__")  # an import of one of its modules asks for this
+    # An import of `package.module` reads `package.__path__`. Without the entry this, too, runs `__init__`
+    path = vars(module).pop("__path__")
 
     def run_init(name: str) -> Any:
+        # Restore the ordinary state first: `__init__` itself reads attributes and imports modules
         del module.__getattr__
         module.__path__ = path
         loader.exec_module(module)
@@ -71,10 +74,11 @@ def defer_package(package: str) -> None:
 
 @contextlib.contextmanager
 def importing() -> Iterator[None]:
-    """Pause the garbage collector during imports. It would look at each of their objects several times."""
+    """Pause the garbage collector during imports. It would visit each of their objects several times."""
     gc.disable()
     try:
         yield
     finally:
+        # The objects of modules stay until the end, so later collections skip them
         gc.freeze()
         gc.enable()

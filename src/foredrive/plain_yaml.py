@@ -54,6 +54,7 @@ def parse_yaml(text: str, *, as_text: bool = False) -> Any:
     """
     try:
         loader: Any = (yaml.BaseLoader if as_text else yaml.SafeLoader)(text)
+        # Nodes are built, not values: an alias is its target's node, so they are no larger than the text
         root = loader.get_single_node()
         if root is None:
             return None
@@ -63,12 +64,12 @@ def parse_yaml(text: str, *, as_text: bool = False) -> Any:
         raise
     except RecursionError:
         raise InputError("nested too deeply") from None
-    except (yaml.YAMLError, ValueError, OverflowError) as error:  # a date such as 2001-13-45 is a ValueError
+    except (yaml.YAMLError, ValueError, OverflowError) as error:  # The date 2001-13-45 is a ValueError
         raise InputError((str(error).splitlines() or [type(error).__name__])[0]) from error
 
 
 def _count_values(node: yaml.Node, counts: dict[int, int]) -> int:
-    """Return how many values a node stands for once all aliases are replaced by what they name.
+    """Return the number of values of a node when all aliases are replaced by their values.
 
     Args:
         node: the node.
@@ -82,6 +83,7 @@ def _count_values(node: yaml.Node, counts: dict[int, int]) -> int:
         if counts[id(node)] == 0:
             raise InputError(f"line {node.start_mark.line + 1}: a value contains itself")
         return counts[id(node)]
+    # A node is counted once; an alias adds the stored count, so the time is linear in the text
     counts[id(node)], children = 0, list[yaml.Node]()
     if isinstance(node, yaml.MappingNode):
         _check_keys(node)

@@ -55,6 +55,7 @@ def check_number(
     elif low is not None:
         wanted = f"a number of {low:g} or more"
     fits = (above is None or value > above) and (low is None or value >= low) and value <= high
+    # NaN fails all comparisons, and infinity may pass them
     if not (math.isfinite(value) and fits):
         raise InputError(f"{flag} must be {wanted}, got {value:g}")
 
@@ -86,7 +87,7 @@ def chosen_rig(rig: str, image_hw: tuple[int, int] | None) -> "RigPlan":
 
 
 def rank() -> int | None:
-    """Return this process' number among those that torchrun started; None if it did not start this one."""
+    """Return the rank of this process among those of torchrun; None if torchrun did not start it."""
     return int(os.environ["RANK"]) if "TORCHELASTIC_RUN_ID" in os.environ else None
 
 

@@ -62,8 +62,9 @@ def _load(path: Path) -> "Benchmark | None":
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
-    sys.modules[module_name] = module  # before it runs: its dataclasses look up their module there
-    sys.path.insert(0, str(path.absolute().parent.parent))  # `benchmarks.common`
+    # Registered before it runs: its dataclasses look up their module there
+    sys.modules[module_name] = module
+    sys.path.insert(0, str(path.absolute().parent.parent))  # For `benchmarks.common`
     spec.loader.exec_module(module)
     benchmark = getattr(module, "BENCHMARK", None)
     return benchmark if isinstance(benchmark, Benchmark) else None

@@ -17,10 +17,10 @@ def check(
 ) -> None:
     """Check 123D logs: what is in them, and what looks wrong.
 
-    Gaps in time, poses that jump, speeds that do not fit them, clocks that are off, black or frozen images,
-    empty sweeps, an ego frame that does not stand on the ground, boxes without points, and calibrations by
-    which lidar points do not fit the images. Problems are told; the exit code is 0 unless a log cannot be
-    opened, which stops no other.
+    It looks for gaps in time, poses that jump, speeds that do not fit them, clocks that are off, black or
+    frozen images, empty sweeps, an ego frame that is not on the ground, boxes without points, and
+    calibrations with which lidar points do not fit the images. Problems are printed. The exit code is 0
+    unless a log cannot be opened; the other logs are checked all the same.
 
     Args:
         logs: Logs, folders of logs, or lists of clips.

@@ -28,15 +28,15 @@ def convert(
 ) -> None:
     """Convert a raw data set into 123D logs.
 
-    Logs that are there are kept, so a conversion that was stopped goes on where it was. A log that cannot be
-    read does not stop the others.
+    Existing logs are kept, so an interrupted conversion continues where it stopped. A log that cannot be read
+    does not stop the others.
 
     Args:
         dataset: Name of the data set.
         source: Folder of one raw log, or of many; for rosbag also a file.
         out: 123D data root to write to.
         workers: Number of logs converted at a time; 0: one for each core.
-        overwrite: Convert logs again that are there.
+        overwrite: Convert logs again that exist already.
         topics: YAML that says which topics of a bag are cameras, lidar and poses; by default the bag's name
             with .topics.yaml, beside it.
         propose: Write this YAML from what the bag holds, and convert nothing.

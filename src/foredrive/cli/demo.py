@@ -31,6 +31,7 @@ def demo(out: OptionalPath = None, quick: bool = False) -> None:
     folder = out or Path("runs", "demo-quick" if quick else "demo")
     step = "demo"
 
+    # The step that runs, and when it began, are read by the thread of `progress_lines`
     def tell(text: str) -> None:
         nonlocal step, began
         step, began = text, time.perf_counter()

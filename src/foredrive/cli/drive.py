@@ -46,6 +46,7 @@ def drive(
     with importing():
         from foredrive.runs.drive.suite import DriveSuite, drive_suite
 
+    # Workers may run in other folders, so the folder of a run is named by its absolute path
     name = str(Path(agent).absolute()) if Path(agent).is_dir() else agent
     source = rebuilt.source() or towns.source(name)
     rig = getattr(source, "rig", None)
@@ -64,16 +65,16 @@ def drive(
 
 
 def _write_report(out: Path) -> None:
-    from foredrive.view.drive_report import write_drive_report  # it brings Matplotlib along
+    from foredrive.view.drive_report import write_drive_report  # Imports Matplotlib
 
     write_drive_report(out)
 
 
 def check_driven(driven: "SuiteResult") -> None:
-    """Check that no drive broke off, and print how many had been driven before.
+    """Check that no drive failed, and print how many had been driven before.
 
     Raises:
-        InputError: some drives broke off.
+        InputError: some drives failed.
     """
     if driven.broken:
         failures = listed_failures({job.name: reason for job, reason in driven.broken.items()})

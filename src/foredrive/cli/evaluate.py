@@ -71,6 +71,7 @@ def evaluate(
     trained = open_run(run)
     chosen = named or trained.logs
     folder = out or run
+    # Metrics, pictures and report appear together; until then they are read back from the scratch folder
     with held_for_results(folder):
         result = evaluate_run(
             trained,

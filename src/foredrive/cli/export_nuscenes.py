@@ -24,9 +24,9 @@ def export_nuscenes(
 ) -> None:
     """Write logs as a data set in nuScenes' format v1.0, which nuscenes-devkit opens.
 
-    OUT gets v1.0-NAME with all tables, samples, sweeps and maps. Logs that were exported are kept, so an
-    export that was stopped goes on where it was, and more logs can be added. A log that cannot be read does
-    not stop the others.
+    OUT gets v1.0-NAME with all tables, samples, sweeps and maps. Exported logs are kept, so an interrupted
+    export continues where it stopped, and more logs can be added. A log that cannot be read does not stop the
+    others.
 
     Args:
         logs: Logs, splits or data roots.

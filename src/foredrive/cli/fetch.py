@@ -25,16 +25,16 @@ def fetch_av2(
 ) -> None:
     """Fetch Argoverse 2 sensor logs from their public bucket, without credentials.
 
-    The size is said first. A download that was stopped goes on where it was; sizes and checksums are
-    checked. Argoverse 2 is published under CC BY-NC-SA 4.0. Without --log some names of logs are printed.
+    The size is printed first. An interrupted download continues where it stopped. Sizes and checksums are
+    checked. Argoverse 2 is published under CC BY-NC-SA 4.0. Without --log, names of some logs are printed.
 
     Args:
         log: Names of logs.
         out: Folder of the data set; a log goes to OUT/SPLIT/ID.
-        seconds: Fetch images and sweeps of the first seconds alone.
+        seconds: Fetch only the images and sweeps of the first seconds.
         images: Fetch the images, which are most of a log.
         at_a_time: Number of files that are downloaded at a time.
-        dry_run: Say the sizes and fetch nothing.
+        dry_run: Print the sizes and fetch nothing.
         split: Split whose logs are printed without --log; a log is found in any.
         bucket: Address of the bucket, or of a copy of it.
     """
@@ -68,7 +68,7 @@ def _size(size: int) -> str:
 
 @contextmanager
 def _progress(total: int) -> Iterator[Callable[[int], None]]:
-    """Show the bytes that came; yield the function that adds some."""
+    """Show the number of downloaded bytes; yield the function that adds to it."""
     from rich.console import Console
     from rich.progress import BarColumn, DownloadColumn, Progress, TimeRemainingColumn, TransferSpeedColumn
 

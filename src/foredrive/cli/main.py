@@ -55,14 +55,14 @@ KEPT_BYTES = 1 << 30
 def keep_freed_memory() -> None:
     """Let the C library keep freed memory for the next tensors, and PyTorch use large pages.
 
-    By default glibc gives freed blocks of megabytes back to the system at once. Each step of a training then
+    By default glibc returns freed blocks of megabytes to the system at once. Each step of a training then
     faults in hundreds of megabytes page by page, which takes a sixth of a training step of `nemo_town`. The
-    memory at its peak stays the same. Other C libraries are left as they are.
+    peak memory stays the same. Other C libraries are left as they are.
     """
     os.environ.setdefault("THP_MEM_ALLOC_ENABLE", "1")  # PyTorch reads it before its first tensor
     try:
         mallopt = ctypes.CDLL(None).mallopt
-    except (AttributeError, OSError, TypeError):  # not glibc
+    except (AttributeError, OSError, TypeError):  # Not glibc
         return
     mallopt(M_MMAP_THRESHOLD, KEPT_BYTES)
     mallopt(M_TRIM_THRESHOLD, KEPT_BYTES)
@@ -107,9 +107,10 @@ DESCRIPTION = (
     "--version says which version this is. With every verb, --verbose logs what is done and shows where "
     "errors come from, and --profile FILE.json.gz records a trace that ui.perfetto.dev opens."
 )
-# OpenMP threads spin while they wait, which would take the cores from kernels and data workers.
+# OpenMP threads spin while they wait, which would take the cores from kernels and data workers
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-if rank() is not None:  # DDP warns in each process where it looked for unused parameters and found none
+# DDP warns in each process when it has searched for unused parameters in vain
+if rank() is not None:
     os.environ.setdefault("TORCH_CPP_LOG_LEVEL", "ERROR")
 
 EXIT_INPUT, EXIT_INTERRUPTED, EXIT_PIPE = 2, 130, 141
@@ -136,7 +137,7 @@ def main(args: Sequence[str] | None = None) -> int:
     """Run one verb; return the exit code.
 
     Bad input and full disks print one line on stderr and return 2; Ctrl-C prints one line and returns 130.
-    Any other error is a mistake in the program, and its traceback is shown. Errors of the command line itself
+    Any other error is an error of the program, and its traceback is shown. Errors of the command line itself
     end in SystemExit(2), `--help` ends in SystemExit(0).
     """
     args = sys.argv[1:] if args is None else list(args)
@@ -149,7 +150,7 @@ def main(args: Sequence[str] | None = None) -> int:
     try:
         _check_flags(args)
         args = take_debugging(args)
-        if " ".join(args[:2]) in VERBS:  # such as `search index`
+        if " ".join(args[:2]) in VERBS:  # A verb of two words, such as `search index`
             args = [" ".join(args[:2]), *args[2:]]
         if not args or args[0] not in SERVERS:
             keep_freed_memory()
@@ -157,13 +158,14 @@ def main(args: Sequence[str] | None = None) -> int:
             tyro.extras.subcommand_cli_from_dict(VERBS, prog="foredrive", description=DESCRIPTION, args=args)
     except InputError as error:
         return _give_up(_last_words(error))
-    except BrokenPipeError:  # the reader of our output, such as `head`, has stopped
+    except BrokenPipeError:  # The reader of the output, such as `head`, has ended
+        # Python flushes stdout at its exit, which must not fail again
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return EXIT_PIPE
     except KeyboardInterrupt:
         return _end_interrupted()
     except Exception as error:
-        if interrupt.pressed:  # the interrupted code raised another error
+        if interrupt.pressed:  # The interrupted code has turned the interrupt into another error
             return _end_interrupted()
         reason = _disk_reason(error) or _memory_reason(error)
         if reason is None:
@@ -177,6 +179,7 @@ def _reflowed(docstring: str) -> str:
 
     The parser of the command line would keep most of the line breaks in its help.
     """
+    # Arguments continue at an indent of 8. tyro joins lines of a paragraph, unless a line begins with a sign
     return re.sub(r"(?<=\S)\n(?: {8}(?=\S)|(?=[^\s\w]))", " ", inspect.cleandoc(docstring))
 
 
@@ -193,7 +196,7 @@ def _check_flags(args: Sequence[str]) -> None:
 
 
 def _end_interrupted() -> int:
-    # An interrupt between the opening of a file and its `with` leaves it to the garbage collector.
+    # An interrupt between the opening of a file and its `with` leaves the file to the garbage collector
     warnings.simplefilter("ignore", ResourceWarning)
     _give_up("interrupted")
     return EXIT_INTERRUPTED
@@ -223,6 +226,7 @@ def _disk_reason(error: BaseException) -> str | None:
     for cause in _causes(error):
         number, where = None, None
         if isinstance(cause, OSError):
+            # `filename2` is the destination of a rename
             number, where = cause.errno, cause.filename2 or cause.filename
         if number is None and (match := ERROR_NUMBER.search(str(cause))):
             number = int(match[1] or match[2])
@@ -233,7 +237,7 @@ def _disk_reason(error: BaseException) -> str | None:
 
 
 def _memory_reason(error: BaseException) -> str | None:
-    """Return that more memory was asked for than there is; None if that is not the cause."""
+    """Return a message about a failed allocation of memory; None if that is not the cause."""
     for cause in _causes(error):
         asked = ASKED_MEMORY.search(str(cause))
         if asked is not None or isinstance(cause, MemoryError):

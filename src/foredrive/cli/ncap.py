@@ -83,6 +83,7 @@ def ncap(
     )
     suite = DriveSuite(name, source, sensors, latency_s=RULES[rules].latency_s)
 
+    # One table for the report and the screen, with the scenarios that the self-test has left out
     def table(driven: SuiteResult) -> Table:
         return safety_table(tested_runs(list(driven.drives.values())), source.tested().left_out)
 

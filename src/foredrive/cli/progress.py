@@ -1,4 +1,4 @@
-"""Progress of verbs: frames of a number that is not known before, or jobs of a known number.
+"""Progress of verbs: frames whose number is not known in advance, or jobs of a known number.
 
 In a terminal it is a bar on stderr. Elsewhere, as in log files of clusters, it is a line every half minute.
 """
@@ -22,10 +22,10 @@ EVERY_S = 30.0
 def progress_lines(
     text: Callable[[], str], every_s: float = EVERY_S, write: Callable[[str], None] | None = None
 ) -> Iterator[None]:
-    """Write a line with a text and the time since the beginning, again and again until the block ends.
+    """Write a line with a text and the time since the beginning, repeatedly until the block ends.
 
     Args:
-        text: what is being done, and how far it is.
+        text: returns the activity and its progress.
         every_s: time between two lines, s.
         write: receives a line; by default it is printed on stderr.
     """
@@ -50,7 +50,7 @@ def progress_lines(
 
 @contextmanager
 def frame_progress(doing: str) -> Iterator[Callable[[], None]]:
-    """Show what is done, the number of frames and the time; yield the function that counts a frame."""
+    """Show the activity, the number of frames and the time; yield the function that counts a frame."""
     from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
     frames = 0
@@ -97,7 +97,7 @@ def job_progress(doing: str, total: int) -> Iterator[Callable[[], None]]:
 
 
 def counted(items: Iterable[T], tick: Callable[[], None]) -> Iterator[T]:
-    """Yield the items, and count each when the next is asked for."""
+    """Yield the items. Count each one when the next one is requested, because it is finished then."""
     for item in items:
         yield item
         tick()

@@ -23,7 +23,7 @@ def pseudo(
     """Score plans in reconstructions by NAVSIM v2's EPDMS, with its two-stage pseudo-simulation.
 
     The agent plans from the logged state, and again from states beside the path 3 s later.
-    docs/safety-tests.md tells what differs from NAVSIM's devkit.
+    docs/safety-tests.md describes the differences from NAVSIM's devkit.
 
     Args:
         rebuilt: Folders of reconstructions whose logs still exist and have maps.

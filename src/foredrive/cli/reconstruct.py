@@ -151,6 +151,7 @@ def _rebuild_logs(
     from foredrive.engine.fan_out import fan_out, reason
 
     jobs = [(log, out / log.name) for log in log_paths]
+    # The logs that are reconstructed at the same time share the cores
     work = functools.partial(work, threads=max(1, torch.get_num_threads() // workers))
     failed = {}
     results = fan_out(jobs, work, workers, on_ray=on_ray)

@@ -89,6 +89,7 @@ def record(
         _record_egos(town, some_seeds, weather, virtual_egos, out, cameras, workers, ray)
         return
     plans = plan_drives(Campaign(town, some_seeds, weather, *between, seconds=seconds, rate_hz=rate))
+    # A single drive is recorded without worker processes
     if len(plans) == 1 and not ray:
         log = record_plan(plans[0], out, cameras)
         print(f"wrote {log.folder}")
@@ -110,7 +111,7 @@ def _record_egos(
     workers: int,
     ray: bool,
 ) -> None:
-    """Record virtual egos of each town and seed, and print what became of them.
+    """Record virtual egos of each town and seed, and print the results.
 
     Raises:
         InputError: some failed.

@@ -36,8 +36,8 @@ def score(
             folder of nuScenes' tables (v1.0-*). For all tasks but sets also a folder of 123D logs.
         task: sets: detections as a random finite set. The others are scored under all published protocols of
             the task, see docs/tasks.md.
-        poses: For occupancy: nuscenes_infos_val.pkl or Occ3D's annotations.json. They tell which frames are
-            scored, and where the lidar was; without it there is no RayIoU.
+        poses: For occupancy: nuscenes_infos_val.pkl or Occ3D's annotations.json. They give the scored
+            frames and the positions of the lidar. Without the file there is no RayIoU.
         against: For sets: other results on the same frames, to compare with.
         out: Folder for summary.json, report.html and, for sets, frames.jsonl, which has the scores of every
             frame for `foredrive search index --scores`.

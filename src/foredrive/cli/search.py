@@ -48,6 +48,7 @@ def search(
     """
     hits.check()
     check_index(index)
+    # With a saved query or a tag to remove, the options of the query may be empty
     asked = as_query(query, condition, ranking) if saved is None and untag is None else None
 
     with importing():

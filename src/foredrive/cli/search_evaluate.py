@@ -16,8 +16,8 @@ def search_evaluate(
 ) -> None:
     """Evaluate the towers of an index: zero-shot classification, and retrieval between images and sweeps.
 
-    Objects, weather and time of day are named by CLIP's and LidarCLIP's prompts, without training for it. The
-    moments of sweeps are found by images, and those of images by sweeps. Intervals are over logs.
+    Objects, weather and time of day are classified with CLIP's and LidarCLIP's prompts, without training for
+    it. Images retrieve the sweeps of the same moments, and sweeps the images. Intervals are over logs.
 
     Args:
         index: The index: a folder, or a location in object storage.

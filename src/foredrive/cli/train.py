@@ -46,10 +46,10 @@ def train(
             that towns record, visible or not. A run with recorded labels is evaluated with them, others with
             those of the frame's sweep.
         start: Another run's folder, or a model that comes with the package (embedded:nemo_town): use its
-            pre-trained weights and begin with fine-tuning. For a driver, the run of another: go on from its
-            weights, and draw clips in which it is wrong more often. With --probe, use its world model and
-            planner as they are. With --set transfer=frozen, keep its world model and its heads as they are
-            and train the planner alone.
+            pre-trained weights and begin with fine-tuning. For a driver, the run of another driver: continue
+            from its weights, and draw clips in which it is wrong more often than others. With --probe, use
+            its world model and planner unchanged. With --set transfer=frozen, keep its world model and its
+            heads unchanged and train only the planner.
         tasks: Tasks to train heads for, separated by commas: detection, tracking, map, motion, occupancy.
             Fine-tuning trains them together with the world model. With --probe also instances: the vehicles'
             cells now and in imagined key frames.
@@ -114,6 +114,7 @@ def _train_agent(
         from foredrive.runs import train_run
 
     run = train_run(recipe, logs, out, cache, start, strategy)
+    # Without torchrun, or in its first process
     if not rank():
         print(f"trained {run.recipe.name}: {run.weights}")
         print(f"next: foredrive evaluate {out} --logs ...")
@@ -128,7 +129,7 @@ def _probe(
     cache: Path | None,
     start: Path | None,
 ) -> None:
-    """Train heads on a frozen world model: that of another run, or one that is trained first."""
+    """Train heads on a frozen world model, either of another run or of a run that is trained first."""
     with importing():
         from foredrive.runs import train_run
         from foredrive.runs.train.tasks import TASKS, probe_run, train_heads
@@ -144,7 +145,7 @@ def _probe(
 
 
 def _plain(recipe: str, occupancy: Occupancy, settings: Settings) -> "Recipe[Any, Any]":
-    """Return the recipe that is named."""
+    """Return the recipe of a name."""
     with importing():
         from foredrive.methods.recipe import with_occupancy_source
         from foredrive.runs.recipes.known import find_recipe
@@ -155,10 +156,11 @@ def _plain(recipe: str, occupancy: Occupancy, settings: Settings) -> "Recipe[Any
 def _with_heads(
     recipe: str, occupancy: Occupancy, tasks: str, settings: Settings
 ) -> "tuple[Recipe[Any, Any], TaskHeadsRecipe]":
-    """Return the recipe that is named, and that of its heads; settings of `tasks.` are theirs."""
+    """Return the recipe of a name and the recipe of its heads. Settings with `tasks.` belong to the heads."""
     with importing():
         from foredrive.runs.recipes.task_heads import heads_for, with_settings
 
+    # Settings of the heads apply to the recipe of the heads, which depends on the chosen recipe
     of_recipe, of_heads = _split(settings)
     chosen = _plain(recipe, occupancy, of_recipe)
     return chosen, with_settings(heads_for(chosen, tasks.split(",")), of_heads)

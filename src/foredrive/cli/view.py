@@ -106,7 +106,7 @@ def _save(path: Path, frames: "LogFrames", index: int, reach_m: float) -> None:
 
 
 def _opened(run: Path) -> "Run":
-    from foredrive.runs import open_run  # only now: a log alone does not need it
+    from foredrive.runs import open_run  # Imported only here, because logs alone do not need it
 
     return open_run(run)
 
@@ -121,6 +121,7 @@ def _serve_rebuilt(folder: Path, edits: Path | None, t_s: float | None, host: st
     if t_s is not None:
         run.vehicle.check_time(t_s)
     edit_list = [] if edits is None else load_edits(edits)
+    # Report edits that do not fit the scene before the page is served
     edited_scene(run.scene, edit_list)
     with closing(RebuiltViewer(run, edit_list, edits or folder / EDITS, host, port)) as viewer:
         if t_s is not None:

@@ -38,7 +38,7 @@ __getattr__ = on_demand(
 )
 
 # py123d.api imports its executors, and Ray with them, only for type annotations. This takes most of its
-# import time and memory, so it is deferred.
+# import time and memory, so it is deferred
 defer_imports(
     "py123d.common.execution",
     {
@@ -55,6 +55,6 @@ defer_imports(
         ),
     },
 )
-# py123d needs these for single formats only: written maps, raw AV2 and PandaSet logs, LAZ files.
+# py123d needs these for single formats only: written maps, raw AV2 and PandaSet logs, LAZ files
 for _package in ("pandas", "geopandas", "laspy"):
     defer_package(_package)

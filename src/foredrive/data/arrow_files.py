@@ -56,7 +56,7 @@ def _said(file: Path, what: str, error: Exception) -> str:
 
 
 def check_whole(folder: Path) -> None:
-    """Check that each file of a log is a whole Arrow file. py123d skips files that it cannot open.
+    """Check that each file of a log is a complete Arrow file. py123d skips files that it cannot open.
 
     Raises:
         InputError: a file is damaged. The message names the first one.
@@ -75,11 +75,13 @@ def arrow_schema(file: Path) -> pa.Schema:
     """
     with reading(file, "it as an Arrow file"), pa.OSFile(str(file)) as source:
         begins = source.read(len(_ARROW_BEGIN)) == _ARROW_BEGIN
+        # The end of a file is missing if its writer or its download was interrupted
         source.seek(max(source.size() - _ARROW_TAIL.size, 0))
         tail = source.read()
         if not begins or len(tail) < _ARROW_TAIL.size:
             raise ValueError("not an Arrow file")
         footer_size, magic = _ARROW_TAIL.unpack(tail)
+        # The footer lies between the beginning and the tail
         room = source.size() - len(_ARROW_BEGIN) - _ARROW_TAIL.size
         if magic != _ARROW_END or not 0 < footer_size <= room:
             raise ValueError("not an Arrow file, or not the whole of it")
@@ -90,8 +92,8 @@ def arrow_schema(file: Path) -> pa.Schema:
 def arrow_table(file: Path) -> pa.Table:
     """Return the table of an Arrow file, which is mapped into memory as long as the table lives.
 
-    It is read as the stream that an Arrow file holds, in this thread: py123d's cache keeps tables that are
-    read again, and is slower for those that are read once.
+    An Arrow file contains a stream after its first bytes, which is read in this thread. py123d's cache keeps
+    tables that are read again, and is slower for tables that are read once.
     """
     with pa.memory_map(str(file)) as source:
         source.seek(len(_ARROW_BEGIN))
@@ -110,6 +112,7 @@ def fixed_lists(array: pa.Array, width: int) -> Float64[np.ndarray, "N W"]:
     """Return an array of fixed-size lists as rows. Null lists become NaN."""
     out = np.full((len(array), width), np.nan)
     present = array.is_valid().to_numpy(zero_copy_only=False)
+    # `flatten` leaves out null lists, so its rows are those of the present ones
     out[present] = array.flatten().to_numpy(zero_copy_only=False).reshape(-1, width)
     return out
 
@@ -119,6 +122,7 @@ def pose_matrices(pose: Float64[np.ndarray, "N 7"]) -> Float64[np.ndarray, "N 4 
 
     A pose that is not finite, or whose quaternion is not valid, becomes NaN.
     """
+    # A quaternion of zeros, as of a missing pose, is not valid
     whole = np.isfinite(pose).all(-1) & (np.linalg.norm(pose[:, 3:], axis=-1) > 0.5)
     T = np.full((len(pose), 4, 4), np.nan)
     T[whole] = np.eye(4)

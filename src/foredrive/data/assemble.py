@@ -38,6 +38,7 @@ def assemble_clip(
         map_patch: map around the vehicle at now.
     """
     chosen = list(frames)
+    # Unknown speeds are NaN in a log; in a clip they are masked zeros
     speed_mps = torch.from_numpy(log.speed_mps[chosen]).float()
     whole = stack_records(seen)
     route_xy, route_valid = clip_route(route)

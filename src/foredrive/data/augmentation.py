@@ -14,7 +14,7 @@ from foredrive.scene import Boxes, CameraRig, Clip, Command, Example, LidarSweep
 
 @dataclass(frozen=True)
 class AugmentConfig:
-    """Augmentation of a training stage. It is drawn anew for each item of each batch. By default none."""
+    """Augmentation of a training stage, drawn for each item of each batch. The default is no augmentation."""
 
     mirror: float = 0.0
     """Probability that left and right are exchanged."""
@@ -39,6 +39,7 @@ def augmented(
     clip = example.clip
     if config.colour > 0:
         drawn = config.colour * (2 * torch.rand(batch, 4, generator=generator) - 1)
+        # One factor for the brightness, and smaller ones for the three channels
         gain = (1 + drawn[:, :1]) * (1 + 0.5 * drawn[:, 1:])
         clip = dataclasses.replace(clip, images=_scaled(clip.images, gain.to(clip.images.device)))
     if config.camera_dropout > 0:
@@ -78,6 +79,7 @@ def mirrored(example: Example, chosen: Bool[Tensor, "b"]) -> Example:
 
 
 def _mirrored_clip(clip: Clip, chosen: Bool[Tensor, "b"]) -> Clip:
+    # The sum of both turns minus one of them is the other
     turned = clip.command.where(clip.command == Command.STRAIGHT, Command.LEFT + Command.RIGHT - clip.command)
     return dataclasses.replace(
         clip,
@@ -102,13 +104,14 @@ def _mirrored_clip(clip: Clip, chosen: Bool[Tensor, "b"]) -> Clip:
 def _mirrored_rig(rig: CameraRig, chosen: Bool[Tensor, "b"]) -> CameraRig:
     """Mirror the images (u becomes W - u) and the cameras with their own x axis."""
     K = rig.K.clone()
+    # With u' = W - u and x' = -x, the focal length keeps its sign and the skew changes it
     K[..., 0, 1] *= -1
     K[..., 0, 2] = rig.size_hw[1] - K[..., 0, 2]
     return dataclasses.replace(
         rig,
         K=_pick(chosen, K, rig.K),
         T_ego_cam=mirrored_pose(rig.T_ego_cam, chosen, axis=0),
-        dist=_negated(rig.dist, chosen, (1.0, 1.0, 1.0, -1.0, 1.0)),  # p2 is odd in x
+        dist=_negated(rig.dist, chosen, (1.0, 1.0, 1.0, -1.0, 1.0)),  # k1 k2 p1 p2 k3: p2 is odd in x
     )
 
 
@@ -142,6 +145,7 @@ def _mirrored_grid(
 
 def mirrored_pose(pose: Float[Tensor, "b *n 4 4"], chosen: Bool[Tensor, "b"], axis: int) -> Tensor:
     """Mirror poses from a frame with mirrored axis `axis` to a frame with mirrored y axis."""
+    # M_to T M_source with diagonal mirrors M: signs of rows and of columns
     to, source = pose.new_ones(4), pose.new_ones(4)
     to[1], source[axis] = -1, -1
     return _pick(chosen, pose * to[:, None] * source, pose)

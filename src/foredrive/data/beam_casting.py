@@ -40,6 +40,7 @@ def cast_beams(
     for beam in range(origin.shape[0]):
         ox, oy, oz = origin[beam, 0], origin[beam, 1], origin[beam, 2]
         dx, dy, dz = end[beam, 0] - ox, end[beam, 1] - oy, end[beam, 2] - oz
+        # The part of the beam inside the grid, as fractions of the way from origin to end
         enter, leave = _clip(ox, dx, nx, 0.0, free_until[beam])
         enter, leave = _clip(oy, dy, ny, enter, leave)
         enter, leave = _clip(oz, dz, nz, enter, leave)
@@ -53,9 +54,9 @@ def cast_beams(
             if opaque and state[cell] >= OCCUPIED:
                 state[cell] = SEEN
                 break
-            # Step across the nearest voxel border.
             if state[cell] == UNKNOWN:
                 state[cell] = FREE
+            # Step across the nearest voxel border
             if next_x <= next_y and next_x <= next_z:
                 x += step_x
                 if next_x >= leave or x < 0 or x >= nx:
@@ -117,6 +118,7 @@ def box_of_points(
     nearest2 = np.full(len(points), np.inf)
     for box in range(len(centre)):
         cos, sin = np.cos(yaw[box]), np.sin(yaw[box])
+        # The circle around the footprint excludes most points cheaply
         reach2 = half_lwh[box, 0] ** 2 + half_lwh[box, 1] ** 2
         for n in range(len(points)):
             x, y = points[n, 0] - centre[box, 0], points[n, 1] - centre[box, 1]

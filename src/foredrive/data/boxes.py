@@ -119,6 +119,7 @@ def read_boxes(log: Log, frame: int) -> Boxes | None:
     row_range = slice(tracks.first_row[row], tracks.first_row[row + 1])
     is_object = tracks.is_object[row_range]
     rows = np.arange(row_range.start, row_range.stop)[is_object]
+    # World to ego frame in double precision: world coordinates may be large
     T_ego_world = np.linalg.inv(log.T_world_ego[frame])
     R_ego_box = T_ego_world[:3, :3] @ tracks.R_world_box[rows]
     centre = tracks.centre[rows] @ T_ego_world[:3, :3].T + T_ego_world[:3, 3]
@@ -162,6 +163,7 @@ def read_track_ids(log: Log) -> dict[str, int]:
         table = get_modality_table(log.path.folder, _KEY)
         if table is None:
             raise ValueError("the table is missing")
+        # Columns are called MODALITY.NAME
         (name,) = [name for name in table.column_names if name.split(".")[-1] == "track_token"]
         tokens = np.array(column_array(table, name).flatten().to_pylist(), dtype=object)
     return dict(zip(tokens.tolist(), _track_ids(tokens).tolist(), strict=True))
@@ -190,6 +192,7 @@ def _recorded_labels(log: Log, frame: int, kept: Bool[np.ndarray, "K"]) -> dict[
     if attribute is not None:
         out["attribute"] = _of_boxes(log, frame, "attributes", attribute, kept)
     if share is not None:
+        # From the visible share to nuScenes' levels 1 to 4
         level = torch.bucketize(share, torch.tensor(LEVELS_FROM), right=True) + Visibility.V0_40
         level = level.where(share.isfinite(), UNKNOWN)
         out["visibility"] = _of_boxes(log, frame, "visibilities", level, kept)
@@ -230,6 +233,7 @@ def _tracks(log: Log, _mtime_ns: int) -> Tracks:
         raise ValueError("the table is missing, or its label set is unknown")
     column = {name.split(".")[-1]: column_array(table, name) for name in table.column_names}
     lists = column["bounding_box_se3"]
+    # Lists of boxes: offsets may begin above 0 in a slice, while `flatten` begins at the first box
     first_row = lists.offsets.to_numpy().astype(np.int64) - lists.offsets[0].as_py()
     box = lists.flatten().flatten().to_numpy(zero_copy_only=False).reshape(-1, 10)
     tokens = np.array(column["track_token"].flatten().to_pylist(), dtype=object)
@@ -238,6 +242,7 @@ def _tracks(log: Log, _mtime_ns: int) -> Tracks:
     of_kind = [metadata.box_detection_label_class(int(value)) for value in kinds]
     category = np.array([category_of(label) for label in of_kind], dtype=np.int64)
     is_ego = np.array([label.to_default() == DefaultBoxDetectionLabel.EGO for label in of_kind], dtype=bool)
+    # Ten numbers for each box: x y z, qw qx qy qz, length width height
     bad = ~np.isfinite(box).all(-1) | (np.linalg.norm(box[:, 3:7], axis=-1) < 0.5)
     if bad.any():
         row = np.searchsorted(first_row, bad.argmax(), side="right") - 1
@@ -247,9 +252,9 @@ def _tracks(log: Log, _mtime_ns: int) -> Tracks:
     t_s = t_us * 1e-6
     logged = fixed_lists(column["velocity_3d"].flatten(), 3)
     if log.metadata.dataset != DATASET:
-        logged[(logged == 0).all(-1)] = np.nan  # py123d's parsers write zeros for an unknown velocity
+        logged[(logged == 0).all(-1)] = np.nan  # py123d's parsers write zeros for unknown velocities
     difference = _track_velocity(track_id, t_s, box[:, :3])
-    quaternion = box[:, 3:7].copy()  # scipy rejects an empty read-only array
+    quaternion = box[:, 3:7].copy()  # scipy rejects empty read-only arrays
     R_world_box = Rotation.from_quat(quaternion, scalar_first=True).as_matrix().reshape(-1, 3, 3)
     if log.metadata.dataset in _BACKWARDS:
         R_world_box = R_world_box @ np.diag([-1.0, -1.0, 1.0])
@@ -293,7 +298,9 @@ def _track_velocity(
     """Return the difference between the observations before and after each box; one-sided at the ends."""
     order = np.lexsort((t_s, track_id))
     track, time_s, xyz = track_id[order], t_s[order], centre[order]
+    # Whether neighbours in this order are observations of one track, not too far apart in time
     joined = (np.diff(track) == 0) & (np.diff(time_s) <= _MAX_DIFFERENCE_S)
+    # Where there is no neighbour, the observation itself takes its place: a one-sided difference
     before = np.arange(len(order)) - np.concatenate([[False], joined])[: len(order)]
     after = np.arange(len(order)) + np.concatenate([joined, [False]])[: len(order)]
     span_s = time_s[after] - time_s[before]

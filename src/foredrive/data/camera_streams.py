@@ -93,9 +93,11 @@ def camera_ids(cameras: list[CameraSpec]) -> list[tuple[CameraSpec, CameraID]]:
     if len(azimuth) < len(cameras):
         raise InputError(f"camera names are not unique: {[c.name for c in cameras]}")
     by_name = CameraID.__members__
+    # Cameras with a name of 123D keep that id; the others share what is left
     taken = {by_name[camera.name]: camera for camera in cameras if camera.name in by_name}
     unnamed = [camera for camera in cameras if camera.name not in by_name]
     left_over = []
+    # From front to back, so that side cameras are numbered in this order
     for camera in sorted(unnamed, key=lambda c: abs(azimuth[c.name])):
         angle = azimuth[camera.name]
         if abs(angle) <= _AHEAD_RAD:

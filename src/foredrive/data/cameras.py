@@ -88,6 +88,7 @@ def rig_of_log(log: Log) -> RigPlan:
 
 def camera_mount(log: Log, metadata: PinholeCameraMetadata) -> Float64[np.ndarray, "4 4"]:
     """Return `T_ego_cam` of a camera at rest: its static extrinsic matrix."""
+    # 123D stores extrinsics relative to the vehicle's IMU frame
     mounted: np.ndarray = np.linalg.inv(log.T_imu_ego) @ metadata.camera_to_imu_se3.transformation_matrix
     return mounted
 
@@ -95,7 +96,7 @@ def camera_mount(log: Log, metadata: PinholeCameraMetadata) -> Float64[np.ndarra
 def find_camera(cameras: dict[str, PinholeCameraMetadata], name: str) -> PinholeCameraMetadata | None:
     """Find a camera by its own name ("CAM_FRONT") or by 123D's name ("pcam_f0"), common to all datasets.
 
-    An upper and a lower case letter are the same.
+    Upper and lower case are not distinguished.
     """
     by_id = {metadata.camera_id.serialize().lower(): metadata for metadata in cameras.values()}
     by_name = {own.lower(): metadata for own, metadata in cameras.items()}
@@ -151,7 +152,7 @@ def read_camera(
 
 
 def encoded_image(log: Log, frame: int, metadata: PinholeCameraMetadata) -> bytes | None:
-    """Return the JPEG or PNG of a camera at one frame in full size, as it is stored where it is stored so.
+    """Return the JPEG or PNG of a camera at one frame in full size. Stored bytes are returned unchanged.
 
     Raises:
         InputError: the image cannot be read.
@@ -189,6 +190,7 @@ def _exposed_us(log: Log, modality_key: str) -> Float64[np.ndarray, "F"]:
     table = get_modality_table(log.path.folder, modality_key)
     if table is not None and len(rows):
         stamp_us = table[f"{modality_key}.timestamp_us"].to_numpy()[rows]
+        # The middle row is exposed halfway between the first and the last
         exposed_us[frames] = stamp_us + 0.5e6 * sum(_rows_exposed_s(log, modality_key))
     return exposed_us
 
@@ -215,7 +217,9 @@ def _extrinsics(log: Log, modality_key: str) -> Float64[np.ndarray, "F 4 4"]:
     T_stamped = log.poses_at(stamp_us)[0]
     T_exposed = log.poses_at(_exposed_us(log, modality_key)[frames])[0]
     unlogged = logged.is_null().to_numpy(zero_copy_only=False)[rows]
+    # Without a logged camera pose: the mounted camera on the vehicle at the time of the image
     T_world_cam[unlogged] = T_stamped[unlogged] @ mounted
+    # The camera pose at the image's time, moved with the vehicle from there to the time of exposure
     T_ego_cam[frames] = (
         np.linalg.inv(log.T_world_ego[frames]) @ T_exposed @ np.linalg.inv(T_stamped) @ T_world_cam
     )
@@ -243,6 +247,7 @@ def _open_image(
                 f"{log.file(metadata.modality_key)}: the images lie outside the log; set the environment "
                 f"variable of the {log.metadata.dataset} folder, or convert the log with its images in it"
             )
+        # The path comes from the log, which may not name files anywhere else
         if PurePath(data).is_absolute() or ".." in PurePath(data).parts:
             raise ValueError(f"the image {data!r} is outside of the data set's folder")
         return Image.open(Path(root) / data)

@@ -1,4 +1,4 @@
-"""Names of classes of objects in public data sets, and the categories that they are here."""
+"""Class names of public data sets, and their categories in Foredrive."""
 
 import functools
 import re
@@ -25,7 +25,7 @@ _MORE_NAMES = {
     Category.OTHER: "tram misc unknown debris static_object movable_object emergency_other",
 }
 """Names of KITTI, Lyft Level 5, ONCE, A2D2, ApolloScape, BDD100K and others that py123d's labels lack. A
-rider stands for the cycle, as in KITTI."""
+rider counts as the cycle, as in KITTI."""
 
 
 @functools.cache
@@ -38,6 +38,7 @@ def _categories() -> dict[str, Category]:
     }
     labels |= {_plain(name): category_of(label) for name, label in NUSCENES_DETECTION_NAME_DICT.items()}
     named = {name: category for category, names in _MORE_NAMES.items() for name in names.split()}
+    # Later entries win: these names are chosen by hand, and the categories' own names are fixed
     return labels | named | {category.name.lower(): category for category in Category}
 
 

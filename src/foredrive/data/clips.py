@@ -62,7 +62,7 @@ class ClipConfig:
     occupancy_source: Literal["lidar", "accumulated", "recorded"] = "lidar"
     """Source of the voxel labels: "lidar" for beams of the frame's own sweep, "accumulated" for those of the
     frames within 3 s too, or "recorded" for the exact occupancy and flow in recordings of towns, which
-    includes voxels that no sensor has observed. Evaluations judge by "lidar" instead of "accumulated"."""
+    includes voxels that no sensor has observed. Evaluations use "lidar" in place of "accumulated"."""
     future_source: Literal["driven", "expert"] = "driven"
     """Source of the future trajectory: "driven" for the recorded path, or "expert" for the expert's plan in
     DAgger demonstrations. Clips without such a plan use the driven path."""
@@ -114,6 +114,7 @@ class ClipDataset(Dataset[Example]):
                 check_recorded_occupancy(log)
         frames = [self._sensed_now(number, _clip_frames(log, config)) for number, log in enumerate(self.logs)]
         self._clip_frames = np.concatenate(frames)
+        # For each clip the number of its log
         self._clip_logs = np.repeat(np.arange(len(self.logs)), [len(of_log) for of_log in frames])
         if not len(self):
             raise InputError(f"{logs[0].folder}: none of the selected parts is long enough for a clip")
@@ -140,11 +141,12 @@ class ClipDataset(Dataset[Example]):
     def _sensed_now(self, number: int, clips: Int64[np.ndarray, "N T"]) -> Int64[np.ndarray, "_ T"]:
         """Return the clips whose now has an image or a sweep, if the log has images of the chosen cameras.
 
-        A log may go on without images, for the true future of the last ones.
+        A log may continue without images, so that the last images have a true future.
         """
         log, cameras = self.logs[number], self._cameras[number]
         chosen = [camera for name in self.camera_names if (camera := find_camera(cameras, name)) is not None]
         sensed = [log.rows(camera.modality_key)[0] for camera in chosen]
+        # Without any image of the chosen cameras all clips are kept
         if not any(len(frames) for frames in sensed):
             return clips
         sensed += [frames_with_lidar(log)] if self.config.lidar else []
@@ -204,7 +206,7 @@ class ClipDataset(Dataset[Example]):
         return float(np.nan_to_num(log.speed_mps[now])), self._future(log, now)
 
     def truth(self, index: int) -> TaskTruth | None:
-        """Read the truth of a clip alone. Return None if none was asked for.
+        """Read only the ground truth of a clip. Return None if the configuration requests none.
 
         Raises:
             InputError: data cannot be read.
@@ -217,7 +219,7 @@ class ClipDataset(Dataset[Example]):
 
     def _voxel_labels(self, log: Log, frame: int) -> VoxelLabels:
         if self.config.occupancy_source == "recorded":
-            return recorded_labels(log, frame, self.config.voxels)  # as fast as reading a cache entry
+            return recorded_labels(log, frame, self.config.voxels)  # As fast as reading a cache entry
         return self._labels.labels(log, frame)
 
     def _choose_cameras(self) -> tuple[str, ...]:
@@ -270,10 +272,12 @@ def _clip_frames(log: Log, config: ClipConfig) -> Int64[np.ndarray, "N T"]:
     slack_us = 0.5e6 * log.period_s
     first_us = log.t_us[0] - offset_us[0]
     last_us = log.t_us[-1] - offset_us[-1]
+    # Times of a now with enough frames before and after it, then the frames nearest to them
     now_us = np.arange(first_us, last_us + slack_us + 1, config.now_stride_s * 1e6)
     now, valid = log.nearest_frames(now_us)
     now = np.unique(now[valid])
     frames, valid = log.nearest_frames(log.t_us[now][:, None] + offset_us)
+    # A frame may not be used twice in a clip, as where the log has a gap
     whole = valid.all(-1) & (np.diff(frames, axis=-1) > 0).all(-1)
     if config.part_s is not None:
         t_s = (log.t_us[frames[:, config.past_frames :]] - log.t_us[0]) * 1e-6
@@ -281,7 +285,7 @@ def _clip_frames(log: Log, config: ClipConfig) -> Int64[np.ndarray, "N T"]:
     if log.path.parts_s:
         now_s = (log.t_us[frames[:, config.past_frames]] - log.t_us[0]) * 1e-6
         whole &= np.any([(now_s >= start) & (now_s < end) for start, end in log.path.parts_s], axis=0)
-    if not whole.any() and not log.path.parts_s:  # a listed clip may lie at the end of its log
+    if not whole.any() and not log.path.parts_s:  # A listed part may be at the end of its log
         raise InputError(
             f"{log.path.folder}: too short for one clip: {len(offset_us)} frames {config.frame_dt_s} s apart "
             f"do not fit into its {len(log)} frames of {(log.t_us[-1] - log.t_us[0]) * 1e-6:.1f} s"
@@ -293,6 +297,7 @@ def _clip_frames(log: Log, config: ClipConfig) -> Int64[np.ndarray, "N T"]:
 
 def _at_times(plan: Trajectory, times_s: Float64[np.ndarray, "T"]) -> Trajectory:
     """Resample a plan of one alternative at evenly spaced times. Times beyond its end are not valid."""
+    # The plan begins at the origin now, one step before its first waypoint
     known_s = plan.dt_s * np.arange(len(plan.xy[0]) + 1)
     yaw = np.unwrap(np.append(0.0, plan.yaw[0].double().numpy()))
     x, y = (np.append(0.0, axis) for axis in plan.xy[0].double().numpy().T)

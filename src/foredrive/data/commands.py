@@ -33,6 +33,7 @@ def command_at(log: Log, frame: int, future: Trajectory) -> tuple[Command | None
         InputError: the route cannot be read.
     """
     lateral_m = _route_offset_m(log, frame)
+    # A provided route comes first; the driven future tells an agent where the vehicle will go
     if lateral_m is not None:
         return command_of(lateral_m), "route"
     valid = future.valid[0].numpy()
@@ -108,9 +109,10 @@ def route_ahead(
     """
     at_m = progress_m + np.array(ROUTE_M)
     dx, dy = (points_at(xy, arc_m, at_m) - T_world_ego[:2, 3]).T
+    # Turn by the heading only, so that pitch and roll do not shorten distances
     forward = T_world_ego[:2, 0] / np.hypot(*T_world_ego[:2, 0])
     ego_xy = np.stack([dx * forward[0] + dy * forward[1], dy * forward[0] - dx * forward[1]], axis=-1)
-    # Of a vehicle beside the end of the route, the first point is given all the same: it is where to stop.
+    # Next to the end of the route, the first point is still valid: the vehicle has to stop there
     return RouteAhead(ego_xy, np.append(True, at_m[1:] <= arc_m[-1]))
 
 
@@ -171,8 +173,10 @@ def route_offset_m(
         progress_m: arc length of the ego's projection on the route.
     """
     half_m = 0.5 * HEADING_OVER_M
+    # The chord lies on the route, also at its ends
     at_m = np.clip(progress_m, arc_m[0] + half_m, arc_m[-1] - half_m)
     along_m = [at_m - half_m, at_m + half_m, progress_m, progress_m + LOOKAHEAD_M]
     behind, ahead, here, beyond = points_at(xy, arc_m, np.array(along_m))
     (dx, dy), (x, y) = ahead - behind, beyond - here
+    # The cross product with the heading's unit vector
     return float((dx * y - dy * x) / max(np.hypot(dx, dy), 1e-9))

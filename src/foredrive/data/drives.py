@@ -48,8 +48,8 @@ def read_drive(
         cameras: camera names, the log's own or 123D's, in this order. None selects all.
         cache_dir: folder for resized images. None disables the cache.
         frames: frames of the log, in order. None reads all.
-        derived: add what the log does not tell itself: the lidar points in boxes, and the beams that did not
-            return where the lidar's pattern is known (`sensors.missed_beams`).
+        derived: add data that the log does not store: the number of lidar points in boxes and, where the
+            lidar's pattern is known, the beams that did not return (`sensors.missed_beams`).
 
     Raises:
         InputError: the log cannot be read, or it lacks a requested camera.
@@ -78,10 +78,12 @@ def _read_beams(log: Log, frame: int) -> tuple[LidarSweep, bool] | None:
         return read
     sweep = read[0]
     T_ego_lidar = torch.eye(4)
+    # The lidar's pose: the origin of the beam nearest to the frame's time, without a rotation
     T_ego_lidar[:3, 3] = sweep.origin_ego[sweep.dt_s.abs().argmin()]
     lidar = lidar_of(log.metadata.dataset, T_ego_lidar)
     if lidar is None:
         return read
+    # The mean motion of the vehicle over the sweep, as a twist in the ego frame
     around_us = log.t_us[frame] + 1e6 * np.array([sweep.dt_s.min(), sweep.dt_s.max()])
     first, last = torch.from_numpy(log.poses_at(around_us)[0])
     span_s = float(sweep.dt_s.max() - sweep.dt_s.min()) or 1.0

@@ -16,6 +16,7 @@ def interpolated_poses(
     if not len(t_us):
         return out
     after = np.searchsorted(at_us, t_us).clip(1, len(at_us) - 1)
+    # Only the poses around the wanted times, with times from a near origin for precision
     span = slice(after.min() - 1, after.max() + 1)
     start_us, inside_us = at_us[span][0], t_us.clip(at_us[0], at_us[-1])
     turn = Slerp((at_us[span] - start_us) * 1e-6, Rotation.from_matrix(T[span, :3, :3]))

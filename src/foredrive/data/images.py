@@ -1,4 +1,4 @@
-"""Decoding of images of other people: 8-bit RGB, or a clear refusal."""
+"""Decoding of images from other sources: 8-bit RGB, or an error that names the problem."""
 
 import io
 from pathlib import Path
@@ -15,7 +15,7 @@ _DEEP_MODES = ("I;16", "I;16B", "I;16L", "I;16N", "I", "F")
 
 
 def is_image(file: Path) -> bool:
-    """Return whether a file has the name of an image; file browsers leave others beside images."""
+    """Return whether a file has the name of an image. File browsers leave hidden files next to images."""
     return file.suffix.lower() in _SUFFIXES and not file.name.startswith(".")
 
 

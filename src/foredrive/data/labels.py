@@ -14,8 +14,8 @@ from foredrive.data.logs import Log
 from foredrive.scene import Boxes, LidarSweep, VoxelSpec
 
 FREE_MARGIN_VOXELS = 0.5
-"""Distance before a return within which a beam frees no voxel. Ranges are noisy, and a surface at the border
-of a voxel must not free the voxel in front of it, which it also occupies."""
+"""Distance before a return within which a beam does not mark voxels as free, in voxels. Ranges are noisy. A
+surface on the border of two voxels occupies both: a return in the rear one must not free the front one."""
 EGO_MARGIN_M = 0.2
 """Margin around the ego vehicle's box. Returns inside (e.g. mirrors) are dropped."""
 BOX_MARGIN_M = 0.1
@@ -101,9 +101,11 @@ def observed_state(beams: Beams, spec: VoxelSpec) -> UInt8[np.ndarray, "Z Y X"]:
     """Return UNKNOWN, FREE or OCCUPIED for each voxel of a grid in the frame of the beams."""
     state = np.full(spec.shape_zyx, UNKNOWN, dtype=np.uint8)
     voxel = _voxels(beams.ends[beams.returned], spec)
+    # Returns come first: beams change only unknown voxels, so a voxel with a return stays occupied
     state.reshape(-1)[voxel[voxel >= 0]] = OCCUPIED
     lower = np.asarray(spec.lower_m)
     margin_m = np.where(beams.returned, FREE_MARGIN_VOXELS * spec.voxel_m, 0.0)
+    # The fraction of the beam that is free; a miss of range 0 says nothing
     free_until = np.where(beams.range_m > 0, 1.0 - margin_m / np.maximum(beams.range_m, 1e-6), 0.0)
     cast_beams((beams.origin - lower) / spec.voxel_m, (beams.ends - lower) / spec.voxel_m, free_until, state)
     return state
@@ -117,6 +119,7 @@ def _on_ego(
 ) -> Bool[np.ndarray, "N"]:
     """Return whether points are on the ego vehicle: in its box, or above it up to its highest sensor."""
     offset, reach = points - centre, 0.5 * size_lwh + EGO_MARGIN_M
+    # Up to the highest sensor, which may be above the box
     top = max(reach[2], float(origin[:, 2].max(initial=-np.inf)) - centre[2] + EGO_MARGIN_M)
     footprint = (np.abs(offset[:, :2]) <= reach[:2]).all(-1)
     return footprint & (offset[:, 2] >= -reach[2]) & (offset[:, 2] <= top)
@@ -143,6 +146,7 @@ def _flow(
     flow = np.zeros((3, *occupied.shape), dtype=np.float32)
     if boxes is None:
         return flow, np.zeros_like(occupied)
+    # In an annotated frame, occupied voxels outside of all boxes are static
     known = occupied.copy()
     boxes = boxes[boxes.valid]
     box = box_of_points(
@@ -154,6 +158,7 @@ def _flow(
     in_box = box >= 0
     velocity = boxes.velocity.numpy()[box[in_box]]
     flow.reshape(3, -1)[:2, voxel[in_box]] = np.nan_to_num(velocity).T
+    # Voxels in boxes without a velocity are occupied, but their flow is unknown
     known.reshape(-1)[voxel[in_box]] = np.isfinite(velocity).all(-1)
     return flow, known
 

@@ -7,7 +7,7 @@ from py123d.datatypes import Lidar, LidarID, LidarMergedMetadata, LidarMetadata,
 from py123d.datatypes.custom.custom_modality import CustomModality
 from torch import Tensor
 
-import foredrive.data.formats.pandaset  # noqa: F401  (a log may refer to raw sweeps, which are pickles)
+import foredrive.data.formats.pandaset  # noqa: F401  (logs may refer to raw sweeps, which are pickles)
 from foredrive.data.arrow_files import reading
 from foredrive.data.logs import Log
 from foredrive.data.modalities import LIDAR_BEAMS, unpack_beams
@@ -94,13 +94,15 @@ def empty_sweep() -> LidarSweep:
 
 def _returns(log: Log, frame: int, lidar: Lidar, origins: Float[np.ndarray, "N 3"] | None) -> LidarSweep:
     T_ego_imu = np.linalg.inv(log.T_imu_ego)
+    # 123D stores points in the IMU frame
     points = lidar.xyz.astype(np.float64).reshape(-1, 3) @ T_ego_imu[:3, :3].T + T_ego_imu[:3, 3]
     count = len(points)
     dt_us = np.zeros(count)
     if lidar.timestamps is not None:
         since = lidar.timestamps - log.t_us[frame]
-        if (np.abs(since) <= _MAX_SWEEP_US).all():  # some datasets use another clock for point times
+        if (np.abs(since) <= _MAX_SWEEP_US).all():  # Some data sets use another clock for point times
             dt_us = since.astype(np.float64)
+    # Recorded origins are exact; otherwise they follow from the mount and the driven path
     if origins is None:
         origins = _origins(log, frame, lidar, dt_us)
     if len(origins) != count:
@@ -108,6 +110,7 @@ def _returns(log: Log, frame: int, lidar: Lidar, origins: Float[np.ndarray, "N 3
     intensity = lidar.intensity if lidar.intensity is not None else np.zeros(count)
     beam = lidar.channel if lidar.channel is not None else np.full(count, -1)
     sweep = _sweep(points, origins, intensity / 255.0, dt_us * 1e-6, beam)
+    # Points at the sensor itself, or without a position, are no returns
     real = torch.isfinite(sweep.range_m) & (sweep.range_m > _MIN_RANGE_M)
     return sweep if bool(real.all()) else sweep[real]
 
@@ -122,6 +125,7 @@ def _origins(log: Log, frame: int, lidar: Lidar, dt_us: Float[np.ndarray, "N"]) 
     for sensor_id, metadata in sensors.items():
         mounted = T_ego_imu[:3, :3] @ metadata.lidar_to_imu_se3.point_3d.array + T_ego_imu[:3, 3]
         mine = ids == int(sensor_id)
+        # Without times of the points, the sensor is where it is at the frame's time
         if not dt_us[mine].any():
             origin[mine] = mounted
             continue

@@ -1,4 +1,4 @@
-"""A check of a log: what is in it, and what in it looks wrong."""
+"""A check of a log: its content, and problems in it."""
 
 import functools
 from collections.abc import Callable, Iterator, Sequence
@@ -23,12 +23,12 @@ SAMPLES = 12
 CHECK_HW = (135, 240)
 """Size at which sampled images are compared, px."""
 MAX_ACCELERATION_MPS2, MAX_TURN_RADPS, MAX_TILT_RAD = 15.0, 1.5, 0.35
-"""Limits of what a road vehicle does."""
+"""Limits of the motion of road vehicles."""
 SPEED_DIFFERS_MPS, SPEED_DIFFERS_SHARE = 1.0, 0.1
 GAP = 1.5
 """A gap is longer than this many times the sensor's usual period."""
 MAX_GROUND_M, NEAR_GROUND_M = 0.3, (4.0, 12.0)
-"""Largest height of the ground in the ego frame, and the distances at which it is looked for."""
+"""Maximum height of the ground in the ego frame, and the range of distances at which it is measured."""
 MIN_GROUND_POINTS = 200
 NEAR_BOX_M, MAX_EMPTY_SHARE = 25.0, 0.3
 MAX_BOX_MPS = 60.0
@@ -40,10 +40,10 @@ DARK, SAME = 4.0, 0.5
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing that was noticed."""
+    """One observation about a log."""
 
     level: Level
-    """problem: results will be wrong or a verb will refuse; note: good to know."""
+    """problem: results will be wrong or a verb will refuse the log; note: for information."""
     subject: str
     text: str
 
@@ -62,7 +62,7 @@ class Stream:
 
 @dataclass(frozen=True)
 class LogCheck:
-    """The content of a log, and what was noticed."""
+    """The content of a log, and the findings."""
 
     log: str
     frames: int
@@ -106,7 +106,7 @@ def _period_s(log: Log, frames: np.ndarray) -> float | None:
 
 
 def _gaps(log: Log, streams: Sequence[Stream]) -> Iterator[Finding]:
-    """Find times without poses or sensors, beyond the usual period. Streams with equal gaps are one."""
+    """Find times without poses or sensors, beyond the usual period. Streams with equal gaps are joined."""
     streams_of: dict[str, list[str]] = {}
     for stream in streams:
         frames, _ = log.rows(stream.name)
@@ -135,7 +135,7 @@ def _named(text: str, names: Sequence[str]) -> str:
 
 
 def _poses(log: Log) -> Iterator[Finding]:
-    """Find motion that no road vehicle makes, and speeds that do not fit the poses."""
+    """Find motion that is impossible for a road vehicle, and speeds that do not fit the poses."""
     if len(log) < 3:
         return
     t_s = (log.t_us - log.t_us[0]) * 1e-6
@@ -145,11 +145,13 @@ def _poses(log: Log) -> Iterator[Finding]:
     yield from _jumps(acceleration > MAX_ACCELERATION_MPS2, acceleration, t_s[1:-1], "accelerates by", "m/s²")
     turn = np.diff(np.unwrap(np.arctan2(log.T_world_ego[:, 1, 0], log.T_world_ego[:, 0, 0]))) / dt_s
     yield from _jumps(np.abs(turn) > MAX_TURN_RADPS, np.abs(turn), t_s[1:], "turns at", "rad/s")
+    # The angle between the z axes of vehicle and world
     tilt = np.arccos(log.T_world_ego[:, 2, 2].clip(-1, 1))
     yield from _jumps(tilt > MAX_TILT_RAD, tilt, t_s, "is tilted by", "rad; is the world's z up?")
     ahead = (velocity * log.T_world_ego[:-1, :3, 0]).sum(axis=-1)
     speed = np.linalg.norm(velocity, axis=-1)
     moving = speed > 2.0
+    # A vehicle that moves sideways has another convention of axes; the median ignores single slips
     if moving.sum() > 5 and np.median(ahead[moving] / speed[moving]) < 0.8:
         share = float(np.median(ahead[moving] / speed[moving]))
         text = f"the vehicle moves along its own x axis by {share:.0%} only; x should be ahead"
@@ -173,7 +175,7 @@ def _jumps(
 
 
 def _images(log: Log) -> Iterator[Finding]:
-    """Find images that cannot be decoded, are black or frozen, and clocks that are off."""
+    """Find images that cannot be decoded, are black or frozen, and clocks that differ."""
     for name, camera in pinhole_cameras(log).items():
         frames, _ = log.rows(camera.modality_key)
         if not len(frames):
@@ -183,6 +185,7 @@ def _images(log: Log) -> Iterator[Finding]:
         for frame in _sampled(frames):
             try:
                 shown = read(frame=int(frame))
+                # An image of a standing vehicle may well equal the next one
                 moves = log.speed_mps[frame] > MIN_MOVING_MPS and int(frame) + 1 < len(log)
                 following = read(frame=int(frame) + 1) if moves else None
             except InputError as error:
@@ -214,7 +217,7 @@ def _clock(name: str, offset_s: Float[np.ndarray, "N"], period_s: float) -> Iter
 
 
 def _sweeps(log: Log) -> Iterator[Finding]:
-    """Find empty sweeps and boxes, missing point times, and a ground that is not where the ego frame says."""
+    """Find empty sweeps and boxes, missing point times, and a ground that does not fit the ego frame."""
     ground_m, empty, untimed, read = [], 0, 0, 0
     near, bare = 0, 0
     for frame in _sampled(frames_with_lidar(log)):
@@ -257,11 +260,14 @@ def _ground_level(points_m: Float[np.ndarray, "N 3"]) -> float | None:
     near_m = points_m[(distance_m > NEAR_GROUND_M[0]) & (distance_m < NEAR_GROUND_M[1])]
     if len(near_m) <= MIN_GROUND_POINTS:
         return None
+    # Cells of one metre cover the square around the circle of the largest distance
     side = 2 * int(NEAR_GROUND_M[1]) + 2
+    # The lowest point of each square metre, in a flat table of cells
     cell = np.floor(near_m[:, :2]).astype(np.int64) + side // 2
     lowest_m = np.full(side * side, np.inf)
     np.minimum.at(lowest_m, cell[:, 0] * side + cell[:, 1], near_m[:, 2])
     lowest_m = lowest_m[np.isfinite(lowest_m)]
+    # The most frequent level: cells on cars and walls, and below bridges, differ from each other
     count, edges = np.histogram(lowest_m, bins=np.arange(lowest_m.min(), lowest_m.max() + 0.4, 0.2))
     return float(edges[count.argmax()]) + 0.1
 
@@ -271,7 +277,7 @@ def _boxes_without_points(log: Log, frame: int, sweep: LidarSweep) -> tuple[int,
     try:
         boxes = read_boxes(log, frame)
     except InputError:
-        return 0, 0  # `_tracks` names it
+        return 0, 0  # `_tracks` reports the error
     if boxes is None:
         return 0, 0
     close = boxes[boxes.valid & (boxes.centre.norm(dim=-1) < NEAR_BOX_M)]
@@ -280,7 +286,7 @@ def _boxes_without_points(log: Log, frame: int, sweep: LidarSweep) -> tuple[int,
 
 
 def _tracks(log: Log) -> Iterator[Finding]:
-    """Find boxes without size, with impossible speeds, and tracks that stand twice in a frame."""
+    """Find boxes without size, with impossible speeds, and tracks that occur twice in a frame."""
     try:
         tracks = read_tracks(log)
     except InputError as error:

@@ -1,8 +1,9 @@
 """Logs in object storage, mirrored into a local folder of bounded size.
 
-s3://BUCKET/PATH is mirrored as FOLDER/s3/BUCKET/PATH, so the local path of a log says where it comes from,
-in every file that notes it. A log is fetched whole when it is opened, and stays as long as a process has it
-open. When there is no room for another, the least recently used logs that nobody has open are removed.
+s3://BUCKET/PATH is mirrored as FOLDER/s3/BUCKET/PATH, so that the local path of a log states its origin in
+every file that contains the path. A log is fetched as a whole when it is opened, and stays as long as a
+process has it open. When there is no room for another log, the least recently used logs that no process has
+open are removed.
 
 Several processes share the mirror. Each file under FOLDER/.locks is the lock of one log or of one folder of
 maps: shared while it is open, exclusive while it is fetched or removed. The operating system releases the
@@ -38,7 +39,7 @@ DEFAULT_GB = 100.0
 PATIENCE = 20
 """Number of attempts to lock a log whose files have changed."""
 AT_A_TIME, CHUNK = 8, 2**22
-"""Files that are fetched at a time, and bytes that are read at a time."""
+"""Number of files fetched at the same time, and number of bytes read at once."""
 _CREDENTIALS = ("ACCESS_DENIED", "NO_CREDENTIALS", "INVALID_ACCESS_KEY", "SIGNATURE", "redential")
 
 Listing = tuple[tuple[str, int, int], ...]
@@ -49,6 +50,7 @@ class Hold:
     """A log that stays in the mirror as long as this object lives."""
 
     def __init__(self, lock: int) -> None:
+        # Closing the descriptor releases the lock
         weakref.finalize(self, os.close, lock)
 
 
@@ -127,7 +129,7 @@ def mirrored_logs(path: Path, depth: int) -> list[Path]:
 
 
 def hold(folder: Path) -> Hold | None:
-    """Keep a log or a folder of maps in the mirror; fetch it if it is not there. None: it is elsewhere.
+    """Keep a log or a folder of maps in the mirror, and fetch it if needed. None: it is not mirrored.
 
     Raises:
         InputError: it cannot be fetched, or there is no room for it.
@@ -140,18 +142,21 @@ def hold(folder: Path) -> Hold | None:
     lock = _open_lock(entry)
     held = Hold(lock)
     for attempt in itertools.count():
-        fcntl.flock(lock, fcntl.LOCK_SH)  # waits while another process fetches it
+        fcntl.flock(lock, fcntl.LOCK_SH)  # Waits while another process fetches it
         if entry.is_whole(listing):
+            # The time of the lock file is the time of last use, by which `_make_room` orders the entries
             os.utime(lock)
             return held
+        # The files in storage have changed while another process keeps the old ones open
         if attempt > PATIENCE and entry.folder.is_dir():
             raise InputError(
                 f"{entry.url}: has changed, and another process reads its former files from {entry.folder}"
             )
+        # Release the shared lock first: two processes that keep theirs could never get the exclusive one
         fcntl.flock(lock, fcntl.LOCK_UN)
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:  # another process fetches it, or is about to
+        except BlockingIOError:  # Another process fetches it, or is about to
             time.sleep(random.uniform(0.01, 0.1))
             continue
         if not entry.is_whole(listing):
@@ -160,10 +165,11 @@ def hold(folder: Path) -> Hold | None:
 
 
 def _fetch(entry: _Entry, listing: Listing) -> None:
-    """Fetch the files of an entry, whose lock is held."""
+    """Fetch the files of an entry. The caller holds its exclusive lock."""
     record, size = entry.note("entries"), sum(size for _, size, _ in listing)
     make_folder(record.parent)
     with FileLock(mirror_folder() / ".room"):
+        # Room is reserved under a lock by the record of the entry, before anything is fetched
         record.unlink(missing_ok=True)
         _make_room(entry, size)
         with atomic_path(record) as temporary:
@@ -175,6 +181,7 @@ def _fetch(entry: _Entry, listing: Listing) -> None:
             for _ in threads.map(copy, listing):
                 pass
     except BaseException:
+        # Give the reserved room back, unless an older version is still in place
         if not entry.folder.is_dir():
             record.unlink(missing_ok=True)
         raise
@@ -190,13 +197,15 @@ def _copy(entry: _Entry, folder: Path, file: tuple[str, int, int]) -> None:
         with storage.open_input_stream(place) as source, path.open("wb") as target:
             shutil.copyfileobj(source, target, CHUNK)
     if path.stat().st_size != size:
+        # The stored listing is out of date, so the next attempt lists the files again
         entry.note("listings").unlink(missing_ok=True)
         raise InputError(f"{url}: has {path.stat().st_size} bytes, not {size}: it has changed; start again")
+    # `is_whole` compares sizes and times with the listing
     os.utime(path, ns=(t_ns, t_ns))
 
 
 def _make_room(entry: _Entry, size: int) -> None:
-    """Remove the least recently used entries that nobody has open until `size` bytes fit.
+    """Remove the least recently used entries that no process has open until `size` bytes fit.
 
     Raises:
         InputError: there is no room.
@@ -218,7 +227,7 @@ def _make_room(entry: _Entry, size: int) -> None:
         lock = _open_lock(other)
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
+        except BlockingIOError:  # Some process has it open
             continue
         else:
             shutil.rmtree(other.folder, ignore_errors=True)
@@ -247,7 +256,7 @@ def _open_lock(entry: _Entry) -> int:
 
 
 def _listings(url: str, *, allow_missing: bool = False) -> dict[Path, Listing]:
-    """Return the files of all folders at a URL, by their local folders; those below "maps" as one folder."""
+    """Return the files of all folders at a URL, by their local folders. A folder of maps is one entry."""
     scheme = url.split("://")[0]
     with _told(url):
         storage, place = _storage(url)
@@ -280,7 +289,7 @@ def _file_system(bucket: str) -> fs.FileSystem:
 
 @contextlib.contextmanager
 def _told(url: str) -> Iterator[None]:
-    """Turn errors of object storage into one line."""
+    """Convert errors of object storage to `InputError`s of one line."""
     try:
         yield
     except FileNotFoundError:

@@ -10,7 +10,7 @@ from foredrive.errors import InputError
 
 _SEARCH_DEPTH = 3
 _URL = re.compile(r"[a-z][a-z0-9+.-]+:/{1,2}[^/]")
-"""The beginning of a URL, such as s3://bucket/logs. pathlib leaves one of its two slashes."""
+"""The beginning of a URL, such as s3://bucket/logs. pathlib reduces its two slashes to one."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ def find_logs(path: Path) -> list[LogPath]:
         InputError: there is no log, or object storage cannot be read.
     """
     if _URL.match(str(path)):
-        from foredrive.data.log_mirror import mirrored_logs  # pyarrow is slow to import
+        from foredrive.data.log_mirror import mirrored_logs  # Imports pyarrow, which is slow
 
         folders = mirrored_logs(path, _SEARCH_DEPTH)
         return _found(folders, str(path))
@@ -58,6 +58,7 @@ def find_logs(path: Path) -> list[LogPath]:
 def _found(folders: list[Path], where: str) -> list[LogPath]:
     if not folders:
         raise InputError(f"{where}: no 123D log here (a log is a folder with a sync.arrow)")
+    # A data root has logs/SPLIT/NAME and maps
     return [LogPath(folder, folder.parents[2] / "maps") for folder in folders]
 
 
@@ -89,7 +90,7 @@ def _listed_logs(path: Path) -> list[LogPath]:
 
 
 def _is_mirrored(folder: Path) -> bool:
-    from foredrive.data.log_mirror import is_mirrored  # pyarrow is slow to import
+    from foredrive.data.log_mirror import is_mirrored  # Imports pyarrow, which is slow
 
     return is_mirrored(folder)
 

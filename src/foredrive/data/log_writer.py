@@ -186,8 +186,9 @@ class LogWriter:
             camera_store_option="jpeg_binary",
             lidar_store_option="binary",
             lidar_codec="ipc_lz4",
-            write_route=False,  # a route derived from the driven path is not a route
+            write_route=False,  # It would be derived from the driven path, which is not a provided route
         )
+        # py123d writes SCRATCH/SPLIT/NAME; the folder is moved to its final place at the end
         scratch = self._final.parent
         self._writer = ArrowLogWriter(config, scratch, scratch)
         self._writer.reset(self._metadata)
@@ -198,6 +199,7 @@ class LogWriter:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        # After an error the scratch folder is removed, and a log of the same name stays
         if kind is not None:
             self._stack.__exit__(kind, error, trace)
             return
@@ -245,6 +247,7 @@ class LogWriter:
     def _ego_state(self, frame: Frame) -> EgoStateSE3:
         turn_rate = np.zeros(3)
         if self._previous is not None:
+            # The mean turn rate since the previous frame, in the ego axes
             turned = torch.from_numpy(self._previous.T_world_ego[:3, :3].T @ frame.T_world_ego[:3, :3])
             turn_rate = log_so3(turned).numpy() / ((frame.t_us - self._previous.t_us) * 1e-6)
         return EgoStateSE3.from_rear_axle(
@@ -294,7 +297,7 @@ class LogWriter:
         returns = sweep[kept]
         if (returns.beam > 255).any():
             raise InputError(f"{self.folder}: 123D stores only the lidar channels 0 to 255")
-        if self._lidar is None:  # static extrinsics, from the beam nearest the frame's time
+        if self._lidar is None:  # Static extrinsics, from the beam nearest to the frame's time
             position = sweep.origin_ego[sweep.dt_s.abs().argmin()].tolist() if len(sweep.dt_s) else [0, 0, 0]
             classes = None if frame.beam_semantic is None else DefaultLidarSegmentationLabel
             self._lidar = LidarMetadata("lidar", LidarID.LIDAR_TOP, PoseSE3(*position, 1, 0, 0, 0), classes)
@@ -303,12 +306,14 @@ class LogWriter:
             "intensity": np.round(returns.intensity.numpy() * 255).astype(np.uint8),
             "timestamps": t_us + dt_us,
         }
+        # A negative channel is unknown
         if (returns.beam >= 0).all():
             features["channel"] = returns.beam.numpy().astype(np.uint8)
         if frame.beam_semantic is not None:
             features["semantic"] = frame.beam_semantic[kept.numpy()]
         if frame.beam_instance is not None:
             features["instance"] = frame.beam_instance[kept.numpy()]
+        # Start and end include the beams that did not return
         seen_us = sweep.dt_s[sweep.valid].double() * 1e6
         start_us, end_us = (int(seen_us.min()), int(seen_us.max())) if len(seen_us) else (0, 0)
         lidar = Lidar(

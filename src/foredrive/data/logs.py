@@ -40,7 +40,8 @@ systems allow."""
 _class_of = functools.cache(resolve_metadata_class)
 _log = logging.getLogger(__name__)
 _may_open = min(MAX_OPEN_TABLES, resource.getrlimit(resource.RLIMIT_NOFILE)[0] // 2)
-os.environ.setdefault("PY123D_MAX_LRU_CACHED_TABLES", str(_may_open))  # read by py123d when it opens a table
+# py123d reads it when it opens a table
+os.environ.setdefault("PY123D_MAX_LRU_CACHED_TABLES", str(_may_open))
 
 
 class LogScene(ArrowSceneAPI):
@@ -53,7 +54,7 @@ class LogScene(ArrowSceneAPI):
         metadata: of all files; None reads them.
 
     Raises:
-        InputError: a file is not whole, or the log's metadata cannot be read.
+        InputError: a file is not complete, or the log's metadata cannot be read.
     """
 
     __slots__ = ("_metadata",)
@@ -125,13 +126,14 @@ class Log:
         ego_t_us, T_world_ego, speed_mps = self._read_ego()
         self._iterations, ego_rows = self._read_sync(ego_t_us)
         self.t_us, self.T_world_ego = ego_t_us[ego_rows], T_world_ego[ego_rows]
-        distinct = np.diff(ego_t_us, prepend=ego_t_us[0] - 1) > 0  # nanosecond stamps may share a microsecond
+        # Times in nanoseconds may share a microsecond; interpolation needs increasing ones
+        distinct = np.diff(ego_t_us, prepend=ego_t_us[0] - 1) > 0
         self._drive_t_us, self._drive_T = ego_t_us[distinct], T_world_ego[distinct]
         self.period_s = float(np.median(np.diff(self.t_us))) * 1e-6 if len(self.t_us) > 1 else 0.0
         self.speed_mps = _speed(speed_mps[ego_rows], self.t_us, self.T_world_ego)
 
     def __getstate__(self) -> dict[str, Any]:
-        return self.__dict__ | {"_held": ()}  # the process that opened a log keeps it for its workers
+        return self.__dict__ | {"_held": ()}  # The process that opened the log holds it for its workers
 
     def __len__(self) -> int:
         return len(self.t_us)
@@ -145,6 +147,7 @@ class Log:
         table = get_sync_table(self.path.folder)
         if modality_key not in table.column_names:
             return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
+        # The sync table has one row for each time, and for each modality its row then, or null
         row = table[modality_key].to_numpy(zero_copy_only=False).astype(np.float64)[self._iterations]
         frames = np.flatnonzero(np.isfinite(row))
         return frames, row[frames].astype(np.int64)
@@ -167,6 +170,7 @@ class Log:
 
     def nearest_frames(self, t_us: Float64[np.ndarray, "*n"]) -> tuple[np.ndarray, np.ndarray]:
         """Return the frame nearest to each time, and whether it is at most half the log's period away."""
+        # The frames before and after each time; a log of one frame has only that one
         after = np.searchsorted(self.t_us, t_us).clip(1, max(len(self) - 1, 1))
         before = after - 1
         after = after.clip(0, len(self) - 1)
@@ -178,6 +182,7 @@ class Log:
         """Return the ego path after `frame`, M = 1. Steps beyond the log or in a gap are not valid."""
         t_us = self.t_us[frame] + np.arange(1, steps + 1) * dt_s * 1e6
         T_world, valid = self.poses_at(t_us)
+        # World to ego frame in double precision, because world coordinates may be large
         T = np.linalg.inv(self.T_world_ego[frame]) @ T_world
         keep = torch.from_numpy(valid)[None]
         return Trajectory(
@@ -195,6 +200,7 @@ class Log:
         times_us = self._drive_t_us.astype(np.float64)
         xyz = self._drive_T[:, :3, :3] @ point_ego + self._drive_T[:, :3, 3]
         if len(times_us) > 1:
+            # One more point at either end, at the velocity of the first and the last step
             times_us = np.concatenate(
                 [[2 * times_us[0] - times_us[1]], times_us, [2 * times_us[-1] - times_us[-2]]]
             )
@@ -265,6 +271,7 @@ class Log:
 def imu_from_ego(vehicle: EgoStateSE3Metadata) -> Float64[np.ndarray, "4 4"]:
     """Return T_imu_ego of a vehicle as 123D describes it."""
     T_rear_ego = np.eye(4)
+    # From the rear axle down to the bottom face of the box, which is on the ground
     T_rear_ego[2, 3] = vehicle.rear_axle_to_center_vertical - vehicle.half_height
     return vehicle.rear_axle_to_imu_se3.transformation_matrix @ T_rear_ego
 

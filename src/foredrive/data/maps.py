@@ -52,6 +52,7 @@ def read_map_patch(log: Log, frame: int) -> MapPatch:
             flat = not api.get_map_metadata().map_has_z
             T_ego_world = np.linalg.inv(T_world_ego)
             for kind, line in _lines(item for items in near.values() for item in items):
+                # A map without heights is taken as level: pitch and roll must not lift far lines
                 line = np.column_stack([line, np.full(len(line), T_world_ego[2, 3])]) if flat else line
                 line = line @ T_ego_world[:3, :3].T + T_ego_world[:3, 3]
                 if flat:
@@ -103,6 +104,7 @@ def write_map(objects: Iterable[BaseMapObject], location: str, root: Path) -> Pa
     maps_dir = Path(root) / "maps"
     final = maps_dir / DATASET / f"{DATASET}_{location}.arrow"
     if not final.is_file():
+        # Several processes may write the map of one location at the same time; each writes its own copy
         with atomic_path(final) as temporary:
             scratch = temporary.parent
             writer = ArrowMapWriter(force_map_conversion=True, maps_root=scratch, logs_root=scratch)
@@ -132,5 +134,6 @@ def _points(line: Polyline2D | Polyline3D) -> Float64[np.ndarray, "V D"]:
 
 def _pieces(line: Float64[np.ndarray, "V 3"]) -> list[Float64[np.ndarray, "v 3"]]:
     """Cut a line into pieces of at most VERTICES, and keep those that come within RADIUS_M."""
+    # Neighbouring pieces share a vertex, so that there is no gap between them
     cuts = [line[start : start + VERTICES] for start in range(0, max(len(line) - 1, 1), VERTICES - 1)]
     return [piece for piece in cuts if (np.linalg.norm(piece[:, :2], axis=-1) <= RADIUS_M).any()]

@@ -25,7 +25,7 @@ BOX_VISIBILITY = "box_visibility"
 BOX_ATTRIBUTE = "box_attribute"
 """An `Attribute` for each box."""
 SETTING = "setting"
-"""The facts of `data.setting.Setting`: words and numbers by field name."""
+"""The fields of `data.setting.Setting` as words and numbers, by name."""
 CAPTION = "caption"
 """One text per frame."""
 EXPERT_PLAN = "expert_plan"
@@ -57,12 +57,14 @@ def pack_beams(sweep: LidarSweep) -> dict[str, Any]:
     returned = (sweep.valid & sweep.returned).numpy()
     missed = (sweep.valid & ~sweep.returned).numpy()
     steps = np.round(sweep.origin_ego.numpy()[returned | missed] / _ORIGIN_STEP_M).astype(np.int32)
+    # A spinning lidar has few different origins after rounding, so beams store an index
     origins, which = np.unique(steps, axis=0, return_inverse=True)
     if len(origins) > np.iinfo(np.uint16).max:
         raise InputError(
             f"a lidar sweep has {len(origins)} different beam origins, at most 65535 can be stored"
         )
     which = which.reshape(-1).astype(np.uint16)
+    # Origins are indexed over all valid beams, then split into returns and misses
     is_return = returned[returned | missed]
     return {
         "origin_steps": squeeze_array(origins),
@@ -83,6 +85,7 @@ def unpack_beams(data: dict[str, Any]) -> tuple[Float[np.ndarray, "R 3"], LidarS
         _ORIGIN_STEP_M
     )
     direction = expand_array(data["miss_direction"]).astype(np.float32)
+    # Rounded directions are normalised again
     direction /= np.linalg.norm(direction, axis=-1, keepdims=True).clip(min=1)
     count = len(direction)
     misses = LidarSweep(
@@ -109,6 +112,7 @@ def pack_occupancy(occupancy: FullOccupancy) -> dict[str, Any]:
     flat = np.ravel_multi_index(tuple(occupancy.index_zyx.T), occupancy.spec.shape_zyx)
     order = np.argsort(flat, kind="stable")
     return {
+        # Differences of sorted indices are small numbers, which compress well
         "voxel_step": squeeze_array(np.diff(flat[order], prepend=0).astype(np.uint32)),
         "category": squeeze_array(occupancy.category[order].astype(np.int8)),
         "velocity_mps": squeeze_array(occupancy.velocity_mps[order].astype(np.float16)),

@@ -1,8 +1,8 @@
 """Notices of a conversion: parts of a raw log that were left out, and values that were assumed.
 
-A converter calls `note`; the conversion collects the notices (`collecting`) and keeps them beside the log, in
-`notices.json`, where `foredrive convert` and `foredrive check` read them (`read_notices`). Outside of a
-conversion they are warnings of Python's logging.
+A converter calls `note`. The conversion collects the notices (`collecting`) and stores them in the folder of
+the log, in `notices.json`, from which `foredrive convert` and `foredrive check` read them (`read_notices`).
+Outside of a conversion, notices are logged as warnings.
 """
 
 import contextlib
@@ -23,7 +23,7 @@ _log = logging.getLogger(__name__)
 
 @dataclass
 class _Notices:
-    """Places and their number by subject and text, in the order in which they came up."""
+    """Places and their number by subject and text, in the order of their first occurrence."""
 
     count: dict[tuple[str, str], int] = field(default_factory=dict)
     places: dict[tuple[str, str], list[str]] = field(default_factory=dict)

@@ -1,4 +1,4 @@
-"""Logs from sensor data of one's own: images, calibration, poses, sweeps and boxes.
+"""Logs from the user's own sensor data: images, calibration, poses, sweeps and boxes.
 
 The frame of the ego vehicle is on the ground below the middle of the rear axle: x ahead, y to the left, z up.
 Camera frames have x to the right, y down and z ahead. The world frame is any frame with z up.
@@ -99,8 +99,9 @@ def write_log(
     """Write sensor data as a 123D log. An existing log of the same name is replaced.
 
     All sequences have one entry for each of T frames, and None where a frame lacks it. They are read one
-    entry at a time, so a sequence that loads its entries keeps the memory flat. Velocities and accelerations
-    are differences to the frame before, so that they know nothing of later frames. Images are stored as JPEG.
+    entry at a time, so a sequence may load its entries when they are read, which limits the memory.
+    Velocities and accelerations are differences to the previous frame, so that they contain nothing of later
+    frames. Images are stored as JPEG.
 
     Args:
         out: 123D data root; the log is out/logs/SPLIT/NAME.
@@ -115,8 +116,8 @@ def write_log(
         lidar_position_m: of the lidar, in the ego frame.
         boxes: labels at each frame. None where a frame is not annotated, empty where nothing is there.
         vehicle: size of the recording vehicle.
-        path: times [P] and poses [P, 4, 4] of the vehicle at a higher rate. They tell where it was when
-            images and points between the frames were measured. Default: those of the frames.
+        path: times [P] and poses [P, 4, 4] of the vehicle at a higher rate. They give its pose at the times
+            of images and points between the frames. Default: those of the frames.
         split: a name that ends in _train, _val or _test.
         tick: called after each frame.
 
@@ -130,6 +131,7 @@ def write_log(
     if path is not None:
         denser = _Drive.of(f"{name}, path", *(np.asarray(values, np.float64) for values in path))
         drive = dataclasses.replace(drive, denser=denser)
+    # All checks that need no file come before the first frame is written
     _check_cameras(name, cameras)
     images, image_t_s = images or {}, image_t_s or {}
     given: dict[str, Sequence[Any] | np.ndarray | None] = {"sweeps": sweeps, "boxes": boxes, **image_t_s}
@@ -154,6 +156,7 @@ def write_log(
                 sweep=None if points is None else _sweep(points, drive, frame, lidar_position_m, where),
                 boxes=None if labels is None else _boxes(labels, where),
                 exposed={camera: times[frame] for camera, times in exposed.items()},
+                # The beams that did not return are unknown
                 misses_known=False,
             )
             writer.write(sensed)
@@ -196,7 +199,7 @@ class _Drive:
             raise InputError(f"{name}: a time or a pose is not finite")
         if np.abs(t_s).max() > _MAX_S:
             raise InputError(f"{name}: times are in seconds; {np.abs(t_s).max():g} s may be in ns, ms or µs")
-        t_us = np.round(t_s * 1e6).astype(np.int64)  # whole numbers, because doubles may be off by one
+        t_us = np.round(t_s * 1e6).astype(np.int64)  # Whole µs: the product may be off by a fraction
         if (np.diff(t_us) < 1).any():
             raise InputError(f"{name}: times must increase, by a microsecond at least")
         R = T_world_ego[:, :3, :3]
@@ -209,6 +212,7 @@ class _Drive:
         return cls(
             t_us,
             T_world_ego,
+            # Rᵀ v: from world to ego axes
             np.einsum("tji,tj->ti", R, velocity),
             np.einsum("tji,tj->ti", R, acceleration),
         )
@@ -220,6 +224,7 @@ class _Drive:
         times_us, T = self.t_us, self.T_world_ego
         if len(times_us) == 1:
             return np.repeat(T, len(t_us), axis=0)
+        # The first and the last step are repeated beyond the ends
         before, after = T[0] @ np.linalg.inv(T[1]) @ T[0], T[-1] @ np.linalg.inv(T[-2]) @ T[-1]
         times_us = np.concatenate(
             [[2 * times_us[0] - times_us[1]], times_us, [2 * times_us[-1] - times_us[-2]]]
@@ -325,6 +330,7 @@ def _compensated(
     xyz_m: Float64[np.ndarray, "N 3"], dt_s: Float64[np.ndarray, "N"], drive: _Drive, frame: int
 ) -> Float64[np.ndarray, "N 3"]:
     """Move points from the ego frame at their own times to that at the frame's time."""
+    # Many points share a time, so each pose is computed once
     times_us, which = np.unique(np.round(dt_s * 1e6), return_inverse=True)
     T = np.linalg.inv(drive.T_world_ego[frame]) @ drive.poses_at(drive.t_us[frame] + times_us)
     return np.einsum("nij,nj->ni", T[which, :3, :3], xyz_m) + T[which, :3, 3]

@@ -73,14 +73,18 @@ def held_voxels(
         Index of a recorded voxel, or NOTHING; True for voxels that are completely inside the recorded grid.
     """
     order = np.argsort(priority, kind="stable")
+    # From here a recorded voxel is its rank by priority, so that the maximum is the one to keep
     index = recorded.index_zyx[order]
-    which = np.full(np.add(recorded.spec.shape_zyx, 1), NOTHING)  # one more layer, for indices outside
+    # One more layer on each axis holds NOTHING: index -1, for places outside, reads it
+    which = np.full(np.add(recorded.spec.shape_zyx, 1), NOTHING)
     which[tuple(index.T)] = np.arange(len(index))
+    # First the recorded voxel at the centre of each voxel, then the recorded centres inside each voxel
     held = which[np.ix_(*_voxels_at_middles(spec, recorded.spec))]
     middles = _voxels_at_middles(recorded.spec, spec)
     z, y, x = (of_axis[index[:, axis]] for axis, of_axis in enumerate(middles))
     within = np.flatnonzero((z >= 0) & (y >= 0) & (x >= 0))
     np.maximum.at(held, (z[within], y[within], x[within]), within)
+    # Rank -1 reads the appended NOTHING
     return np.append(order, NOTHING)[held], _within(spec, recorded.spec)
 
 

@@ -44,6 +44,7 @@ def read_road_map(log: Log) -> RoadMap | None:
     outlines = tuple(_lane_ring(lane) for lane in lanes)
     along = np.stack([_driven_along(lane, ring, log) for lane, ring in zip(lanes, outlines, strict=True)])
     used = [bool(row.any()) for row in along]
+    # Parallel lanes of a driven lane belong to the route too
     groups = {lane.lane_group_id for lane, on in zip(lanes, used, strict=True) if on} - {None}
     on_route = tuple(on or lane.lane_group_id in groups for lane, on in zip(lanes, used, strict=True))
     return RoadMap(
@@ -68,9 +69,11 @@ def _lane_ring(lane: Lane) -> Float64[np.ndarray, "V 2"]:
 def _driven_along(lane: Lane, ring: Float64[np.ndarray, "V 2"], log: Log) -> Bool[np.ndarray, "F"]:
     """Return at which frames the vehicle is in a lane and points along it."""
     xy, forward = log.T_world_ego[:, :2, 3], log.T_world_ego[:, :2, 0]
+    # Outlines of lanes may cross themselves
     inside = np.asarray(shapely.contains_xy(shapely.make_valid(shapely.Polygon(ring)), *xy.T))
     line = lane.centerline_2d.linestring
     at_m = shapely.line_locate_point(line, shapely.points(xy))
+    # The lane's direction here: a chord of two metres around the nearest point
     step = shapely.get_coordinates(shapely.line_interpolate_point(line, np.minimum(at_m + 1.0, line.length)))
     step -= shapely.get_coordinates(shapely.line_interpolate_point(line, np.maximum(at_m - 1.0, 0.0)))
     return np.asarray(inside & ((step * forward).sum(axis=1) > 0))
@@ -86,6 +89,7 @@ def _centreline(
         nearest = min(lines, key=spot.distance, default=None)
         if nearest is not None:
             xy = np.array(nearest.interpolate(nearest.project(spot)).coords[0][:2])
+        # Points of a slow vehicle are thinned out, so that the direction between them is defined
         if np.hypot(*(xy - points[-1])) >= SPACING_M or frame == 0:
             points.append(xy)
     line = np.stack(points[1:] if len(points) > 2 else [driven[0], driven[-1]])

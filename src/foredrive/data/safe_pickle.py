@@ -1,8 +1,8 @@
-"""Reading of untrusted pickles without running their code, in memory that their bytes account for.
+"""Reading of untrusted pickles without running their code, in memory proportional to their size.
 
-Some of the names that arrays and tables need can be called with other arguments than pandas and NumPy write:
-`ndarray((10**10,))`, `DataFrame(0, RangeIndex(10**9))`, or `encode` again and again on its own result. Here
-classes are stand-ins that cannot be called, and functions check their arguments.
+Some names that arrays and tables need can be called with other arguments than pandas and NumPy write:
+`ndarray((10**10,))`, `DataFrame(0, RangeIndex(10**9))`, or `encode` repeatedly on its own result. Here
+classes are replaced by objects that cannot be called, and functions check their arguments.
 """
 
 import functools
@@ -24,7 +24,7 @@ from foredrive.errors import InputError
 MAX_UNZIPPED_BYTES = 2**26
 """Size of the largest gzipped pickle. A sweep of PandaSet has 9 MB."""
 MAX_ROWS = 10**7
-"""Number of rows of the longest table whose index is a range, which takes no bytes."""
+"""Maximum number of rows of a table whose index is a range, which takes no bytes in the file."""
 
 _PLAIN = {
     ("numpy", "dtype"),
@@ -38,7 +38,7 @@ _PLAIN = {
 
 _TABLE = _PLAIN | {
     ("builtins", "slice"),
-    ("pandas", "DataFrame"),  # pandas 3; earlier versions name the defining module
+    ("pandas", "DataFrame"),  # Of pandas 3; earlier versions name the defining module
     ("pandas", "Index"),
     ("pandas", "RangeIndex"),
     ("pandas.core.frame", "DataFrame"),
@@ -59,7 +59,7 @@ class _Unpickler(pickle.Unpickler):
         self._allowed, self._moved = allowed, moved or {}
 
     def find_class(self, module: str, name: str) -> Any:
-        module = module.replace("numpy.core.", "numpy._core.")  # before numpy 2
+        module = module.replace("numpy.core.", "numpy._core.")  # The name before numpy 2
         module = self._moved.get(module, module)
         if (module, name) not in self._allowed:
             raise pickle.UnpicklingError(f"it asks for {module}.{name}, which plain data do not need")
@@ -71,14 +71,14 @@ class _Unpickler(pickle.Unpickler):
 
 
 class _StandIn:
-    """Stands for a class that a pickle names and may not call."""
+    """Takes the place of a class that a pickle may name, but not call."""
 
 
 _NDARRAY, _INDEX, _RANGE = _StandIn(), _StandIn(), _StandIn()
 
 
 def _reconstruct(kind: object, shape: object, dtype: object) -> Any:
-    """Return an empty array; its shape and its bytes, whose number NumPy compares, follow."""
+    """Return an empty array. Its shape and bytes follow in the pickle, and NumPy compares their sizes."""
     if kind is not _NDARRAY or shape != (0,):
         raise pickle.UnpicklingError("an array is not as NumPy writes it")
     return multiarray._reconstruct(np.ndarray, (0,), dtype)
@@ -109,9 +109,9 @@ def _new_index(kind: object, state: dict[str, Any]) -> Any:
 
 @functools.cache
 def _table_class() -> type:
-    """Return the class of a table that is made of its unpickled state alone.
+    """Return the class of a table that is restored only from its unpickled state.
 
-    It is made when it is needed, because logs are opened without pandas, which is slow to import.
+    It is defined at the first use, because logs are opened without pandas, which is slow to import.
     """
 
     class Table(pd.DataFrame):
@@ -130,7 +130,7 @@ _CHECKED: Mapping[str, Any] = {
     "encode": _encode,
     "_new_Index": _new_index,
 }
-"""Stand-ins by allowed name. Other allowed names cannot take more memory than they are given."""
+"""Replacements by allowed name. Other allowed names cannot allocate more memory than they are given."""
 
 
 def load_pickle(file: Path) -> Any:
@@ -153,7 +153,7 @@ def load_table(file: Path) -> "pd.DataFrame":
         raise InputError(f"{file}: not a table but a {type(table).__name__}")
     try:
         return pd.DataFrame(table, copy=False)
-    except AttributeError as error:  # a pickle can make a table without its content
+    except AttributeError as error:  # A pickle can create a table without its content
         raise InputError(f"{file}: a table without content") from error
 
 
@@ -176,7 +176,7 @@ def load_records(file: Path, schema: str, moved: Mapping[str, str]) -> Any:
 
 
 class PlainPickle:
-    """The functions of the module `pickle`, limited to plain data, to be put in its place in a library.
+    """The functions of the module `pickle`, limited to plain data. It replaces `pickle` in a library.
 
     Args:
         classes: further classes that are allowed, as (module, name).
@@ -207,14 +207,14 @@ def _load(
 ) -> Any:
     try:
         with opened(file, "rb") as source, warnings.catch_warnings():
-            warnings.filterwarnings("ignore", message="dtype.*align")  # written by an older numpy
+            warnings.filterwarnings("ignore", message="dtype.*align")  # Written by an older numpy
             if opened is gzip.open:
-                unzipped = source.read(MAX_UNZIPPED_BYTES + 1)  # to its end, where its checksum is compared
+                unzipped = source.read(MAX_UNZIPPED_BYTES + 1)  # To the end, where gzip checks the checksum
                 if len(unzipped) > MAX_UNZIPPED_BYTES:
                     raise ValueError(f"longer than {MAX_UNZIPPED_BYTES:,} bytes")
                 source = io.BytesIO(unzipped)
             return _Unpickler(source, allowed, moved).load()
-    except Exception as error:  # a damaged pickle can raise any error
+    except Exception as error:  # A damaged pickle can raise any error
         raise InputError(f"{file}: cannot read it as a pickle of plain data: {_first_line(error)}") from error
 
 

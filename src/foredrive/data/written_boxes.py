@@ -45,7 +45,7 @@ def box_modalities(boxes: Boxes, T_world_ego: Float64[np.ndarray, "4 4"], t_us: 
     T_ego_box = matrix_from_yaw(boxes.yaw.double(), boxes.centre.double()).numpy()
     detections = []
     T_world_box = T_world_ego @ T_ego_box
-    # py123d's conversion of one matrix at a time would take most of the time of writing a log.
+    # py123d's conversion of one matrix at a time would take most of the time of writing a log
     quaternions = get_quaternion_array_from_rotation_matrices(T_world_box[:, :3, :3])
     for pose, size, velocity, track, category, hits in zip(
         np.concatenate([T_world_box[:, :3, 3], quaternions], axis=1),

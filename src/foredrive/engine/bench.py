@@ -1,9 +1,9 @@
 """Benchmarks: arms side by side, over seeds, stored after each measurement.
 
-A benchmark runs seed by seed and arm by arm. An interrupted run goes on where it stopped. Figures of speed
+A benchmark runs seed by seed and arm by arm. An interrupted run continues where it stopped. Figures of speed
 are kept only while the code (commit and changes since), the benchmark's configuration and the machine are the
-same. Figures of quality, such as those of trained models, stand together as long as the configuration and the
-modules that decide them are the same, so a study may go on at another commit and on another machine.
+same. Figures of quality, such as those of trained models, are kept as long as the configuration and the
+modules that decide them are the same. So a study may continue at another commit and on another machine.
 """
 
 import ast
@@ -33,11 +33,11 @@ class Benchmark:
     question: str
     """The question that the figures answer, in one line."""
     arms: Mapping[str, Callable[[int], Mapping[str, float]]]
-    """Functions by name: seed → figures by name, units in the names. ARM@PART is a part of ARM, measured and
-    stored by itself; its figures stand with those of ARM."""
+    """Functions by name: seed → figures by name, units in the names. ARM@PART is a part of ARM. It is
+    measured and stored separately, and its figures are reported as figures of ARM."""
     seeds: tuple[int, ...] = (0, 1, 2)
     config: Mapping[str, Any] | None = None
-    """Values that the figures depend on beside the code, JSON-able; other values start the benchmark anew."""
+    """Values that the figures depend on besides the code, JSON-able. Changed values restart the benchmark."""
     decided_by: tuple[str, ...] | None = None
     """Modules and packages whose code decides the figures of a study of quality, by full name. None: the
     figures are speeds, which depend on commit and machine."""
@@ -71,7 +71,9 @@ def run_benchmark(
     if _kept_runs(path, same, benchmark, origin) is None:
         say(f"{path.name}: measured on other code, configuration or machine; starting anew")
     chosen = [arm for arm in benchmark.arms if arms is None or arm in arms]
-    for seed, arm in product(benchmark.seeds, chosen):  # what is interrupted has all arms beside each other
+    # Seeds are the outer loop, so that an interrupted benchmark has the same seeds for all arms
+    for seed, arm in product(benchmark.seeds, chosen):
+        # The file is read again before each measurement: another process may fill it at the same time
         runs = _kept_runs(path, same, benchmark, origin) or []
         if any(run["arm"] == arm and run["seed"] == seed for run in runs):
             say(f"{name}: {arm}, seed {seed}: measured before")
@@ -81,7 +83,8 @@ def run_benchmark(
         figures = {key: float(value) for key, value in benchmark.arms[arm](seed).items()}
         wall_s = time.perf_counter() - started
         made_on = {key: origin[key] for key in MADE_ON}
-        runs = _kept_runs(path, same, benchmark, origin) or []  # other processes may have measured other arms
+        # Other processes may have added measurements while this one ran
+        runs = _kept_runs(path, same, benchmark, origin) or []
         runs.append({"arm": arm, "seed": seed, "figures": figures, "wall_s": wall_s, **made_on})
         write_json(path, _report(name, benchmark, origin, same, runs))
         say(f"{name}: {arm}, seed {seed}: " + ", ".join(f"{k} {v:.4g}" for k, v in figures.items()))
@@ -137,6 +140,7 @@ def _identity(benchmark: Benchmark, origin: Mapping[str, Any]) -> str:
     """Return a digest of all facts that make two measurements comparable."""
     if benchmark.decided_by is not None:
         return study_identity(benchmark.config or {}, benchmark.decided_by)
+    # Speeds depend on machine, versions and commit. The command is left out: it may name single arms
     parts = {key: value for key, value in origin.items() if key != "command"}
     parts["config"] = dict(benchmark.config or {})
     return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:16]
@@ -201,6 +205,7 @@ def _kept_runs(
     except (ValueError, KeyError, TypeError) as error:
         raise InputError(f"{path}: not a benchmark's results; move it away to start anew") from error
     if identity == same:
-        made_on = {key: earlier.get(key, origin[key]) for key in MADE_ON}  # files that have it once for all
+        # Runs without entries of their own take those of the file
+        made_on = {key: earlier.get(key, origin[key]) for key in MADE_ON}
         return [made_on | run for run in runs]
     return None

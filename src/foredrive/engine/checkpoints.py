@@ -32,6 +32,7 @@ def save_checkpoint(
     that of one process.
     """
     final = folder / f"step_{step:07d}"
+    # Gathering shards is a collective operation: every process takes part before the others leave
     weights, (tensors, scalars) = whole_weights(model), _flatten_optimizer(optimizer)
     if not writes:
         return final
@@ -40,13 +41,14 @@ def save_checkpoint(
         save_file(weights, temporary / MODEL)
         save_file(tensors, temporary / OPTIMIZER)
         (temporary / PROGRESS).write_text(json.dumps({"step": step, "optimizer": scalars}))
+    # The new checkpoint is complete on disk, so at every moment there is one to resume from
     remove_older(final)
     _log.info("saved %s", final)
     return final
 
 
 def remove_older(checkpoint: Path) -> None:
-    """Remove the other checkpoints beside one. It is done again on resuming, in case it was killed."""
+    """Remove the other checkpoints in its folder. Resuming repeats this, in case that it was cut short."""
     for old in checkpoint.parent.glob("step_*"):
         if old != checkpoint:
             shutil.rmtree(old)
@@ -105,6 +107,7 @@ def load_weights(model: nn.Module, path: Path, part: str = "") -> None:
         raise InputError(f"{path}: weights cannot be read: {error}") from error
     state = {name.removeprefix(prefix): value for name, value in saved.items() if name.startswith(prefix)}
     own = model.state_dict()
+    # Names that only one side has, then names with different shapes
     wrong = sorted(set(own) ^ set(state)) + [
         name for name in sorted(set(own) & set(state)) if own[name].shape != state[name].shape
     ]
@@ -116,6 +119,7 @@ def load_weights(model: nn.Module, path: Path, part: str = "") -> None:
 def _flatten_optimizer(optimizer: Optimizer) -> tuple[dict[str, Tensor], dict[str, Any]]:
     state = optimizer.state_dict()
     tensors = {
+        # Keys are PARAMETER.ENTRY, the parameter as its index over all groups
         f"{index}.{name}": whole(value).contiguous()
         for index, entry in state["state"].items()
         for name, value in entry.items()
@@ -140,6 +144,7 @@ def _restore_optimizer(optimizer: Optimizer, tensors: dict[str, Tensor], scalars
     for key, value in tensors.items():
         index, name = key.split(".", 1)
         own = parameters[int(index)]
-        placed = placed_like(value, own) if value.shape == own.shape else value  # the count of steps is not
+        # Moments are sharded as their parameter is. The count of steps is a scalar, which is not sharded
+        placed = placed_like(value, own) if value.shape == own.shape else value
         state.setdefault(int(index), {})[name] = placed
     optimizer.load_state_dict({"state": state, "param_groups": scalars["param_groups"]})

@@ -164,6 +164,7 @@ def overridden(written: Mapping[str, Any], settings: Sequence[str]) -> dict[str,
                 raise InputError(f"--set {setting}: {'.'.join(parents[:depth])} has no entries")
             if key not in place:
                 raise InputError(f"--set {setting}: no entry {key!r}{_nearest(key, name, place, values)}")
+            # Stop at the parent of the last key, which is assigned below
             if depth < len(parents):
                 place = place[key]
         try:
@@ -178,6 +179,7 @@ def _nearest(key: str, name: str, siblings: Mapping[str, Any], values: Mapping[s
     near = difflib.get_close_matches(key, siblings, n=1)
     if near:
         return f"; {near[0]!r} is near"
+    # No similar key here: prefer entries of this name elsewhere, then those with a similar full name
     everywhere = list(_names(values))
     near = [full_name for full_name in everywhere if full_name.split(".")[-1] == key]
     near = near or difflib.get_close_matches(name, everywhere, n=1, cutoff=0.4)

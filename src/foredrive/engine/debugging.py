@@ -20,7 +20,7 @@ from foredrive.errors import InputError
 _log = logging.getLogger(__name__)
 
 VERBOSE, PROFILE = "FOREDRIVE_VERBOSE", "FOREDRIVE_PROFILE"
-"""Variables of the environment: any text; FILE:START_S:LENGTH_S."""
+"""Environment variables. The first may have any value, the second is FILE:START_S:LENGTH_S."""
 DEFAULT_START_S, DEFAULT_LENGTH_S = 30.0, 5.0
 
 
@@ -63,7 +63,7 @@ def take_debugging(args: Sequence[str]) -> list[str]:
     Raises:
         InputError: `--profile` is without a file, or its text is not understood.
     """
-    for variable in (VERBOSE, PROFILE):  # of an earlier command in this process
+    for variable in (VERBOSE, PROFILE):  # Left by an earlier command in this process
         os.environ.pop(variable, None)
     rest: list[str] = []
     words = iter(args)
@@ -89,7 +89,7 @@ def debugging(worker: bool = False) -> Iterator[None]:
     """Log and profile inside the block, as the environment says.
 
     Args:
-        worker: whether this is a process of another command: its trace has a name of its own.
+        worker: whether this is a worker process of a command. Its trace has its own file name.
     """
     if is_verbose():
         logging.basicConfig(format="%(relativeCreated)7d ms %(process)d %(name)s: %(message)s")
@@ -99,15 +99,18 @@ def debugging(worker: bool = False) -> Iterator[None]:
         return
     plan = ProfilePlan.parse(os.environ[PROFILE])
     if worker:
+        # NAME.json.gz becomes NAME.PROCESS.json.gz
         plan = dataclasses.replace(
             plan, file=plan.file.with_suffix("").with_suffix(f".{os.getpid()}.json.gz")
         )
     recording = _Recording(plan)
+    # An alarm of wall-clock time starts the recording in whatever code runs then
     signal.signal(signal.SIGALRM, recording)
     signal.setitimer(signal.ITIMER_REAL, plan.start_s)
     try:
         yield
     finally:
+        # No alarm may arrive while the trace is written
         signal.setitimer(signal.ITIMER_REAL, 0)
         recording.end()
 
@@ -119,11 +122,13 @@ class _Recording:
     """Whether this process has had its recording: a worker records in its first job."""
 
     def __init__(self, plan: ProfilePlan) -> None:
-        from torch.profiler import profile  # not in the handler, where an import may be half done
+        # Not imported in the handler, which may interrupt an import halfway
+        from torch.profiler import profile
 
-        # Stacks make Python's own functions events of the trace, beside those of PyTorch.
+        # With stacks, the trace has Python's own functions as well as those of PyTorch
         self._made = functools.partial(profile, with_stack=True)
-        with self._made():  # the first profile of a process loses operators while the profiler sets itself up
+        # A first, empty profile: the first one of a process loses operators while the profiler sets itself up
+        with self._made():
             pass
         self._plan, _Recording.is_made = plan, True
         self._profiler: Any = None
@@ -148,6 +153,7 @@ class _Recording:
             return
         self._profiler.stop()
         file.parent.mkdir(parents=True, exist_ok=True)
+        # Written beside its place and renamed, so that the file is complete when it appears
         with tempfile.TemporaryDirectory(dir=file.parent) as folder:
             written = Path(folder) / file.name
             self._profiler.export_chrome_trace(str(written))

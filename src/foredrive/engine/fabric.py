@@ -21,7 +21,7 @@ Sharing = Literal["ddp", "fsdp"]
 """How processes share a training. DDP: each holds all weights and the optimizer's state. FSDP: each holds a
 shard of both, and has all weights only during a step."""
 PATIENCE = timedelta(hours=2)
-"""Time that the other processes wait for what the first does alone, such as the fit of path features."""
+"""Time for which processes wait for work of the first process alone, such as fitting path features."""
 
 
 class _Autocast(MixedPrecision):
@@ -70,7 +70,8 @@ def _strategy(sharing: Sharing, processes: int) -> DDPStrategy | ModelParallelSt
         )
     warnings.filterwarnings("ignore", message="Grad strides do not match bucket view strides")
     warnings.filterwarnings("ignore", message="`broadcast_buffers` is deprecated")
-    # Heads have no loss in batches without their truth, so some parameters may be unused in a step.
+    # Heads have no loss in batches without their truth, so some parameters may be unused in a step
+    # `StepBuffers` averages the buffers, so DDP must not overwrite them with those of the first process
     return DDPStrategy(find_unused_parameters=True, broadcast_buffers=False, timeout=PATIENCE)
 
 

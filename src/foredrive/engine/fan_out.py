@@ -1,7 +1,7 @@
 """Run many jobs at once, in processes or on Ray; a job that fails does not stop the others.
 
-A job whose process dies is tried once more. In a pool of processes all jobs under way are lost with one
-process. Each of them is then tried alone, so that a job that kills its process takes no other along.
+A job whose process dies is tried once more. When one process of a pool dies, all running jobs of the pool are
+lost. Each of them is then tried alone, so that a job that kills its process does not affect other jobs.
 
 An interruption reaches every worker. Each worker removes its unfinished files before the interruption is
 raised.
@@ -39,7 +39,7 @@ LAST_WORDS_S = 60.0
 """Maximum time for Ray's tasks to remove their unfinished files, s."""
 
 _DEATHS_ON_RAY = ("WorkerCrashedError", "OutOfMemoryError", "NodeDiedError", "LocalRayletDiedError")
-"""Names of ray.exceptions that stand for the death of a task's process; Ray is slow to import."""
+"""Names of the ray.exceptions that report the death of a task's process. Ray itself is slow to import."""
 _log = logging.getLogger(__name__)
 J = TypeVar("J")
 R = TypeVar("R")
@@ -63,6 +63,7 @@ def fan_out(
     with (_on_ray if on_ray else _on_processes)(work, workers) as (submit, width):
         _log.info("%d jobs, %d at a time", len(jobs), width)
         while waiting or lost or running:
+            # Jobs that were lost with a process run one by one; new jobs start when none of them is left
             alone = bool(lost) and not running
             if alone:
                 job = lost.popleft()
@@ -73,6 +74,7 @@ def fan_out(
             for future in wait(running, return_when=FIRST_COMPLETED).done:
                 job, error = running.pop(future), future.exception()
                 _log.info("%s: %s", reprlib.repr(job), "done" if error is None else repr(error))
+                # A job that ran alone has broken the pool itself, so its second failure is final
                 if isinstance(error, BrokenProcessPool) and not alone:
                     lost.append(job)
                 else:
@@ -80,12 +82,12 @@ def fan_out(
 
 
 def reason(name: str, error: BaseException) -> str:
-    """Return in one line why a job failed.
+    """Return the reason of a job's failure in one line.
 
     Raises:
         BaseException: the error itself, if the job did not cause it: a full disk, an interruption.
     """
-    error = getattr(error, "cause", None) or error  # Ray wraps the error, with its traceback as text
+    error = getattr(error, "cause", None) or error  # Ray wraps the error and its traceback in one of its own
     if isinstance(error, OSError) or not isinstance(error, Exception):
         raise error
     if isinstance(error, InputError):
@@ -101,13 +103,17 @@ def _on_processes(work: Callable[[J], R], workers: int) -> Iterator[tuple[Callab
     """Run jobs in worker processes, which remove their unfinished files at the end; replace a dead worker."""
     start_fork_server(preload=_module_of(work))
     context = multiprocessing.get_context("forkserver")
-    stop, alive = context.Pipe(duplex=False)  # an event would wait for ever for a dead process
+    # Workers stop when `alive` is closed, which also happens when this process is killed. An Event instead
+    # would wait for ever for the wake-up of a worker that has died
+    stop, alive = context.Pipe(duplex=False)
     pool: ProcessPoolExecutor | None = None
 
     def submit(job: J) -> Future[R]:
         nonlocal pool
-        with hold_interrupts():  # a worker that is interrupted while it starts would print a traceback
+        # A worker that is interrupted while it starts would print a traceback
+        with hold_interrupts():
             if pool is not None:
+                # A pool refuses all jobs once a worker has died; then it is replaced
                 with contextlib.suppress(BrokenProcessPool):
                     return pool.submit(_unless_stopped, work, job)
                 pool.shutdown()
@@ -117,6 +123,7 @@ def _on_processes(work: Callable[[J], R], workers: int) -> Iterator[tuple[Callab
     try:
         yield submit, workers
     finally:
+        # First tell the workers to stop, then wait for them: they remove their unfinished files
         alive.close()
         if pool is not None:
             pool.shutdown(cancel_futures=True)
@@ -134,16 +141,18 @@ def _start_worker(stop: Connection) -> None:
     """Set up a worker: stop when the parent closes its end of the pipe, and by Ctrl-C and SIGTERM.
 
     The worker removes its unfinished files when it stops. The pool ends the workers, unless the parent was
-    killed: then a worker ends by itself.
+    killed: then each worker ends on its own.
     """
-    rich.get_console().quiet = True  # the parent shows the progress
+    rich.get_console().quiet = True  # The parent shows the progress
     main = threading.get_ident()
 
     def watch() -> None:
+        # Nothing is ever sent: this returns when the other end is closed
         stop.poll(None)
-        signal.pthread_kill(main, signal.SIGINT)  # wakes a thread that sleeps or waits, too
+        signal.pthread_kill(main, signal.SIGINT)  # Also wakes a main thread that sleeps or waits
 
     def terminate(number: int, frame: "FrameType | None") -> None:
+        # Without a job nothing has to be removed. With one, the process ends after the job's clean-up
         if not _Worker.is_busy:
             os._exit(EXIT_TERMINATED)
         _Worker.is_terminated = True
@@ -151,6 +160,7 @@ def _start_worker(stop: Connection) -> None:
 
     signal.signal(signal.SIGINT, _Worker.interrupt)
     signal.signal(signal.SIGTERM, terminate)
+    # The fork server blocks SIGINT. Here it is handled, so that a job can remove its files
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     threading.Thread(target=watch, daemon=True).start()
     end_with_parent(0)
@@ -172,13 +182,13 @@ def _unless_stopped(work: Callable[[J], R], job: J) -> R:
 @contextlib.contextmanager
 def _on_ray(work: Callable[[J], R], workers: int) -> Iterator[tuple[Callable[[J], Future[R]], int]]:
     """Run jobs as Ray tasks of one core each. At the end the tasks have removed their unfinished files."""
-    import ray  # the import takes a second
+    import ray  # The import takes a second
 
     started_here = not ray.is_initialized()
     if started_here:
         cpus = None if "RAY_ADDRESS" in os.environ else workers
         ray.init(num_cpus=cpus, include_dashboard=False, log_to_driver=False, logging_level=logging.ERROR)
-    task: Any = ray.remote(num_cpus=1, max_retries=1)(_quietly)  # only when its process dies
+    task: Any = ray.remote(num_cpus=1, max_retries=1)(_quietly)  # Ray retries only if the process dies
     refs = {}
 
     def submit(job: J) -> Future[R]:
@@ -190,6 +200,7 @@ def _on_ray(work: Callable[[J], R], workers: int) -> Iterator[tuple[Callable[[J]
     try:
         yield submit, int(ray.cluster_resources()["CPU"])
     finally:
+        # Cancel what still runs, and wait while the tasks remove their unfinished files
         under_way = [ref for future, ref in refs.items() if not future.done()]
         for ref in under_way:
             ray.cancel(ref)

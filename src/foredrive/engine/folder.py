@@ -28,8 +28,8 @@ SUITE, DRIVES = "suite.json", "drives"
 MADE_BY = "made_by.json"
 """File that notes the commit with which a run began."""
 LOCK = ".lock"
-"""Lock file. The operating system holds the lock as long as its process lives, so that a killed process
-leaves the folder free.
+"""Lock file. The operating system releases the lock when its process ends in any way, so a killed process
+does not block the folder.
 """
 RESULTS_LOCK = ".results.lock"
 """Lock file of results that are written in one go. A run may be evaluated while it is being trained."""
@@ -72,7 +72,8 @@ class RunFolder:
         with held(self.path):
             begun = self.check()
             _log.info("%s: %s", self.path, "goes on" if begun else "begins")
-            self._mark(begun)  # before the request: a folder with a request has begun
+            # Before the request is written: the request marks the folder as begun
+            self._mark(begun)
             if not begun or self.grows:
                 self.write()
             yield
@@ -84,7 +85,7 @@ class RunFolder:
             with atomic_path(file) as temporary:
                 temporary.write_text(json.dumps({"commit": COMMIT}) + "\n")
             return
-        with contextlib.suppress(OSError, ValueError, LookupError, TypeError):  # older runs have no such file
+        with contextlib.suppress(OSError, ValueError, LookupError, TypeError):  # Runs may lack the file
             commit = json.loads(file.read_text())["commit"]
             if commit != COMMIT:
                 _log.warning(
@@ -96,7 +97,7 @@ class RunFolder:
 def held(folder: Path) -> Iterator[None]:
     """Keep other processes from writing to a folder; create it if it does not exist.
 
-    What a killed process left half-written in it is removed.
+    Unfinished files of killed processes in it are removed.
 
     Raises:
         InputError: another process writes to it.
@@ -108,6 +109,7 @@ def held(folder: Path) -> Iterator[None]:
     except Timeout:
         raise InputError(f"{folder}: another process is writing to it; wait for it or end it") from None
     try:
+        # With the lock held no other process of this kind writes here, so unfinished files have no owner
         remove_abandoned(folder, below=True)
         yield
     finally:
@@ -140,5 +142,5 @@ def held_for_results(folder: Path) -> Iterator[None]:
         (folder / RESULTS_LOCK).unlink(missing_ok=True)
         lock.release()
         if not was_there:
-            with contextlib.suppress(OSError):  # it holds results
+            with contextlib.suppress(OSError):  # It holds results, so it stays
                 folder.rmdir()

@@ -49,6 +49,7 @@ def fit_in_memory(
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, fit.steps)
     draws = torch.Generator().manual_seed(seed)
     module.train()
+    # Dropout draws from torch's own generators, batches from `draws`
     with torch.random.fork_rng():
         torch.manual_seed(seed)
         for _ in range(fit.steps):

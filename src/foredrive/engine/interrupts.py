@@ -1,4 +1,4 @@
-"""Interrupted and killed trainings: steps that are not cut in half, worker processes that do not stay."""
+"""Interrupted and killed trainings: steps are completed, and no worker process is left behind."""
 
 import _thread
 import contextlib
@@ -38,6 +38,7 @@ def hold_interrupts() -> Iterator[Callable[[], bool]]:
             raise KeyboardInterrupt
         pressed = True
 
+    # A local handler replaces the usual one; `interrupting_signals` has left out foreign handlers
     for number in before:
         signal.signal(number, note)
     try:
@@ -45,6 +46,7 @@ def hold_interrupts() -> Iterator[Callable[[], bool]]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+    # Raised after the handlers are restored, so that a further signal acts as usual
     if pressed:
         raise KeyboardInterrupt
 
@@ -59,7 +61,9 @@ def start_fork_server(preload: str) -> None:
         preload: module that the workers need. It is imported once, not in each worker, and stays shared.
     """
     multiprocessing.set_forkserver_preload([preload, "foredrive.engine.frozen"])
-    resource_tracker.ensure_running()  # the fork server would start it, which unblocks SIGINT
+    # Before SIGINT is blocked: the fork server would start it, and its start unblocks SIGINT
+    resource_tracker.ensure_running()
+    # The fork server inherits the environment and the signal mask of this moment; both are then reset
     os.environ[SOCKETS] = multiprocessing.util.get_temp_dir()
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
@@ -72,8 +76,8 @@ def start_fork_server(preload: str) -> None:
 def end_with_parent(worker_id: int) -> None:
     """Make this worker process end when its parent has ended in any way, for example by `kill -9`.
 
-    Nobody else does it. A worker's parent in the eyes of the operating system, and so of PyTorch, is the fork
-    server, which lives as long as its workers.
+    Neither the operating system nor PyTorch ends it: for them the worker's parent is the fork server, which
+    lives as long as its workers.
     """
     parent = multiprocessing.parent_process()
     assert parent is not None
@@ -81,14 +85,17 @@ def end_with_parent(worker_id: int) -> None:
 
     def watch() -> None:
         parent.join()
+        # Interrupt the main thread, so that its job removes its unfinished files. A signal also wakes a
+        # thread that sleeps or waits, but without a handler it would end the process at once
         if callable(signal.getsignal(signal.SIGTERM)):
-            signal.pthread_kill(main, signal.SIGTERM)  # wakes a thread that sleeps or waits, too
+            signal.pthread_kill(main, signal.SIGTERM)
         else:
             _thread.interrupt_main()
         until_s = time.monotonic() + CLEANUP_S
         time.sleep(PATIENCE_S)
         while writes_files() and time.monotonic() < until_s:
             time.sleep(PATIENCE_S)
+        # Without Python's shutdown, which could wait for other threads
         os._exit(1)
 
     threading.Thread(target=watch, daemon=True).start()

@@ -11,7 +11,7 @@ class Rate:
     """A learning rate that rises as the first quarter of a sine, then decays exponentially."""
 
     first: float
-    """Rate after the warm-up; 0 keeps the parameters as they are."""
+    """Rate after the warm-up. 0 leaves the parameters unchanged."""
     final: float = 0.1
     """Rate at the end, as a fraction of `first`."""
     warmup_steps: int = 0

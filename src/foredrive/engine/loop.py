@@ -27,7 +27,7 @@ from foredrive.engine.ranges import check_at_least
 from foredrive.errors import InputError
 from foredrive.files import atomic_path
 
-if TYPE_CHECKING:  # slow to import, and not needed to read schedules and metrics
+if TYPE_CHECKING:  # Slow to import, and not needed to read schedules and metrics
     from lightning_fabric import Fabric
     from lightning_fabric.wrappers import _FabricModule
 
@@ -86,8 +86,9 @@ class Schedule:
     one_cycle: OneCycle | None = None
     """1cycle policy of learning rate and momentum; None: warm-up and cosine."""
     accumulate: int = 1
-    """Parts of a step, one after the other or in several processes; their gradients are accumulated. More
-    processes make more parts. The same number of parts gives the same losses, on any number of processes."""
+    """Parts of a step, computed one after the other or in several processes; their gradients are accumulated.
+    A step has at least as many parts as processes. With the same number of parts, losses are the same on any
+    number of processes."""
 
     def __post_init__(self) -> None:
         """Check the numbers' ranges. No steps are allowed: then nothing is trained."""
@@ -141,6 +142,7 @@ def batch_order(
     Each epoch is a new permutation. With weights, it is as many draws with replacement.
     """
     for epoch in itertools.count():
+        # Each epoch has its own seed, so that a resumed training finds its place without any state
         generator = torch.Generator().manual_seed(seed * 1_000_003 + epoch)
         if weights is None:
             order = torch.randperm(items, generator=generator).tolist()
@@ -178,11 +180,13 @@ def train(
     if items == 0:
         raise InputError("there is nothing to train on: the data set is empty")
     total = schedule.total_steps(items)
+    # A resumed training keeps the parts with which it began: the losses depend on their number
     parts = schedule.parts(fabric.world_size, _parts_before(folder))
     with naming_lost_processes(fabric):
         model = fabric.setup_module(objective)
         groups = parameter_groups(objective, schedule.weight_decay)
         optimizer = torch.optim.AdamW(groups, lr=schedule.lr, fused=True)
+        # All processes resume from the checkpoint that the first one sees
         checkpoint = fabric.broadcast(latest_checkpoint(folder / CHECKPOINTS))
         done = 0 if checkpoint is None else load_checkpoint(checkpoint, objective, optimizer)
         if checkpoint is not None and fabric.is_global_zero:
@@ -193,9 +197,11 @@ def train(
             write_conditions(folder, fabric, parts)
         weights_m = sum(p.numel() for p in objective.parameters()) / 1e6
         _log.info("%s: steps %d to %d on %s, %.2f M weights", folder, done, total, fabric.device, weights_m)
+        # Skip the batches of finished steps
         batches = itertools.islice(
             batch_order(items, schedule.batch_size, schedule.seed, weights), done, total
         )
+        # Process r of n computes the parts r, r + n, ... of each step
         mine = [parts_of_step(batch, parts)[fabric.global_rank :: fabric.world_size] for batch in batches]
         loader: Any = fabric.setup_dataloaders(
             _loader(dataset, collate, mine, schedule.workers), use_distributed_sampler=False
@@ -204,6 +210,7 @@ def train(
         steps = _Steps(
             model, fabric.setup_optimizers(optimizer), StepBuffers(objective), schedule, total, fabric
         )
+        # The loader yields the parts of all steps of this process one after the other
         examples = iter(loader)
         with step_counter(
             folder,
@@ -219,7 +226,8 @@ def train(
                 losses = steps.take(step, own, examples)
                 if end_step(losses, f"loss {losses['loss'].item():.3f}"):
                     break
-        if step + 1 < total:  # another process was interrupted
+        # In an interrupted process `step_counter` raises this itself; the other processes end in the same way
+        if step + 1 < total:
             raise KeyboardInterrupt
 
 
@@ -264,6 +272,7 @@ def step_counter(
             if log is not None:
                 log.add(step, losses)
             progress.update(task, completed=step, note=note)
+            # All processes have to stop after the same step: saving and the next step need them all
             last = agreed(interrupted()) or step == total
             if last or step % checkpoint_every == 0:
                 save_checkpoint(folder / CHECKPOINTS, model, optimizer, step, writes=writes)
@@ -291,7 +300,7 @@ def _loader(
 
 @dataclass(frozen=True)
 class _Steps:
-    """What a step needs besides its data."""
+    """The model, optimizer and settings that a step needs besides its data."""
 
     model: "_FabricModule"
     optimizer: Any
@@ -304,6 +313,7 @@ class _Steps:
         """Take a step from this process' parts; return the losses of all processes, by name."""
         self._set_rates(step)
         self.optimizer.zero_grad(set_to_none=True)
+        # One part is the whole step, and its buffers need no averaging
         in_parts = parts[0].weight < 1
         if in_parts:
             self.buffers.begin()
@@ -311,11 +321,13 @@ class _Steps:
         for part in parts:
             last = part is parts[-1]
             example = next(examples)
+            # Processes exchange gradients only once, after the last part of each
             with self.fabric.no_backward_sync(self.model, enabled=not last):
                 losses = self._backward(step, part, example)
             if in_parts:
                 self.buffers.end_part(part.weight, last=last)
             results.append((part.weight, {name: value.item() for name, value in losses.items()}))
+            # Not raised here: the other processes would wait for this one
             complaint = complaint or _not_finite(losses, step, f"the batch {', '.join(example.key)}")
         if in_parts:
             self.buffers.end(processes=self.fabric.world_size)
@@ -323,6 +335,7 @@ class _Steps:
         for _, fault in everywhere:
             if fault is not None:
                 raise InputError(fault)
+        # The losses are finite everywhere. Gradients are not checked, only clipped
         self.fabric.clip_gradients(
             self.model, self.optimizer, max_norm=self.schedule.clip_grad_norm, error_if_nonfinite=False
         )
@@ -339,10 +352,11 @@ class _Steps:
 
     def _backward(self, step: int, part: Part, example: Batch) -> dict[str, Tensor]:
         """Return the losses of a part; add its share to the gradients."""
+        # A part has the same random numbers in whichever process computes it
         seed = (self.schedule.seed * 1_000_003 + step) * 1009 + part.number
-        torch.manual_seed(seed)  # dropout
+        torch.manual_seed(seed)  # For dropout
         losses: dict[str, Tensor] = self.model(example, torch.Generator().manual_seed(seed))
-        # The gradients of processes are averaged.
+        # Fabric averages the gradients over processes, but the parts' weights already add up to 1
         self.fabric.backward(losses["loss"] * (part.weight * self.fabric.world_size))
         return {name: value.detach() for name, value in losses.items()}
 
@@ -357,7 +371,7 @@ def _parts_before(folder: Path) -> int:
 def write_conditions(folder: Path, fabric: "Fabric", parts: int) -> None:
     """Write device, precision, number of processes and parts of a step to `folder/conditions.json`.
 
-    The precision is the one that was used: bfloat16 is not where it would be slower.
+    The precision is the one that is used, which is not bfloat16 where that would be slower.
     """
     device = fabric.device.type
     with fabric.autocast():
@@ -384,7 +398,7 @@ def check_finite(losses: dict[str, Tensor], step: int, source: str) -> None:
 
 
 def _not_finite(losses: dict[str, Tensor], step: int, source: str) -> str | None:
-    """Return what is wrong with the losses of a step; None if they are finite."""
+    """Return a message if a loss of a step is not finite, else None."""
     if bool(torch.stack([value.detach() for value in losses.values()]).isfinite().all()):
         return None
     values = ", ".join(f"{name} = {value.item():g}" for name, value in losses.items())

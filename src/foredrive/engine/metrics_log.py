@@ -16,6 +16,7 @@ class MetricsLog:
     """
 
     def __init__(self, path: Path, done: int) -> None:
+        # Steps after the checkpoint are repeated, so their lines are written again
         kept = [line for line in read_metrics(path) if line["step"] <= done]
         with atomic_path(path) as temporary:
             temporary.write_text("".join(json.dumps(line) + "\n" for line in kept))

@@ -31,6 +31,7 @@ class OneCycle:
     def at(self, step: int, total: int) -> tuple[float, float]:
         """Return the share of the maximum learning rate, and Adam's first beta, at step (from 0) of total."""
         start, (low, high) = 1 / self.initial_div, self.betas
+        # The last step of the rise, as a fractional step, as in PyTorch
         peak = self.rise_share * total - 1
         if step < peak:
             return _between(start, 1.0, step / peak), _between(high, low, step / peak)

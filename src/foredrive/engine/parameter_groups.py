@@ -20,6 +20,7 @@ def parameter_groups(module: nn.Module, weight_decay: float) -> list[dict[str, A
     seen: set[nn.Parameter] = set()
     for part in module.modules():
         for name, parameter in part.named_parameters(recurse=False):
+            # Shared parameters belong to the first module that has them
             if not parameter.requires_grad or parameter in seen:
                 continue
             seen.add(parameter)

@@ -1,7 +1,7 @@
 """Steps in parts: gradients are accumulated over the parts, and several processes share them.
 
 Random numbers, batch normalisation and losses belong to a part. A step is the mean over its parts, weighted
-by their items. So a step does not depend on the processes that compute its parts, but for rounding.
+by their items. So, apart from rounding, a step does not depend on the processes that compute its parts.
 """
 
 import itertools
@@ -24,6 +24,7 @@ class Part:
 
 def parts_of_step(batch: Sequence[int], count: int) -> list[Part]:
     """Return `count` parts of a batch. Items of a batch that is too short are repeated."""
+    # The last batch of an epoch may have fewer items than there are parts, and no part may be empty
     padded = list(itertools.islice(itertools.cycle(batch), max(len(batch), count)))
     taken = [padded[number::count] for number in range(count)]
     return [Part(number, len(items) / len(padded), items) for number, items in enumerate(taken)]
@@ -51,6 +52,7 @@ class StepBuffers:
 
     def __init__(self, module: nn.Module) -> None:
         parameters = {id(parameter) for parameter in module.parameters()}
+        # Only the persistent buffers, which a checkpoint holds
         state = module.state_dict(keep_vars=True).values()
         self._buffers = [value for value in state if id(value) not in parameters]
         self._means = [buffer for buffer in self._buffers if buffer.is_floating_point()]
@@ -74,6 +76,7 @@ class StepBuffers:
         """End the step: average over the parts of all processes."""
         if not self._means:
             return
+        # One exchange for all buffers. The weights of all parts add up to 1, so the sum is the mean
         joined = torch.cat([total.flatten() for total in self._sums])
         if processes > 1:
             torch.distributed.all_reduce(joined)
@@ -92,7 +95,7 @@ def placed_like(tensor: Tensor, other: Tensor) -> Tensor:
     """Return a tensor in the same shards as another one of its shape; itself if the other is whole."""
     if not hasattr(other, "full_tensor"):
         return tensor
-    from torch.distributed.tensor import DTensor, distribute_tensor  # slow to import
+    from torch.distributed.tensor import DTensor, distribute_tensor  # Slow to import
 
     assert isinstance(other, DTensor)
     return distribute_tensor(tensor.to(other.device), other.device_mesh, other.placements)

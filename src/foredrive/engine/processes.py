@@ -1,4 +1,4 @@
-"""Processes that train together: the same answer in all, and one line in each when one of them is lost."""
+"""Processes that train together: a common result in all, and a one-line error if one of them is lost."""
 
 import contextlib
 import os
@@ -12,7 +12,7 @@ import torch
 
 from foredrive.errors import InputError
 
-if TYPE_CHECKING:  # slow to import
+if TYPE_CHECKING:  # Slow to import
     from types import FrameType
 
     from lightning_fabric import Fabric
@@ -40,7 +40,7 @@ def gathered(value: T, fabric: "Fabric") -> list[T]:
 
 @contextlib.contextmanager
 def entered_by_first(context: AbstractContextManager[None], fabric: "Fabric") -> Iterator[None]:
-    """Enter a context in the first process alone. The others go on when it has been entered.
+    """Enter a context in the first process only. The others continue when it has been entered.
 
     Raises:
         InputError: the context raised it; every process does.
@@ -52,6 +52,7 @@ def entered_by_first(context: AbstractContextManager[None], fabric: "Fabric") ->
                 stack.enter_context(context)
             except InputError as error:
                 refusal = str(error)
+        # The first process reports failure as well as success, so that no process waits in vain
         refusal = fabric.broadcast(refusal)
         if refusal is not None:
             raise InputError(refusal)
@@ -59,7 +60,7 @@ def entered_by_first(context: AbstractContextManager[None], fabric: "Fabric") ->
 
 
 class _ProcessLost(BaseException):
-    """Ends this process at once: no handler of damaged files may take it for damage."""
+    """Ends this process. It is no `Exception`, so that no handler of damaged files takes it for damage."""
 
 
 @contextlib.contextmanager
@@ -76,6 +77,7 @@ def naming_lost_processes(fabric: "Fabric") -> Iterator[None]:
         return
 
     def end(number: int, frame: "FrameType | None") -> None:
+        # A further SIGTERM must not interrupt the clean-up
         signal.signal(signal.SIGTERM, signal.SIG_IGN)
         raise _ProcessLost
 
@@ -86,7 +88,7 @@ def naming_lost_processes(fabric: "Fabric") -> Iterator[None]:
     except _ProcessLost:
         raise InputError(_GO_ON) from None
     except RuntimeError as error:
-        # gloo's errors have no class of their own
+        # Errors of gloo have no class of their own
         if isinstance(error, torch.distributed.DistError) or "gloo" in str(error):
             raise InputError(_GO_ON) from error
         raise

@@ -54,6 +54,7 @@ def git_commit(checkout: Path) -> str | None:
     changed = _git(checkout, "status", "--porcelain", "--untracked-files=all", *CODE)
     if commit is None or not changed:
         return commit
+    # `git diff` shows tracked files only, so the content of new files is added
     digest = hashlib.sha256((_git(checkout, "diff", "HEAD", *CODE) or "").encode())
     for line in changed.splitlines():
         if line.startswith("?? "):
@@ -64,11 +65,12 @@ def git_commit(checkout: Path) -> str | None:
 def peak_rss_gib() -> float:
     """Return the peak resident memory of this process, GiB, without worker processes."""
     status = Path("/proc/self/status")
-    if status.is_file():  # getrusage would count the memory of the parent process, too
+    if status.is_file():  # getrusage would include the memory of the parent process
         for line in status.read_text().splitlines():
             if line.startswith("VmHWM:"):
                 return int(line.split()[1]) * 1024 / GIB
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    # macOS reports bytes, other systems KiB
     return peak / GIB if sys.platform == "darwin" else peak * 1024 / GIB
 
 
@@ -93,4 +95,4 @@ def _cpu_model() -> str:
 
 
 COMMIT = git_commit(Path(foredrive.__file__).parents[2])
-"""Of the code this process runs. Read as it starts: the checkout may change before figures are written."""
+"""Commit of the running code. It is read at the start: the checkout may change before figures are written."""

@@ -1,4 +1,4 @@
-"""Checks of the numbers in schedules: a wrong one is one clear error, before anything is read or trained."""
+"""Checks of the numbers in schedules. A wrong number is reported before anything is read or trained."""
 
 import math
 
@@ -19,6 +19,7 @@ def check_at_least(record: object, **least: int) -> None:
         value = getattr(record, name)
         numbers = value if isinstance(value, tuple) else () if value is None else (value,)
         for number in numbers:
+            # Written so that NaN fails as well
             if not (math.isfinite(number) and number >= bound):
                 raise InputError(f"{name} is {number:g}, but has to be {bound:g} or more")
 

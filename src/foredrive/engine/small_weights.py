@@ -23,6 +23,7 @@ def save_small(model: nn.Module, path: Path) -> None:
     for name, value in model.state_dict().items():
         if value.is_floating_point() and value.dim() > 1:
             entries[name], entries[name + SCALE] = _in_8_bits(value.detach())
+        # Values beyond the range of float16 stay in 32 bits
         elif value.is_floating_point() and value.abs().max() < torch.finfo(torch.float16).max:
             entries[name] = value.detach().half().contiguous()
         else:
@@ -32,13 +33,14 @@ def save_small(model: nn.Module, path: Path) -> None:
 
 def _in_8_bits(value: Float[Tensor, "..."]) -> tuple[Int8[Tensor, "..."], Float[Tensor, "..."]]:
     rows = value.float().flatten(1)
+    # A row of zeros gets a tiny scale instead of a division by zero
     scale = rows.abs().amax(1, keepdim=True).clamp_min(1e-12) / LEVELS
     codes = (rows / scale).round_().to(torch.int8).view(value.shape)
     return codes.contiguous(), scale.view(-1, *[1] * (value.dim() - 1)).contiguous()
 
 
 def full_precision(saved: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Return the weights of a file in 32 bits. Those of other files are returned as they are."""
+    """Return 8-bit weights of a file as 32-bit values. All other weights are returned unchanged."""
     return {
         name: value.float() * saved[name + SCALE] if name + SCALE in saved else value
         for name, value in saved.items()

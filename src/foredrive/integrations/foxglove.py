@@ -1,4 +1,4 @@
-"""Messages of Foxglove's schemas (protocol buffers), made of the types of `scene`.
+"""Messages of Foxglove's schemas (protocol buffers), converted from the types of `scene`.
 
 Source: docs.foxglove.dev/docs/visualization/message-schemas. The package `foxglove-schemas-protobuf` has the
 compiled messages. Frames: "world", "ego", and "camera/NAME" with z ahead. Pixel centres are at whole numbers
@@ -52,6 +52,7 @@ def calibration_message(
 ) -> CameraCalibration:
     """Return the calibration of a camera."""
     at_whole = K.double().clone()
+    # Here the middle of the first pixel is at 0.5, in Foxglove's schemas at 0
     at_whole[:2, 2] -= 0.5
     P = torch.cat([at_whole, torch.zeros(3, 1, dtype=torch.float64)], dim=1)
     return CameraCalibration(
@@ -80,7 +81,7 @@ def transform_message(t_us: int, parent: str, child: str, T: Float64[Tensor, "4 
 
 
 def cloud_message(t_us: int, sweep: LidarSweep) -> PointCloud:
-    """Return the returns of a sweep in the ego frame; "time" is relative to the message's, s."""
+    """Return the returns of a sweep in the ego frame. The field "time" is relative to the message, s."""
     kept = sweep[sweep.valid & sweep.returned]
     cells = np.zeros(len(kept.range_m), _POINT)
     for axis, name in enumerate("xyz"):
@@ -120,6 +121,7 @@ def boxes_message(t_us: int, boxes: Boxes, colours: list[RGB]) -> SceneUpdate:
         T[:2, :2] = torch.tensor([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
         T[:3, 3] = kept.centre[row].double()
         name = Category(int(kept.category[row])).name.lower()
+        # The label stands half a height above the roof
         above = _pose(T)
         above.position.z += float(kept.size_lwh[row, 2])
         shown = f"{name} {int(kept.track_id[row])}"
@@ -169,6 +171,7 @@ def path_message(t_us: int, path: Trajectory) -> PosesInFrame:
 
 def voxels_message(t_us: int, occupied: Bool[Tensor, "Z Y X"], spec: VoxelSpec, colour: RGB) -> VoxelGrid:
     """Return occupied voxels in the ego frame; free ones are transparent."""
+    # The pose of the grid is that of its lower corner, not of the middle of a voxel
     corner = torch.eye(4, dtype=torch.float64)
     corner[:3, 3] = torch.tensor(spec.lower_m)
     cells = np.zeros((*occupied.shape, 4), np.uint8)
@@ -196,6 +199,7 @@ def camera_frame(camera: str) -> str:
 
 
 def _update(t_us: int, entities: list[SceneEntity]) -> SceneUpdate:
+    # All earlier entities of the topic are deleted
     deletion = SceneEntityDeletion(timestamp=_stamp(t_us), type=SceneEntityDeletion.ALL)
     return SceneUpdate(deletions=[deletion], entities=entities)
 

@@ -104,7 +104,9 @@ MEANING = {
 
 
 class AgentGraph(nn.Module):
-    """An agent between plain tensors. No step depends on the values of the data, so it can be traced.
+    """An agent with plain tensors as inputs and outputs.
+
+    No operation depends on the values of the data, so that it can be traced.
 
     Args:
         agent: in evaluation mode.
@@ -142,6 +144,7 @@ class AgentGraph(nn.Module):
             K=K,
             T_ego_cam=T_ego_cam,
             dist=dist,
+            # The graph has no input for the readout time: a global shutter
             readout_s=torch.zeros_like(dist[..., 0]),
             names=self.camera_names,
             size_hw=self.image_hw,
@@ -156,9 +159,11 @@ class AgentGraph(nn.Module):
             speed_valid=frame_speed_valid,
         )
         now = model.encode(frames)
+        # The planner may need more imagined frames than the graph returns; these are dropped below
         beliefs = [now, *model.imagine(now, max(self.steps, planner.imagined_frames))]
         volume = self.agent.planner_volume
         future = volume(beliefs[1]) if planner.imagined_frames else None
+        # The same arguments as in `PlanningAgent.forward`, from plain tensors in place of a clip
         plan = planner(
             volume(now),
             future,

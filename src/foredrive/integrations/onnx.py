@@ -28,7 +28,7 @@ def write_onnx(
     logger.setLevel(logging.ERROR)
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", FutureWarning)  # from the exporter itself
+            warnings.simplefilter("ignore", FutureWarning)  # Raised by the exporter itself
             model = torch.onnx.export(
                 program,
                 dynamo=True,
@@ -36,7 +36,7 @@ def write_onnx(
                 input_names=list(input_names),
                 output_names=list(output_names),
                 custom_translation_table=TRANSLATIONS,
-                optimize=False,  # takes minutes, and onnxruntime optimises again
+                optimize=False,  # It takes minutes, and onnxruntime optimises again
                 verbose=False,
             )
     finally:
@@ -57,6 +57,7 @@ def _adaptive_avg_pool3d(self: Any, output_size: Sequence[int]) -> Any:
     """Average over windows ⌊i·n/m⌋ to ⌈(i+1)·n/m⌉, one axis after the other."""
     sizes = [int(size) for size in self.shape]
     for axis, windows in enumerate(output_size, start=len(sizes) - 3):
+        # -(-a // b) rounds up
         bounds = [(i * sizes[axis] // windows, -(-(i + 1) * sizes[axis] // windows)) for i in range(windows)]
         means = [op.ReduceMean(_slice(self, axis, *bound), _ints(axis), keepdims=1) for bound in bounds]
         self = op.Concat(*means, axis=axis)
@@ -66,6 +67,7 @@ def _adaptive_avg_pool3d(self: Any, output_size: Sequence[int]) -> Any:
 def _cummax(self: Any, dim: int) -> tuple[Any, Any]:
     """Return values and their indices, with the last index of equal values, as in PyTorch."""
     steps = [_slice(self, dim, k, k + 1) for k in range(int(self.shape[dim]))]
+    # Zeros of the right shape and integer type, the index of the first step
     values, places = [steps[0]], [op.CastLike(op.Sub(steps[0], steps[0]), _ints(0))]
     for k, step in enumerate(steps[1:], start=1):
         rises = op.GreaterOrEqual(step, values[-1])
@@ -92,6 +94,7 @@ def _attention(
         raise NotImplementedError("attention with dropout, another scale or shared heads")
     rank = len(query.shape)
     turned = op.Transpose(key, perm=[*range(rank - 2), rank - 1, rank - 2])
+    # Scaling the query instead of the scores needs fewer products
     scaled = op.Mul(query, op.Constant(value_float=int(query.shape[-1]) ** -0.5))
     score = op.MatMul(scaled, turned)
     if attn_mask is not None:

@@ -20,7 +20,7 @@ CALIBRATION_HW = (270, 480)
 
 
 def check_with_calibration(path: LogPath) -> LogCheck:
-    """Check a log, and whether lidar points fit the images where both are there.
+    """Check a log, and whether its lidar points fit its images if it has both.
 
     Raises:
         InputError: the log cannot be opened, or has no ego poses.
@@ -34,12 +34,14 @@ def _calibration(path: LogPath) -> list[Finding]:
     swept = frames_with_lidar(log)
     if not len(swept):
         return []
+    # A few frames spread along the path are enough to compare images with sweeps
     frames = swept[spread_along_path(torch.from_numpy(log.T_world_ego[swept, :3, 3]))].tolist()
     try:
         drive = read_drive(path, CALIBRATION_HW, frames=frames, derived=False)
     except InputError as error:
         return [Finding("problem", "calibration", f"not checked: {error}")]
     t_s = torch.from_numpy((log.t_us - log.t_us[0]).astype(np.float32) * 1e-6)
+    # Motion is computed from all poses of the log, then taken at the chosen frames
     twists = ego_twists(t_s, torch.from_numpy(log.T_world_ego))[frames]
     T_world_scene = drive.T_world_ego[0]
     views = [view for camera in camera_views(drive, T_world_scene, twists) for view in camera]

@@ -1,4 +1,7 @@
-"""Convert the logs of a data set, several at a time. Finished logs are kept; a bad one stops no other."""
+"""Convert the logs of a data set, several at a time.
+
+Finished logs are kept. A bad log does not stop the others.
+"""
 
 import contextlib
 import functools
@@ -20,7 +23,7 @@ from foredrive.files import remove_abandoned, sole_writer
 
 @dataclass(frozen=True)
 class Conversion:
-    """What became of one raw log."""
+    """The outcome of one raw log."""
 
     name: str
     """Its split and name."""
@@ -63,7 +66,7 @@ def convert_all(
     for raw in find_raw_logs(source, dataset, topics):
         with reading_raw(raw.source):
             path = log_path(raw.log.get_log_metadata(), out)
-        remove_abandoned(path.folder.parent)  # also if all logs are there
+        remove_abandoned(path.folder.parent)  # Also where no log has to be converted
         if not overwrite and _is_whole(path.folder):
             yield Conversion(path.name, path, kept=True)
         else:
@@ -93,6 +96,7 @@ def _converted(
 
 
 def _convert_here(raw: RawLog, out: Path, overwrite: bool) -> LogPath | None:
+    # One thread for each worker, because the workers share the cores
     torch.set_num_threads(1)
     return _convert_unless_there(raw, out, overwrite)
 
@@ -107,6 +111,7 @@ def _convert_unless_there(
     """
     with reading_raw(raw.source):
         path = log_path(raw.log.get_log_metadata(), out)
+    # Look again with the path claimed: another process may have finished the log in the meantime
     with sole_writer(path.folder):
         return None if not overwrite and _is_whole(path.folder) else convert_log(raw, out, tick)
 

@@ -1,4 +1,4 @@
-"""The demo without its pictures: once round the loop, each step in its own part of one folder.
+"""The demo without its pictures: all steps of the loop, each in its own part of one folder.
 
 The folder is a 123D data root. What an earlier call has finished is not done again.
 """
@@ -45,7 +45,7 @@ ROUTES = "town05-short"
 MODEL = "model"
 """Key of the shipped model's drive, beside that of the expert."""
 MET_BY = (REPLAY, CORRIDOR)
-"""Agents that meet the car in the way: one that drives on as recorded, one that looks at the lidar."""
+"""Agents that meet the car in their way: one replays the recorded drive, the other one uses the lidar."""
 TEXTS = ("a pedestrian close by", "a street at night")
 HITS = 3
 STRIDE_S = 0.5
@@ -106,7 +106,7 @@ class Driven:
 
 @dataclass(frozen=True)
 class Rebuilt:
-    """A rebuilt drive, and what became of each agent that met a car in it."""
+    """A rebuilt drive, and the drive of each agent that met a car in it."""
 
     scene: Reconstruction
     met: dict[str, Driven]
@@ -135,7 +135,7 @@ def full_demo() -> DemoSize:
         ),
         route="28",
         examples=4,
-        # estimates: speeds of the parts in benchmarks/results (towns, real-to-sim), training time in README
+        # Estimates from speeds in benchmarks/results (towns, real-to-sim) and the training time in README
         minutes={"Record": 2, "See": 1, "Learn": 10, "Drive": 2, "Rebuild": 3, "Search": 1},
     )
 
@@ -252,6 +252,7 @@ def _logs(demo: Demo, plans: Sequence[DrivePlan]) -> list[LogPath]:
 
 def _judged(run: Run, demo: Demo, out: Path) -> Judged:
     logs = _logs(demo, [demo.size.test])
+    # The metrics of an earlier call are kept; the predictions for the pictures are not stored
     if not (out / SUMMARY).is_file():
         evaluate_run(run, logs, out)
     return Judged(run, logs, read_summary(out / SUMMARY), predict_examples(run, logs, demo.size.examples))

@@ -68,12 +68,14 @@ def export_run(run: Run, logs: Sequence[LogPath], out: Path, clips: int = 8) -> 
     dataset = open_clips(logs, size, run.cache_dir)
     samples = _samples(dataset, agent, min(clips, len(dataset)))
     graph = AgentGraph(agent, dataset.camera_names, size.image_hw, steps).eval()
+    # Traced with one sample: batch size, cameras, image size and frames are fixed by its shapes
     program = torch.export.export(graph, tuple(samples[0].inputs))
     with atomic_path(out / PROGRAM) as temporary:
         torch.export.save(program, temporary)
     with atomic_path(out / MODEL) as temporary:
         write_onnx(program, temporary, GraphInputs._fields, GraphOutputs._fields)
 
+    # The written files are read back, so that the comparison covers writing and loading too
     truth = [GraphOutputs.from_agent(agent(sample.observed, steps)) for sample in samples]
     runtimes = {PROGRAM: _program(latest(out / PROGRAM)), MODEL: _session(latest(out / MODEL))}
     outputs = {name: [infer(sample.inputs) for sample in samples] for name, infer in runtimes.items()}
@@ -118,7 +120,7 @@ def _check_packages() -> None:
 def _program(path: Path) -> Infer:
     """Read back a torch.export program."""
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", FutureWarning)  # from PyTorch itself
+        warnings.simplefilter("ignore", FutureWarning)  # Raised by PyTorch itself
         module = torch.export.load(path).module()
     return lambda inputs: GraphOutputs(**module(*inputs))
 
@@ -129,11 +131,12 @@ def _session(path: Path) -> Infer:
 
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = torch.get_num_threads()
-    options.log_severity_level = 3  # it would report every constant that it cannot fold
+    options.log_severity_level = 3  # Errors only: warnings report every constant that is not folded
     session = onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
     names = [entry.name for entry in session.get_inputs()]
 
     def infer(inputs: GraphInputs) -> GraphOutputs:
+        # The model may lack inputs that its agent does not read, and the session refuses unknown ones
         fed = {name: tensor.numpy() for name, tensor in inputs._asdict().items() if name in names}
         return GraphOutputs(*(torch.from_numpy(array) for array in session.run(None, fed)))
 
@@ -141,9 +144,9 @@ def _session(path: Path) -> Infer:
 
 
 def _max_difference(truth: Sequence[GraphOutputs], outputs: Sequence[GraphOutputs]) -> dict[str, float]:
-    """Return the maximum difference of each output over all clips, and the share of voxels that change sides.
+    """Return the maximum difference of each output over all clips, and the share of voxels that change state.
 
-    Differences are in the unit of the output. A voxel changes sides if its logit changes sign.
+    Differences are in the unit of the output. A voxel changes state if its logit changes sign.
     """
     pairs = list(zip(truth, outputs, strict=True))
     differences = {

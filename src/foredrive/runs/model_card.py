@@ -1,4 +1,4 @@
-"""Cards of the models that come with the package: Markdown for people, read back for `foredrive models`."""
+"""Cards of the models of the package: Markdown for people, which `foredrive models` reads back."""
 
 import json
 import re
@@ -12,6 +12,7 @@ from foredrive.runs.shipped import CARD, CONFIG, EMBEDDED, MODELS, shipped_model
 from foredrive.search.embedded import CARD as TOWER_CARD
 from foredrive.search.embedded import SHIPPED as TOWERS
 
+# The form that `ModelCard.markdown` writes
 _PARTS = re.compile(
     r"# (?P<name>.+?)\n\nRecipe `(?P<recipe>.+?)`, evaluated at commit `(?P<commit>.+?)`\.\n\n"
     r"\*\*Data\.\*\* (?P<data>.+?)\n\n\*\*Figures\*\* on (?P<clips>\d+) clips, (?P<failed>\d+) failed:\n\n"
@@ -23,7 +24,7 @@ _ROW = re.compile(r"\| (.+?) \| (\S+) \| (\S+) \|")
 
 @dataclass(frozen=True)
 class ModelCard:
-    """What is known of a shipped model."""
+    """Description of a shipped model."""
 
     name: str
     recipe: str

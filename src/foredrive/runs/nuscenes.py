@@ -1,4 +1,4 @@
-"""Export logs as a data set in nuScenes' format, several at a time. A bad log stops no other."""
+"""Export logs as a data set in nuScenes' format, several at a time. A bad log does not stop the others."""
 
 import contextlib
 import functools
@@ -35,8 +35,8 @@ def export_nuscenes(
 ) -> Iterator[ExportedLog]:
     """Yield each log when it is exported, has failed, or was exported before; then write the tables.
 
-    The tables have all logs that were exported into the folder, now or before. Before the last log they are
-    those of the export before.
+    The tables contain all logs of the folder, of this export and of earlier ones. Until the last log has been
+    yielded, the tables of the earlier export stay in place.
 
     Args:
         logs: whole logs.
@@ -54,6 +54,7 @@ def export_nuscenes(
     with atomic_path(folder.tables, alone=True) as tables:
         todo = []
         for log in logs:
+            # The part of a log appears as a whole, when all its files and rows are written
             if not overwrite and folder.part(log).is_dir():
                 yield ExportedLog(log.name, kept=True)
             else:
@@ -84,5 +85,6 @@ def _exported(
 
 
 def _export_here(log: LogPath, folder: NuScenesFolder) -> LogPath:
+    # One thread for each worker, because the workers share the cores
     torch.set_num_threads(1)
     return export_log(log, folder)

@@ -34,6 +34,7 @@ def renderer_of(folder: Path) -> Answers:
         InputError: the folder holds no finished reconstruction.
     """
     opened, names, start_us = open_rebuilt(folder), dict[int, str](), 0
+    # The log may have been moved or deleted since
     with contextlib.suppress(InputError):
         log = Log(open_run_log(folder)[1])
         names, start_us = {number: token for token, number in read_track_ids(log).items()}, int(log.t_us[0])
@@ -60,7 +61,7 @@ def alpasim_server_of(agent: str, host: str, port: int) -> tuple[Any, int]:
     require_alpasim()
     from foredrive.integrations.remote.alpasim_server import AlpasimDriver, serve_alpasim
 
-    make_agent(agent, lambda: 0.0)  # now, not with the first drive
+    make_agent(agent, lambda: 0.0)  # Reports errors at the start, not at the first drive
     driver = AlpasimDriver(Path(agent).name, lambda clock: make_agent(agent, clock), _needs_of(agent))
     return serve_alpasim(driver, host, port)
 

@@ -1,4 +1,4 @@
-"""Making a trained run part of the package (`runs.shipped`)."""
+"""Add a trained run to the models of the package (`runs.shipped`)."""
 
 import dataclasses
 import json
@@ -59,7 +59,7 @@ DRIVE_FIGURES = {
     "red lights in 100 routes": ("red_lights", 100),
     "collisions in 100 routes": ("collisions", 100),
 }
-"""Rows of a driver's card by their keys, of what it sees, and of its drives with a factor."""
+"""Rows of a driver's card by their keys: those of its perception, and those of its drives with a factor."""
 
 
 def ship(run: Run, name: str, test: Sequence[LogPath], data: str, limits: str, models: Path = MODELS) -> Path:
@@ -83,6 +83,7 @@ def ship(run: Run, name: str, test: Sequence[LogPath], data: str, limits: str, m
     with atomic_path(models / name) as temporary:
         weights = temporary / run.weights.relative_to(run.folder)
         _save(load_agent(run), weights)
+        # The baselines are shipped, because they are fitted to training logs, which are not
         baselines = Baselines(*run_baselines(run.folder, run.logs, run.recipe, run.cache_dir, past))
         save_small(baselines, temporary / baselines_file(past))
         for file in (RIGS, f"{TASKS}/{PRIORS}"):
@@ -91,6 +92,7 @@ def ship(run: Run, name: str, test: Sequence[LogPath], data: str, limits: str, m
                 shutil.copyfile(run.folder / file, temporary / file)
         save_recipe(run.recipe, temporary / CONFIG)
         (temporary / LOGS).write_text(json.dumps({"logs": [], "cache_dir": "cache", "start": None}))
+        # Evaluate the model from the files that are shipped, before they appear in the package
         small = dataclasses.replace(run, folder=temporary, logs=())
         with tempfile.TemporaryDirectory() as folder:
             evaluate_run(small, test, Path(folder), views=False)
@@ -112,14 +114,14 @@ def ship_driver(
 ) -> Path:
     """Write a trained driver as a model of the package; return its folder.
 
-    Both the run and the model, whose weights have 8 bits, see the test logs and drive the routes; their
-    figures are on the card.
+    Both the run and the model, whose weights have 8 bits, are evaluated on the test logs and drive the
+    routes. The card shows the figures of both.
 
     Args:
         name: name of the model.
         test: logs with lights and boxes.
-        routes: what is driven.
-        work: folder of drives and caches, where an interrupted call goes on.
+        routes: the routes to drive.
+        work: folder of drives and caches, from which an interrupted call continues.
         data: the training and test data, in one sentence.
         limits: what the driver cannot do, in a sentence or two.
         models: folder of all models.
@@ -148,6 +150,7 @@ def ship_driver(
                 for title, (key, count) in DRIVE_FIGURES.items()
             }
         )
+    # Per figure: the run as trained, then the model as shipped
     figures = {title: (both[0][title], both[1][title]) for title in both[0]}
     commit = str(collect_provenance()["commit"])
     card = ModelCard(name, run.recipe.name, commit, data, len(clips), 0, figures, limits)

@@ -10,9 +10,9 @@ from foredrive.files import atomic_path
 
 EMBEDDED = "embedded:"
 DRIVER = "driver"
-"""Name of the model that drives as the agent `embedded`."""
+"""Name of the model that the agent `embedded` uses."""
 CONFIG, LOGS, WEIGHTS = "config.yaml", "logs.json", "model.safetensors"
-"""As in `engine.folder`, which is slow to import; arguments are checked before."""
+"""As in `engine.folder`, which is slow to import. Arguments are checked before slow imports."""
 MODELS = Path(__file__).parent / "models"
 """A folder for each model: config.yaml, logs.json without logs, the baselines, weights of the last stage in
 8 bits (`save_small`), and card.md."""
@@ -56,6 +56,7 @@ def run_folder(run: Path, copies: Path = COPIES) -> Path:
         with atomic_path(copy) as temporary:
             shutil.copytree(source, temporary)
             logs = temporary / LOGS
+            # Caches go into the copy, because the folder of the package may not be writable
             entries = json.loads(logs.read_text()) | {"cache_dir": str((copy / "cache").absolute())}
             logs.write_text(json.dumps(entries, indent=1))
     return copy

@@ -4,7 +4,7 @@ from enum import StrEnum
 
 
 class Crop(StrEnum):
-    """Crops of an image. The sweep beside the image is cut to the same part, so that both show one ground."""
+    """Crops of an image. The sweep of a view is cut to the same part, so that both show the same scene."""
 
     WHOLE = "whole"
     MIDDLE_SQUARE = "middle-square"

@@ -143,6 +143,7 @@ def load_towers(folder: Path) -> Towers:
     base = _load_base(folder, card)
     if card.lidar is None:
         return base
+    # A lidar tower fits only the embeddings of the image tower that it was trained with
     if base.fingerprint != card.base_fingerprint:
         raise InputError(
             f"{folder}: the lidar tower was trained beside {card.text} with other weights or another crop of "
@@ -204,6 +205,7 @@ def _load_weights(model: nn.Module, file: Path) -> dict[str, Tensor]:
     """Load weights into a model. Return the other entries of the file."""
     try:
         state = load_file(file)
+        # Entries that are not the model's own, such as the mean of the texts; the rest has to fit exactly
         rest = {name: state.pop(name) for name in state.keys() - model.state_dict().keys()}
         model.load_state_dict(state)
     except (OSError, SafetensorError, RuntimeError) as error:

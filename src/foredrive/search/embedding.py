@@ -45,7 +45,7 @@ class View:
 
 
 def embed_frames(log: Log, frames: Sequence[int], towers: Towers) -> pa.Table:
-    """Return the rows of some frames, sorted by frame. The row of the whole scene comes first in each frame.
+    """Return the rows of frames, sorted by frame. In each frame the row of the whole scene comes first.
 
     Raises:
         InputError: data cannot be read.
@@ -67,7 +67,9 @@ def _embed_few(log: Log, frames: Sequence[int], towers: Towers) -> pa.Table:
     by_image, by_lidar = [], []
     for now, (frame, views) in enumerate(zip(frames, seen, strict=True)):
         facts, counts = _facts(log, frame), _counts(log, frame, views)
+        # Axes: view, then image and lidar, then embedding
         embedded = np.array([vectors[now, name] for name in views], np.float32).reshape(-1, 2, towers.dim)
+        # The embedding of the whole scene is the mean direction of its views
         for name, (image, lidar) in zip((WHOLE, *views), [mean_direction(embedded), *embedded], strict=True):
             azimuth = None if name == WHOLE else math.degrees(views[name].sector.azimuth_rad)
             rows.append({**facts, "view": name, "azimuth_deg": azimuth, **counts[name]})
@@ -109,6 +111,7 @@ def read_views(log: Log, frame: int, side_px: int, crop: Crop, *, with_lidar: bo
     sweep = None if lidar is None else lidar[0][lidar[0].valid & lidar[0].returned]
     views = {}
     for name, metadata in pinhole_cameras(log).items():
+        # The shorter side of the whole image gets the length that the tower expects
         scale = side_px / min(metadata.height, metadata.width)
         size_hw = (round(metadata.height * scale), round(metadata.width * scale))
         camera = read_camera(log, frame, metadata, size_hw, with_image=True)
@@ -123,6 +126,7 @@ def embed_views(towers: Towers, views: Sequence[View]) -> Float[np.ndarray, "n 2
     """Return image and lidar unit vectors of views with one image size. NaN where the input is missing."""
     out = np.full((len(views), 2, towers.dim), np.nan, dtype=np.float32)
     images = [(n, view.image) for n, view in enumerate(views) if view.image is not None]
+    # Empty sweeps have no embedding
     sweeps = [(n, v.sweep) for n, v in enumerate(views) if v.sweep is not None and len(v.sweep.valid)]
     with torch.no_grad():
         if images:
@@ -136,6 +140,7 @@ def embed_views(towers: Towers, views: Sequence[View]) -> Float[np.ndarray, "n 2
 
 def mean_direction(vectors: Float[np.ndarray, "n *m D"]) -> Float[np.ndarray, "*m D"]:
     """Return the normalised sum of unit vectors over n. NaN vectors are left out; NaN if all are NaN."""
+    # `nansum` gives 0 where all are NaN, so these are set to NaN again
     total = np.nansum(vectors, axis=0)
     total /= np.linalg.norm(total, axis=-1, keepdims=True).clip(min=_SMALLEST)
     return np.where(np.isnan(vectors).any(-1).all(0)[..., None], np.float32(np.nan), total)
@@ -144,6 +149,7 @@ def mean_direction(vectors: Float[np.ndarray, "n *m D"]) -> Float[np.ndarray, "*
 def _vector_column(vectors: Float[np.ndarray, "n D"]) -> pa.FixedSizeListArray:
     """Return vectors as an Arrow column. NaN vectors become null."""
     missing = np.isnan(vectors).any(-1)
+    # The mask marks whole vectors as null; their values are zeros
     flat = pa.array(np.where(missing[:, None], 0, vectors).astype(np.float32).reshape(-1))
     return pa.FixedSizeListArray.from_arrays(flat, vectors.shape[-1], mask=pa.array(missing))
 

@@ -77,6 +77,7 @@ class ViewFacts(NamedTuple):
 def _counted(things: tuple[Thing, ...]) -> Iterator[str]:
     for noun in {thing.noun for thing in things}:
         manners = [thing.manners for thing in things if thing.noun == noun]
+        # The empty manner stands for all objects of the noun
         for manner in {"", *(manner for those in manners for manner in those)}:
             count = len(manners) if not manner else sum(manner in those for those in manners)
             what = f"{manner} {noun}".strip()
@@ -103,7 +104,7 @@ def view_facts(log: Log, frame: int, sectors: dict[str, Sector]) -> dict[str, Vi
     reach_m = IN_FOG_M if recorded is not None and recorded.weather is Weather.FOG else AHEAD_M
     seen = boxes.valid & (boxes.centre[:, :2].norm(dim=-1) < reach_m)
     if visibility is not None:
-        seen = seen & ~(visibility < MIN_VISIBILITY)  # NaN: not known
+        seen = seen & ~(visibility < MIN_VISIBILITY)  # Objects of unknown visibility (NaN) are kept
     return {
         name: ViewFacts(*setting, tuple(_things(boxes[seen & sector.contains(boxes.centre)])))
         for name, sector in sectors.items()
@@ -134,6 +135,7 @@ def _manners(
         return
     yield "moving"
     (x, y), (forward, across) = centre[:2].tolist(), velocity.tolist()
+    # Only objects ahead and on the road can cross it or come towards the vehicle
     if x <= 0 or abs(y) > ROAD_HALF_M:
         return
     heading = float(torch.cos(yaw))

@@ -34,6 +34,7 @@ def k_centre(vectors: Float[ndarray, "n D"], count: int, worth: Float[ndarray, "
     distance = np.full(len(vectors), np.inf)
     while len(chosen) < min(count, len(vectors)):
         likeness = vectors @ vectors[chosen[-1]]
+        # For unit vectors |a - b|² = 2 - 2 a·b. Rounding may make it slightly negative
         distance = np.minimum(distance, np.sqrt(np.maximum(2 - 2 * likeness, 0.0)))
         gain = distance * worth
         gain[chosen] = -1.0
@@ -110,12 +111,14 @@ def find(index: FrameIndex, query: Query, target: Target | None, *, exact_up_to:
     exact = target is None or total <= exact_up_to
     wanted = query.top * (POOL_PER_HIT if query.diverse else 1)
     limit = wanted * CANDIDATES_PER_HIT
+    # Collapsing drops neighbours and other views, so more candidates are read until there are enough hits
     while True:
         limit = min(limit, total)
         rows = _candidates(index, query, target, where, None if exact else limit)
         score = _rank(rows, query, target)
         order = collapse(score, rows["log"].to_pylist(), _column(rows, "t_us"), query.gap_s, wanted)
-        reranked = query.modality == "joint" and query.rule == "rerank"  # a fixed number of rows is reranked
+        # Reranking takes a fixed number of rows, so that more candidates change nothing
+        reranked = query.modality == "joint" and query.rule == "rerank"
         if exact or reranked or len(order) >= wanted or limit >= total:
             break
         limit *= MORE
@@ -136,8 +139,9 @@ def collapse(
     times: dict[str, list[int]] = {}
     for n in np.argsort(-score, kind="stable").tolist():
         if np.isnan(score[n]) or len(kept) == top:
-            break  # NaN is sorted last
+            break  # NaN is sorted last, so no valid row follows
         of_log = times.setdefault(logs[n], [])
+        # At least 1 µs: without a gap, the views of one moment still count as one hit
         if all(abs(int(t_us[n]) - other) >= max(gap_s * 1e6, 1) for other in of_log):
             of_log.append(int(t_us[n]))
             kept.append(n)
@@ -168,12 +172,13 @@ def _conditions(index: FrameIndex, query: Query, target: Target | None) -> str |
     if query.tag is not None:
         conditions.append(where_tagged(index.uri, query.tag))
     if target is not None and target.moment is not None:
+        # The example itself and its neighbours in time would be the best hits
         log, t_us = target.moment
         gap_us = max(round(query.gap_s * 1e6), 1)
         near = f"t_us > {t_us - gap_us} AND t_us < {t_us + gap_us}"
         conditions.append(f"NOT (log = {quoted(log)} AND {near})")
     if query.where:
-        index.count(query.where)  # checked alone, so that the error shows the user's text
+        index.count(query.where)  # Checked separately, so that the error shows the user's text
     return " AND ".join(conditions) or None
 
 
@@ -186,6 +191,7 @@ def _candidates(
         columns += ["image", "lidar", *(["joint"] if query.modality == "joint" else [])]
     if target is None or limit is None:
         return index.select(where, columns)
+    # The embeddings that rank the rows: sums of logits need both, reranking begins with images
     by: tuple[str, ...] = (query.modality,)
     if query.modality == "joint" and query.rule != "features":
         by = ("image", "lidar") if query.rule == "logits" else ("image",)
@@ -199,6 +205,7 @@ def _candidates(
 
 def _without_twins(rows: pa.Table) -> pa.Table:
     keys = zip(rows["log"].to_pylist(), rows["t_us"].to_pylist(), rows["view"].to_pylist(), strict=True)
+    # The dict keeps the last entry of a key, which is the first row in this order
     first = {key: n for n, key in reversed(list(enumerate(keys)))}
     return rows.take(pa.array(sorted(first.values())))
 
@@ -208,6 +215,7 @@ def _rank(rows: pa.Table, query: Query, target: Target | None) -> Float[ndarray,
     score = np.zeros(len(rows)) if target is None else _likeness(rows, query, target)
     if query.by is None:
         return score
+    # Similarities and the column have different scales, so both are mixed as ranks
     wanted = _column(rows, query.by).astype(float)
     mix = query.mix if target is not None else 1.0
     return (1 - mix) * _by_rank(score) + mix * _by_rank(wanted)
@@ -220,8 +228,9 @@ def _likeness(rows: pa.Table, query: Query, target: Target) -> Float[ndarray, "n
     if target.image is None or target.lidar is None:
         raise InputError(f"{query.rule} need an image and a sweep, and the example has one of them only")
     image, lidar = vectors_of(rows, "image") @ target.image, vectors_of(rows, "lidar") @ target.lidar
-    if query.rule == "logits":  # a row with one modality counts it twice, to be comparable
+    if query.rule == "logits":  # A row with a single modality counts it twice, to be comparable
         return np.where(np.isnan(lidar), 2 * image, np.where(np.isnan(image), 2 * lidar, image + lidar))
+    # NaN excludes all rows but the best by image, which are ranked by lidar
     best = np.argsort(-image, kind="stable")[: query.top * CANDIDATES_PER_HIT]
     again = np.full(len(image), np.nan)
     again[best] = lidar[best]
@@ -243,6 +252,7 @@ def _scores(rows: pa.Table, target: Target | None, query: Query) -> list[dict[st
         cosines["joint"] = 0.5 * (cosines["image"] + cosines["lidar"])
     elif query.rule == "features":
         both = mean_direction(np.stack(list(of_rows.values())))
+        # A sum is NaN if either part is
         both[np.isnan(of_rows["image"] + of_rows["lidar"]).any(-1)] = np.nan
         cosines["joint"] = both @ vectors["joint"]
     return [
@@ -282,6 +292,7 @@ def vectors_of(rows: pa.Table, name: str) -> Float[ndarray, "n D"]:
     column = rows[name].combine_chunks()
     if isinstance(column, pa.ChunkedArray):
         column = pa.concat_arrays(column.chunks) if column.num_chunks else pa.array([], column.type)
+    # `values` is the flat child array without the offset of the slice, and with values below nulls
     values = column.values.to_numpy(zero_copy_only=False)
     values = values[column.offset * dim : (column.offset + len(column)) * dim].reshape(-1, dim)
     missing = ~_mask(column.is_valid())

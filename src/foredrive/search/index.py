@@ -37,7 +37,7 @@ SCORED_AT_ONCE = 2000
 
 @dataclass(frozen=True)
 class IndexSettings:
-    """Settings with which all rows of an index were made."""
+    """Settings that all rows of an index have in common."""
 
     towers: str
     fingerprint: str
@@ -86,6 +86,7 @@ class FrameIndex:
             InputError: an index exists that was made with other towers or another stride.
         """
         if find_table(uri, FRAMES) is None:
+            # The settings are stored in the metadata of the table's schema
             schema = row_schema(settings.dim).with_metadata({_REMEMBERED: json.dumps(asdict(settings))})
             make_table(uri, FRAMES, schema)
         index = cls(uri)
@@ -119,6 +120,7 @@ class FrameIndex:
         rows = pa.concat_tables([rows for _, rows in parts])
         part_table = pa.Table.from_pylist([part._asdict() for part, _ in parts], schema=_PART_SCHEMA)
         with naming(self.uri):
+            # The list of parts is written last: the next call replaces what an interrupted one has added
             self._frames.delete(f"key IN ({quoted_list(rows['key'].unique().to_pylist())})")
             self._put(rows)
             make_table(self.uri, PARTS, _PART_SCHEMA).add(part_table)
@@ -126,7 +128,8 @@ class FrameIndex:
     def drop(self, log: str) -> None:
         """Remove a log, because it has changed."""
         table = find_table(self.uri, PARTS)
-        if table is not None:  # first, so that a log without rows is never listed as indexed
+        # Before the rows, so that no log without rows is listed as indexed
+        if table is not None:
             table.delete(f"log = {quoted(log)}")
         self._frames.delete(f"log = {quoted(log)}")
 
@@ -149,15 +152,16 @@ class FrameIndex:
                     self._partition(name, max(1, rows // PARTITION_ROWS))
 
     def _partition(self, column: str, partitions: int) -> None:
-        """Partition the rows by an embedding, unless a recent partition exists.
+        """Partition the rows by an embedding, unless there are partitions of about the right number.
 
-        The number of partitions is stored in the name.
+        The number of partitions is stored in the name of the index.
         """
         from lancedb.index import IvfSq
 
         names = [index.name for index in self._frames.list_indices() if column in index.columns]
         if any(partitions < GROWN * int(name.removeprefix(f"{column}_")) for name in names):
             return
+        # The new partitions are ready before the old ones are dropped, so that searches stay fast
         config = IvfSq(distance_type="cosine", num_partitions=partitions)
         self._frames.create_index(column, config=config, name=f"{column}_{partitions}")
         for name in names:
@@ -192,9 +196,12 @@ class FrameIndex:
         """
         query = self._frames.search(vector, vector_column_name=to).distance_type("cosine")
         query = query.select([*columns, "_distance"]).limit(limit)
-        query = query.minimum_nprobes(PROBES).maximum_nprobes(0)  # search more if conditions leave too few
+        # More partitions are searched if the condition leaves too few rows; 0 is no limit
+        query = query.minimum_nprobes(PROBES).maximum_nprobes(0)
+        # The stored 8-bit vectors select more rows than asked for, which are compared again exactly
         query = query.refine_factor(REFINEMENT)
         with understanding(where):
+            # The condition is applied before the search. Afterwards it could leave fewer rows than asked for
             hits = (query if where is None else query.where(where, prefilter=True)).to_arrow()
         return hits.select(list(columns))
 
@@ -218,4 +225,4 @@ class FrameIndex:
         return changed
 
     def _put(self, rows: pa.Table) -> None:
-        self._frames.add(rows, on_bad_vectors="null")  # otherwise it rejects rows without embedding
+        self._frames.add(rows, on_bad_vectors="null")  # By default rows without an embedding are rejected

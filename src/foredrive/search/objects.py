@@ -57,6 +57,7 @@ def read_objects(log: Log, frame: int, side_px: int) -> list[ObjectView]:
             continue
         corners_cam = transform_points(inverse_se3(camera.T_ego_cam), corners.flatten(0, 1))
         uv, _, in_image = project(corners_cam, camera.K, camera.dist, size_hw)
+        # A box is shown as a whole if all its eight corners are in the image
         uv, whole = uv.unflatten(0, (-1, 8)), in_image.unflatten(0, (-1, 8)).all(-1)
         for number in (seen_enough & whole).nonzero()[:, 0].tolist():
             view = _object_view(camera, uv[number], sweep[inside[:, number]], side_px)
@@ -68,13 +69,14 @@ def read_objects(log: Log, frame: int, side_px: int) -> list[ObjectView]:
 def _object_view(
     camera: CameraFrame, corners_px: Float[Tensor, "8 2"], returns: LidarSweep, side_px: int
 ) -> View | None:
-    """Return the view of a box. None if it is too small in the image, or its returns lie beside the crop."""
+    """Return the view of a box. None if it is too small in the image, or too few returns lie in the crop."""
     assert camera.image is not None
     height, width = camera.image.shape[-2:]
     lower, upper = corners_px.amin(0), corners_px.amax(0)
     side = min(int((upper - lower).max().ceil()), height, width)
     if side < MIN_SIDE_PX:
         return None
+    # A square around the middle of the box, moved into the image where it would leave it
     left, top = (
         int((middle - side / 2).round().clamp(0, whole - side))
         for middle, whole in zip((lower + upper) / 2, (width, height), strict=True)

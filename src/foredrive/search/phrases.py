@@ -97,6 +97,7 @@ def _phrase(view: ViewFacts, rng: np.random.Generator) -> Phrase:
     settings = [fact for fact in view[:3] if fact is not None]
     kept = [fact for fact in settings if rng.random() < 0.5]
     if view.things is None or (settings and rng.random() >= _SUBJECT):
+        # A text without a subject names at least one setting
         kept = kept or [settings[int(rng.integers(len(settings)))]]
         subject, facts = "", set[str]()
     else:
@@ -111,6 +112,7 @@ def _phrase(view: ViewFacts, rng: np.random.Generator) -> Phrase:
 
 def _setting(fact: str, rng: np.random.Generator) -> tuple[str, set[str]]:
     words = _pick(SETTINGS[fact], rng)
+    # These words are true of any daylight, so they state no more than that
     return words, {"day"} if words == "by day" else {fact}
 
 

@@ -27,7 +27,7 @@ KINDS = ("clip", "siglip", "siglip2")
 class PretrainedTowers:
     """The towers of a CLIP or SigLIP model. There is no lidar tower.
 
-    CLIP looks at the middle square of an image. SigLIP squeezes the whole image into a square. Both are as in
+    CLIP takes the middle square of an image. SigLIP resizes the whole image to a square. Both match their
     training.
 
     Args:
@@ -48,6 +48,7 @@ class PretrainedTowers:
         self.image_side_px = int(config.vision_config.image_size)
         self.dim = int(config.projection_dim if self.is_clip else config.vision_config.hidden_size)
         self.crop = Crop.MIDDLE_SQUARE if self.is_clip else Crop.WHOLE
+        # Embeddings depend on the crop as well as on the weights
         kind = f"clip-{self.crop}" if self.is_clip else config.model_type
         self.fingerprint = f"{kind}-{weights_digest(self.model.state_dict())}"
         mean, std = (CLIP_MEAN, CLIP_STD) if self.is_clip else (SIGLIP_MEAN, SIGLIP_STD)
@@ -77,7 +78,7 @@ class PretrainedTowers:
         tokens = self.tokenizer(list(texts), truncation=True, return_tensors="pt", **padded)
         kept = {key: tokens[key] for key in ("input_ids", "attention_mask") if key in tokens}
         if not self.is_clip:
-            kept.pop("attention_mask", None)  # the towers were trained to read padding too
+            kept.pop("attention_mask", None)  # SigLIP is trained to read the padding too
         return _features(self.model.get_text_features(**kept))
 
 
@@ -121,13 +122,13 @@ def _reach_hub(model: str) -> None:
         raise _not_loaded(model, OSError("it is not here, and HF_HUB_OFFLINE forbids to look elsewhere"))
     try:
         get_session().head(constants.ENDPOINT, timeout=HUB_ANSWERS_S)
-    except Exception as error:  # the type depends on the library's HTTP client
+    except Exception as error:  # The type depends on the library's HTTP client
         reason = f"it is not here, and {constants.ENDPOINT} cannot be reached ({error})"
         raise _not_loaded(model, OSError(reason)) from error
 
 
 def _from_files(model: str, *, local_files_only: bool) -> tuple[Any, Any]:
-    from transformers import AutoConfig, AutoModel, AutoTokenizer  # takes seconds
+    from transformers import AutoConfig, AutoModel, AutoTokenizer  # The import takes seconds
 
     config = AutoConfig.from_pretrained(model, local_files_only=local_files_only)
     if config.model_type not in KINDS:

@@ -39,6 +39,7 @@ def project_scenes(index: FrameIndex) -> Plane:
         return Plane(np.zeros((len(vectors), 2)), IndexRow.all_of(rows), 0.0, total)
     centred = vectors - vectors.mean(0)
     variance, axes = np.linalg.eigh(centred.T @ centred)
+    # Eigenvalues are in ascending order, so the last two axes come first
     xy = centred @ axes[:, :-3:-1]
     xy /= np.abs(xy).max(0).clip(min=1e-9)
     share = float(variance[-2:].sum() / max(float(variance.sum()), 1e-12))

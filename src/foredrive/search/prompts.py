@@ -1,4 +1,4 @@
-"""Classes and prompt templates of zero-shot classification, as LidarCLIP has them (Hess et al. 2024)."""
+"""Classes and prompt templates of zero-shot classification, as in LidarCLIP (Hess et al. 2024)."""
 
 from foredrive.scene import Category
 

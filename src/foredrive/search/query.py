@@ -126,6 +126,7 @@ def parse_like(text: str) -> Like:
     Raises:
         InputError: the text has a wrong format.
     """
+    # Groups: log, seconds, view, and the four sides of a crop, which needs a view
     match = re.fullmatch(r"(.+)@(\d+(?:\.\d*)?)s?(?:/([^:/]+))?(?::(\d+),(\d+),(\d+),(\d+))?", text.strip())
     if match is None or (match[4] is not None and match[3] is None):
         raise InputError(f"{text!r}: an example is LOG@12.5s, LOG@12.5s/VIEW or LOG@12.5s/VIEW:10,20,110,90")

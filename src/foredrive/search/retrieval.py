@@ -11,7 +11,7 @@ _TIE = 1e-6
 def match_rank(queries: Float[np.ndarray, "n D"], gallery: Float[np.ndarray, "n D"]) -> Int[np.ndarray, "n"]:
     """Return for each query the rank, from 1, of its own item: item i of the gallery belongs to query i.
 
-    Both are unit vectors. Items that are as similar as the own one rank before it.
+    Both are unit vectors. Other items that are as similar as the query's own item rank before it.
     """
     own = (queries * gallery).sum(axis=1)
     shares = [
@@ -27,11 +27,12 @@ def mean_of_groups(
     sequence: Int[np.ndarray, "n"],
     drawn: Int[np.ndarray, "B S"],
 ) -> Float[np.ndarray, "B"]:
-    """Return the mean over groups of the mean of a group, of each draw of sequences.
+    """Return, for each draw of sequences, the mean over groups of the mean of each group.
 
     A group without a value in a draw is left out of it.
     """
     shape = (drawn.max() + 1, group.max() + 1)
+    # Sums per sequence and group, so that a draw only adds the rows of its sequences
     total, count = np.zeros(shape), np.zeros(shape)
     np.add.at(total, (sequence, group), values)
     np.add.at(count, (sequence, group), 1)
@@ -42,7 +43,7 @@ def mean_of_groups(
 
 
 def draw_sequences(sequences: int, draws: int, seed: int) -> Int[np.ndarray, "B S"]:
-    """Return all sequences as they are, then draws with replacement (Efron & Tibshirani 1993, chapter 6)."""
+    """Return each sequence once, then draws with replacement (Efron & Tibshirani 1993, chapter 6)."""
     drawn = np.random.default_rng(seed).integers(sequences, size=(draws, sequences))
     return np.concatenate([np.arange(sequences)[None], drawn])
 

@@ -30,7 +30,7 @@ FACTS = pa.schema(
         ("t_us", pa.int64()),  # in the time of the log
         ("t_s", pa.float64()),  # since the log's start
         ("view", pa.string()),
-        # Azimuth of the sector's middle, counter-clockwise from ahead; null for the whole scene.
+        # Azimuth of the sector's middle, counter-clockwise from ahead; null for the whole scene
         ("azimuth_deg", pa.float32()),
         ("dataset", pa.string()),
         ("place", pa.string()),  # town or city

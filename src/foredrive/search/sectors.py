@@ -1,4 +1,4 @@
-"""Sectors of a scene: the part that a camera sees, or one of four directions in logs without cameras."""
+"""Sectors of a scene: the field of view of a camera, or one of four directions in logs without cameras."""
 
 import dataclasses
 import math
@@ -31,6 +31,7 @@ class Sector(NamedTuple):
     @classmethod
     def of_camera(cls, camera: CameraFrame, size_hw: tuple[int, int]) -> "Sector":
         """Return the sector of a camera whose images have this size."""
+        # The camera's z axis in the ego frame
         forward = camera.T_ego_cam[:2, 2]
         return cls(float(torch.atan2(forward[1], forward[0])), camera, size_hw)
 
@@ -38,6 +39,7 @@ class Sector(NamedTuple):
         """Return whether points are in the sector."""
         if self.camera is None:
             off_rad = torch.atan2(points_ego[:, 1], points_ego[:, 0]) - self.azimuth_rad
+            # Wrap the difference of angles to ±π
             return torch.atan2(off_rad.sin(), off_rad.cos()).abs() <= _HALF_RAD
         points_cam = transform_points(inverse_se3(self.camera.T_ego_cam), points_ego)
         return project(points_cam, self.camera.K, self.camera.dist, self.size_hw)[2]
@@ -45,6 +47,7 @@ class Sector(NamedTuple):
     def sweep(self, sweep: LidarSweep) -> LidarSweep:
         """Return an unbatched sweep's returns in the sector, with x along its middle (see `Towers`)."""
         inside = sweep[sweep.valid & sweep.returned & self.contains(sweep.points_ego)]
+        # Turned about the ego origin, not moved to the camera
         T_sector_ego = matrix_from_yaw(torch.tensor(-self.azimuth_rad), torch.zeros(3))
         return dataclasses.replace(
             inside,

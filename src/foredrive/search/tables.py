@@ -19,7 +19,7 @@ _TROUBLE = (ValueError, RuntimeError, OSError)
 
 
 def connect(uri: str) -> "DBConnection":
-    """Connect to the tables in a folder or on object storage ("s3://…"), which has its own credentials.
+    """Connect to the tables in a folder or on object storage ("s3://…"), whose credentials are set elsewhere.
 
     Raises:
         InputError: LanceDB is not installed.
@@ -37,6 +37,7 @@ def find_table(uri: str, name: str) -> "Table | None":
     Raises:
         InputError: the table cannot be read.
     """
+    # Opening a database in a local folder would create the folder
     if "://" not in uri and not (Path(uri) / f"{name}.lance").exists():
         return None
     try:

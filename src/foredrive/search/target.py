@@ -92,7 +92,7 @@ def example_views(index: FrameIndex | None, like: Like, towers: Towers) -> Examp
     else:
         views = read_views(log, int(frame[0]), towers.image_side_px, towers.crop, with_lidar=towers.has_lidar)
         if like.view != WHOLE:
-            camera = find_camera(pinhole_cameras(log), like.view)  # by its own name or 123D's
+            camera = find_camera(pinhole_cameras(log), like.view)  # By its own name or by 123D's
             name = like.view if camera is None else camera.camera_name
             if name not in views:
                 raise InputError(f"{log.path.name}: no view {like.view}; there are {', '.join(views)}")
@@ -107,6 +107,7 @@ def _find_log(index: FrameIndex | None, name: str) -> LogPath:
         return find_logs(Path(name))[0]
     if index is None:
         raise InputError(f"{name}: no folder of a log")
+    # The name without its split is accepted if only one log of the index has it
     ends = quoted("%/" + name.replace("%", ""))
     rows = index.select(
         f"view = {quoted(WHOLE)} AND (log = {quoted(name)} OR log LIKE {ends})", ["log", "folder", "maps_dir"]
@@ -138,6 +139,7 @@ def _cropped(log: Log, frame: int, like: Like, towers: Towers) -> View:
         )
     part = cut_camera(camera, like.crop_px)
     sweep = read_sweep(log, frame) if towers.has_lidar else None
+    # The tower's crop applies to the part that was chosen, not to the whole image
     seen = cut_camera(part, towers.crop.box_px((bottom - top, right - left)))
     return View.of_camera(seen, None if sweep is None else sweep[0])
 

@@ -19,7 +19,7 @@ EGO_OUTLINE_XY = np.array([[-1.0, 0.92], [2.4, 0.92], [3.1, 0.55], [3.1, -0.55],
 AREA_KINDS = (MapKind.INTERSECTION, MapKind.WALKWAY, MapKind.CROSSWALK, MapKind.STOP_ZONE)
 LINE_KINDS = (MapKind.LANE_CENTRE, MapKind.LANE_BOUNDARY, MapKind.ROAD_EDGE)
 GRID_M = 10.0
-MOVING_MPS = 0.5  # slower boxes get no arrow
+MOVING_MPS = 0.5  # Slower boxes get no arrow
 
 
 def draw_bev(ax: Axes, clip: Clip, reach_m: float, plan: Trajectory | None = None) -> None:
@@ -48,6 +48,7 @@ def draw_bev(ax: Axes, clip: Clip, reach_m: float, plan: Trajectory | None = Non
 def start_bev(ax: Axes, reach_m: float) -> None:
     """Set limits, aspect, a grid every 10 m and its labels."""
     ax.set_facecolor(palette.GROUND)
+    # The horizontal axis is y, reversed, so that left is on the left
     ax.set(xlim=(reach_m, -reach_m), ylim=(-reach_m, reach_m), aspect="equal")
     step = GRID_M if reach_m <= 60 else 2 * GRID_M
     ticks = np.arange(-np.floor(reach_m / step), np.floor(reach_m / step) + 1) * step
@@ -77,7 +78,8 @@ def draw_map(ax: Axes, patch: MapPatch) -> None:
     """Draw the map: areas filled, lines in the colour of their kind."""
     for kind in AREA_KINDS:
         outlines = _polylines(patch, kind)
-        whole = [line for line in outlines if np.allclose(line[0], line[-1])]  # long outlines come in pieces
+        # Long outlines come in pieces, which are not closed and cannot be filled
+        whole = [line for line in outlines if np.allclose(line[0], line[-1])]
         ax.add_collection(
             PolyCollection(
                 whole, facecolor=palette.MAP_COLOURS[kind], alpha=0.22, edgecolor="none", zorder=1.0
@@ -113,6 +115,7 @@ def draw_sweep(ax: Axes, sweep: LidarSweep, reach_m: float) -> None:
 def draw_boxes(ax: Axes, boxes: Boxes) -> None:
     """Draw footprints coloured by category, with a thick front edge and an arrow of one second of motion."""
     kept = boxes[boxes.valid]
+    # The first four corners are the footprint, and its first edge is the front. Horizontal axis first
     corners = box_corners(kept.centre, kept.size_lwh, kept.yaw)[:, :4, [1, 0]]  # [M 4 (y x)]
     outlines, fronts = list(corners.numpy()), list(corners[:, :2].numpy())
     colours = [palette.box_colour(c) for c in kept.category.tolist()]

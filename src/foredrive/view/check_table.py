@@ -5,7 +5,7 @@ from foredrive.view.table import Cell, Column, Row, Section, Table
 
 
 def check_table(check: LogCheck) -> Table:
-    """Return what a log holds, then what was noticed."""
+    """Return the streams of a log, then the findings."""
     problems = sum(finding.level == "problem" for finding in check.findings)
     length = f"{check.frames} frames in {check.duration_s:.1f} s, {check.driven_m:.0f} m driven"
     sections = [Section([_stream_row(stream) for stream in check.streams])]

@@ -60,7 +60,7 @@ def means_table(comparison: Comparison) -> Table:
 
 
 def routes_table(comparison: Comparison, shown: int | None = None) -> Table:
-    """Return the routes, those that separate the agents most first, with what happened on them."""
+    """Return the routes with their events, those that separate the agents most first."""
     columns = [Column("route", align="left")]
     for agent in comparison.agents:
         columns += [Column("score", agent.name, digits=0), Column("events", agent.name, align="left")]
@@ -110,6 +110,7 @@ def _difference(metric: str, mean: BootstrapMean, digits: int) -> Cell:
     if np.isnan(mean.low):
         return Cell(text)
     text += f" [{mean.low:z.{digits}f}, {mean.high:z.{digits}f}]"
+    # Coloured only where the interval leaves out 0, and where more or less is better
     if mean.low <= 0 <= mean.high or metric in NEUTRAL:
         return Cell(text)
     better = (mean.mean > 0) != (metric in WORSE_IF_MORE)

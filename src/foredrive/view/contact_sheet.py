@@ -52,6 +52,7 @@ def write_contact_sheet(path: Path, drives: Sequence[tuple[LogPath, str]]) -> No
     width = TEXT_PX + THUMBNAILS * (cell_w + GAP_PX) + cell_h + 2 * GAP_PX
     height = HEAD_PX + len(chosen) * row_h
     sheet = Sheet(width, height)
+    # All names get one font size, at which the longest fits into its column
     longest = max(len(drives[index][0].folder.name) for index in chosen)
     name_pt = min(MAX_NAME_PT, PT_PER_PX * TEXT_PX / longest)
     commanded: Counter[str] = Counter()
@@ -128,6 +129,7 @@ def draw_drive_path(ax: Axes, log: Log) -> None:
     """Draw the driven path over the map, north up, with a dot at its start."""
     xy = log.T_world_ego[:, :2, 3]
     start_path_map(ax, xy, MARGIN_M, MIN_HALF_WIDTH_M)
+    # Map patches have this radius, so their centres need not be closer
     for frame in _frames_every(xy, RADIUS_M):
         patch = read_map_patch(log, frame)
         for kind, width in MAP_LINES.items():

@@ -16,7 +16,7 @@ from foredrive.view.table import Table
 
 @dataclass(frozen=True)
 class Block:
-    """A part of a section; what it lacks is left out."""
+    """A part of a section. Parts that are empty are left out."""
 
     title: str = ""
     text: str = ""
@@ -31,7 +31,7 @@ class Block:
 
 @dataclass(frozen=True)
 class Section:
-    """What came out of one step."""
+    """The results of one step."""
 
     result: str
     """The outcome in one line, for the loop."""
@@ -42,13 +42,13 @@ class Section:
 
 @dataclass(frozen=True)
 class Step:
-    """A step of the demo: what it is about, and the function that does it and shows what came out."""
+    """A step of the demo: its texts, and the function that does it and shows its results."""
 
     title: str
     doing: str
     """What it does, in one line, for the terminal."""
     about: str
-    """What a reader should know of it."""
+    """Explanation for the reader."""
     commands: Sequence[str]
     """Commands that do the same with other data."""
     work: Callable[[Demo], Section]
@@ -56,7 +56,7 @@ class Step:
 
 @dataclass(frozen=True)
 class Outcome:
-    """A step that was done, or failed."""
+    """A step that is finished or has failed."""
 
     step: Step
     seconds: float

@@ -1,4 +1,4 @@
-"""The sections of the demo's report: each function does a step of `runs.demo` and shows what came out."""
+"""The sections of the demo's report. Each function does a step of `runs.demo` and shows its results."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -78,7 +78,7 @@ def show_recording(demo: Demo) -> Section:
 
 
 def show_shipped(demo: Demo) -> Section:
-    """Show what the shipped model sees in the held-out town."""
+    """Show the predictions of the shipped model in the held-out town."""
     judged = judge_shipped(demo)
     best = _fastest(judged.examples)
     write_overview(demo.out / "hero.png", Overview.of(best))
@@ -106,7 +106,7 @@ def show_shipped(demo: Demo) -> Section:
 
 
 def show_training(demo: Demo) -> Section:
-    """Train a model from scratch; show its losses and what it sees."""
+    """Train a model from scratch; show its losses and predictions."""
     judged = train_tiny(demo)
     _write_run_report(judged, judged.run.folder / "report.html")
     losses = {stage: read_metrics(judged.run.folder / stage / "metrics.jsonl") for stage in STAGES}
@@ -266,7 +266,7 @@ def _from_above(shown: ExamplePrediction) -> list[Picture]:
 
 @torch.no_grad()
 def _held_out(rebuilt: Rebuilt) -> list[Picture]:
-    """Draw some held-out images that look ahead, each beside its rendering."""
+    """Draw some held-out images of the front camera, each with its rendering."""
     scene = rebuilt.scene.scene
     ahead = [view for view in rebuilt.scene.held_out.cameras if view.sensor == 0]
     pictures = []

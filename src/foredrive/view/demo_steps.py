@@ -1,4 +1,4 @@
-"""The steps of the demo, in the order of the loop, with what its report says about each."""
+"""The steps of the demo in the order of the loop, with the texts of its report."""
 
 from foredrive.view.demo_report import Step
 from foredrive.view.demo_sections import (

@@ -57,6 +57,7 @@ def draw_drive_path(drive: DriveRecord) -> Figure:
     if len(track) > 1:
         pieces = LineCollection(
             list(np.stack([track[:-1], track[1:]], axis=1)),
+            # One piece for each step, coloured by the speed at its end
             array=np.array(drive.track.speed_mps[1:]),
             cmap=SPEED_MAP,
             norm=Normalize(DARKEST * MAX_SHOWN_MPS, MAX_SHOWN_MPS),
@@ -78,7 +79,7 @@ def draw_drive_path(drive: DriveRecord) -> Figure:
 def draw_timeline(drive: DriveRecord) -> Figure:
     """Draw speed over time, with marks for scenarios and infractions and shaded times of near collisions."""
     figure = Figure(figsize=(7.6, 2.3))
-    ax = figure.add_axes((0.07, 0.22, 0.90, 0.70))  # half of the last label stands to the right
+    ax = figure.add_axes((0.07, 0.22, 0.90, 0.70))  # Room on the right for half of the last label
     t_s, speed = drive.track.t_s, drive.track.speed_mps
     ax.fill_between(t_s, speed, color="#4c8be0", alpha=0.25, linewidth=0)
     ax.plot(t_s, speed, color="#4c8be0", linewidth=1.6)

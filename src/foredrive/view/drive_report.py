@@ -104,6 +104,7 @@ def write_drive_report(out: Path, shown: int | None = None, safety: Table | None
     Raises:
         InputError: the folder holds no suite whose drives are all complete.
     """
+    # The metrics may not be in place yet: they can be held back to appear with this report
     if not latest(out / SUMMARY).is_file():
         raise InputError(f"{out}: not a suite of drives (no {SUMMARY})")
     title = suite_title(out)
@@ -119,6 +120,7 @@ def write_drive_report(out: Path, shown: int | None = None, safety: Table | None
         "drive_report.html.j2",
         title=title,
         provenance=Provenance.of(summary),
+        # Safety tests have scores of their own in place of the leaderboards'
         tiles=_tiles(summary)[0 if safety is None else len(LEADERBOARDS) :],
         endings=_counted(summary, "endings", Ending),
         scenarios=_counted(summary, "scenarios", ScenarioKind),
@@ -256,6 +258,7 @@ def _show_drive(name: str, drive: DriveRecord) -> ShownDrive:
         for place, event in enumerate(drive.scenario_events, start=1)
     ]
     events.sort(key=lambda entry: entry.t_s or 0.0)
+    # The outcome of a threat concerns the whole drive and comes last
     if drive.threat is not None:
         events.append(DriveEvent(None, f"{words(drive.threat.kind)} threat", threat_text(drive.threat)))
     return ShownDrive(

@@ -27,8 +27,8 @@ SHOWN = 3
 """The cameras that are shown, side by side over the whole width, and how many of them at most."""
 ABOVE_WH = (768, 288)
 PX_PER_M, EGO_AT_X = 5.0, 0.3
-"""Scale of the view from above, px per metre, and the ego's place as a part of the width. The ego faces
-right.
+"""Scale of the view from above, px per metre, and the position of the ego vehicle as a part of the width.
+The ego vehicle faces right.
 """
 MIN_RADIUS_PX = 3.5
 """Minimum radius of an actor, px; pedestrians would otherwise be too small to see."""
@@ -58,7 +58,7 @@ def _frame(log: Log, index: int, drive: DriveRecord) -> Image.Image:
     front = [camera for name in FRONT if (camera := find_camera(cameras, name)) is not None][:SHOWN]
     if not front:
         return above
-    # All cameras of a row have the shape of the first.
+    # All cameras of a row have the shape of the first
     width = ABOVE_WH[0] // len(front)
     height = round(width * front[0].height / front[0].width)
     frame = Image.new("RGB", (ABOVE_WH[0], ABOVE_WH[1] + height), palette.GROUND)
@@ -82,12 +82,13 @@ def draw_from_above(
         town: town whose lanes are drawn; None: there is no map.
         boxes: boxes of the other actors, in the ego frame.
     """
-    twice = 2  # draw at twice the size and shrink: PIL does not smooth the edges of polygons
+    twice = 2  # Drawn at twice the size and shrunk, because PIL does not smooth the edges of polygons
     image = Image.new("RGB", (twice * ABOVE_WH[0], twice * ABOVE_WH[1]), palette.GROUND)
     pen = ImageDraw.Draw(image)
     T_ego_world = np.linalg.inv(T_world_ego)
 
     def pixels(xy_ego: Float[np.ndarray, "N 2"]) -> list[tuple[float, float]]:
+        # Forward is to the right and left is up; image rows count downwards
         x = twice * (EGO_AT_X * ABOVE_WH[0] + PX_PER_M * xy_ego[:, 0])
         y = twice * (0.5 * ABOVE_WH[1] - PX_PER_M * xy_ego[:, 1])
         return list(zip(x.tolist(), y.tolist(), strict=True))

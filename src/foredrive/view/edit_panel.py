@@ -62,6 +62,7 @@ class EditPanel:
     ) -> None:
         self._graph, self._nodes, self._tell, self._on_change = graph, nodes, tell, on_change
         self._open = functools.lru_cache(RUNS_KEPT)(lambda run: open_rebuilt(Path(run)).scene.graph)
+        # Handlers of the page run in several threads. Re-entrant: adding an edit replaces all edits
         self._changing = threading.RLock()
         self.edits: list[Edit] = []
         self.edited: EditedScene = apply_edits(graph, [])
@@ -70,7 +71,7 @@ class EditPanel:
         self.gizmo = server.scene.add_transform_controls(
             f"{ROOT}/gizmo",
             scale=GIZMO_M,
-            active_axes=(True, True, False),  # along the ground, and turns about the vertical
+            active_axes=(True, True, False),  # Moves along the ground, and turns about the vertical
             depth_test=False,
             visible=False,
         )
@@ -96,6 +97,7 @@ class EditPanel:
         """Replace the edits; return whether they can be made."""
         with self._changing:
             try:
+                # All edits are applied to the unedited scene, so a failure leaves the present scene unchanged
                 edited = apply_edits(self._graph, edits, self._open)
             except InputError as error:
                 self._tell(str(error))
@@ -121,6 +123,7 @@ class EditPanel:
             if self.chosen is None:
                 return
             tracks = self.edited.graph.tracks
+            # The edit is the motion from the actor's present pose to that of the gizmo
             before = states_at(tracks, self._t_s).T_scene_actor[tracks.index_of(self.chosen)].detach().cpu()
             after = torch.eye(4)
             after[:3, :3] = torch.from_numpy(SO3(self.gizmo.wxyz).as_matrix()).float()

@@ -69,6 +69,7 @@ def draw_example(shown: ExamplePrediction) -> ExamplePanel:
         plan=_plan(shown),
         tasks=task_pictures(shown, front_camera(clip)),
         cameras=cameras,
+        # Two or four images make full rows of two, other numbers look better in rows of three
         camera_columns="two" if len(next(iter(cameras.values()), [])) in (2, 4) else "three",
         occupancy=[
             picture(predicted_voxels(shown, 0), f"Predicted occupancy, {_content_text(shown, 0)}"),
@@ -88,6 +89,7 @@ def example_title(example: Example) -> str:
 
 def front_camera(clip: Clip) -> int | None:
     """Return the camera with an image at now that points most straight ahead; None: there is none."""
+    # The x component of the optical axis in the ego frame; cameras without an image never win
     ahead = clip.rig.T_ego_cam[clip.now, :, 0, 2].masked_fill(~clip.image_valid[clip.now], -torch.inf)
     return int(ahead.argmax()) if bool(ahead.isfinite().any()) else None
 
@@ -210,6 +212,7 @@ def with_ego(columns: UInt8[np.ndarray, "X Y 3"], spec: VoxelSpec) -> UInt8[np.n
         (columns.shape[1] * factor, columns.shape[0] * factor), Image.Resampling.NEAREST
     )
     px_per_m = factor / spec.voxel_m
+    # Rows run backwards from the front edge, columns to the right from the left edge
     outline = [
         ((spec.upper_m[1] - y) * px_per_m, (spec.upper_m[0] - x) * px_per_m) for x, y in EGO_OUTLINE_XY
     ]

@@ -24,7 +24,7 @@ REACH_M = 40.0
 
 
 def hit_picture(hit: Hit) -> UInt8[np.ndarray, "H W 3"]:
-    """Draw camera and lidar side by side, in the same size for every hit; a missing sensor stays dark.
+    """Draw camera and lidar side by side, in the same size for every hit. A missing sensor is left dark.
 
     A whole scene shows its front camera. For any other view, a mark at the lidar's edge shows its direction.
     """
@@ -53,11 +53,13 @@ def lidar_from_above(sweep: LidarSweep, size_px: int) -> UInt8[np.ndarray, "S S 
     hits = sweep[sweep.valid & sweep.returned]
     points, range_m = hits.points_ego.numpy(), hits.range_m.numpy()
     scale = size_px / 2 / REACH_M
+    # Forward is up and left is on the left, as in all views from above
     column = (size_px / 2 - points[:, 1] * scale).astype(int)
     row = (size_px / 2 - points[:, 0] * scale).astype(int)
     inside = (column >= 0) & (column < size_px) & (row >= 0) & (row < size_px)
     picture = np.full((size_px, size_px, 3), palette.rgb255(palette.PANEL), dtype=np.uint8)
     picture[row[inside], column[inside]] = palette.range_colours(range_m[inside])
+    # A car of 4.4 m x 1.8 m around the rear axle, at least two pixels wide
     half_h, half_w = round(2.2 * scale), max(1, round(0.9 * scale))
     middle = size_px // 2
     picture[middle - half_h : middle + half_h, middle - half_w : middle + half_w] = palette.rgb255(

@@ -22,7 +22,7 @@ from foredrive.files import atomic_path
 from foredrive.view.table import Cell, Value, number, words
 
 INK_MARK = "#010203"
-"""Colour that stands for the page's text colour."""
+"""Placeholder colour in figures, which is replaced by the page's text colour."""
 NO_METADATA = {"Date": None, "Creator": None, "Format": None, "Type": None}
 
 
@@ -108,11 +108,13 @@ def stored_film(path: Path, caption: str) -> Picture:
 
 def inline_svg(figure: Figure) -> Markup:
     """Draw a figure as SVG with the page's width, font and text colour; matplotlib escapes its texts."""
+    # Texts stay texts in the page's font. A fixed salt gives equal pages for equal figures
     with rc_context({"svg.fonttype": "none", "svg.hashsalt": "foredrive"}):
         buffer = io.StringIO()
         figure.savefig(buffer, format="svg", transparent=True, metadata=NO_METADATA)
     svg = buffer.getvalue()
     svg = svg[svg.index("<svg") :].replace(INK_MARK, "currentColor")
+    # Without its own size the drawing fills the width of its place
     svg = re.sub(r'\s(width|height)="[\d.]+pt"', "", svg, count=2)
     return Markup(re.sub(r"font-family: '?DejaVu Sans[^;\"]*", "font-family: inherit", svg))
 
@@ -143,7 +145,7 @@ def _environment() -> Environment:
 
 
 def _breakable(text: str) -> Markup:
-    """Let a long name of a log be broken after its folders and before its time, not within a word."""
+    """Allow line breaks in a long name of a log at its slashes and before its time, but not within words."""
     return Markup("<wbr>@").join(Markup("/<wbr>").join(part.split("/")) for part in text.split("@"))
 
 

@@ -17,8 +17,8 @@ from foredrive.view.palette import box_colour, rgb255
 
 NEAR_M = 0.1
 SUPERSAMPLING = 2
-STEPS_PER_LINE = 24  # a straight edge is curved by lens distortion
-FRONT_CROSS = ((0, 5), (1, 4))  # diagonals of `box_corners`' front face
+STEPS_PER_LINE = 24  # Lens distortion bends straight edges
+FRONT_CROSS = ((0, 5), (1, 4))  # Diagonals of the front face of `box_corners`
 
 
 @dataclass(frozen=True)
@@ -82,6 +82,7 @@ def draw_points_on_image(
     centre, colour = uv.numpy()[shown][order], colours[shown][order]
     reach = int(np.ceil(radius_px))
     dv, du = np.mgrid[-reach : reach + 1, -reach : reach + 1]
+    # Every pixel of a square around each point, then those whose centre (+0.5) is within the radius
     pixel = np.floor(centre).astype(int)[:, None] + np.stack([du.ravel(), dv.ravel()], -1)  # [N, S, 2]
     distance = np.linalg.norm(pixel + 0.5 - centre[:, None], axis=-1)
     height, width = image.shape[:2]
@@ -89,7 +90,8 @@ def draw_points_on_image(
     point, offset = np.nonzero(inside & (distance <= radius_px))
     u, v = pixel[point, offset].T
     painted = image.copy()
-    painted[v, u] = (1 - alpha) * image[v, u] + alpha * colour[point]  # the last, nearest dot stays
+    # Where dots overlap, the last assignment counts, which is that of the nearest point
+    painted[v, u] = (1 - alpha) * image[v, u] + alpha * colour[point]
     return painted
 
 
@@ -135,7 +137,8 @@ def draw_path_on_image(
     for polygon in shapes:
         cam = camera.from_ego(polygon)
         uv, depth, inside = project(cam, camera.K, camera.dist, camera.size_hw)
-        drawable = inside if bool(camera.dist.any()) else depth > NEAR_M  # distortion is defined in view only
+        # Distortion is defined only inside the image
+        drawable = inside if bool(camera.dist.any()) else depth > NEAR_M
         if bool(drawable.all()):
             draw.polygon([tuple(p) for p in (uv * SUPERSAMPLING).tolist()], fill=255)
     return _blend(image, overlay, rgb255(colour), 0.85)
@@ -168,32 +171,34 @@ def _projected_lines(segments_cam: Float[Tensor, "S 2 3"], camera: Camera) -> li
     uv, _, inside = project(points.flatten(0, 1), camera.K, camera.dist, camera.size_hw)
     uv, inside = uv.unflatten(0, points.shape[:2]), inside.unflatten(0, points.shape[:2])
     pieces = torch.stack([uv[:, :-1], uv[:, 1:]], dim=2)  # [S, K-1, 2, 2]
-    # Distortion is defined only inside the image; an ideal pinhole camera may draw beyond the image.
+    # Distortion is defined only inside the image; an ideal pinhole camera may draw beyond the image
     return list(pieces[inside[:, :-1] & inside[:, 1:]] if bent else pieces.flatten(0, 1))
 
 
 def _clip_to_view(
     segments_cam: Float[Tensor, "S 2 3"], camera: Camera
 ) -> tuple[Float[Tensor, "S 2 3"], Tensor]:
-    """Cut segments at the near plane and the sides of the viewing frustum; also return which are left.
+    """Clip segments to the near plane and the sides of the viewing frustum; also return which remain.
 
-    Segments are cut in 3-D, before the division by depth. Otherwise an edge that passes beside or behind the
-    camera would run across the picture.
+    Segments are clipped in 3-D, before the division by depth. Otherwise an edge that passes beside or behind
+    the camera would run across the picture.
     """
     height, width = camera.size_hw
     border = torch.tensor([[0.0, 0.0], [width, 0.0], [0.0, height], [width, height]])
     rays = pixels_to_rays(border, camera.K, camera.dist)
     slopes = rays[:, :2] / rays[:, 2:]
     (left, top), (right, bottom) = slopes.amin(0).tolist(), slopes.amax(0).tolist()
-    planes = torch.tensor(  # inside where normal · p >= offset
+    planes = torch.tensor(  # Inside is where normal · p >= offset
         [[0, 0, 1], [1, 0, -left], [-1, 0, right], [0, 1, -top], [0, -1, bottom]], dtype=segments_cam.dtype
     )
     offset = torch.tensor([NEAR_M, 0, 0, 0, 0])
     signed = segments_cam @ planes.T - offset  # [S, 2, P]
     start, end = signed[:, 0], signed[:, 1]
+    # Where each plane cuts the segment, from 0 to 1 along it (Liang-Barsky)
     crossing = start / torch.where(start == end, torch.ones_like(start), start - end)
     enter = torch.where(start < 0, crossing, torch.zeros_like(start)).amax(-1)
     leave = torch.where(end < 0, crossing, torch.ones_like(start)).amin(-1)
+    # A segment with both ends outside of one plane is outside
     kept = (enter < leave) & ~((start < 0) & (end < 0)).any(-1)
     ends = torch.stack([enter, leave], -1)[..., None]  # [S, 2, 1]
     return segments_cam[:, :1] + ends * (segments_cam[:, 1:] - segments_cam[:, :1]), kept
@@ -210,6 +215,7 @@ def _draw_lines(
     canvas = Image.fromarray(image).resize(size, Image.Resampling.NEAREST)
     draw = ImageDraw.Draw(canvas)
     for points, rgb, width in lines:
+        # In PIL, pixel centres are at whole numbers
         points_px = [tuple(p) for p in (points * SUPERSAMPLING - 0.5).tolist()]
         draw.line(points_px, fill=rgb, width=max(1, round(width * SUPERSAMPLING)))
     return np.asarray(canvas.resize((image.shape[1], image.shape[0]), Image.Resampling.BOX))

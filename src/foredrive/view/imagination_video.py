@@ -50,6 +50,7 @@ def draw_imagined(imagined: ImaginedFutures, step: int, frame_dt_s: float) -> Im
         (f"future {k + 1} of {count}" if count > 1 else "imagined", future[step])
         for k, future in enumerate(imagined.futures)
     ]
+    # Rounded up
     lines = -(-len(panels) // COLUMNS)
     cell_h = TITLE_PX + PANEL_PX * truth.shape[2] // truth.shape[1] + GAP_PX
     strips_h = sum(TITLE_PX + strip.shape[0] + GAP_PX for _, strip in rows)

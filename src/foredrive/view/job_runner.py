@@ -1,4 +1,4 @@
-"""Slow work of a page in its own thread; a newer job replaces an older one with the same name."""
+"""Slow work of a page in a thread of its own. A newer job replaces an older one with the same name."""
 
 import logging
 import threading
@@ -53,7 +53,7 @@ class JobRunner:
                 job()
             except InputError as error:
                 self._tell(str(error))
-            except Exception as error:  # a mistake in the program, but the page continues
+            except Exception as error:  # An error of the program, after which the page continues
                 _log.exception("while drawing")
                 self._tell(f"{type(error).__name__}: {error}")
 
@@ -65,6 +65,7 @@ class JobRunner:
             if self._closed:
                 return None
             self._turns, self._busy = self._turns + 1, True
+            # The name whose last turn is the longest ago; one that has not run yet comes first
             name = min(self._wanted, key=lambda name: self._last_turn.get(name, 0))
             self._last_turn[name] = self._turns
             return self._wanted.pop(name)

@@ -53,6 +53,7 @@ class LogFrames:
         self.duration_s = float(log.t_us[-1] - log.t_us[0]) * 1e-6
         config = ClipConfig(
             past_frames=0,
+            # One key frame, and every frame of the log is a now
             future_frames=0,
             image_hw=(round(image_width_px * aspect), image_width_px),
             voxels=NO_LABELS,
@@ -68,7 +69,7 @@ class LogFrames:
         self.predictor = None
         if run is not None:
             from foredrive.runs.evaluate.display import DisplayPredictor
-            from foredrive.runs.train.run import load_agent  # without a run, models are not imported
+            from foredrive.runs.train.run import load_agent  # Models are imported only for a run
             from foredrive.runs.train.tasks import load_heads
 
             size, trained = run.recipe.clips, load_heads(run)
@@ -76,6 +77,7 @@ class LogFrames:
             self.predictor = DisplayPredictor(load_agent(run), size.future_frames, heads)
             if heads is not None and heads.voxels is not None:
                 self.taxonomy = heads.voxels.taxonomy
+            # The model's own clips, also at every frame, without the future that it does not see
             seen = dataclasses.replace(
                 size,
                 future_frames=0,
@@ -84,6 +86,7 @@ class LogFrames:
                 occupancy_source="lidar",
             )
             self._observed = ClipDataset([path], seen, cache_dir=None)
+            # The clips of both data sets are matched by time: those of the model begin later
             index_at = {self._observed.now_us(index): index for index in range(len(self._observed))}
             self._observed_index = [index_at.get(t_us) for t_us in self.now_us]
         self.clip = functools.lru_cache(KEPT)(self._clip)

@@ -88,6 +88,7 @@ def _write_sensors(mcap: _Mcap, log: Log, frame: int) -> None:
             continue
         size_hw = (camera.height, camera.width)
         read = read_camera(log, frame, camera, size_hw, with_image=False)
+        # Image and calibration carry the time of exposure; the message is logged at its frame's time
         exposed_us = t_us + round(read.exposed_dt_s * 1e6)
         mounted = torch.from_numpy(camera_mount(log, camera))
         own = foxglove.camera_frame(name)
@@ -110,6 +111,7 @@ def _write_labels(mcap: _Mcap, log: Log, frames: LogFrames, index: int, frame: i
     driven = log.driven_future(frame, DRIVEN_STEPS, DRIVEN_S)
     mcap.write("/driven", t_us, foxglove.path_message(t_us, driven))
     here = log.T_world_ego[frame, :3, 3]
+    # A map patch is written only where the vehicle has left the middle of the last one
     if mcap.map_at is None or np.linalg.norm(here - mcap.map_at) > MAP_STEP_M:
         mcap.map_at = here
         _write_map(mcap, log, frame)

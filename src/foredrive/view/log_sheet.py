@@ -68,13 +68,14 @@ def write_log_sheet(path: Path, clip: Clip, title: str, reach_m: float = 50.0) -
 
 
 def camera_rows(rig: CameraRig) -> list[list[int]]:
-    """Return rows of camera indices as around the car: cameras that look ahead above those that look back.
+    """Return rows of camera indices in their order around the car: forward cameras above backward ones.
 
     In both rows the cameras on the left of the car are on the left.
     """
-    forward = rig.T_ego_cam[..., :2, 2]  # the optical axis seen from above
+    forward = rig.T_ego_cam[..., :2, 2]  # The optical axis seen from above
     azimuth = torch.atan2(forward[:, 1], forward[:, 0])
     ahead_first = azimuth.abs().argsort(stable=True).tolist()
+    # Up to three cameras fit into one row
     front = (len(ahead_first) + 1) // 2 if len(ahead_first) > 3 else len(ahead_first)
     rows = [ahead_first[:front], ahead_first[front:]]
     return [sorted(row, key=lambda c: -_leftness(float(azimuth[c]))) for row in rows if row]
@@ -95,7 +96,7 @@ def camera_picture(
     else:
         image = np.full((*size_hw, 3), palette.rgb255(palette.PANEL), dtype=np.uint8)
     camera = Camera.of(clip.rig[now], index)
-    if torch.equal(camera.K, torch.eye(3)):  # a camera this log does not have
+    if torch.equal(camera.K, torch.eye(3)):  # Padding for a camera that the log does not have
         return image
     camera = camera.resized(size_hw)
     if bool(clip.sweep_valid[now]):

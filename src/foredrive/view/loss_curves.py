@@ -37,7 +37,7 @@ def draw_loss_curves(stages: Losses) -> Markup | None:
 
 def _draw_stage(ax: Axes, name: str, lines: Sequence[Mapping[str, float | int]]) -> None:
     names = [key for key in lines[0] if key not in NOT_LOSSES]
-    names.sort(key=lambda key: key != "loss")  # the minimised loss comes first
+    names.sort(key=lambda key: key != "loss")  # The minimised loss comes first
     for key, colour in zip(names, COLOURS, strict=False):
         steps = np.array([line["step"] for line in lines if key in line], dtype=float)
         values = np.array([line[key] for line in lines if key in line], dtype=float)
@@ -67,6 +67,7 @@ def _running_mean(values: Float[np.ndarray, " S"]) -> Float[np.ndarray, " S"]:
     number = np.isfinite(values)
     total = np.cumsum(np.where(number, values, 0.0))
     count = np.cumsum(number)
+    # The difference of two cumulative sums is the sum over the last few steps
     total[SMOOTH_STEPS:] -= total[:-SMOOTH_STEPS].copy()
     count[SMOOTH_STEPS:] -= count[:-SMOOTH_STEPS].copy()
     return np.where(count > 0, total / np.maximum(count, 1), np.nan)

@@ -85,7 +85,9 @@ def show_true_classes(
     """Draw the recorded voxels of now in the colours of their classes, to the left of the scene."""
     if classes is None:
         return clear(scene, "/true voxels")
+    # The last class is free space
     shown = (classes != len(VOXEL_CLASSES[taxonomy]) - 1) & (spec.centres_m()[..., 2] >= min_height_m)
+    # Shifted to the left by the width of the grid and a gap
     beside = torch.eye(4)
     beside[1, 3] = spec.upper_m[1] - spec.lower_m[1] + BESIDE_M
     return _show_cubes(scene, "/true voxels", beside, spec, shown, voxel_colours(taxonomy)[classes.numpy()])
@@ -135,7 +137,7 @@ def show_flow(
     if not bool(moves.any()):
         return clear(scene, "/flow")
     ends = arrows(start[moves], end[moves])
-    lift = torch.tensor([0.0, 0.0, 0.75 * spec.voxel_m])  # on top of the cubes, not inside
+    lift = torch.tensor([0.0, 0.0, 0.75 * spec.voxel_m])  # On top of the cubes, not inside
     scene.add_line_segments(
         "/flow",
         (ends + lift).numpy(),
@@ -148,6 +150,7 @@ def show_flow(
 def arrows(start: Float[Tensor, "N 3"], end: Float[Tensor, "N 3"]) -> Float[Tensor, "N3 2 3"]:
     """Return three segments for each of N arrows with flat heads, the shaft first."""
     along = end - start
+    # Horizontally across the arrow, as long as the arrow seen from above
     across = torch.stack([-along[:, 1], along[:, 0], torch.zeros_like(along[:, 0])], dim=-1)
     back = end - HEAD_SHARE * along
     heads = [back + 0.5 * HEAD_SHARE * across, back - 0.5 * HEAD_SHARE * across]
@@ -167,6 +170,7 @@ def show_agents(scene: viser.SceneApi, agents: Agents | None) -> None:
         return
     boxes = agents_found.boxes
     corners = box_corners(boxes.centre, boxes.size_lwh, boxes.yaw)
+    # With the diagonals of the front face
     edges = torch.tensor([*EDGES, (0, 5), (1, 4)])
     pieces, colours = [], []
     for n, kind in enumerate(boxes.category.tolist()):
@@ -225,6 +229,7 @@ class ModelPanel:
         self._index, self._drawing = 0, threading.Lock()
         gui, steps, spec = server.gui, self._predictor.steps, self.spec
         low_m, high_m = spec.lower_m[2], spec.upper_m[2] - spec.voxel_m
+        # The first step of the slider above the ground
         above_road = low_m + spec.voxel_m * math.ceil((ABOVE_GROUND_M - low_m) / spec.voxel_m)
         with gui.add_folder("Model"):
             self._note = gui.add_markdown("")
@@ -252,6 +257,7 @@ class ModelPanel:
 
     def show(self, index: int) -> None:
         """Draw the model's predictions at a frame of the log."""
+        # Handlers of the page run in several threads; one drawing at a time
         with self._drawing:
             self._index = index
             prediction, k, scene = self._frames.prediction(index), self.frame.value, self._server.scene
@@ -271,7 +277,7 @@ class ModelPanel:
                         node.visible = box.value and prediction is not None
 
     def _show_tasks(self, prediction: DisplayPrediction) -> None:
-        """Draw what the task heads have found now, and the true voxels beside it."""
+        """Draw the results of the task heads now, and the true voxels next to them."""
         scene = self._server.scene
         show_agents(scene, prediction.agents)
         show_lines(scene, prediction.lines)
@@ -293,6 +299,7 @@ class ModelPanel:
             camera = event.client.camera
             T_now_cam = np.eye(4)
             T_now_cam[:3, :3], T_now_cam[:3, 3] = SO3(camera.wxyz).as_matrix(), camera.position
+            # An imagined volume is in the ego frame of its own time, the browser's camera in that of now
             T_ego_cam = np.linalg.inv(prediction.T_now_ego[k].double().numpy()) @ T_now_cam
             rig = pinhole(T_ego_cam, camera.fov, camera.aspect, RENDERED_HEIGHT_PX)
             rgb = to_image(self._predictor.render(prediction, k, rig)[0].permute(2, 0, 1))

@@ -1,4 +1,4 @@
-"""A picture of a safety test: what a camera would see shortly before the impact, and the ways from above."""
+"""A picture of a safety test: a camera's view shortly before the impact, and the paths from above."""
 
 import math
 from pathlib import Path
@@ -38,6 +38,7 @@ def write_scenario_picture(path: Path, place: Place, scenario: SafetyScenario) -
     """
     drawn, drive = draw_run(scenario, 0), LoggedDrive(place.vehicle, torch.eye(4))
     graph = place_actors(place.graph, drawn, place.vehicle.T_world_scene, place.track_ids, moving_stay=True)
+    # The run begins after the priming frames, and an ego vehicle without action is hit after `IMPACT_S`
     at_s = FRAME_DT_S * (drawn.start_frame + scenario.priming_frames) + IMPACT_S - BEFORE_S
     T_world_ego, ego = torch.from_numpy(drive.pose_at(at_s)), drive.state_at(at_s)
     renderer = place.renderer(graph)
@@ -46,6 +47,7 @@ def write_scenario_picture(path: Path, place: Place, scenario: SafetyScenario) -
     tracks = graph.all_tracks.map_tensors(lambda tensor: tensor.detach().cpu())
     T_scene_ego = inverse_se3(place.vehicle.T_world_scene) @ T_world_ego
     boxes = boxes_at(tracks, T_scene_ego, at_s)
+    # Boxes that the log does not have are those of the scenario
     added = torch.isin(boxes.track_id, place.graph.all_tracks.track_id.cpu(), invert=True)
     camera = facing(renderer.rig, boxes.centre[added][0].numpy() if bool(added.any()) else np.zeros(3))
     width_px = 0

@@ -30,7 +30,7 @@ OUTPUT_CAPTION = "Output: predicted occupancy and plan (red; driven path: green)
 
 @dataclass(frozen=True)
 class Overview:
-    """Input of a model at one time, with its occupancy and plan. Nothing has leading dimensions."""
+    """Input of a model at one time, with its occupancy and plan, all without leading dimensions."""
 
     title: str
     clip: Clip
@@ -102,8 +102,9 @@ def _draw_path(
 
 
 def _draw_ego(draw: ImageDraw.ImageDraw, viewpoint: Viewpoint, size_hw: tuple[int, int]) -> None:
-    """Draw the vehicle as a box: the rear, right side and top that the viewpoint sees."""
+    """Draw the vehicle as a box: the rear, right side and top, which are visible from the viewpoint."""
     (x0, y0, z0), (x1, y1, z1) = EGO_LOWER_M, EGO_UPPER_M
+    # Each face with its brightness; the top is drawn last, over the other two
     faces = (
         (0.62, [(x0, y0, z0), (x0, y1, z0), (x0, y1, z1), (x0, y0, z1)]),
         (0.78, [(x0, y0, z0), (x1, y0, z0), (x1, y0, z1), (x0, y0, z1)]),

@@ -20,7 +20,8 @@ from foredrive.errors import InputError
 PORTS, PORTS_TRIED = 65536, 100
 AMBIENT_LIGHT = 0.7
 _log = logging.getLogger(__name__)
-_log.addFilter(lambda record: record.msg != "opening handshake failed")  # a client's fault, not worth a line
+# A failed handshake is an error of the client and not worth a line
+_log.addFilter(lambda record: record.msg != "opening handshake failed")
 START_EYE_M, START_TARGET_M = (-20.0, 8.0, 15.0), (6.0, 0.0, 0.0)
 
 
@@ -48,6 +49,7 @@ class _BoundedConnection(ServerConnection):
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         super().connection_made(transport)
+        # Connections whose handshake is not complete, the oldest first; abort one for the new connection
         waited_for = [one for one in self.server.handlers if one.state is State.CONNECTING]
         if len(waited_for) > MAX_CONNECTIONS:
             waited_for[0].transport.abort()
@@ -55,11 +57,13 @@ class _BoundedConnection(ServerConnection):
 
 @contextlib.contextmanager
 def _bounded() -> Iterator[None]:
-    """Make the servers that viser starts in the block refuse what pages of other sites ask, and bound them.
+    """Make servers that viser starts in the block refuse requests of other sites' pages, and bound them.
 
-    viser has no option for either. Browsers let any page open a WebSocket to this machine, through which it
-    would see the log and move the controls. Of the bounds, `websockets` has that of the time for a request.
+    viser has no option for either. Browsers let any page open a WebSocket to this machine, through which the
+    page could see the log and move the controls. Of the bounds, `websockets` itself offers only the one on
+    the time of a request.
     """
+    # viser calls this function by its module, so that it can be replaced while viser starts
     serve = websockets.asyncio.server.serve
 
     def checking(
@@ -89,12 +93,12 @@ def _bounded() -> Iterator[None]:
 
 
 def _open_server(label: str, host: str, port: int) -> viser.ViserServer:
-    """Serve an empty dark page, seen from behind and above the ego vehicle; it has its own threads."""
-    port = free_port(host, port)  # viser would wait for a host that does not exist
+    """Serve an empty dark page in threads of the server, seen from behind and above the ego vehicle."""
+    port = free_port(host, port)  # With a host that does not exist, viser would wait
     with contextlib.redirect_stdout(io.StringIO()), _bounded():  # viser prints a greeting
         server = viser.ViserServer(host=host, port=port, label=label, verbose=False)
     server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
-    server.scene.configure_environment_map(hdri=None)  # lights without a download
+    server.scene.configure_environment_map(hdri=None)  # Light without a downloaded environment map
     server.scene.add_light_ambient("/light", intensity=AMBIENT_LIGHT)
     server.initial_camera.position = START_EYE_M
     server.initial_camera.look_at = START_TARGET_M
@@ -122,5 +126,5 @@ class Page:
 
     def close(self) -> None:
         """Stop serving."""
-        with contextlib.suppress(RuntimeError):  # its thread may end before it has received everything
+        with contextlib.suppress(RuntimeError):  # viser's thread may end before it has handled all calls
             self.server.stop()

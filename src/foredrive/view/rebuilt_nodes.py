@@ -37,6 +37,7 @@ def thin_out(gaussians: Gaussians, share: float, from_m: Float[Tensor, "K 3"]) -
     seen = (opacity >= MIN_OPACITY).nonzero()[:, 0]
     max_count = round(share * len(opacity))
     if len(seen) > max_count:
+        # The two longest axes span the largest section; its solid angle falls with the squared distance
         scale_m = gaussians.log_scale.exp().sort(dim=-1).values
         range_m = torch.cdist(gaussians.mean_m, from_m).amin(-1).clamp_min(MIN_DISTANCE_M)
         covers = opacity * scale_m[:, 1] * scale_m[:, 2] / range_m**2
@@ -48,6 +49,7 @@ def thin_out(gaussians: Gaussians, share: float, from_m: Float[Tensor, "K 3"]) -
 def show_splats(scene: viser.SceneApi, name: str, gaussians: Gaussians) -> viser.GaussianSplatHandle:
     """Draw Gaussians in the frame of the parent node."""
     factor = gaussians.factor().permute(2, 0, 1)
+    # Gaussians that are too large for half precision are scaled down as a whole
     held = (MAX_STD_M / gaussians.log_scale.exp().amax(-1)).clamp_max(1.0)
     factor = factor * held[:, None, None]
     return scene.add_gaussian_splats(
@@ -66,7 +68,7 @@ def _array(values: Tensor) -> np.ndarray:
 ROOT = "/scene"
 """Name of the scene's frame; nodes beside it are in the ego frame at the time shown."""
 MAX_SPLATS = 400_000
-"""Maximum number of drawn splats; more are thin_out out. These are 13 MB at 32 bytes each."""
+"""Maximum number of drawn splats; larger scenes are thinned out. At 32 bytes each, these are 13 MB."""
 HIDDEN_AT_M = (0.0, 0.0, -1e6)
 """Position of hidden splats, m: the browser draws the splats of invisible nodes too."""
 SHOWN_AT_M = (0.0, 0.0, 0.0)
@@ -118,6 +120,7 @@ class RebuiltNodes:
 
     def show(self, graph: SceneGraph, T_scene_ego: Float[Tensor, "4 4"], t_s: float) -> None:
         """Draw the scene at a time in the ego frame; nodes that exist only move."""
+        # Actors are placed in the scene's frame below the root, so the static part needs no change
         _place(self._root, inverse_se3(T_scene_ego))
         ids = graph.tracks.track_id.tolist()
         for gone in self._actors.keys() - set(ids):
@@ -126,7 +129,8 @@ class RebuiltNodes:
         for row, track_id in enumerate(ids):
             present, own = bool(states.present[row]), graph.content.preview(row)
             node = self._actors.get(track_id)
-            if node is not None and not torch.equal(node.own.mean_m, own.mean_m):  # another actor, same id
+            # Another actor may have the id of a removed one
+            if node is not None and not torch.equal(node.own.mean_m, own.mean_m):
                 self._actors.pop(track_id).frame.remove()
                 node = None
             if node is None and present:
@@ -165,7 +169,7 @@ class RebuiltNodes:
     def nudge(self) -> None:
         """Make browsers sort the splats again by an invisible movement.
 
-        If several nodes arrive at once, browsers show only the first until something moves.
+        If several nodes arrive at once, browsers show only the first one until something moves.
         """
         self._root.position = self._root.position + np.array([0.0, 0.0, NUDGE_M])
 
@@ -176,7 +180,7 @@ class RebuiltNodes:
         scene, shown = self._scene, thin_out(own, self.share, own.mean_m.new_zeros(1, 3))
         frame = scene.add_frame(name, show_axes=False)
         corners = box_corners(torch.zeros(3), size, torch.tensor(0.0))
-        edges = corners[torch.tensor([*EDGES, (0, 5), (1, 4)])]  # corners 0, 1, 5, 4 are the front
+        edges = corners[torch.tensor([*EDGES, (0, 5), (1, 4)])]  # With the diagonals of the front face
         face = scene.add_box(
             f"{name}/face",
             rgb,

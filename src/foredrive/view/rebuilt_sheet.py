@@ -1,4 +1,4 @@
-"""A reconstructed scene beside the recorded images."""
+"""Renderings of a reconstructed scene next to the recorded images."""
 
 from collections.abc import Sequence
 from pathlib import Path

@@ -140,7 +140,7 @@ def _column(shot: RenderedFrame, rig: CameraRig, colour: Colour) -> Image.Image:
 
 def _draw_from_above(sweep: LidarSweep, boxes: Boxes, width_px: int, colour: Colour) -> Image.Image:
     """Draw coloured returns, low ones first, and the outlines of the actors with their ids."""
-    twice = 2  # draw at twice the size and shrink: PIL does not smooth the edges of lines
+    twice = 2  # Drawn at twice the size and shrunk, because PIL does not smooth the edges of lines
     height_px = round(ABOVE_HW[0] * width_px)
     scale = twice * width_px / ABOVE_M
     picture = np.full((twice * height_px, twice * width_px, 3), palette.rgb255(palette.GROUND), np.uint8)
@@ -150,9 +150,11 @@ def _draw_from_above(sweep: LidarSweep, boxes: Boxes, width_px: int, colour: Col
 
     returned = sweep[sweep.returned & sweep.valid]
     points = returned.points_ego.numpy()
+    # High returns are drawn last, over low ones
     order = points[:, 2].argsort(kind="stable")
     colours = sweep_colours(returned, colour)[order]
     u, v = pixels(points[order, :2]).astype(int).T
+    # A return covers a square of two pixels, one pixel of the final picture
     for right, down in ((0, 0), (1, 0), (0, 1), (1, 1)):
         x, y = u + right, v + down
         inside = (x >= 0) & (x < picture.shape[1]) & (y >= 0) & (y < picture.shape[0])
@@ -180,7 +182,8 @@ def sweep_colours(sweep: LidarSweep, colour: Colour) -> UInt8[np.ndarray, "N 3"]
         share = (sweep.points_ego[:, 2].numpy() - LOW_M) / (HIGH_M - LOW_M)
         mapped = palette.HEIGHT_MAP(share.clip(0, 1))
     else:
+        # The colour map runs from bright to dark
         faint, bright = palette.RANGE_SPAN[::-1]
-        share = np.sqrt(sweep.intensity.numpy().clip(0, 1))  # most returns are faint
+        share = np.sqrt(sweep.intensity.numpy().clip(0, 1))  # The root spreads the many faint returns
         mapped = palette.RANGE_MAP(faint + (bright - faint) * share)
     return (mapped[:, :3] * 255).astype(np.uint8)

@@ -67,6 +67,7 @@ class RebuiltPictures:
         self._shown = SceneAtTime(edited, t_s)
         self._request_lidar()
         for camera, name in enumerate(self._run.vehicle.rig.names):
+            # One job for each sensor: a newer time replaces a waiting job of the same sensor
             self._jobs.submit(name, partial(self._show_camera, camera, self._shown))
 
     def show_layers(self) -> None:
@@ -112,6 +113,7 @@ class RebuiltPictures:
     def _show_own_view(self, client: viser.ClientHandle) -> None:
         assert self._shown is not None
         camera, shown = client.camera, self._shown
+        # All nodes of the page are in the ego frame, so the browser's camera is too
         T_ego_cam = np.eye(4)
         T_ego_cam[:3, :3], T_ego_cam[:3, 3] = SO3(camera.wxyz).as_matrix(), camera.position
         rig = pinhole(T_ego_cam, camera.fov, camera.aspect, OWN_HEIGHT_PX)
@@ -135,9 +137,9 @@ NOTE_S = 8.0
 class RebuiltViewer(Page):
     """A page with a slider for time, sensors rendered at that time, and edits.
 
-    The browser draws the Gaussians' albedo by itself. Sensor images are rendered in the background, the
-    newest time first, so that the slider never waits. All nodes are in the ego frame at the time shown. The
-    server runs in its own threads until `close`.
+    The browser itself draws the Gaussians' albedo. Sensor images are rendered in the background, the newest
+    time first, so that the slider never waits. All nodes are in the ego frame at the time shown. The server
+    runs in its own threads until `close`.
 
     Args:
         run: the shown reconstruction.
@@ -155,9 +157,11 @@ class RebuiltViewer(Page):
         super().__init__(run.folder.name, host, port)
         self.run = run
         self.server.initial_camera.far = FAR_M
+        # Handlers of the page run in several threads
         self._showing = threading.RLock()
         self.jobs = JobRunner(self.tell)
         show_ego(self.server.scene)
+        # Without gradients, because the scene is only shown
         graph = run.scene.graph.map_tensors(lambda tensor: tensor.detach())
         path_m = run.vehicle.T_scene_ego[:, :3, 3].to(graph.content.device)
         self.nodes = RebuiltNodes(
@@ -167,12 +171,13 @@ class RebuiltViewer(Page):
         self.edits = EditPanel(self.server, graph, self.nodes, file, self.tell, self.show_now)
         self.pictures = RebuiltPictures(self.server, run, self.jobs)
         self.server.on_client_connect(self._welcome)
+        # `replace` draws the scene if the edits can be made
         if not self.edits.replace(edits):
             self.show_now()
 
     def show(self, t_s: float) -> None:
         """Go to a time since the start of the log, s."""
-        self.time_s.value = t_s  # calls `show_now`, unless the value is the same
+        self.time_s.value = t_s  # Calls `show_now`, unless the value is the same
 
     def show_now(self) -> None:
         """Draw the scene as it is now; the sensors' pictures follow."""
@@ -238,6 +243,7 @@ class RebuiltViewer(Page):
     def _show_layers(self) -> None:
         for name in self.nodes.layers:
             self.nodes.layers[name] = self.layers[name].value
+        # The rendered view replaces the splats that the browser draws
         self.nodes.layers["splats"] &= not self.own.value
         for name in self.pictures.layers:
             self.pictures.layers[name] = self.layers[name].value

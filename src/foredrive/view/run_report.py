@@ -34,13 +34,13 @@ COMMAND_SOURCES = {
     "none": "Unknown commands",
 }
 REFERENCES = ("ego_mlp", "constant_velocity")
-"""Baselines of planning: the first that was evaluated stands beside the model in the tiles."""
+"""Baselines of planning. The tiles compare the model with the first one that was evaluated."""
 MAX_NAMED_FAILURES = 5
 
 
 @dataclass(frozen=True)
 class RunReport:
-    """The content of a report; a part without content is left out."""
+    """The content of a report. Parts without content are left out."""
 
     title: str
     provenance: Provenance
@@ -114,6 +114,7 @@ def _notes(run: Run, logs: Sequence[LogPath], failures: Sequence[Failure], losse
             f"{len(trained_on)} of the {len(logs)} evaluated logs were trained on: these figures show that "
             "the model fits, not that it generalises."
         )
+    # Stages that render have the perceptual loss "perc", which is 0 in all steps if it is off
     rendered = [lines for lines in losses.values() if lines and "perc" in lines[0]]
     if any(not any(line["perc"] for line in lines) for lines in rendered):
         notes.append("The perceptual loss was off in training (no VGG-16 weights, or weight 0).")

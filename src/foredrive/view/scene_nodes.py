@@ -44,7 +44,7 @@ def show_boxes(scene: viser.SceneApi, clip: Clip) -> None:
     """Draw wire frames in the colours of their kinds, a cross on the front of each."""
     boxes = clip.boxes[clip.now]
     boxes = boxes[boxes.valid]
-    edges = torch.tensor([*EDGES, (0, 5), (1, 4)])  # corners 0, 1, 5, 4 are the front
+    edges = torch.tensor([*EDGES, (0, 5), (1, 4)])  # With the diagonals of the front face
     corners = box_corners(boxes.centre, boxes.size_lwh, boxes.yaw)
     colours = np.array([palette.rgb255(palette.box_colour(kind)) for kind in boxes.category.tolist()])
     line_colours = np.repeat(colours.reshape(-1, 3), 2 * len(edges), axis=0)
@@ -55,6 +55,7 @@ def show_map(scene: viser.SceneApi, clip: Clip) -> None:
     """Draw polylines in the colours of their kinds."""
     if clip.map is None:
         return clear(scene, "/map")
+    # A piece of a line is drawn if both of its ends are valid
     both = clip.map.valid[:, 1:] & clip.map.valid[:, :-1]
     pieces = torch.stack([clip.map.vertices[:, :-1], clip.map.vertices[:, 1:]], dim=2)[both]
     kinds = clip.map.kind[:, None].expand(both.shape)[both].tolist()
@@ -79,6 +80,7 @@ def show_camera(scene: viser.SceneApi, rig: CameraRig, index: int, image: UInt8[
     pose = rig.T_ego_cam[index].double().numpy()
     scene.add_camera_frustum(
         f"{CAMERAS}/{rig.names[index]}",
+        # The vertical field of view, for a principal point in the middle
         fov=2 * float(np.arctan(height / 2 / float(rig.K[index, 1, 1]))),
         aspect=width / height,
         scale=FRUSTUM_M,
@@ -111,6 +113,7 @@ def show_ego(scene: viser.SceneApi) -> None:
     bottom = np.column_stack([EGO_OUTLINE_XY, np.full(count, 0.25)])
     top = np.column_stack([EGO_OUTLINE_XY, np.full(count, EGO_HEIGHT_M)])
     side = [(i, (i + 1) % count) for i in range(count)]
+    # Top and bottom are fans of triangles around one corner, each side is two triangles
     faces = [(0, i, i + 1) for i in range(1, count - 1)] + [
         (count, count + i + 1, count + i) for i in range(1, count - 1)
     ]

@@ -64,6 +64,7 @@ def draw_detection_frame(frame: DetectionFrame, score: FrameScore, is_3d: bool) 
 
 
 def _corners(state: Float[ndarray, "D"], yaw: float, is_3d: bool) -> Float[ndarray, "4 2"]:
+    # The state is left, top, right, bottom in images; in 3-D it begins with the centre and log sizes
     signs = np.array([[1, 1], [1, -1], [-1, -1], [-1, 1]])
     if not is_3d:
         return 0.5 * (state[:2] + state[2:] + signs * (state[2:] - state[:2]))
@@ -75,6 +76,7 @@ def _corners(state: Float[ndarray, "D"], yaw: float, is_3d: bool) -> Float[ndarr
 def _centre_covariance(covariance: Float[ndarray, "D D"], is_3d: bool) -> Float[ndarray, "2 2"]:
     if is_3d:
         return covariance[:2, :2]
+    # The centre is a linear function of the sides, so its covariance follows from theirs
     middle = 0.5 * np.array([[1, 0, 1, 0], [0, 1, 0, 1]])
     return middle @ covariance @ middle.T
 
@@ -82,6 +84,7 @@ def _centre_covariance(covariance: Float[ndarray, "D D"], is_3d: bool) -> Float[
 def _draw_ellipse(
     axes: Axes, centre: Float[ndarray, "2"], covariance: Float[ndarray, "2 2"], alpha: float
 ) -> None:
+    # The eigenvectors are the axes of the ellipse
     variance, direction = np.linalg.eigh(covariance)
     width, height = 2 * SIGMAS * np.sqrt(variance)
     angle = np.degrees(np.arctan2(direction[1, 0], direction[0, 0]))

@@ -143,7 +143,7 @@ class SearchPage:
 
     def __init__(self, index: FrameIndex, towers: str | None, host: str, port: int) -> None:
         self._index, self._towers = index, towers
-        self._one_at_a_time = threading.Lock()  # one query uses all cores
+        self._one_at_a_time = threading.Lock()  # One query uses all cores
         answers: dict[tuple[str, str], Answer] = {
             ("GET", "/"): lambda _: Raw(page_html().encode(), "text/html; charset=utf-8"),
             ("GET", "/picture"): self._picture,
@@ -167,7 +167,7 @@ class SearchPage:
         return self._server.in_background()
 
     def close(self) -> None:
-        """Give up the port."""
+        """Release the port."""
         self._server.close()
 
     def _find(self, asked: Mapping[str, str]) -> ShownHits:
@@ -233,6 +233,7 @@ def query_of(asked: Mapping[str, str]) -> Query:
     """
     names = {field.name for field in fields(Query)}
     given = {name: value for name, value in asked.items() if name in names and value.strip()}
+    # The fields of a URL are texts; validation converts numbers
     query: Query = validated(Query, given, "the query")
     if query.top > MAX_TOP:
         raise InputError(f"the page shows at most {MAX_TOP} hits")

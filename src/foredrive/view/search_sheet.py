@@ -95,7 +95,7 @@ def hits_table(hits: Sequence[Hit]) -> Table:
     """Return the hits as a table."""
     columns = (
         Column(),
-        Column("moment and view", align="left", wraps=False),  # to be copied into --like
+        Column("moment and view", align="left", wraps=False),  # Users copy it into --like
         Column("score", align="left", wraps=False),
         Column("content", align="left"),
     )

@@ -140,6 +140,7 @@ def occupancy_table(summary: Summary) -> Table | None:
             rows.append(Row([time_title(when), *cells]))
         sections.append(Section(rows, title))
     notes = [ABOVE_NOTE, BASELINES_NOTE]
+    # Other columns than baselines are best and mean of sampled futures
     if not set(others) <= BASELINE_TITLES.keys():
         notes.append(FUTURES_NOTE)
     return Table(columns, sections, "Occupancy on known voxels", notes)
@@ -161,7 +162,7 @@ def flow_table(summary: Summary) -> Table | None:
 
 
 def vehicle_table(summary: Summary) -> Table | None:
-    """List the recall of the columns that hold a car and the precision of all columns, by range."""
+    """List the recall of grid columns that contain a car and the precision of all columns, by range."""
     rows = [
         (
             f"within {match[1]} m",
@@ -189,9 +190,10 @@ def image_table(summary: Summary) -> Table | None:
 
 def task_table(summary: Summary) -> Table | None:
     """Compare the main figures that metrics state with their baselines."""
-    from foredrive.tasks.evaluation.metrics import METRICS  # they bring PyTorch along
+    from foredrive.tasks.evaluation.metrics import METRICS  # Imports PyTorch
 
     rows: dict[str, list[Row]] = {}
+    # Metrics are started only to read their names and titles; their settings have no effect here
     for metric in (start(EvaluationContext(frame_dt_s=1.0)) for start in METRICS):
         for figure in metric.shown:
             keys = (f"{metric.name}.{figure.key}", f"{metric.name}.{figure.key}.{figure.baseline}")
@@ -265,5 +267,6 @@ def _planning_key(agent: str, key: str) -> str:
 
 def _best(column: Sequence[Value]) -> float | None:
     """Return the smallest value of a column; None if all values are equal or missing."""
+    # A set: equal values count once
     values = {value for value in column if isinstance(value, float) and not math.isnan(value)}
     return min(values) if len(values) > 1 else None

@@ -103,8 +103,9 @@ def words(name: str) -> str:
 
 
 def print_table(table: Table, console: Console) -> None:
-    """Print a table and its notes; a console that is too narrow for its numbers is widened."""
+    """Print a table and its notes. A console that is too narrow for the numbers is widened."""
     shown = _rich(table)
+    # Measured with room to spare: in a narrow console rich would shorten the numbers
     wide = console.options.update(max_width=MAX_WIDTH)
     console.width = max(console.width, Measurement.get(console, wide, shown).minimum)
     console.print(shown)
@@ -137,6 +138,7 @@ def _rich(table: Table) -> RichTable:
         for row in section.rows:
             shown.add_row(*map(_rich_cell, row.cells, table.columns), style="bold" if row.is_strong else None)
         shown.add_section()
+    # Titles of rows and numbers get the width of their longest line, so that only texts wrap
     for place, (made, column) in enumerate(zip(shown.columns, table.columns, strict=True)):
         if place == 0 or column.align == "right" or not column.wraps:
             lines = [line for cell in (made.header, *made.cells) for line in str(cell).split("\n")]

@@ -1,4 +1,4 @@
-"""What task heads find beside the ground truth: from above, in a camera, and as semantic voxels."""
+"""Results of task heads next to the ground truth: from above, in a camera, and as semantic voxels."""
 
 import io
 from collections.abc import Sequence
@@ -54,7 +54,7 @@ class SeenAgents:
 
 @dataclass(frozen=True)
 class SeenScene:
-    """One side of a comparison: the truth, or what a model has found. None: this side has none."""
+    """One side of a comparison: the truth, or the results of a model. None: this side does not exist."""
 
     agents: SeenAgents | None = None
     lines: Sequence[tuple[ElementKind, Float[ndarray, "V 2"]]] | None = None
@@ -88,7 +88,7 @@ def true_scene(shown: ExamplePrediction) -> SeenScene:
 
 
 def found_scene(prediction: Prediction) -> SeenScene:
-    """Return what heads have found in the first item of a batch."""
+    """Return the results of the heads for the first item of a batch."""
     agents = None if prediction.agents is None else found_agents(prediction.agents[0].to("cpu"))
     lines = None
     if prediction.map_lines is not None:
@@ -121,6 +121,7 @@ def found_agents(agents: Agents) -> SeenAgents:
     if agents.future_xy is not None and agents.log_prob is not None:
         for n, (modes, log_prob) in enumerate(zip(agents.future_xy, agents.log_prob, strict=True)):
             alternatives = zip(modes.numpy(), log_prob.exp().tolist(), strict=True)
+            # The likeliest future is kept however small its probability is
             likeliest = float(log_prob.exp().max())
             futures[n] = [(mode, p) for mode, p in alternatives if p >= min(MIN_PROBABILITY, likeliest)]
     return SeenAgents(boxes, names, futures)
@@ -178,6 +179,7 @@ def scene_picture(scene: SeenScene, spec: VoxelSpec) -> UInt8[ndarray, "H W 3"]:
     """Draw road users with names and futures, and map elements, from above; the model's grid is framed."""
     figure = Figure(figsize=FIGURE_IN, dpi=DPI, facecolor=palette.GROUND)
     ax = figure.add_axes((0.125, 0.17, 0.855, 0.79))
+    # The view is square and centred on the ego vehicle, the grid may not be
     reach_m = max(*(abs(corner) for corner in (*spec.lower_m[:2], *spec.upper_m[:2]))) + 2.0
     start_bev(ax, reach_m)
     (x0, y0, _), (x1, y1, _) = spec.lower_m, spec.upper_m
@@ -220,6 +222,7 @@ def draw_agents(ax: Axes, agents: SeenAgents, reach_m: float) -> None:
             alpha = 0.25 + 0.75 * probability
             ax.add_collection(LineCollection([path], color=colour, linewidth=1.1, alpha=alpha, zorder=3.4))
             ax.plot(*path[1:].T, ".", color=colour, markersize=2.2, alpha=alpha, zorder=3.5)
+        # The extent of a name, m: names are written along y, which is horizontal
         free = all(abs(x - other_x) > 2.5 or abs(y - other_y) > 6.0 for other_x, other_y in named)
         if free and max(abs(x), abs(y)) < reach_m - 2:
             named.append((x, y))
@@ -265,6 +268,7 @@ def voxels_picture(
     ax = figure.add_axes((0.125, 0.17, 0.855, 0.79))
     start_bev(ax, max(abs(corner) for corner in (*spec.lower_m[:2], *spec.upper_m[:2])))
     (x0, y0, _), (x1, y1, _) = spec.lower_m, spec.upper_m
+    # Rows are x and columns are y; the reversed horizontal axis puts left on the left
     rgb = columns_rgb(voxels, taxonomy).swapaxes(0, 1)
     ax.imshow(rgb, origin="lower", extent=(y0, y1, x0, x1), interpolation="nearest", zorder=1)
     ax.set(xlim=(y1, y0), ylim=(x0, x1))
@@ -283,6 +287,7 @@ def columns_rgb(voxels: UInt8[ndarray, "Z Y X"], taxonomy: Taxonomy) -> UInt8[nd
     """Return the colour of the highest occupied voxel of each column, or that of free space."""
     colours = voxel_colours(taxonomy)
     occupied = voxels != len(colours) - 1
+    # The first occupied voxel from above; in an empty column it is the topmost, which is free
     top = len(voxels) - 1 - occupied[::-1].argmax(axis=0)
     y, x = np.indices(top.shape)
     return colours[voxels[top, y, x]]

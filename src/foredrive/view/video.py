@@ -55,7 +55,7 @@ def write_video(path: Path, frames: Iterable[Image.Image], frame_s: float) -> No
 
 
 def _write_mp4(path: Path, frames: Iterator[Image.Image], frame_s: float) -> None:
-    import av  # an optional package
+    import av  # An optional package
 
     first = next(frames)
     width, height = (n - n % 2 for n in first.size)  # H.264 needs even sizes
@@ -65,4 +65,5 @@ def _write_mp4(path: Path, frames: Iterator[Image.Image], frame_s: float) -> Non
         for frame in itertools.chain([first], frames):
             picture = av.VideoFrame.from_ndarray(np.asarray(frame)[:height, :width].copy(), format="rgb24")
             container.mux(stream.encode(picture))
+        # Flush the frames that the encoder has delayed
         container.mux(stream.encode())

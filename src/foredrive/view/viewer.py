@@ -49,7 +49,7 @@ class Viewer(Page):
                 self.show((self._frame.value + 1) % len(self.frames))
 
     def close(self) -> None:
-        """Stop serving. Frames that browsers have asked for are not drawn any more."""
+        """Stop serving. Frames that browsers have requested are not drawn."""
         with self._drawing:
             self._closed = True
         super().close()
@@ -74,6 +74,7 @@ class Viewer(Page):
     def _draw(self) -> None:
         """Draw the newest requested frame; frames requested in between are dropped."""
         with self._drawing:
+            # Read with the lock held: while one frame was drawn, the slider may have moved on several times
             index = min(self._frame.value, len(self.frames) - 1)
             if index == self._drawn or self._closed:
                 return

@@ -16,7 +16,7 @@ from foredrive.view import palette
 
 SUN = np.array([-0.35, 0.45, 0.82]) / np.linalg.norm([-0.35, 0.45, 0.82])
 AMBIENT, DIFFUSE = 0.52, 0.48
-RIM_SHADE, RIM_PX = 0.78, 1.6  # rims of voxels are darker
+RIM_SHADE, RIM_PX = 0.78, 1.6  # Rims of voxels are darker
 SUPERSAMPLING = 2
 
 
@@ -38,12 +38,15 @@ class Viewpoint:
         position = (middle[0] - 1.75 * reach, middle[1] - 0.55 * reach, 1.35 * reach)
         target = (middle[0] - 0.12 * reach, middle[1], 0.0)
         corners = np.stack(np.meshgrid(*zip(low, high, strict=True)), -1).reshape(8, 3)
+        # How far the corners of the grid are from the middle of a picture with focal length 1
         off_centre = np.abs(cls(position, target, 1.0).project(corners, (1, 1)) - 0.5).max(0)  # [u v]
+        # The largest focal length that shows all corners, times 1.45: empty corners may be cut off
         limits = np.array([0.5 * size_hw[1] / size_hw[0], 0.5]) / off_centre
         return cls(position, target, 1.45 * float(limits.min()))
 
     def axes(self) -> Float[np.ndarray, "3 3"]:
         """Return the rows right, down and forward in the ego frame."""
+        # Right is level; down is across both
         forward = np.subtract(self.target_m, self.position_m)
         forward = forward / np.linalg.norm(forward)
         right = np.cross(forward, [0.0, 0.0, 1.0])
@@ -142,7 +145,8 @@ def _principal(features: Float[Tensor, "D *n"]) -> Float[Tensor, "3 *n"]:
     flat = features.float().flatten(1)
     centred = flat - flat.mean(1, keepdim=True)
     _, vectors = torch.linalg.eigh(centred @ centred.T / centred.shape[1])
-    components = vectors[:, -3:].flip(-1)  # largest variance first
+    components = vectors[:, -3:].flip(-1)  # Largest variance first
+    # The sign of an eigenvector is arbitrary: its largest entry is made positive
     signs = components.gather(0, components.abs().argmax(0, keepdim=True)).sign()
     return ((components * signs).T @ centred).unflatten(1, features.shape[1:])
 
@@ -170,6 +174,7 @@ def _march(occupied, origin, direction, cell, step, to_next, per_cell):
     """
     shape = (occupied.shape[2], occupied.shape[1], occupied.shape[0])
     near, far, axis = 0.0, math.inf, -1
+    # Distances at which the ray enters and leaves the grid, and the face through which it enters
     for i in range(3):
         if direction[i] == 0.0:
             if origin[i] < 0 or origin[i] > shape[i]:
@@ -183,6 +188,7 @@ def _march(occupied, origin, direction, cell, step, to_next, per_cell):
     if near >= far:
         return -1.0, -1
     for i in range(3):
+        # The first cell, slightly inside of the face; then the distances to the next border of each axis
         point = origin[i] + (near + 1e-9) * direction[i]
         cell[i] = min(max(math.floor(point), 0), shape[i] - 1)
         step[i], per_cell[i], to_next[i] = 0, math.inf, math.inf
@@ -195,6 +201,7 @@ def _march(occupied, origin, direction, cell, step, to_next, per_cell):
     while True:
         if occupied[cell[2], cell[1], cell[0]]:
             return distance, axis
+        # Go on through the nearest border
         axis = 0 if to_next[0] <= to_next[1] else 1
         if to_next[2] < to_next[axis]:
             axis = 2
@@ -215,6 +222,7 @@ def _cast(occupied, colours, origin, axes, focal_px, sun, picture):
     to_next, per_cell = np.empty(3), np.empty(3)
     for row in range(height):
         for column in range(width):
+            # The ray of a pixel's centre, of unit length, so that distances are in voxels
             u, v = column + 0.5 - width / 2, row + 0.5 - height / 2
             length = math.sqrt(u * u + v * v + focal_px * focal_px)
             for i in range(3):
@@ -226,10 +234,12 @@ def _cast(occupied, colours, origin, axes, focal_px, sun, picture):
             light, rim = AMBIENT, 1.0
             for i in range(3):
                 hit[i] = above[i] = origin[i] + distance * direction[i]
-                if i != axis:  # distance from the nearest rim of the face, in voxels
+                if i != axis:  # Distance from the nearest rim of the face, in voxels
                     rim = min(rim, hit[i] - math.floor(hit[i]), math.ceil(hit[i]) - hit[i])
             if axis >= 0:
+                # The normal of the entered face points against the ray
                 facing = -sun[axis] if direction[axis] > 0 else sun[axis]
+                # The shadow ray starts just outside of the face. It may overwrite `cell`, which is used up
                 above[axis] -= 1e-4 if direction[axis] > 0 else -1e-4
                 if facing > 0 and _march(occupied, above, sun, cell, step, to_next, per_cell)[0] < 0:
                     light += DIFFUSE * facing

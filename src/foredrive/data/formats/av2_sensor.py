@@ -2,7 +2,7 @@
 
 py123d's own parser steps from sweep to sweep and stops where a camera, a calibration or a sweep is missing.
 It writes empty frames of boxes where a log has no annotations, as in the test split. Here each time of a
-sweep or of annotations is a frame, and what is missing costs itself.
+sweep or of annotations is a frame, and a frame lacks only the data that is missing in the log.
 """
 
 from collections.abc import Iterator, Sequence
@@ -70,7 +70,7 @@ class Av2SensorParser(BaseLogParser):
         return LogMetadata("av2-sensor", self._split, self._folder.name, location, map_metadata)
 
     def iter_modalities_sync(self) -> Iterator[ModalitiesSync]:
-        """Yield the ego pose at each time of a sweep or of annotations, with what the log has then."""
+        """Yield the ego pose at each time of a sweep or of annotations, with the data of that time."""
         poses = _poses(self._folder)
         annotations = _annotations(self._folder)
         sweeps, lidars = self._sweeps()
@@ -103,7 +103,7 @@ class Av2SensorParser(BaseLogParser):
             yield ModalitiesSync(timestamp, modalities)
 
     def _sweeps(self) -> tuple[dict[int, Path], dict[LidarID, LidarMetadata]]:
-        """Return the sweeps by time, ns, and the calibrated lidars; neither where one is missing."""
+        """Return the sweeps by time, ns, and the calibrated lidars. Both are empty if either is missing."""
         sweeps = _files_by_time(self._folder / "sensors" / "lidar", ".feather")
         mounts = self._folder / _MOUNTS
         if not sweeps:
@@ -157,6 +157,7 @@ class _Camera:
 
     def image(self, t_ns: int, poses: dict[int, PoseSE3], root: Path) -> ParsedCamera | None:
         """Return the first image from the start of a sweep to its end. None: there is none with a pose."""
+        # The first image at or after the start of the sweep
         n = int(np.searchsorted(self.times_ns, t_ns))
         if n == len(self.times_ns) or self.times_ns[n] - t_ns >= _SWEEP_NS:
             return None
@@ -167,6 +168,7 @@ class _Camera:
         return ParsedCamera(
             metadata=self.metadata,
             timestamp=Timestamp.from_ns(exposed_ns),
+            # The vehicle moves within a sweep, so the camera's pose is that of its own exposure
             camera_to_global_se3=rel_to_abs_se3(poses[exposed_ns], self.metadata.camera_to_imu_se3),
             dataset_root=root,
             relative_path=self.images[exposed_ns].relative_to(root),
@@ -187,6 +189,7 @@ def _annotations(log: Path) -> dict[int, pa.Table]:
         note("annotations", "missing; the log has no boxes")
         return {}
     table = feather.read_table(file).sort_by("timestamp_ns")
+    # Rows are sorted by time, so each time has a contiguous slice of rows
     times_ns, start = np.unique(table["timestamp_ns"].to_numpy(), return_index=True)
     ends = [*start[1:], len(table)]
     return {int(t): table.slice(a, b - a) for t, a, b in zip(times_ns, start, ends, strict=True)}
@@ -198,11 +201,12 @@ def _files_by_time(folder: Path, suffix: str) -> dict[int, Path]:
 
 
 def _note_missing(subject: str, text: str, times_ns: Sequence[int], frames_ns: Sequence[int]) -> None:
-    """Note where a sensor has nothing between the first and the last frame, by its own period."""
+    """Note where a sensor has no data between the first and the last frame, judged by its own period."""
     if not frames_ns:
         return
     steps_ns = np.diff(times_ns)
     period_ns = float(np.median(steps_ns)) if len(steps_ns) > 1 else float(_SWEEP_NS)
+    # A step of n periods lacks n - 1 items
     missing = np.round(steps_ns / period_ns).astype(np.int64) - 1
     before, after = ((times_ns[0] - frames_ns[0]) // period_ns, (frames_ns[-1] - times_ns[-1]) // period_ns)
     for start_ns, count in zip([frames_ns[0], *times_ns], [before, *missing, after], strict=True):
@@ -213,6 +217,7 @@ def _note_missing(subject: str, text: str, times_ns: Sequence[int], frames_ns: S
 def _boxes(rows: pa.Table, ego: PoseSE3, timestamp: Timestamp) -> BoxDetectionsSE3:
     """Return the boxes of one time, without the ego vehicle. AV2 has no velocities."""
     box = _columns(rows, _POSE + _SIZE)
+    # AV2's boxes are in the ego frame at their time
     box[:, :7] = rel_to_abs_se3_array(ego, box[:, :7])
     detections = [
         BoxDetectionSE3(
