@@ -65,10 +65,10 @@ BAD_INPUTS = (
 )
 PRELUDE = """
 import foredrive.runs.drive.recording, foredrive.runs.drive.suite, foredrive.runs.drive.in_towns
-import foredrive.runs.convert, foredrive.runs.train.run, foredrive.runs.rebuild.reconstruct
+import foredrive.runs.convert, foredrive.runs.train.run, foredrive.runs.reconstruction.reconstruct
 import foredrive.runs.search.indexing, foredrive.runs.score.run, foredrive.engine.fabric
 import foredrive.runs.evaluate.run, foredrive.view.run_report
-import foredrive.view.score_report, foredrive.view.drive_report, foredrive.view.rebuilt_sheet
+import foredrive.view.score_report, foredrive.view.drive_report, foredrive.view.reconstruction_sheet
 import lancedb
 """
 

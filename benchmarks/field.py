@@ -24,9 +24,9 @@ from foredrive.engine.bench import Benchmark
 from foredrive.geometry.se3 import exp_se3
 from foredrive.methods.neurad.recipes import tiny_field
 from foredrive.methods.neurad.scene import FieldScene
-from foredrive.methods.rebuilding.tracks import ActorTracks
-from foredrive.methods.rebuilding.training import SensorViews, make_optimizer
-from foredrive.methods.rebuilding.views import CameraView, SweepView
+from foredrive.methods.reconstruction.tracks import ActorTracks
+from foredrive.methods.reconstruction.training import SensorViews, make_optimizer
+from foredrive.methods.reconstruction.views import CameraView, SweepView
 from foredrive.ops.hash_grid import Level, grid_levels, read_hash_grid, read_hash_grid_reference
 from foredrive.scene import LidarSweep
 from foredrive.sensors import pandar64

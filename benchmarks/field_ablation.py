@@ -14,26 +14,26 @@ from typing import Any
 from benchmarks.common.study import pandaset_log
 from benchmarks.rebuild_pandaset import FIGURES
 from foredrive.engine.bench import Benchmark, study_identity
-from foredrive.runs.rebuild.reconstruct import reconstruct
-from foredrive.runs.recipes.rebuilding import RebuildRecipe, field_tiny, rescheduled_recipe
+from foredrive.runs.recipes.reconstruction import ReconstructionRecipe, field_tiny, rescheduled_recipe
+from foredrive.runs.reconstruction.reconstruct import reconstruct
 
 ROOT = Path("runs/field_ablation")
 STEPS = 1500
 SHORT = rescheduled_recipe(dataclasses.replace(field_tiny(), cameras=("pcam_f0",)), steps=STEPS)
 
 
-def with_scene(**changes: Any) -> RebuildRecipe[Any]:
+def with_scene(**changes: Any) -> ReconstructionRecipe[Any]:
     """Return the short recipe with changed entries of its scene."""
     scene = dataclasses.replace(SHORT.representation.scene, **changes)
     return dataclasses.replace(SHORT, representation=dataclasses.replace(SHORT.representation, scene=scene))
 
 
-def with_network(**changes: Any) -> RebuildRecipe[Any]:
+def with_network(**changes: Any) -> ReconstructionRecipe[Any]:
     """Return the short recipe with changed entries of its network."""
     return with_scene(network=dataclasses.replace(SHORT.representation.scene.network, **changes))
 
 
-ARMS: dict[str, RebuildRecipe[Any]] = {
+ARMS: dict[str, ReconstructionRecipe[Any]] = {
     "short": SHORT,
     "no_rolling_shutter": with_scene(rolling=False),
     "no_drop": dataclasses.replace(
@@ -52,7 +52,7 @@ DECIDED_BY = (
     "foredrive.ops.hash_grid",
     "foredrive.ops.ray_boxes",
     "foredrive.methods.neurad.recipes",
-    "foredrive.methods.rebuilding",
+    "foredrive.methods.reconstruction",
     "foredrive.methods.neurad.training",
 )
 CONFIG = {"arms": {arm: dataclasses.asdict(recipe) for arm, recipe in ARMS.items()}}

@@ -20,8 +20,8 @@ from benchmarks.common.study import pandaset_log
 from foredrive.engine.bench import Benchmark, study_identity
 from foredrive.errors import InputError
 from foredrive.runs.drive.in_ncap import propose_scenarios
-from foredrive.runs.rebuild.reconstruct import reconstruct
-from foredrive.runs.recipes.rebuilding import gaussians_tiny
+from foredrive.runs.recipes.reconstruction import gaussians_tiny
+from foredrive.runs.reconstruction.reconstruct import reconstruct
 
 SIZE = SuiteSize()
 WORKERS = len(os.sched_getaffinity(0))
@@ -48,12 +48,12 @@ CONFIG = {
 }
 DECIDED_BY = (
     "benchmarks.common.safety_suites",
-    "foredrive.methods.rebuilding",
+    "foredrive.methods.reconstruction",
     "foredrive.driving.collisions",
     "foredrive.driving.controller",
     "foredrive.driving.dynamics",
     "foredrive.driving.ncap",
-    "foredrive.driving.replay.rebuilt",
+    "foredrive.driving.replay.reconstructed",
     "foredrive.methods.splatad.training",
 )
 WORK = Path("runs/ncap") / study_identity(CONFIG, DECIDED_BY)

@@ -37,12 +37,12 @@ CONFIG = {
 DECIDED_BY = (
     "benchmarks.common.safety_pairs",
     "benchmarks.common.safety_suites",
-    "foredrive.methods.rebuilding",
+    "foredrive.methods.reconstruction",
     "foredrive.driving.collisions",
     "foredrive.driving.controller",
     "foredrive.driving.dynamics",
     "foredrive.driving.ncap",
-    "foredrive.driving.replay.rebuilt",
+    "foredrive.driving.replay.reconstructed",
     "foredrive.towns.driving.town_replay",
     "foredrive.methods.splatad.training",
 )

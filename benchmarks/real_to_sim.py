@@ -16,8 +16,8 @@ from foredrive.data import LogPath
 from foredrive.engine.bench import Benchmark
 from foredrive.engine.summary import numbers
 from foredrive.runs.evaluate.real_to_sim_gap import measure_gap
-from foredrive.runs.rebuild.reconstruct import reconstruct
-from foredrive.runs.recipes.rebuilding import gaussians_tiny, rescheduled_recipe
+from foredrive.runs.recipes.reconstruction import gaussians_tiny, rescheduled_recipe
+from foredrive.runs.reconstruction.reconstruct import reconstruct
 from foredrive.runs.shipped import run_folder
 from foredrive.runs.train.run import open_run
 from foredrive.sensors.rigs import SURROUND

@@ -21,11 +21,16 @@ from benchmarks.rebuild_pandaset import FIGURES
 from benchmarks.rebuild_town import DRIVE, judged_town
 from foredrive.data import LogPath
 from foredrive.engine.bench import Benchmark, study_identity
-from foredrive.runs.rebuild.reconstruct import reconstruct
-from foredrive.runs.recipes.rebuilding import RebuildRecipe, field_tiny, gaussians_tiny, rescheduled_recipe
+from foredrive.runs.recipes.reconstruction import (
+    ReconstructionRecipe,
+    field_tiny,
+    gaussians_tiny,
+    rescheduled_recipe,
+)
+from foredrive.runs.reconstruction.reconstruct import reconstruct
 
 ROOT = Path("runs/rebuild_compare")
-RECIPES: dict[str, RebuildRecipe[Any]] = {"gaussians": gaussians_tiny(), "field": field_tiny()}
+RECIPES: dict[str, ReconstructionRecipe[Any]] = {"gaussians": gaussians_tiny(), "field": field_tiny()}
 """The smallest recipe of each representation, by the name of its arm."""
 LENGTHS = {"eighth": 1 / 8, "third": 1 / 3, "whole": 1.0}
 """Shares of a recipe's steps."""
@@ -48,7 +53,7 @@ DECIDED_BY = (
     "foredrive.ops.splatting_kernels",
     "foredrive.methods.neurad.recipes",
     "foredrive.methods.splatad.recipes",
-    "foredrive.methods.rebuilding",
+    "foredrive.methods.reconstruction",
     "foredrive.methods.neurad.training",
     "foredrive.methods.splatad.training",
     "foredrive.methods.splatad.training",
@@ -61,7 +66,7 @@ CONFIG = {
 WORK = ROOT / study_identity(CONFIG, DECIDED_BY)
 
 
-def shortened(recipe: RebuildRecipe[Any], share: float) -> RebuildRecipe[Any]:
+def shortened(recipe: ReconstructionRecipe[Any], share: float) -> ReconstructionRecipe[Any]:
     """Return a recipe of a share of the steps, with as many rounds of growth."""
     schedule = recipe.representation.schedule
 
@@ -97,7 +102,7 @@ def on_kitti(arm: str) -> Callable[[int], dict[str, float]]:
     return measure
 
 
-def rebuilt(recipe: RebuildRecipe[Any], log: LogPath, folder: Path, seed: int) -> dict[str, float]:
+def rebuilt(recipe: ReconstructionRecipe[Any], log: LogPath, folder: Path, seed: int) -> dict[str, float]:
     """Return the figures of a reconstruction, with its peak memory."""
     forget_peak("cpu")
     summary = reconstruct(rescheduled_recipe(recipe, seed=seed), log, folder, ROOT / "cache").summary

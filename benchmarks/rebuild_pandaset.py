@@ -2,7 +2,7 @@
 
 `foredrive bench rebuild-pandaset`, with the raw PandaSet log in FOREDRIVE_REAL_DATA/pandaset. Training uses
 the front camera and the lidar of every second frame; the other frames are for evaluation. Each arm is a run
-in runs/rebuild/COMMIT, which continues where it stopped.
+in runs/reconstruction/COMMIT, which continues where it stopped.
 """
 
 import dataclasses
@@ -12,8 +12,8 @@ from typing import Any
 
 from benchmarks.common.study import pandaset_log, work_folder
 from foredrive.engine.bench import Benchmark
-from foredrive.runs.rebuild.reconstruct import reconstruct
-from foredrive.runs.recipes.rebuilding import RebuildRecipe, gaussians_tiny, rescheduled_recipe
+from foredrive.runs.recipes.reconstruction import ReconstructionRecipe, gaussians_tiny, rescheduled_recipe
+from foredrive.runs.reconstruction.reconstruct import reconstruct
 
 WORK = work_folder(Path("runs/rebuild"))
 RECIPE = dataclasses.replace(gaussians_tiny(), cameras=("pcam_f0",))
@@ -21,7 +21,7 @@ SHORTER = rescheduled_recipe(
     RECIPE, steps=150, shrink_steps=(15,), grow_from=15, grow_until=120, grow_every=15
 )
 """Less than a third of the steps, with as much growth: the recipe that arms change in one thing each."""
-ARMS: dict[str, RebuildRecipe[Any]] = {
+ARMS: dict[str, ReconstructionRecipe[Any]] = {
     "gaussians_tiny": RECIPE,
     "shorter": SHORTER,
     "static_only": dataclasses.replace(SHORTER, actors=False),

@@ -20,14 +20,14 @@ from benchmarks.common.rebuilt_towns import TownDrive, TownTruth, TrueViews
 from benchmarks.common.study import work_folder
 from foredrive.engine.bench import Benchmark
 from foredrive.engine.summary import numbers
-from foredrive.methods.rebuilding.edits import Edit, Move, Remove, ShiftEgo, apply_edits
-from foredrive.methods.rebuilding.evaluation import evaluate_cameras, evaluate_sweeps
-from foredrive.methods.rebuilding.scene_graph import SceneGraph
-from foredrive.methods.rebuilding.views import CameraView, SweepView
-from foredrive.runs.rebuild.reconstruct import Reconstruction, reconstruct
-from foredrive.runs.recipes.rebuilding import RebuildRecipe, gaussians_tiny, rescheduled_recipe
+from foredrive.methods.reconstruction.edits import Edit, Move, Remove, ShiftEgo, apply_edits
+from foredrive.methods.reconstruction.evaluation import evaluate_cameras, evaluate_sweeps
+from foredrive.methods.reconstruction.scene_graph import SceneGraph
+from foredrive.methods.reconstruction.views import CameraView, SweepView
+from foredrive.runs.recipes.reconstruction import ReconstructionRecipe, gaussians_tiny, rescheduled_recipe
+from foredrive.runs.reconstruction.reconstruct import Reconstruction, reconstruct
 from foredrive.scene import Category
-from foredrive.view.rebuilt_sheet import write_rebuilt_sheet
+from foredrive.view.reconstruction_sheet import write_reconstruction_sheet
 
 WORK = work_folder(Path("runs/rebuild_town"))
 DRIVE = TownDrive("Town10HD", seed=3)
@@ -46,7 +46,7 @@ OF_IMAGES = ("psnr_db", "ssim", "nearest.psnr_db", "nearest.ssim")
 OF_SWEEPS = ("depth_median_sq_m2", "intensity_rmse", "drop_accuracy", "chamfer_m2")
 RECIPE = dataclasses.replace(gaussians_tiny(), cameras=DRIVE.cameras, moves_m=0.0)
 """All tracks are actors, because the edited car may stand."""
-ARMS: dict[str, RebuildRecipe[Any]] = {
+ARMS: dict[str, ReconstructionRecipe[Any]] = {
     "gaussians": RECIPE,
     "static_only": dataclasses.replace(RECIPE, actors=False),
 }
@@ -124,7 +124,7 @@ def judged_town(run: Reconstruction) -> dict[str, float]:
         if edited:
             figures |= judge_changed(run, name, graph)
         cameras = [camera for view in views for camera in view.cameras]
-        write_rebuilt_sheet(run.folder / f"{name}.png", run.scene, cameras, title, graph)
+        write_reconstruction_sheet(run.folder / f"{name}.png", run.scene, cameras, title, graph)
     return figures
 
 

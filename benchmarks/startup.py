@@ -35,7 +35,7 @@ IMPORTS = {
     "begin: record": "foredrive.runs.drive.recording, foredrive.towns.campaign",
     "begin: train": "foredrive.runs.recipes.known, foredrive.runs.train.run",
     "begin: evaluate": "foredrive.runs.evaluate.run",
-    "begin: reconstruct": "foredrive.runs.rebuild.reconstruct",
+    "begin: reconstruct": "foredrive.runs.reconstruction.reconstruct",
     "begin: drive": "foredrive.runs.drive.suite",
     "begin: search": "foredrive.runs.search.searching",
 }

@@ -1,8 +1,8 @@
-"""Draws pages in the browser with Chromium: `python docs/draw_pages.py model LOG` or `… rebuilt RUN`.
+"""Draws pages in the browser with Chromium: `python docs/draw_pages.py model LOG` or `… reconstructed RUN`.
 
 `model` draws docs/nemo_viewer.jpg, nemo_features.jpg and nemo_rendered.jpg: what the NeMo of the package
-sees in runs/demo-quick/logs/town_test/Town05_seed7 of `foredrive demo --quick`. `rebuilt` draws
-docs/rebuilt_view.jpg, of runs/demo/rebuilt of `foredrive demo`.
+sees in runs/demo-quick/logs/town_test/Town05_seed7 of `foredrive demo --quick`. `reconstructed` draws
+docs/reconstructed_view.jpg, of runs/demo/reconstructed of `foredrive demo`.
 """
 
 import base64
@@ -25,11 +25,11 @@ from websockets.sync.client import ClientConnection, connect
 
 from foredrive.data import find_logs
 from foredrive.runs import open_run
-from foredrive.runs.rebuild.rebuilt_run import open_rebuilt
+from foredrive.runs.reconstruction.reconstruction_run import open_reconstruction
 from foredrive.runs.shipped import run_folder
 from foredrive.view.log_frames import CAMERA_WIDTH_PX, LogFrames
 from foredrive.view.page import START_EYE_M, START_TARGET_M, Page
-from foredrive.view.rebuilt_viewer import RebuiltViewer
+from foredrive.view.reconstruction_viewer import ReconstructedViewer
 from foredrive.view.viewer import Viewer
 
 HERE = Path(__file__).parent
@@ -137,17 +137,17 @@ def draw_model(log: Path, chromium: Browser) -> None:
             chromium.write(HERE / "nemo_features.jpg")
 
 
-def draw_rebuilt(folder: Path, chromium: Browser) -> None:
-    """Draw a rebuilt log from behind and above, from where no camera was."""
-    page = RebuiltViewer(open_rebuilt(folder), [], Path("edits.json"), "127.0.0.1", 0)
+def draw_reconstructed(folder: Path, chromium: Browser) -> None:
+    """Draw a reconstructed log from behind and above, from where no camera was."""
+    page = ReconstructedViewer(open_reconstruction(folder), [], Path("edits.json"), "127.0.0.1", 0)
     with contextlib.closing(page):
         page.show(AT_S)
         client = chromium.open(page)
         client.camera.position, client.camera.look_at = (-16.0, 7.0, 10.0), (8.0, 0.0, 0.0)
-        chromium.write(HERE / "rebuilt_view.jpg")
+        chromium.write(HERE / "reconstructed_view.jpg")
 
 
-DRAWN_BY = {"model": draw_model, "rebuilt": draw_rebuilt}
+DRAWN_BY = {"model": draw_model, "reconstructed": draw_reconstructed}
 
 
 def main() -> None:

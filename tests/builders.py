@@ -1,4 +1,4 @@
-"""What tests of several folders build: logs that are rebuilt in seconds."""
+"""What tests of several folders build: logs that are reconstructed in seconds."""
 
 import dataclasses
 from pathlib import Path
@@ -6,15 +6,15 @@ from pathlib import Path
 import synthetic_log
 
 from foredrive.data import find_logs
-from foredrive.methods.rebuilding.decoders import CameraDecoderConfig
+from foredrive.methods.reconstruction.decoders import CameraDecoderConfig
 from foredrive.methods.splatad.initial import InitialGaussians
 from foredrive.methods.splatad.recipes import GaussianRecipe
 from foredrive.methods.splatad.scene_config import GaussianSceneConfig
 from foredrive.methods.splatad.training import GaussianSchedule
-from foredrive.runs.rebuild.reconstruct import Reconstruction, reconstruct
-from foredrive.runs.recipes.rebuilding import RebuildRecipe
+from foredrive.runs.recipes.reconstruction import ReconstructionRecipe
+from foredrive.runs.reconstruction.reconstruct import Reconstruction, reconstruct
 
-SMALLEST = RebuildRecipe(
+SMALLEST = ReconstructionRecipe(
     name="smallest",
     image_hw=(24, 48),
     moves_m=0.0,
@@ -35,9 +35,9 @@ SMALLEST = RebuildRecipe(
 ONE_CAMERA = dataclasses.replace(SMALLEST, cameras=("ahead",))
 
 
-def rebuilt_log(
-    folder: Path, frames: int, recipe: RebuildRecipe[GaussianRecipe] = SMALLEST
+def reconstructed_log(
+    folder: Path, frames: int, recipe: ReconstructionRecipe[GaussianRecipe] = SMALLEST
 ) -> Reconstruction:
-    """A made-up log that is rebuilt, in `run` beside the log."""
+    """A made-up log that is reconstructed, in `run` beside the log."""
     (log,) = find_logs(synthetic_log.write(folder, frames=frames))
     return reconstruct(recipe, log, folder / "run")

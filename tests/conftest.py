@@ -46,7 +46,7 @@ from foredrive.scene.clip import ROUTE_M  # noqa: E402
 if TYPE_CHECKING:
     from foredrive.data import LogPath
     from foredrive.runs import Run
-    from foredrive.runs.rebuild.reconstruct import Reconstruction
+    from foredrive.runs.reconstruction.reconstruct import Reconstruction
     from foredrive.towns.map.town_map import TownMap
     from foredrive.towns.world import World
 
@@ -207,11 +207,11 @@ def trained(log: "LogPath", tmp_path_factory: pytest.TempPathFactory) -> "Run":
 
 
 @pytest.fixture(scope="session")
-def briefly_rebuilt(tmp_path_factory: pytest.TempPathFactory) -> "Reconstruction":
-    """Five frames of one camera, rebuilt. Tests do not change its folder."""
-    from builders import ONE_CAMERA, rebuilt_log
+def small_run(tmp_path_factory: pytest.TempPathFactory) -> "Reconstruction":
+    """Five frames of one camera, reconstructed. Tests do not change its folder."""
+    from builders import ONE_CAMERA, reconstructed_log
 
-    return rebuilt_log(tmp_path_factory.mktemp("rebuilt"), frames=5, recipe=ONE_CAMERA)
+    return reconstructed_log(tmp_path_factory.mktemp("reconstructed"), frames=5, recipe=ONE_CAMERA)
 
 
 @pytest.fixture(scope="session")

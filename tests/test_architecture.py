@@ -102,7 +102,7 @@ INNER_FLOORS = {
     "towns": [{"map"}, {"traffic", "place"}, {"sensing"}, {"labels"}, {"driving"}],
     "methods": [
         {"blocks"},
-        {"planner", "rebuilding"},
+        {"planner", "reconstruction"},
         {"nemo", "splatad", "lidarclip"},
         {"driveworld", "neurad"},
     ],

@@ -14,10 +14,10 @@ from torch import Tensor
 from foredrive.data import LogPath
 from foredrive.errors import InputError
 from foredrive.geometry.se3 import inverse_se3, matrix_from_yaw, sensor_twist
-from foredrive.methods.rebuilding.edits import Edit, Move, Remove, ShiftEgo
-from foredrive.methods.rebuilding.novel_views import novel_camera_view
-from foredrive.methods.rebuilding.vehicle import EgoState
-from foredrive.methods.rebuilding.views import CameraView, SweepView
+from foredrive.methods.reconstruction.edits import Edit, Move, Remove, ShiftEgo
+from foredrive.methods.reconstruction.novel_views import novel_camera_view
+from foredrive.methods.reconstruction.vehicle import EgoState
+from foredrive.methods.reconstruction.views import CameraView, SweepView
 from foredrive.scene.actors import ActorState
 from foredrive.scene.conditions import BackgroundTraffic
 from foredrive.sensors.rigs import camera_rig

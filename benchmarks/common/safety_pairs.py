@@ -24,11 +24,11 @@ from foredrive.driving.ncap.scenario import SafetyScenario
 from foredrive.driving.ncap.self_test import run_reference
 from foredrive.driving.replay.replayed import users_at
 from foredrive.engine.summary import write_json
-from foredrive.methods.rebuilding.scene_graph import SceneGraph
-from foredrive.methods.rebuilding.tracks import ActorTracks
+from foredrive.methods.reconstruction.scene_graph import SceneGraph
+from foredrive.methods.reconstruction.tracks import ActorTracks
 from foredrive.runs.drive.agent_inputs import inputs_of
 from foredrive.runs.drive.in_ncap import place_in
-from foredrive.runs.drive.in_rebuilt import agent_in
+from foredrive.runs.drive.in_reconstruction import agent_in
 from foredrive.scene import Renderer
 from foredrive.towns.driving.town_replay import TownReplayRenderer
 

@@ -19,8 +19,8 @@ from foredrive.errors import InputError
 from foredrive.runs.drive.in_ncap import SafetyTests, propose_scenarios
 from foredrive.runs.drive.records import tested_runs
 from foredrive.runs.drive.suite import DriveSuite, drive_suite
-from foredrive.runs.rebuild.reconstruct import reconstruct
-from foredrive.runs.recipes.rebuilding import gaussians_tiny
+from foredrive.runs.recipes.reconstruction import gaussians_tiny
+from foredrive.runs.reconstruction.reconstruct import reconstruct
 from foredrive.scene.conditions import BackgroundTraffic
 
 CAMERAS = ("PCAM_F0", "PCAM_L0", "PCAM_R0", "PCAM_L1", "PCAM_R1", "PCAM_B0")
@@ -53,9 +53,9 @@ REBUILDING = {
 WORK = Path("runs/safety_rebuilds") / study_identity(
     REBUILDING,
     (
-        "foredrive.methods.rebuilding",
+        "foredrive.methods.reconstruction",
         "foredrive.methods.splatad.training",
-        "foredrive.methods.rebuilding.training",
+        "foredrive.methods.reconstruction.training",
     ),
 )
 

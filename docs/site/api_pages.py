@@ -7,7 +7,7 @@ from pathlib import Path
 FOLDERS = {
     "scene": "The types that every part reads, and the protocols between the parts",
     "data": "Logs, clips, labels; writing logs",
-    "runs": "Train, evaluate, drive, rebuild, search and score",
+    "runs": "Train, evaluate, drive, reconstruct, search and score",
     "methods": "Published methods: configuration, network, loss, training and recipes",
     "tasks": "Heads, losses, metrics, protocols and files of results, a folder for each task",
     "sets": "Random finite sets",

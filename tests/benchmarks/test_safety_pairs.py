@@ -7,14 +7,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from benchmarks.common.reconstructed_towns import TownDrive, TownTruth
 
-from benchmarks.common.rebuilt_towns import TownDrive, TownTruth
 from benchmarks.common.safety_pairs import Driven, Pair, agreement, outline, read_pair
 from benchmarks.common.safety_suites import spread
 from foredrive.driving.ncap.scenario import Polyline, SafetyScenario, ScenarioActor
 from foredrive.driving.replay.threats import Threat
 from foredrive.errors import InputError
-from foredrive.methods.rebuilding.tracks import ActorTracks
+from foredrive.methods.reconstruction.tracks import ActorTracks
 from foredrive.towns.driving.town_replay import TownReplayRenderer
 
 
@@ -33,8 +33,8 @@ def test_agreement_by_hand() -> None:
     assert (found["pairs"], found["failed"]) == (3, 1)
     assert found["collision_agreement"] == pytest.approx(2 / 3)
     assert found["score_difference"] == pytest.approx((0 + 1 + 3) / 3)
-    town, rebuilt = np.array([5.0, 1.0, 2.0]), np.array([5.0, 2.0, 5.0])
-    assert found["score_correlation"] == pytest.approx(np.corrcoef(town, rebuilt)[0, 1])
+    town, reconstructed = np.array([5.0, 1.0, 2.0]), np.array([5.0, 2.0, 5.0])
+    assert found["score_correlation"] == pytest.approx(np.corrcoef(town, reconstructed)[0, 1])
     assert found["min_distance_difference_m"] == 1.0
     assert read_pair(dataclasses.asdict(pairs[2])) == pairs[2]
 

@@ -42,7 +42,7 @@ from foredrive.driving.ncap.scenario_file import load_scenarios
 from foredrive.driving.route_sets import read_carla_routes
 from foredrive.engine.config import save_recipe
 from foredrive.errors import InputError
-from foredrive.methods.rebuilding.edits import Remove, load_edits, save_edits
+from foredrive.methods.reconstruction.edits import Remove, load_edits, save_edits
 from foredrive.runs.drive.records import read_suite
 from foredrive.runs.recipes.world_models import load_recipe
 from foredrive.runs.train.run import open_run

@@ -20,7 +20,7 @@ from foredrive.runs.drive.agents import make_agent
 from foredrive.runs.drive.in_towns import TownRoutes
 from foredrive.runs.model_card import find_card, read_card, shipped_weights
 from foredrive.runs.recipes.known import find_recipe
-from foredrive.runs.recipes.rebuilding import RebuildRecipe
+from foredrive.runs.recipes.reconstruction import ReconstructionRecipe
 from foredrive.runs.ship import ship_driver
 from foredrive.runs.shipped import DRIVER, run_folder
 from foredrive.runs.train.driver import load_driver, open_driver, train_driver
@@ -184,7 +184,7 @@ def test_recipes_of_drivers_are_found_by_name_and_file(tmp_path: Path) -> None:
     from foredrive.engine.config import save_recipe
 
     with pytest.raises(InputError, match="driver_small: this recipe is for `foredrive train`"):
-        find_recipe("driver_small", (), RebuildRecipe)
+        find_recipe("driver_small", (), ReconstructionRecipe)
     changed = find_recipe("driver_small", ["see.epochs=1"], DriverRecipe)
     assert changed.see.epochs == 1
     save_recipe(changed, tmp_path / "mine.yaml")

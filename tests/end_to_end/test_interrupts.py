@@ -168,7 +168,7 @@ def test_the_demo_goes_on_from_every_phase(programs: Programs, tmp_path: Path) -
         lambda: len(read_metrics(run / "pretrain/metrics.jsonl")) > 1,
         lambda: len(read_metrics(run / "finetune/metrics.jsonl")) > 1,
         there(tmp_path / "driven", "drives/*.json"),
-        lambda: len(read_metrics(tmp_path / "rebuilt/metrics.jsonl")) > 1,
+        lambda: len(read_metrics(tmp_path / "reconstructed/metrics.jsonl")) > 1,
     ):
         programs.interrupt(sign, *arguments)
         assert no_scratch(tmp_path)

@@ -13,9 +13,9 @@ from foredrive.cli.main import main
 from foredrive.driver.recipes import DRIVER_RECIPES
 from foredrive.engine.config import explained_yaml, field_helps, recipe_yaml
 from foredrive.runs.recipes.known import KINDS, RECIPES, find_recipe
-from foredrive.runs.recipes.rebuilding import REBUILD_RECIPES
+from foredrive.runs.recipes.reconstruction import RECONSTRUCTION_RECIPES
 
-ALL: dict[str, Any] = {**RECIPES, **DRIVER_RECIPES, **REBUILD_RECIPES}
+ALL: dict[str, Any] = {**RECIPES, **DRIVER_RECIPES, **RECONSTRUCTION_RECIPES}
 
 
 @dataclass(frozen=True)

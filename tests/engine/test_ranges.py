@@ -15,7 +15,7 @@ from foredrive.methods.planner.ego_mlp_fit import EgoMLPFit
 from foredrive.methods.planner.path_fit import PathFit
 from foredrive.methods.splatad.recipes import tiny_gaussians
 from foredrive.runs.recipes.known import find_recipe
-from foredrive.runs.recipes.rebuilding import RebuildRecipe
+from foredrive.runs.recipes.reconstruction import ReconstructionRecipe
 
 SCHEDULES = {
     "training": Schedule(batch_size=2, lr=1e-3, steps=5),
@@ -61,7 +61,7 @@ def test_none_and_no_steps_are_allowed() -> None:
 @pytest.mark.parametrize("recipe", ["field_tiny", "gaussians_tiny"])
 def test_a_setting_of_a_recipe_is_refused_in_one_line_with_its_place(recipe: str) -> None:
     with pytest.raises(InputError) as refused:
-        find_recipe(recipe, ["representation.schedule.steps=-3"], RebuildRecipe)
+        find_recipe(recipe, ["representation.schedule.steps=-3"], ReconstructionRecipe)
     (line,) = str(refused.value).splitlines()
     assert f"{recipe}: not a recipe: representation.schedule: " in line
     assert "steps is -3, but has to be 0 or more" in line

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from foredrive.geometry.se3 import exp_se3
-from foredrive.methods.rebuilding.tracks import ActorTracks, poses_at, states_at
+from foredrive.methods.reconstruction.tracks import ActorTracks, poses_at, states_at
 from foredrive.ops import ray_boxes
 from foredrive.ops.ray_boxes import Crossings, MovingBoxes, cross_boxes, key_poses
 

@@ -12,7 +12,7 @@ from foredrive.engine.config import save_recipe
 from foredrive.errors import InputError
 from foredrive.methods.recipe import with_occupancy_source
 from foredrive.runs.recipes.known import RECIPES, find_recipe
-from foredrive.runs.recipes.rebuilding import RebuildRecipe
+from foredrive.runs.recipes.reconstruction import ReconstructionRecipe
 from foredrive.runs.recipes.world_models import load_recipe
 
 
@@ -128,13 +128,13 @@ def test_a_setting_that_does_not_fit_is_one_line(setting: str, said: str) -> Non
 
 def test_recipes_of_reconstructions_take_files_and_settings(tmp_path: Path) -> None:
     own = tmp_path / "own.yaml"
-    save_recipe(find_recipe("gaussians_tiny", (), RebuildRecipe), own)
+    save_recipe(find_recipe("gaussians_tiny", (), ReconstructionRecipe), own)
     settings = ("representation.schedule.steps=7", "representation.scene.rolling=false")
-    chosen = find_recipe(str(own), settings, RebuildRecipe)
+    chosen = find_recipe(str(own), settings, ReconstructionRecipe)
     gaussians = chosen.representation
     assert (gaussians.schedule.steps, gaussians.scene.rolling) == (7, False)
-    assert gaussians.initial == find_recipe("gaussians_tiny", (), RebuildRecipe).representation.initial
+    assert gaussians.initial == find_recipe("gaussians_tiny", (), ReconstructionRecipe).representation.initial
     with pytest.raises(InputError, match=r"no entry 'schedule'; did you mean representation\.schedule"):
-        find_recipe("gaussians_tiny", ("schedule.steps=7",), RebuildRecipe)
+        find_recipe("gaussians_tiny", ("schedule.steps=7",), ReconstructionRecipe)
     with pytest.raises(InputError, match="near: gaussians_tiny"):
-        find_recipe("gaussian_tiny", (), RebuildRecipe)
+        find_recipe("gaussian_tiny", (), ReconstructionRecipe)

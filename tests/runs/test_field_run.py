@@ -1,4 +1,4 @@
-"""A log rebuilt as a neural field: trained, resumed to the same bits, opened, edited, rendered."""
+"""A log reconstructed as a neural field: trained, resumed to the same bits, opened, edited, rendered."""
 
 import dataclasses
 from pathlib import Path
@@ -23,27 +23,32 @@ from foredrive.methods.neurad.rays import FieldRays
 from foredrive.methods.neurad.recipes import FieldRecipe, padded_scale_m, tiny_field
 from foredrive.methods.neurad.scene import FieldScene, FieldSceneConfig
 from foredrive.methods.neurad.training import FieldTraining
-from foredrive.methods.rebuilding.edits import Duplicate, Insert, Move, Remove, apply_edits
-from foredrive.methods.rebuilding.scene_graph import STATIC, SceneGraph
-from foredrive.methods.rebuilding.training import SensorViews, make_optimizer
+from foredrive.methods.reconstruction.edits import Duplicate, Insert, Move, Remove, apply_edits
+from foredrive.methods.reconstruction.scene_graph import STATIC, SceneGraph
+from foredrive.methods.reconstruction.training import SensorViews, make_optimizer
 from foredrive.methods.splatad.content import GaussianContent
 from foredrive.methods.splatad.initial import AHEAD_LEFT_UP
-from foredrive.runs.rebuild.rebuilt_run import open_rebuilt
-from foredrive.runs.rebuild.reconstruct import Reconstruction, reconstruct
-from foredrive.runs.recipes.rebuilding import RebuildRecipe, field_base, field_tiny, rescheduled_recipe
-from foredrive.view.rebuilt_viewer import RebuiltViewer
+from foredrive.runs.recipes.reconstruction import (
+    ReconstructionRecipe,
+    field_base,
+    field_tiny,
+    rescheduled_recipe,
+)
+from foredrive.runs.reconstruction.reconstruct import Reconstruction, reconstruct
+from foredrive.runs.reconstruction.reconstruction_run import open_reconstruction
+from foredrive.view.reconstruction_viewer import ReconstructedViewer
 
 STEPS = 6
 
 
-def recipe(steps: int = STEPS) -> RebuildRecipe[FieldRecipe]:
+def recipe(steps: int = STEPS) -> ReconstructionRecipe[FieldRecipe]:
     actors = GridConfig(levels=2, features=1, coarsest=8, finest=32, log2_rows=10)
     small = GridsConfig(GridConfig(levels=3, features=1, coarsest=8, finest=64, log2_rows=12), actors)
     schedule = dataclasses.replace(
         tiny_field().schedule, steps=steps, patch=8, beams=64, checkpoint_every=3, free_m=50.0
     )
     rates = dataclasses.replace(schedule.rates, camera_offset=Rate(1e-4), actor_offset=Rate(1e-3))
-    return RebuildRecipe(
+    return ReconstructionRecipe(
         name="small_field",
         image_hw=(48, 96),
         moves_m=0.0,
@@ -84,7 +89,7 @@ def test_it_is_trained_evaluated_and_opens_as_it_was(run: Reconstruction) -> Non
     assert bool(scene.actor_offset.any())
     assert bool(scene.camera_offset.any())
     assert image(scene, scene.graph, run).shape == (3, 48, 96)
-    opened = open_rebuilt(run.folder).scene
+    opened = open_reconstruction(run.folder).scene
     assert isinstance(opened, FieldScene)
     assert torch.equal(image(opened, opened.graph, run), image(scene, scene.graph, run))
 
@@ -131,7 +136,7 @@ def test_beams_that_end_in_the_sky_do_not_return_from_the_sensor(
     run: Reconstruction, log_opacity: float
 ) -> None:
     """Almost nothing, then nothing at all stops the beams, and the decoder takes all of them to return."""
-    scene = open_rebuilt(run.folder).scene
+    scene = open_reconstruction(run.folder).scene
     assert isinstance(scene, FieldScene)
     geometry, last = scene.field.layers.geometry.linear[-1], scene.lidar_decoder.net[-1]
     assert isinstance(geometry, torch.nn.Linear)
@@ -150,8 +155,8 @@ def test_beams_that_end_in_the_sky_do_not_return_from_the_sensor(
 
 def test_what_stands_belongs_to_the_static_grid(log: LogPath, tmp_path: Path) -> None:
     """A ray to the box that stands crosses no box; one to the box that moves crosses its own."""
-    rebuilt = reconstruct(dataclasses.replace(recipe(steps=1), moves_m=0.5), log, tmp_path / "run")
-    scene = open_rebuilt(rebuilt.folder).scene
+    reconstructed = reconstruct(dataclasses.replace(recipe(steps=1), moves_m=0.5), log, tmp_path / "run")
+    scene = open_reconstruction(reconstructed.folder).scene
     assert isinstance(scene, FieldScene)
     assert scene.graph.tracks.track_id.tolist() == [11]
     assert scene.graph.all_tracks.track_id.tolist() == [11, 7]
@@ -188,7 +193,7 @@ def test_an_actor_of_gaussians_is_refused_and_one_of_this_field_opened_again_is_
         InputError, match="actor 7 cannot be copied here: an actor that is not part of a field"
     ):
         apply_edits(scene.graph, [insert], lambda _: other)
-    again = open_rebuilt(run.folder).scene
+    again = open_reconstruction(run.folder).scene
     same = field_of(apply_edits(scene.graph, [insert], lambda _: again.graph).graph)
     assert same.slot.tolist()[-1] == scene.tracks.index_of(7)
     assert same.owner.tolist() == [0, 0, 0]
@@ -295,7 +300,9 @@ def test_a_film_of_it_without_an_actor(run: Reconstruction, tmp_path: Path) -> N
 
 
 def test_a_page_says_that_the_browser_draws_lidar_points(run: Reconstruction, tmp_path: Path) -> None:
-    page = RebuiltViewer(open_rebuilt(run.folder), [Remove(7)], tmp_path / "edits.json", "localhost", 0)
+    page = ReconstructedViewer(
+        open_reconstruction(run.folder), [Remove(7)], tmp_path / "edits.json", "localhost", 0
+    )
     try:
         assert page.layers["splats"].label == "coloured lidar points"
         assert "the browser draws coloured lidar points" in page._note.content
@@ -314,16 +321,18 @@ def test_the_choices_of_the_reference_are_trained_and_open_as_they_were(log: Log
     )
     scene_config = dataclasses.replace(small.representation.scene, network=network, whole_ranges=False)
     representation = dataclasses.replace(small.representation, scene=scene_config)
-    rebuilt = reconstruct(dataclasses.replace(small, representation=representation), log, tmp_path / "run")
-    scene, opened = rebuilt.scene, open_rebuilt(rebuilt.folder).scene
+    reconstructed = reconstruct(
+        dataclasses.replace(small, representation=representation), log, tmp_path / "run"
+    )
+    scene, opened = reconstructed.scene, open_reconstruction(reconstructed.folder).scene
     assert isinstance(scene, FieldScene)
     assert isinstance(opened, FieldScene)
     assert [name for name, _ in scene.field.named_parameters() if "bias" in name] == []
     # The first frame is 1.5 m behind the middle of the 3 m, cameras and lidar are 0.8 m further on average.
     assert float(opened.field.scale_m) == pytest.approx(80 + 1.5 + 0.8, abs=0.01)
     assert opened.field.grids.scale_m == pytest.approx(float(scene.field.scale_m))
-    assert torch.equal(image(opened, opened.graph, rebuilt), image(scene, scene.graph, rebuilt))
-    view = rebuilt.held_out.sweeps[0]
+    assert torch.equal(image(opened, opened.graph, reconstructed), image(scene, scene.graph, reconstructed))
+    view = reconstructed.held_out.sweeps[0]
     with torch.no_grad():
         plain = scene.sweep(scene.graph, scene.prepare_sweep(view), view.t_s)
         scene.config = dataclasses.replace(scene.config, whole_ranges=True)

@@ -1,4 +1,4 @@
-"""Another representation than Gaussians, in this file alone: rebuilt, opened, edited, rendered, evaluated.
+"""Another representation than Gaussians, in this file: reconstructed, opened, edited, rendered, evaluated.
 
 The scene is a flat ground under a sky and a box for each actor, each of one learned colour and intensity.
 """
@@ -21,21 +21,21 @@ from foredrive.engine.learning_rates import Rate
 from foredrive.errors import InputError
 from foredrive.geometry.projection import pixel_centres, pixels_to_rays
 from foredrive.geometry.se3 import inverse_se3, rotate_vectors, transform_points
-from foredrive.methods.rebuilding.edits import DriveStraight, Duplicate, Insert, Remove, apply_edits
-from foredrive.methods.rebuilding.gaussians import Gaussians
-from foredrive.methods.rebuilding.novel_views import novel_camera_view
-from foredrive.methods.rebuilding.rebuilt import RebuiltScene, saved_tracks
-from foredrive.methods.rebuilding.rendered import RenderedImage, RenderedSweep
-from foredrive.methods.rebuilding.scene_graph import STATIC, Content, SceneGraph
-from foredrive.methods.rebuilding.tracks import ActorTracks, states_at
-from foredrive.methods.rebuilding.training import ParameterGroup, SensorViews, StepLosses, ViewOrder
-from foredrive.methods.rebuilding.views import CameraView, SweepView
+from foredrive.methods.reconstruction.edits import DriveStraight, Duplicate, Insert, Remove, apply_edits
+from foredrive.methods.reconstruction.gaussians import Gaussians
+from foredrive.methods.reconstruction.novel_views import novel_camera_view
+from foredrive.methods.reconstruction.reconstructed import ReconstructedScene, saved_tracks
+from foredrive.methods.reconstruction.rendered import RenderedImage, RenderedSweep
+from foredrive.methods.reconstruction.scene_graph import STATIC, Content, SceneGraph
+from foredrive.methods.reconstruction.tracks import ActorTracks, states_at
+from foredrive.methods.reconstruction.training import ParameterGroup, SensorViews, StepLosses, ViewOrder
+from foredrive.methods.reconstruction.views import CameraView, SweepView
 from foredrive.methods.splatad.content import GaussianContent
 from foredrive.methods.splatad.losses import intensity_loss
-from foredrive.runs.rebuild.rebuilt_run import edited_scene, open_rebuilt
-from foredrive.runs.rebuild.reconstruct import Reconstruction, reconstruct
-from foredrive.runs.recipes import rebuilding
-from foredrive.runs.recipes.rebuilding import RebuildRecipe
+from foredrive.runs.recipes import reconstruction
+from foredrive.runs.recipes.reconstruction import ReconstructionRecipe
+from foredrive.runs.reconstruction.reconstruct import Reconstruction, reconstruct
+from foredrive.runs.reconstruction.reconstruction_run import edited_scene, open_reconstruction
 from foredrive.scene.record import Record
 
 
@@ -69,7 +69,7 @@ class BoxContent(Record):
         )
 
 
-class BoxScene(RebuiltScene):
+class BoxScene(ReconstructedScene):
     def __init__(self, tracks: ActorTracks, cameras: int, reach_m: float) -> None:
         super().__init__(tracks, cameras, reach_m, frames=0)
         self.ground = nn.Parameter(torch.full((4,), 0.5))
@@ -183,12 +183,14 @@ class BoxRecipe:
         return 0.01
 
 
-RECIPE = RebuildRecipe("boxes", image_hw=(48, 96), representation=BoxRecipe(BoxSchedule()), moves_m=0.0)
+RECIPE = ReconstructionRecipe(
+    "boxes", image_hw=(48, 96), representation=BoxRecipe(BoxSchedule()), moves_m=0.0
+)
 
 
 @pytest.fixture(autouse=True)
 def known(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(rebuilding.REPRESENTATIONS, "boxes", BoxRecipe)
+    monkeypatch.setitem(reconstruction.REPRESENTATIONS, "boxes", BoxRecipe)
 
 
 @pytest.fixture(scope="module")
@@ -202,7 +204,7 @@ def run(log: LogPath, tmp_path: Path) -> Reconstruction:
     return reconstruct(RECIPE, log, tmp_path / "run")
 
 
-def test_it_is_rebuilt_and_evaluated(run: Reconstruction) -> None:
+def test_it_is_reconstructed_and_evaluated(run: Reconstruction) -> None:
     """Its geometry is exact, so that colours alone are learned: red, green and the ground's grey."""
     found = {name: value for name, value in run.summary.items() if isinstance(value, float)}
     assert run.summary["boxes"] == 2
@@ -213,7 +215,7 @@ def test_it_is_rebuilt_and_evaluated(run: Reconstruction) -> None:
 
 
 def test_it_goes_on_and_opens(run: Reconstruction, log: LogPath) -> None:
-    opened = open_rebuilt(run.folder).scene
+    opened = open_reconstruction(run.folder).scene
     view = run.held_out.cameras[0]
     assert isinstance(opened, BoxScene)
     assert torch.equal(opened.camera(opened.graph, view).rgb, run.scene.camera(run.scene.graph, view).rgb)
@@ -224,7 +226,7 @@ def test_it_goes_on_and_opens(run: Reconstruction, log: LogPath) -> None:
 @torch.no_grad()
 def test_edits_know_nothing_of_it(run: Reconstruction) -> None:
     """A copy of the parked red box is sent into the view, the original goes."""
-    scene, vehicle = run.scene, open_rebuilt(run.folder).vehicle
+    scene, vehicle = run.scene, open_reconstruction(run.folder).vehicle
     sent = DriveStraight(7, copy=9, at_m=(9.0, 0.0, 1.0), at_s=0.2)
     edits = [sent, Duplicate(11, copy=12, offset_m=(30.0, 0.0, 0.0)), Remove(7)]
     graph = apply_edits(scene.graph, edits).graph

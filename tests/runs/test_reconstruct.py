@@ -1,4 +1,4 @@
-"""A log is rebuilt in seconds: whole, interrupted, and without what logs may lack."""
+"""A log is reconstructed in seconds: whole, interrupted, and without what logs may lack."""
 
 import dataclasses
 import json
@@ -21,35 +21,35 @@ from foredrive.engine.config import save_recipe
 from foredrive.engine.learning_rates import Rate
 from foredrive.errors import InputError
 from foredrive.methods.blocks.inception import InceptionFeatures
-from foredrive.methods.rebuilding.evaluation import evaluate_cameras, evaluate_sweeps
-from foredrive.methods.rebuilding.perceptual import PerceptualMetrics, PerceptualWeights
-from foredrive.methods.rebuilding.scene_graph import STATIC
+from foredrive.methods.reconstruction.evaluation import evaluate_cameras, evaluate_sweeps
+from foredrive.methods.reconstruction.perceptual import PerceptualMetrics, PerceptualWeights
+from foredrive.methods.reconstruction.scene_graph import STATIC
 from foredrive.methods.splatad.initial import InitialGaussians
 from foredrive.methods.splatad.rates import LearningRates
 from foredrive.methods.splatad.recipes import GaussianRecipe
 from foredrive.methods.splatad.training import GaussianSchedule
-from foredrive.runs.rebuild.rebuilt_run import open_rebuilt
-from foredrive.runs.rebuild.reconstruct import (
+from foredrive.runs.recipes.known import find_recipe
+from foredrive.runs.recipes.reconstruction import (
+    ReconstructionRecipe,
+    gaussians_base,
+    gaussians_published,
+    gaussians_tiny,
+    load_reconstruction_recipe,
+    rescheduled_recipe,
+)
+from foredrive.runs.reconstruction.reconstruct import (
     initial_model,
     memory_needed_gib,
     read_reconstruction_data,
     reconstruct,
 )
-from foredrive.runs.recipes.known import find_recipe
-from foredrive.runs.recipes.rebuilding import (
-    RebuildRecipe,
-    gaussians_base,
-    gaussians_published,
-    gaussians_tiny,
-    load_rebuild_recipe,
-    rescheduled_recipe,
-)
+from foredrive.runs.reconstruction.reconstruction_run import open_reconstruction
 
 STEPS = 40
 
 
-def recipe(steps: int = STEPS) -> RebuildRecipe[GaussianRecipe]:
-    return RebuildRecipe(
+def recipe(steps: int = STEPS) -> ReconstructionRecipe[GaussianRecipe]:
+    return ReconstructionRecipe(
         name="smallest",
         image_hw=(24, 48),
         representation=GaussianRecipe(
@@ -82,7 +82,7 @@ def recipe(steps: int = STEPS) -> RebuildRecipe[GaussianRecipe]:
 
 @pytest.fixture(scope="module")
 def log(tmp_path_factory: pytest.TempPathFactory) -> LogPath:
-    (log,) = find_logs(world.write(tmp_path_factory.mktemp("rebuilt"), frames=9))
+    (log,) = find_logs(world.write(tmp_path_factory.mktemp("reconstructed"), frames=9))
     return log
 
 
@@ -134,7 +134,7 @@ def test_an_interrupted_run_comes_to_the_same(
 
 
 def test_the_recipe_comes_back_from_its_file(run: Path) -> None:
-    assert load_rebuild_recipe(run / "config.yaml") == recipe()
+    assert load_reconstruction_recipe(run / "config.yaml") == recipe()
 
 
 def test_weights_that_are_none_are_told(run: Path, log: LogPath, tmp_path: Path) -> None:
@@ -192,9 +192,9 @@ def test_too_little_memory_is_said_before(
 
 
 def test_named_recipes() -> None:
-    assert find_recipe("gaussians_tiny", (), RebuildRecipe) == gaussians_tiny()
+    assert find_recipe("gaussians_tiny", (), ReconstructionRecipe) == gaussians_tiny()
     with pytest.raises(InputError, match="near: gaussians_"):
-        find_recipe("gaussians_huge", (), RebuildRecipe)
+        find_recipe("gaussians_huge", (), ReconstructionRecipe)
     assert memory_needed_gib(gaussians_tiny(), frames=56, cameras=6) < 3
     assert 8 < memory_needed_gib(gaussians_base(), frames=80, cameras=6) < 40
 
@@ -290,7 +290,7 @@ def test_the_published_recipe_learns_on_few_gaussians(log: LogPath, tmp_path: Pa
     assert torch.equal(weights["camera_offset"], torch.zeros(1, 6))
     assert torch.equal(weights["camera_twist"], torch.zeros(1, 6))
     assert not torch.equal(weights["frame_velocity"], before.frame_velocity)
-    opened, camera = open_rebuilt(tmp_path / "run").scene, data.held_out.cameras[0]
+    opened, camera = open_reconstruction(tmp_path / "run").scene, data.held_out.cameras[0]
     with torch.no_grad():
         shown, again = (scene.camera(scene.graph, camera).rgb for scene in (opened, found.scene))
     torch.testing.assert_close(shown, again)
@@ -321,7 +321,7 @@ def test_several_logs_have_a_run_each_and_a_bad_one_stops_no_other(
     assert main([*line, "--recipe", str(tmp_path / "recipe.yaml")]) == 2
     told = capsys.readouterr()
     assert "1 of 3 logs failed: flat_train/bad (" in told.err
-    assert told.out.count("rebuilt flat_train/") == 2
+    assert told.out.count("reconstructed flat_train/") == 2
     alone = tmp_path / "alone"
     reconstruct(recipe(3), LogPath(split / "first", tmp_path / "data" / "maps"), alone)
     for name in ("first", "second"):

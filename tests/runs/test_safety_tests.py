@@ -1,4 +1,4 @@
-"""The verb for safety tests, in a small log that was rebuilt: scenarios, runs that are kept, report."""
+"""The verb for safety tests, in a small log that was reconstructed: scenarios, runs that are kept, report."""
 
 import dataclasses
 import shutil
@@ -18,17 +18,17 @@ from foredrive.driving.ncap.scenario_file import load_scenarios
 from foredrive.engine.summary import read_summary
 from foredrive.errors import InputError
 from foredrive.runs.drive.in_ncap import SafetyTests, _folders, place_in, propose_scenarios
-from foredrive.runs.drive.in_rebuilt import RebuiltRoutes
+from foredrive.runs.drive.in_reconstruction import ReconstructedRoutes
 from foredrive.runs.drive.pseudo import pseudo_simulate
 from foredrive.runs.drive.suite import DriveSuite, drive_suite
-from foredrive.runs.rebuild.rebuilt_run import open_run_log
+from foredrive.runs.reconstruction.reconstruction_run import open_run_log
 from foredrive.view.ncap_pictures import write_scenario_picture
 
 
 def test_the_verb_tests_keeps_and_reports(
-    rebuilt: Path, scenarios: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    reconstructed: Path, scenarios: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    command = ["ncap", str(rebuilt), "--scenarios", str(scenarios), "--out", str(tmp_path / "out")]
+    command = ["ncap", str(reconstructed), "--scenarios", str(scenarios), "--out", str(tmp_path / "out")]
     command += ["--agent", "stop", "--rules", "paper", "--no-sensors", "--films", "1"]
     assert main([*command, "--runs", "1"]) == 0
     told = capsys.readouterr().out
@@ -52,74 +52,76 @@ def test_the_verb_tests_keeps_and_reports(
 
 
 def test_log_replay_crashes_and_wrong_input_is_one_line(
-    rebuilt: Path, scenarios: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    reconstructed: Path, scenarios: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    source = SafetyTests((str(rebuilt),), str(scenarios), "ours", 1)
+    source = SafetyTests((str(reconstructed),), str(scenarios), "ours", 1)
     (drive,) = drive_suite(DriveSuite("log", source, sensors=False), tmp_path / "log").drives.values()
     assert drive.threat is not None
     assert drive.threat.outcome is Outcome.COLLIDED
     assert drive.threat.score == pytest.approx(0.0, abs=0.3)
     out = ["--agent", "stop", "--out", str(tmp_path / "none")]
-    assert main(["ncap", str(rebuilt), "--scenarios", str(tmp_path / "no.yaml"), *out]) == 2
+    assert main(["ncap", str(reconstructed), "--scenarios", str(tmp_path / "no.yaml"), *out]) == 2
     assert "no.yaml: cannot be read" in capsys.readouterr().err
     scenarios.with_name("late.yaml").write_text(
         scenarios.read_text().replace("length_s: 6.0", "length_s: 60.0")
     )
-    assert main(["ncap", str(rebuilt), "--scenarios", str(scenarios.with_name("late.yaml")), *out]) == 2
+    assert main(["ncap", str(reconstructed), "--scenarios", str(scenarios.with_name("late.yaml")), *out]) == 2
     error = capsys.readouterr().err
     assert "no scenario passes the self-test" in error
     assert "the log ends at 6.6 s" in error
-    assert main(["ncap", str(rebuilt), "--scenarios", str(scenarios), "--propose"]) == 2
+    assert main(["ncap", str(reconstructed), "--scenarios", str(scenarios), "--propose"]) == 2
     assert "scenarios.yaml: exists already" in capsys.readouterr().err
-    assert main(["ncap", str(rebuilt), "--scenarios", str(scenarios)]) == 2
+    assert main(["ncap", str(reconstructed), "--scenarios", str(scenarios)]) == 2
     assert "needs --agent and --out" in capsys.readouterr().err
     assert main(["ncap", "--scenarios", str(scenarios), *out]) == 2
     assert "name at least one reconstruction" in capsys.readouterr().err
 
 
 def test_other_scenarios_in_the_same_file_are_another_suite(
-    rebuilt: Path, scenarios: Path, tmp_path: Path
+    reconstructed: Path, scenarios: Path, tmp_path: Path
 ) -> None:
     changed = tmp_path / "changed.yaml"
     changed.write_text(scenarios.read_text())
-    suite = DriveSuite("stop", SafetyTests((str(rebuilt),), str(changed), "ours", 1), sensors=False)
+    suite = DriveSuite("stop", SafetyTests((str(reconstructed),), str(changed), "ours", 1), sensors=False)
     drive_suite(suite, tmp_path / "out")
     changed.write_text(scenarios.read_text().replace("length_s: 6.0", "length_s: 5.5"))
     with pytest.raises(InputError, match="another suite"):
         drive_suite(suite, tmp_path / "out")
 
 
-def test_reconstructions_of_one_name_are_an_error(rebuilt: Path, tmp_path: Path) -> None:
+def test_reconstructions_of_one_name_are_an_error(reconstructed: Path, tmp_path: Path) -> None:
     """A second reconstruction of the log: its own name tells it apart, that of the log does not."""
-    for folder in (tmp_path / "other", tmp_path / "same" / rebuilt.name):
-        shutil.copytree(rebuilt, folder)
-    with pytest.raises(InputError, match=f"two reconstructions have the name '{rebuilt.name}'"):
-        propose_scenarios((str(rebuilt), str(tmp_path / "same" / rebuilt.name)), tmp_path / "new", "ours", 1)
-    (log,) = {open_run_log(rebuilt)[1].folder.name}
-    assert log in _folders((str(rebuilt),))
-    assert set(_folders((str(rebuilt), str(tmp_path / "other")))) == {rebuilt.name, "other"}
+    for folder in (tmp_path / "other", tmp_path / "same" / reconstructed.name):
+        shutil.copytree(reconstructed, folder)
+    with pytest.raises(InputError, match=f"two reconstructions have the name '{reconstructed.name}'"):
+        propose_scenarios(
+            (str(reconstructed), str(tmp_path / "same" / reconstructed.name)), tmp_path / "new", "ours", 1
+        )
+    (log,) = {open_run_log(reconstructed)[1].folder.name}
+    assert log in _folders((str(reconstructed),))
+    assert set(_folders((str(reconstructed), str(tmp_path / "other")))) == {reconstructed.name, "other"}
 
 
 def test_an_agent_that_sees_more_of_the_past_than_the_log_has_is_told_so(
-    rebuilt: Path, scenarios: Path
+    reconstructed: Path, scenarios: Path
 ) -> None:
-    place, (test, _) = place_in(str(rebuilt)), load_scenarios(scenarios)
+    place, (test, _) = place_in(str(reconstructed)), load_scenarios(scenarios)
     with pytest.raises(InputError, match=r"stationary-.*: run 0 begins to drive at .* sees 20 earlier"):
         set_up_run(place, test, 0, RULES["ours"], sensors=False, past_frames=20)
 
 
-def test_the_expert_hits_nobody(rebuilt: Path, scenarios: Path, tmp_path: Path) -> None:
-    source = SafetyTests((str(rebuilt),), str(scenarios), "ours", 2)
+def test_the_expert_hits_nobody(reconstructed: Path, scenarios: Path, tmp_path: Path) -> None:
+    source = SafetyTests((str(reconstructed),), str(scenarios), "ours", 2)
     drives = drive_suite(DriveSuite("expert", source, sensors=False), tmp_path).drives.values()
     outcomes = {drive.threat.outcome for drive in drives if drive.threat}
     assert outcomes <= {Outcome.PASSED, Outcome.STOPPED_SHORT}
 
 
 @pytest.mark.slow
-def test_workers_drive_as_one_process_does(rebuilt: Path, scenarios: Path, tmp_path: Path) -> None:
+def test_workers_drive_as_one_process_does(reconstructed: Path, scenarios: Path, tmp_path: Path) -> None:
     threats = []
     for spread in (False, True):
-        source = SafetyTests((str(rebuilt),), str(scenarios), "ours", 2, spread=spread)
+        source = SafetyTests((str(reconstructed),), str(scenarios), "ours", 2, spread=spread)
         driven = drive_suite(DriveSuite("log", source, sensors=False), tmp_path / str(spread), workers=2)
         assert not driven.broken
         threats.append([drive.threat for drive in driven.drives.values()])
@@ -127,9 +129,9 @@ def test_workers_drive_as_one_process_does(rebuilt: Path, scenarios: Path, tmp_p
 
 
 def test_an_agent_is_shown_some_sensors_alone_or_told_that_it_cannot(
-    rebuilt: Path, scenarios: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    reconstructed: Path, scenarios: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    command = ["ncap", str(rebuilt), "--scenarios", str(scenarios), "--runs", "1", "--films", "0"]
+    command = ["ncap", str(reconstructed), "--scenarios", str(scenarios), "--runs", "1", "--films", "0"]
     lidar = [*command, "--agent", "lidar-corridor", "--out", str(tmp_path / "lidar")]
     assert main([*lidar, "--sees", "camera"]) == 2
     assert "lidar-corridor needs its lidar, which --sees camera hides" in capsys.readouterr().err
@@ -142,12 +144,12 @@ def test_an_agent_is_shown_some_sensors_alone_or_told_that_it_cannot(
     assert "(default: )" not in capsys.readouterr().out
 
 
-def test_a_picture_shows_a_scenario(rebuilt: Path, scenarios: Path, tmp_path: Path) -> None:
+def test_a_picture_shows_a_scenario(reconstructed: Path, scenarios: Path, tmp_path: Path) -> None:
     test = load_scenarios(scenarios)[0]
     assert isinstance(test.actors[0].way, Polyline)
     crossing = Rectilinear(test.actors[0].way.xyz_m[0], 5.0, 1.57, 5.0)
     test = dataclasses.replace(test, actors=(dataclasses.replace(test.actors[0], way=crossing),))
-    write_scenario_picture(tmp_path / "on.png", place_in(str(rebuilt)), test)
+    write_scenario_picture(tmp_path / "on.png", place_in(str(reconstructed)), test)
     with Image.open(tmp_path / "on.png") as picture:
         pixels = np.asarray(picture.convert("RGB")).astype(int)
     red = (np.abs(pixels - [255, 77, 79]).sum(axis=2) < 30).sum()
@@ -157,15 +159,17 @@ def test_a_picture_shows_a_scenario(rebuilt: Path, scenarios: Path, tmp_path: Pa
 
 @pytest.mark.parametrize("agent", ["idm", "disturbed"])
 def test_an_agent_of_towns_cannot_be_pseudo_simulated_and_is_no_failed_start(
-    agent: str, rebuilt: Path, tmp_path: Path
+    agent: str, reconstructed: Path, tmp_path: Path
 ) -> None:
     with pytest.raises(InputError, match="can drive only there"):
-        pseudo_simulate([str(rebuilt)], agent, tmp_path, every_s=1.0)
+        pseudo_simulate([str(reconstructed)], agent, tmp_path, every_s=1.0)
     assert not list(tmp_path.iterdir())
 
 
-def test_a_camera_that_the_reconstruction_does_not_have_cannot_fail(rebuilt: Path, tmp_path: Path) -> None:
+def test_a_camera_that_the_reconstruction_does_not_have_cannot_fail(
+    reconstructed: Path, tmp_path: Path
+) -> None:
     faults = Faults((CameraFault("black", "ahed"),))
-    suite = DriveSuite("stop", RebuiltRoutes(str(rebuilt)), sensors=False, faults=faults)
+    suite = DriveSuite("stop", ReconstructedRoutes(str(reconstructed)), sensors=False, faults=faults)
     with pytest.raises(InputError, match="no camera ahed; there are ahead, left"):
         drive_suite(suite, tmp_path)

@@ -23,20 +23,24 @@ from foredrive.errors import InputError
 from foredrive.integrations.remote.json_http import ask
 from foredrive.json_server import Address, JsonServer
 from foredrive.runs.drive.in_ncap import SafetyTests
-from foredrive.runs.drive.in_rebuilt import opened_rebuilt
+from foredrive.runs.drive.in_reconstruction import opened_reconstruction
 from foredrive.runs.drive.suite import DriveSuite, drive_suite
 from foredrive.runs.serve import alpasim_server_of, planner_of, renderer_of
 
 
-def suite(agent: str, rebuilt: Path, scenarios: Path, runs: int = 1) -> DriveSuite:
-    return DriveSuite(agent, SafetyTests((str(rebuilt),), str(scenarios), "paper", runs), sensors=False)
+def suite(agent: str, reconstructed: Path, scenarios: Path, runs: int = 1) -> DriveSuite:
+    return DriveSuite(agent, SafetyTests((str(reconstructed),), str(scenarios), "paper", runs), sensors=False)
 
 
-def test_a_planner_over_http_drives_as_it_does_here(rebuilt: Path, scenarios: Path, tmp_path: Path) -> None:
+def test_a_planner_over_http_drives_as_it_does_here(
+    reconstructed: Path, scenarios: Path, tmp_path: Path
+) -> None:
     with JsonServer(planner_of("constant-velocity")).in_background() as address:
-        remote = suite(f"http://{address}", rebuilt, scenarios)
+        remote = suite(f"http://{address}", reconstructed, scenarios)
         (over_wire,) = drive_suite(remote, tmp_path / "wire").drives.values()
-    (here,) = drive_suite(suite("constant-velocity", rebuilt, scenarios), tmp_path / "here").drives.values()
+    (here,) = drive_suite(
+        suite("constant-velocity", reconstructed, scenarios), tmp_path / "here"
+    ).drives.values()
     assert over_wire.threat is not None
     assert over_wire.threat == here.threat
     assert over_wire.threat.outcome is Outcome.COLLIDED
@@ -54,7 +58,7 @@ def test_a_planner_over_http_drives_as_it_does_here(rebuilt: Path, scenarios: Pa
     ],
 )
 def test_an_agent_without_a_plan_is_a_counted_failure(
-    answer: object, told: str, rebuilt: Path, scenarios: Path, tmp_path: Path
+    answer: object, told: str, reconstructed: Path, scenarios: Path, tmp_path: Path
 ) -> None:
     def infer(_: object) -> object:
         if answer == "late":
@@ -67,7 +71,7 @@ def test_an_agent_without_a_plan_is_a_counted_failure(
         ("POST", "/infer"): infer,
     }
     with JsonServer(answers).in_background() as address:
-        driven = suite(f"http://{address}?timeout=0.5", rebuilt, scenarios)
+        driven = suite(f"http://{address}?timeout=0.5", reconstructed, scenarios)
         (drive,) = drive_suite(driven, tmp_path).drives.values()
     assert drive.threat is not None
     assert (drive.threat.outcome, drive.threat.score) == (Outcome.FAILED, None)
@@ -77,7 +81,7 @@ def test_an_agent_without_a_plan_is_a_counted_failure(
 
 
 def test_who_is_not_there_is_told_before_driving(
-    rebuilt: Path,
+    reconstructed: Path,
     scenarios: Path,
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
@@ -88,7 +92,7 @@ def test_who_is_not_there_is_told_before_driving(
     server.close()
     command = [
         "ncap",
-        str(rebuilt),
+        str(reconstructed),
         "--scenarios",
         str(scenarios),
         "--out",
@@ -119,10 +123,10 @@ def tensors(content: bytes) -> Any:
     return torch.load(io.BytesIO(base64.b64decode(content)), weights_only=True)
 
 
-def test_the_renderer_serves_images_sweeps_and_actors(rebuilt: Path) -> None:
+def test_the_renderer_serves_images_sweeps_and_actors(reconstructed: Path) -> None:
     """A client after neuro-ncap's `renderer_api.py`: it moves the parked car away and looks again."""
-    opened = opened_rebuilt(str(rebuilt))
-    with JsonServer(renderer_of(rebuilt)).in_background() as address:
+    opened = opened_reconstruction(str(reconstructed))
+    with JsonServer(renderer_of(reconstructed)).in_background() as address:
         assert ask(address, "/alive") is True
         start_us = ask(address, "/start_time")
         assert start_us == world.START_US
@@ -184,14 +188,14 @@ def _shift(x_m: float, y_m: float) -> np.ndarray:
 
 
 def _view(opened: Any, t_s: float) -> Any:
-    from foredrive.methods.rebuilding.novel_views import novel_camera_view
-    from foredrive.methods.rebuilding.vehicle import EgoState
+    from foredrive.methods.reconstruction.novel_views import novel_camera_view
+    from foredrive.methods.reconstruction.vehicle import EgoState
 
     ego = opened.vehicle.at(t_s)
     return novel_camera_view(opened.vehicle.rig, 0, EgoState(ego.T_scene_ego, torch.zeros(6), t_s))
 
 
-def test_the_verb_serves_on_loopback_until_it_is_interrupted(rebuilt: Path) -> None:
+def test_the_verb_serves_on_loopback_until_it_is_interrupted(reconstructed: Path) -> None:
     command = [sys.executable, "-m", "foredrive", "serve", "stop", "--port", "0"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
@@ -203,17 +207,19 @@ def test_the_verb_serves_on_loopback_until_it_is_interrupted(rebuilt: Path) -> N
 
 
 def test_a_driver_of_alpasim_drives_as_the_agent_does_here(
-    rebuilt: Path, scenarios: Path, tmp_path: Path
+    reconstructed: Path, scenarios: Path, tmp_path: Path
 ) -> None:
     pytest.importorskip("carla_driver_interface")
     server, port = alpasim_server_of("constant-velocity", "127.0.0.1", 0)
     server.start()
     try:
-        remote = suite(f"grpc://127.0.0.1:{port}", rebuilt, scenarios)
+        remote = suite(f"grpc://127.0.0.1:{port}", reconstructed, scenarios)
         (over_wire,) = drive_suite(remote, tmp_path / "wire").drives.values()
     finally:
         server.stop(grace=1.0).wait()
-    (here,) = drive_suite(suite("constant-velocity", rebuilt, scenarios), tmp_path / "here").drives.values()
+    (here,) = drive_suite(
+        suite("constant-velocity", reconstructed, scenarios), tmp_path / "here"
+    ).drives.values()
     assert over_wire.threat is not None
     assert here.threat is not None
     assert over_wire.threat.outcome is here.threat.outcome is Outcome.COLLIDED

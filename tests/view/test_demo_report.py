@@ -86,14 +86,14 @@ def test_the_page_is_one_harmless_file_whose_loop_leads_to_its_sections(tmp_path
 
 
 def test_the_loop_has_six_steps_in_order() -> None:
-    assert [step.title for step in STEPS] == ["Record", "See", "Learn", "Drive", "Rebuild", "Search"]
+    assert [step.title for step in STEPS] == ["Record", "See", "Learn", "Drive", "Reconstruct", "Search"]
     assert all(line.startswith("foredrive ") for step in STEPS for line in step.commands)
 
 
 @pytest.mark.parametrize("size", [full_demo(), quick_demo()])
 def test_no_model_learns_from_the_town_that_it_is_judged_in(size: object) -> None:
     assert isinstance(size, type(full_demo()))
-    assert {size.test.town, size.rebuilt.town} == {"Town05"}
+    assert {size.test.town, size.reconstructed.town} == {"Town05"}
     assert "Town05" not in {plan.town for plan in size.train}
     names = [plan.log_name for plan in Demo(size, Path()).plans]
     assert len(names) == len(set(names))

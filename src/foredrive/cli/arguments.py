@@ -105,7 +105,7 @@ def check_run(run: Path) -> Path:
     return folder
 
 
-def check_rebuilt(folder: Path) -> None:
+def check_reconstruction(folder: Path) -> None:
     """Check that a folder holds a reconstruction. Raise `InputError` if it does not."""
     if not (folder / RUN_CONFIG).is_file():
         raise InputError(f"{folder}: not a reconstruction folder (no {RUN_CONFIG})")

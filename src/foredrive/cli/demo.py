@@ -10,7 +10,7 @@ from foredrive.lazy import importing
 
 
 def demo(out: OptionalPath = None, quick: bool = False) -> None:
-    """Go once round the loop: record towns, see, learn, drive, rebuild, search; one report shows it all.
+    """Go once round the loop: record towns, see, learn, drive, reconstruct, search; one report shows it all.
 
     Args:
         out: Folder for logs, runs and report.html; by default runs/demo or runs/demo-quick. An interrupted

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from foredrive.cli.arguments import check_out_folder
-from foredrive.cli.drive_options import InputFaults, InRebuilt, InTowns, Planning
+from foredrive.cli.drive_options import InputFaults, InReconstruction, InTowns, Planning
 from foredrive.cli.failures import listed_failures
 from foredrive.errors import InputError
 from foredrive.lazy import importing
@@ -24,7 +24,7 @@ def drive(
     planning: tyro.conf.OmitArgPrefixes[Planning],
     inputs: tyro.conf.OmitArgPrefixes[InputFaults],
     towns: tyro.conf.OmitArgPrefixes[InTowns],
-    rebuilt: tyro.conf.OmitArgPrefixes[InRebuilt],
+    reconstructed: tyro.conf.OmitArgPrefixes[InReconstruction],
 ) -> None:
     """Drive routes in closed loop and score them like CARLA's leaderboards 1.0 and 2.1.
 
@@ -37,9 +37,9 @@ def drive(
         out: Folder of the suite: summary.json, report.html, drives, logs.
     """
     check_out_folder(out)
-    for options in (planning, inputs, towns, rebuilt):
+    for options in (planning, inputs, towns, reconstructed):
         options.check()
-    if rebuilt.rebuilt is not None and (
+    if reconstructed.reconstructed is not None and (
         towns.rig is not None or towns.other_rig or towns.image_size is not None
     ):
         raise InputError("--rig, --other-rig and --image-size do not go with --in: the cameras are the log's")
@@ -48,7 +48,7 @@ def drive(
 
     # Workers may run in other folders, so the folder of a run is named by its absolute path
     name = str(Path(agent).absolute()) if Path(agent).is_dir() else agent
-    source = rebuilt.source() or towns.source(name)
+    source = reconstructed.source() or towns.source(name)
     rig = getattr(source, "rig", None)
     faults = inputs.faults(() if rig is None else tuple(rig.cameras))
     suite = DriveSuite(

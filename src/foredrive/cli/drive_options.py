@@ -13,7 +13,7 @@ from foredrive.cli.arguments import (
     check_file,
     check_image_size,
     check_number,
-    check_rebuilt,
+    check_reconstruction,
     chosen_rig,
 )
 from foredrive.errors import InputError
@@ -21,7 +21,7 @@ from foredrive.errors import InputError
 if TYPE_CHECKING:
     from foredrive.driving.faults import Faults
     from foredrive.runs.drive.in_carla import CarlaRoutes
-    from foredrive.runs.drive.in_rebuilt import RebuiltRoutes
+    from foredrive.runs.drive.in_reconstruction import ReconstructedRoutes
     from foredrive.runs.drive.in_towns import TownRoutes
 
 
@@ -173,45 +173,45 @@ class InTowns:
 
 
 @dataclass(frozen=True)
-class InRebuilt:
+class InReconstruction:
     """A reconstructed log; it replaces the options for towns.
 
     Args:
-        rebuilt: Folder of a reconstruction to drive in. Its actors replay the log. The agent "log" replays
-            the logged ego drive.
+        reconstructed: Folder of a reconstruction to drive in. Its actors replay the log. The agent "log"
+            replays the logged ego drive.
         start: Times of the log at which drives begin, s; by default as early as possible.
         threat: Put a car in the way: it stands, comes head-on or crosses.
         edits: File of edits to the reconstructed scene.
     """
 
-    rebuilt: Annotated[OptionalPath, tyro.conf.arg(name="in", metavar="RUN")] = None
+    reconstructed: Annotated[OptionalPath, tyro.conf.arg(name="in", metavar="RUN")] = None
     start: Annotated[tuple[float, ...], tyro.conf.arg(metavar="S [S ...]")] = ()
     threat: tuple[Literal["stationary", "frontal", "side"], ...] = ()
     edits: OptionalPath = None
 
     def check(self) -> None:
         """Raise `InputError` if a file does not exist or a time is impossible."""
-        if self.rebuilt is not None:
-            check_rebuilt(self.rebuilt)
+        if self.reconstructed is not None:
+            check_reconstruction(self.reconstructed)
         for start in self.start:
             check_number("--start", start)
         check_file(self.edits)
 
-    def source(self) -> "RebuiltRoutes | None":
+    def source(self) -> "ReconstructedRoutes | None":
         """Return the source of drives in a reconstructed log; None without --in.
 
         Raises:
             InputError: options for reconstructed logs are given without --in.
         """
-        if self.rebuilt is None:
+        if self.reconstructed is None:
             if self.start or self.threat or self.edits is not None:
                 raise InputError("--start, --threat and --edits need a reconstructed log (--in RUN)")
             return None
         from foredrive.driving.replay.threats import Threat
-        from foredrive.runs.drive.in_rebuilt import RebuiltRoutes
+        from foredrive.runs.drive.in_reconstruction import ReconstructedRoutes
 
-        return RebuiltRoutes(
-            run=str(Path(self.rebuilt).absolute()),
+        return ReconstructedRoutes(
+            run=str(Path(self.reconstructed).absolute()),
             starts_s=self.start,
             threats=tuple(map(Threat, self.threat)),
             edits=None if self.edits is None else str(self.edits.absolute()),

@@ -10,7 +10,7 @@ from foredrive.cli.arguments import (
     SomePaths,
     check_number,
     check_out_folder,
-    check_rebuilt,
+    check_reconstruction,
     check_run,
 )
 from foredrive.data.log_paths import find_all_logs
@@ -24,7 +24,7 @@ def evaluate(
     examples: int = 4,
     batch_size: int = 4,
     write_results: Literal["nuscenes"] | None = None,
-    rebuilt: Annotated[OptionalPath, tyro.conf.arg(name="in", metavar="REBUILT")] = None,
+    reconstructed: Annotated[OptionalPath, tyro.conf.arg(name="in", metavar="RECONSTRUCTED")] = None,
     workers: int = 1,
     ray: bool = False,
 ) -> None:
@@ -43,7 +43,7 @@ def evaluate(
         write_results: Also write what the task heads predict to the folder "results" beside summary.json, in
             the formats of nuScenes' code bases, which `foredrive score` reads: detection.json, tracking.json,
             motion.json, map.json and the folder occupancy (docs/tasks.md).
-        rebuilt: Folder of a reconstruction whose log still exists; writes gap.json.
+        reconstructed: Folder of a reconstruction whose log still exists; writes gap.json.
         workers: Number of processes that predict; 1 predicts in this process, on all cores. On Ray it is the
             size of a cluster that is started here.
         ray: Predict on Ray: on the cluster at RAY_ADDRESS, or on a cluster that is started here.
@@ -52,9 +52,9 @@ def evaluate(
     check_number("--examples", examples, low=0)
     run = check_run(run)
     check_out_folder(out)
-    if rebuilt is not None:
-        check_rebuilt(rebuilt)
-        _evaluate_gap(run, rebuilt, out or run)
+    if reconstructed is not None:
+        check_reconstruction(reconstructed)
+        _evaluate_gap(run, reconstructed, out or run)
         return
     named = find_all_logs(logs)
 
@@ -94,7 +94,7 @@ def evaluate(
         )
 
 
-def _evaluate_gap(run: Path, rebuilt: Path, out: Path) -> None:
+def _evaluate_gap(run: Path, reconstructed: Path, out: Path) -> None:
     with importing():
         from rich.console import Console
         from rich.progress import Progress
@@ -108,7 +108,7 @@ def _evaluate_gap(run: Path, rebuilt: Path, out: Path) -> None:
     with held_for_results(out), Progress() as progress:
         bar = progress.add_task("real and rendered")
         figures = measure_gap(
-            open_run(run), rebuilt, out, lambda done, of: progress.update(bar, completed=done, total=of)
+            open_run(run), reconstructed, out, lambda done, of: progress.update(bar, completed=done, total=of)
         )
     print_table(gap_table(figures), Console())
     print(f"wrote {out / GAP}")

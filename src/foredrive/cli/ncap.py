@@ -5,17 +5,17 @@ from typing import Annotated, Literal
 
 import tyro
 
-from foredrive.cli.arguments import OptionalPath, check_number, check_out_folder, check_rebuilt
+from foredrive.cli.arguments import OptionalPath, check_number, check_out_folder, check_reconstruction
 from foredrive.cli.drive import DrivesProgress, check_driven
 from foredrive.errors import InputError
 from foredrive.lazy import importing
 
 
 def ncap(
-    rebuilt: Annotated[
+    reconstructed: Annotated[
         tuple[Path, ...],
         tyro.conf.Positional,
-        tyro.conf.arg(metavar="REBUILT [REBUILT ...]", help_behavior_hint="(required)"),
+        tyro.conf.arg(metavar="RECONSTRUCTED [RECONSTRUCTED ...]", help_behavior_hint="(required)"),
     ],
     scenarios: Path,
     agent: Annotated[str | None, tyro.conf.arg(metavar="RUN|constant-velocity|stop|log|…")] = None,
@@ -36,7 +36,7 @@ def ncap(
     again. docs/safety-tests.md compares the rules.
 
     Args:
-        rebuilt: Folders of reconstructions. A scenario's scene is the name of a folder or of its log.
+        reconstructed: Folders of reconstructions. A scenario's scene is the name of a folder or of its log.
         scenarios: File or folder of scenarios, ours or neuro-ncap's. With --propose: file to write.
         agent: As for `foredrive drive --in`; lidar-corridor stops if lidar sees something in its corridor.
             Required without --propose.
@@ -56,11 +56,11 @@ def ncap(
     check_number("--runs", runs, low=1)
     check_number("--films", films, low=0)
     check_number("--workers", workers, low=1)
-    if not rebuilt:
-        raise InputError("name at least one reconstruction (REBUILT)")
-    for folder in rebuilt:
-        check_rebuilt(folder)
-    folders = tuple(str(folder.absolute()) for folder in rebuilt)
+    if not reconstructed:
+        raise InputError("name at least one reconstruction (RECONSTRUCTED)")
+    for folder in reconstructed:
+        check_reconstruction(folder)
+    folders = tuple(str(folder.absolute()) for folder in reconstructed)
     if propose:
         _propose(folders, scenarios, rules, runs)
         return

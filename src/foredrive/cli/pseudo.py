@@ -5,16 +5,16 @@ from typing import Annotated
 
 import tyro
 
-from foredrive.cli.arguments import check_number, check_out_folder, check_rebuilt
+from foredrive.cli.arguments import check_number, check_out_folder, check_reconstruction
 from foredrive.errors import InputError
 from foredrive.lazy import importing
 
 
 def pseudo(
-    rebuilt: Annotated[
+    reconstructed: Annotated[
         tuple[Path, ...],
         tyro.conf.Positional,
-        tyro.conf.arg(metavar="REBUILT [REBUILT ...]", help_behavior_hint="(required)"),
+        tyro.conf.arg(metavar="RECONSTRUCTED [RECONSTRUCTED ...]", help_behavior_hint="(required)"),
     ],
     agent: Annotated[str, tyro.conf.arg(metavar="RUN|constant-velocity|stop|log|…")],
     out: Path,
@@ -26,17 +26,17 @@ def pseudo(
     docs/safety-tests.md describes the differences from NAVSIM's devkit.
 
     Args:
-        rebuilt: Folders of reconstructions whose logs still exist and have maps.
+        reconstructed: Folders of reconstructions whose logs still exist and have maps.
         agent: As for `foredrive drive --in`.
         out: Folder for summary.json.
         every: Time between two starts in a log, s.
     """
     check_out_folder(out)
     check_number("--every", every, above=0)
-    if not rebuilt:
-        raise InputError("name at least one reconstruction (REBUILT)")
-    for folder in rebuilt:
-        check_rebuilt(folder)
+    if not reconstructed:
+        raise InputError("name at least one reconstruction (RECONSTRUCTED)")
+    for folder in reconstructed:
+        check_reconstruction(folder)
     with importing():
         from rich.console import Console
 
@@ -45,6 +45,6 @@ def pseudo(
         from foredrive.view.table import print_table
 
     name = str(Path(agent).absolute()) if Path(agent).is_dir() else agent
-    summary = pseudo_simulate([str(folder.absolute()) for folder in rebuilt], name, out, every)
+    summary = pseudo_simulate([str(folder.absolute()) for folder in reconstructed], name, out, every)
     print_table(pseudo_table(summary), Console())
     print(f"wrote {out / 'summary.json'}")

@@ -24,8 +24,8 @@ from foredrive.errors import InputError
 from foredrive.lazy import importing
 
 if TYPE_CHECKING:
-    from foredrive.methods.rebuilding.perceptual import PerceptualWeights
-    from foredrive.runs.recipes.rebuilding import RebuildRecipe
+    from foredrive.methods.reconstruction.perceptual import PerceptualWeights
+    from foredrive.runs.recipes.reconstruction import ReconstructionRecipe
 
 FIGURES = (
     *("minutes", "psnr_db", "nearest.psnr_db", "ssim", "lpips", "fid"),
@@ -80,11 +80,11 @@ def reconstruct(
     log_paths = find_logs(logs)
 
     with importing():
-        from foredrive.methods.rebuilding.perceptual import PerceptualWeights
+        from foredrive.methods.reconstruction.perceptual import PerceptualWeights
         from foredrive.runs.recipes.known import find_recipe
-        from foredrive.runs.recipes.rebuilding import RebuildRecipe
+        from foredrive.runs.recipes.reconstruction import ReconstructionRecipe
 
-    chosen = find_recipe(recipe or f"{method or 'gaussians'}_tiny", set, RebuildRecipe)
+    chosen = find_recipe(recipe or f"{method or 'gaussians'}_tiny", set, ReconstructionRecipe)
     kind = chosen.representation.kind
     if method not in (None, kind):
         raise InputError(f"--method {method} does not go with the recipe {chosen.name}, which is {kind}")
@@ -93,7 +93,7 @@ def reconstruct(
     if image_size is not None:
         chosen = dataclasses.replace(chosen, image_hw=image_size)
     work = functools.partial(
-        rebuild_log,
+        reconstruct_log,
         recipe=chosen,
         cache=(cache or out / "cache").absolute(),
         weights=PerceptualWeights(lpips_weights, fid_weights),
@@ -101,12 +101,12 @@ def reconstruct(
     if len(log_paths) == 1 and not ray:
         print(work((log_paths[0], out)), flush=True)
     else:
-        _rebuild_logs(log_paths, out.absolute(), work, workers, ray)
+        _reconstruct_logs(log_paths, out.absolute(), work, workers, ray)
 
 
-def rebuild_log(
+def reconstruct_log(
     job: tuple[LogPath, Path],
-    recipe: "RebuildRecipe[Any]",
+    recipe: "ReconstructionRecipe[Any]",
     cache: Path,
     weights: "PerceptualWeights",
     threads: int | None = None,
@@ -114,9 +114,9 @@ def rebuild_log(
     """Reconstruct one log in a folder, draw its held-out frames, and return its figures as lines."""
     import torch
 
-    from foredrive.methods.rebuilding.perceptual import PerceptualMetrics, PerceptualWeights
-    from foredrive.runs.rebuild.reconstruct import Reconstruction, reconstruct
-    from foredrive.view.rebuilt_sheet import write_rebuilt_sheet
+    from foredrive.methods.reconstruction.perceptual import PerceptualMetrics, PerceptualWeights
+    from foredrive.runs.reconstruction.reconstruct import Reconstruction, reconstruct
+    from foredrive.view.reconstruction_sheet import write_reconstruction_sheet
 
     if threads is not None:
         torch.set_num_threads(threads)
@@ -126,10 +126,10 @@ def rebuild_log(
     def draw(run: Reconstruction) -> None:
         if run.held_out.cameras:
             title = f"{log.name}, frames that were held out"
-            write_rebuilt_sheet(out / "held_out.png", run.scene, run.held_out.cameras, title)
+            write_reconstruction_sheet(out / "held_out.png", run.scene, run.held_out.cameras, title)
 
     run = reconstruct(recipe, log, out, cache, perceptual, draw)
-    lines = [f"rebuilt {log.name} by {recipe.representation.kind}: {out}"]
+    lines = [f"reconstructed {log.name} by {recipe.representation.kind}: {out}"]
     if not run.held_out.cameras and not run.held_out.sweeps:
         lines.insert(0, f"{log.name} is too short: no frame was held out, so the scene is not evaluated")
     shared = {
@@ -138,7 +138,7 @@ def rebuild_log(
     return "\n".join([*lines, *(f"  {name}: {value:.4g}" for name, value in shared.items())])
 
 
-def _rebuild_logs(
+def _reconstruct_logs(
     log_paths: Sequence[LogPath], out: Path, work: Callable[..., str], workers: int, on_ray: bool
 ) -> None:
     """Reconstruct several logs, some at a time.

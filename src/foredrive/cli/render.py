@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from foredrive.cli.arguments import OptionalPath, check_file, check_number, check_rebuilt
+from foredrive.cli.arguments import OptionalPath, check_file, check_number, check_reconstruction
 from foredrive.lazy import importing
 
 MAX_SHIFT_M = 100.0
@@ -56,21 +56,21 @@ def render(
     check_number("--seconds", seconds, above=0)
     check_number("--rate-hz", rate_hz, above=0)
     check_file(edits)
-    check_rebuilt(run)
+    check_reconstruction(run)
 
     with importing():
-        from foredrive.methods.rebuilding.edits import load_edits
-        from foredrive.methods.rebuilding.edits import save_edits as write_edits
-        from foredrive.runs.rebuild.rebuilt_run import open_rebuilt
-        from foredrive.runs.rebuild.render import edits_from_arguments, plan_frames
-        from foredrive.view.rebuilt_video import write_rebuilt_video
+        from foredrive.methods.reconstruction.edits import load_edits
+        from foredrive.methods.reconstruction.edits import save_edits as write_edits
+        from foredrive.runs.reconstruction.reconstruction_run import open_reconstruction
+        from foredrive.runs.reconstruction.render import edits_from_arguments, plan_frames
+        from foredrive.view.reconstruction_video import write_reconstruction_video
 
-    opened = open_rebuilt(run)
+    opened = open_reconstruction(run)
     plan = plan_frames(opened.vehicle, cameras, lidar, start_s=start, seconds=seconds, rate_hz=rate_hz)
     edit_list = [] if edits is None else load_edits(edits)
     tracks = opened.scene.graph.all_tracks
     changes = [*edit_list, *edits_from_arguments(tracks, edit_list, shift_left, remove, insert)]
-    write_rebuilt_video(out, opened, changes, plan, colour)
+    write_reconstruction_video(out, opened, changes, plan, colour)
     if save_edits is not None:
         write_edits(changes, save_edits)
     print(f"wrote {out}: {len(plan.t_s)} frames")

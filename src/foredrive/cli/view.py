@@ -60,7 +60,7 @@ def view(
             raise InputError(
                 f"{log}: --run and --save need a log; `foredrive render` makes videos of reconstructions"
             )
-        _serve_rebuilt(log, edits, t, host, port)
+        _serve_reconstructed(log, edits, t, host, port)
         return
     if edits is not None:
         raise InputError(f"{log}: --edits needs the folder of a reconstruction")
@@ -111,19 +111,19 @@ def _opened(run: Path) -> "Run":
     return open_run(run)
 
 
-def _serve_rebuilt(folder: Path, edits: Path | None, t_s: float | None, host: str, port: int) -> None:
+def _serve_reconstructed(folder: Path, edits: Path | None, t_s: float | None, host: str, port: int) -> None:
     with importing():
-        from foredrive.methods.rebuilding.edits import load_edits
-        from foredrive.runs.rebuild.rebuilt_run import edited_scene, open_rebuilt
-        from foredrive.view.rebuilt_viewer import RebuiltViewer
+        from foredrive.methods.reconstruction.edits import load_edits
+        from foredrive.runs.reconstruction.reconstruction_run import edited_scene, open_reconstruction
+        from foredrive.view.reconstruction_viewer import ReconstructedViewer
 
-    run = open_rebuilt(folder)
+    run = open_reconstruction(folder)
     if t_s is not None:
         run.vehicle.check_time(t_s)
     edit_list = [] if edits is None else load_edits(edits)
     # Report edits that do not fit the scene before the page is served
     edited_scene(run.scene, edit_list)
-    with closing(RebuiltViewer(run, edit_list, edits or folder / EDITS, host, port)) as viewer:
+    with closing(ReconstructedViewer(run, edit_list, edits or folder / EDITS, host, port)) as viewer:
         if t_s is not None:
             viewer.show(t_s)
         print(f"{folder.name} is at {viewer.url} until you press Ctrl-C", flush=True)

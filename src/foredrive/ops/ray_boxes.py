@@ -58,9 +58,9 @@ def cross_boxes(
     """Find the boxes that each ray passes through.
 
     Between key times the centres move linearly and rotations are about one axis, as in
-    `methods.rebuilding.tracks.poses_at`. A box is there between two key times at which it is present. Before
-    the first and after the last key time its motion continues for at most one step between key times. With a
-    single key time it stands still.
+    `methods.reconstruction.tracks.poses_at`. A box is there between two key times at which it is present.
+    Before the first and after the last key time its motion continues for at most one step between key times.
+    With a single key time it stands still.
 
     The distances and the rays in the boxes' frames are differentiable in the rays and in the poses. Which
     pairs there are is not.

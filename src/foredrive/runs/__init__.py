@@ -1,4 +1,4 @@
-"""Train, evaluate, drive, rebuild, search and score, into folders of results."""
+"""Train, evaluate, drive, reconstruct, search and score, into folders of results."""
 
 from typing import TYPE_CHECKING
 

@@ -11,10 +11,10 @@ from foredrive.data.lidar import frames_with_lidar
 from foredrive.data.log_check import Finding, LogCheck, check_log
 from foredrive.data.logs import Log
 from foredrive.errors import InputError
-from foredrive.methods.rebuilding.calibration import spread_along_path
-from foredrive.methods.rebuilding.tracks import read_tracks
-from foredrive.methods.rebuilding.views import camera_views, ego_twists, sweep_views
-from foredrive.runs.rebuild.calibration_check import calibration_findings
+from foredrive.methods.reconstruction.calibration import spread_along_path
+from foredrive.methods.reconstruction.tracks import read_tracks
+from foredrive.methods.reconstruction.views import camera_views, ego_twists, sweep_views
+from foredrive.runs.reconstruction.calibration_check import calibration_findings
 
 CALIBRATION_HW = (270, 480)
 

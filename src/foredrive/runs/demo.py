@@ -19,14 +19,14 @@ from foredrive.errors import InputError
 from foredrive.methods.nemo.recipes import nemo_tiny
 from foredrive.methods.recipe import Recipe, rescheduled
 from foredrive.runs.drive.agents import CORRIDOR, EXPERT, REPLAY
-from foredrive.runs.drive.in_rebuilt import RebuiltRoutes
+from foredrive.runs.drive.in_reconstruction import ReconstructedRoutes
 from foredrive.runs.drive.in_towns import TownRoutes
 from foredrive.runs.drive.recording import log_of, record_drives
 from foredrive.runs.drive.suite import DriveSuite, drive_suite
 from foredrive.runs.evaluate.run import ExamplePrediction, evaluate_run, predict_examples
-from foredrive.runs.rebuild.reconstruct import Reconstruction
-from foredrive.runs.rebuild.reconstruct import reconstruct as rebuild_log
-from foredrive.runs.recipes.rebuilding import RebuildRecipe, gaussians_tiny, rescheduled_recipe
+from foredrive.runs.recipes.reconstruction import ReconstructionRecipe, gaussians_tiny, rescheduled_recipe
+from foredrive.runs.reconstruction.reconstruct import Reconstruction
+from foredrive.runs.reconstruction.reconstruct import reconstruct as reconstruct_log
 from foredrive.runs.search.indexing import index_logs
 from foredrive.runs.search.searching import ask, listed_clips
 from foredrive.runs.search.towers import EMBEDDED
@@ -60,10 +60,10 @@ class DemoSize:
     train: tuple[DrivePlan, ...]
     test: DrivePlan
     """The drive through the town that no model was trained on."""
-    rebuilt: DrivePlan
-    """The drive that is rebuilt."""
+    reconstructed: DrivePlan
+    """The drive that is reconstructed."""
     recipe: Recipe
-    rebuilding: RebuildRecipe
+    reconstruction: ReconstructionRecipe
     route: str
     """Id of the route of `ROUTES` that is driven."""
     examples: int
@@ -82,7 +82,7 @@ class Demo:
     @property
     def plans(self) -> tuple[DrivePlan, ...]:
         """Return all drives to record, each once."""
-        return tuple(dict.fromkeys((*self.size.train, self.size.test, self.size.rebuilt)))
+        return tuple(dict.fromkeys((*self.size.train, self.size.test, self.size.reconstructed)))
 
 
 @dataclass(frozen=True)
@@ -105,8 +105,8 @@ class Driven:
 
 
 @dataclass(frozen=True)
-class Rebuilt:
-    """A rebuilt drive, and the drive of each agent that met a car in it."""
+class Reconstructed:
+    """A reconstructed drive, and the drive of each agent that met a car in it."""
 
     scene: Reconstruction
     met: dict[str, Driven]
@@ -128,15 +128,15 @@ def full_demo() -> DemoSize:
             for drive in (("Town01", 1), ("Town03", 1), ("Town10HD", 1, "night"))
         ),
         test=plan_drive("Town05", 1, seconds=30.0),
-        rebuilt=plan_drive("Town05", 7, seconds=8.0, rate_hz=10.0),
+        reconstructed=plan_drive("Town05", 7, seconds=8.0, rate_hz=10.0),
         recipe=nemo_tiny(),
-        rebuilding=dataclasses.replace(
+        reconstruction=dataclasses.replace(
             rescheduled_recipe(gaussians_tiny(), steps=300), image_hw=SURROUND.image_hw
         ),
         route="28",
         examples=4,
         # Estimates from speeds in benchmarks/results (towns, real-to-sim) and the training time in README
-        minutes={"Record": 2, "See": 1, "Learn": 10, "Drive": 2, "Rebuild": 3, "Search": 1},
+        minutes={"Record": 2, "See": 1, "Learn": 10, "Drive": 2, "Reconstruct": 3, "Search": 1},
     )
 
 
@@ -147,14 +147,16 @@ def quick_demo() -> DemoSize:
     return DemoSize(
         train=(plan_drive("Town02", 1, "night", seconds=6.0),),
         test=test,
-        rebuilt=test,
+        reconstructed=test,
         recipe=dataclasses.replace(
             tiny,
             name="nemo_tiny (quick)",
             pretrain=None if tiny.pretrain is None else rescheduled(tiny.pretrain, steps=12, **few),
             finetune=rescheduled(tiny.finetune, steps=6, **few),
         ),
-        rebuilding=dataclasses.replace(rescheduled_recipe(gaussians_tiny(), steps=20), image_hw=(72, 128)),
+        reconstruction=dataclasses.replace(
+            rescheduled_recipe(gaussians_tiny(), steps=20), image_hw=(72, 128)
+        ),
         route="4",
         examples=1,
     )
@@ -197,13 +199,15 @@ def drive_route(demo: Demo) -> dict[str, Driven]:
     }
 
 
-def rebuild_drive(demo: Demo) -> Rebuilt:
-    """Rebuild a drive, and put a car in the way of some agents that drive in it."""
-    (log,) = _logs(demo, [demo.size.rebuilt])
-    folder = demo.out / "rebuilt"
-    scene = rebuild_log(demo.size.rebuilding, log, folder)
-    source = RebuiltRoutes(str(folder.absolute()), threats=(Threat.STATIONARY,))
-    return Rebuilt(scene, {agent: _driven(DriveSuite(agent, source), folder / agent) for agent in MET_BY})
+def reconstruct_drive(demo: Demo) -> Reconstructed:
+    """Reconstruct a drive, and put a car in the way of some agents that drive in it."""
+    (log,) = _logs(demo, [demo.size.reconstructed])
+    folder = demo.out / "reconstructed"
+    scene = reconstruct_log(demo.size.reconstruction, log, folder)
+    source = ReconstructedRoutes(str(folder.absolute()), threats=(Threat.STATIONARY,))
+    return Reconstructed(
+        scene, {agent: _driven(DriveSuite(agent, source), folder / agent) for agent in MET_BY}
+    )
 
 
 def search_logs(demo: Demo) -> list[Found]:

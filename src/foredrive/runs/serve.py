@@ -14,7 +14,7 @@ from foredrive.integrations.remote.render_server import RenderService
 from foredrive.json_server import Answer
 from foredrive.runs.drive.agent_inputs import inputs_of
 from foredrive.runs.drive.agents import make_agent, require_alpasim
-from foredrive.runs.rebuild.rebuilt_run import open_rebuilt, open_run_log
+from foredrive.runs.reconstruction.reconstruction_run import open_reconstruction, open_run_log
 
 Answers = Mapping[tuple[str, str], Answer]
 
@@ -33,7 +33,7 @@ def renderer_of(folder: Path) -> Answers:
     Raises:
         InputError: the folder holds no finished reconstruction.
     """
-    opened, names, start_us = open_rebuilt(folder), dict[int, str](), 0
+    opened, names, start_us = open_reconstruction(folder), dict[int, str](), 0
     # The log may have been moved or deleted since
     with contextlib.suppress(InputError):
         log = Log(open_run_log(folder)[1])

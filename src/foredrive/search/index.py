@@ -20,7 +20,7 @@ EXACT_UP_TO = 100_000
 KEPT_VERSIONS = datetime.timedelta(hours=1)
 """Time for which old versions are kept, so that concurrent readers can finish."""
 PARTITION_ROWS, GROWN = 4096, 2
-"""Number of rows per partition, and the growth factor of the table at which partitions are rebuilt."""
+"""Number of rows per partition, and the growth factor of the table at which partitions are reconstructed."""
 PROBES, REFINEMENT = 32, 3
 """Number of partitions searched, and the factor of additional rows compared exactly. The factor is needed
 because partitions store vectors with 8 bits."""

@@ -15,10 +15,10 @@ from foredrive.runs.demo import (
     Demo,
     Driven,
     Judged,
-    Rebuilt,
+    Reconstructed,
     drive_route,
     judge_shipped,
-    rebuild_drive,
+    reconstruct_drive,
     record_logs,
     search_logs,
     train_tiny,
@@ -45,7 +45,7 @@ from foredrive.view.summary_tables import BASELINE_TITLES, PRIOR, planning_overv
 from foredrive.view.table import Cell, Column, Table, number, simple_table, words
 
 COVER_HW = (225, 400)
-REBUILT_WIDTH_PX = 512
+RECONSTRUCTION_WIDTH_PX = 512
 SHOWN_VIEWS = 2
 IOU = "occupancy.above_ground.iou_now"
 L2 = "uniad.l2_avg_m"
@@ -151,26 +151,28 @@ def show_drive(demo: Demo) -> Section:
     )
 
 
-def show_rebuilding(demo: Demo) -> Section:
-    """Rebuild a drive; show held-out images beside rendered ones, and the films of the car in the way."""
-    rebuilt = rebuild_drive(demo)
-    for one in rebuilt.met.values():
+def show_reconstruction(demo: Demo) -> Section:
+    """Reconstruct a drive; show held-out images beside rendered ones, and the films of the car in the way."""
+    reconstructed = reconstruct_drive(demo)
+    for one in reconstructed.met.values():
         write_drive_report(one.folder)
-    summary = rebuilt.scene.summary
+    summary = reconstructed.scene.summary
     psnr, nearest = (number(summary.get(key), 1) for key in ("psnr_db", "nearest.psnr_db"))
     tiles = [
         MetricTile("Held-out images, PSNR", psnr, "dB", f"the nearest recorded image: {nearest} dB"),
         MetricTile("Gaussians", f"{summary['gaussians']:,}"),
         MetricTile("Training", number(summary.get("minutes"), 1), "min"),
     ]
-    films = [stored_film(_film_path(one), f"{agent}: {MET_BY[agent]}") for agent, one in rebuilt.met.items()]
+    films = [
+        stored_film(_film_path(one), f"{agent}: {MET_BY[agent]}") for agent, one in reconstructed.met.items()
+    ]
     return Section(
         f"{psnr} dB on held-out images, and a car that was never there",
-        _cover(_middle_frame(_film_path(rebuilt.met[CORRIDOR]))),
+        _cover(_middle_frame(_film_path(reconstructed.met[CORRIDOR]))),
         [
             Block(tiles=tiles),
-            Block("Recorded and rendered", figures=_held_out(rebuilt), columns="two"),
-            Block("A car stands in the way", figures=films, columns="two", table=_threats(rebuilt.met)),
+            Block("Recorded and rendered", figures=_held_out(reconstructed), columns="two"),
+            Block("A car stands in the way", figures=films, columns="two", table=_threats(reconstructed.met)),
         ],
     )
 
@@ -265,10 +267,10 @@ def _from_above(shown: ExamplePrediction) -> list[Picture]:
 
 
 @torch.no_grad()
-def _held_out(rebuilt: Rebuilt) -> list[Picture]:
+def _held_out(reconstructed: Reconstructed) -> list[Picture]:
     """Draw some held-out images of the front camera, each with its rendering."""
-    scene = rebuilt.scene.scene
-    ahead = [view for view in rebuilt.scene.held_out.cameras if view.sensor == 0]
+    scene = reconstructed.scene.scene
+    ahead = [view for view in reconstructed.scene.held_out.cameras if view.sensor == 0]
     pictures = []
     for place in np.linspace(0, len(ahead) - 1, min(SHOWN_VIEWS, len(ahead))).round().astype(int):
         view = ahead[place]
@@ -276,7 +278,10 @@ def _held_out(rebuilt: Rebuilt) -> list[Picture]:
         real = view.image.float() / 255
         rgb = scene.camera(scene.graph, view.to(scene.device)).rgb.clamp(0, 1).cpu()
         quality = float(psnr_db(rgb[None], real[None], torch.ones(1, *view.size_hw, dtype=torch.bool)))
-        size_hw = (round(REBUILT_WIDTH_PX * view.size_hw[0] / view.size_hw[1]), REBUILT_WIDTH_PX)
+        size_hw = (
+            round(RECONSTRUCTION_WIDTH_PX * view.size_hw[0] / view.size_hw[1]),
+            RECONSTRUCTION_WIDTH_PX,
+        )
         pictures += [
             picture(resize(to_image(real), size_hw), f"Recorded at {view.t_s:.1f} s, held out"),
             picture(resize(to_image(rgb), size_hw), f"Rendered, {quality:.1f} dB"),

@@ -3,7 +3,7 @@
 from foredrive.view.demo_report import Step
 from foredrive.view.demo_sections import (
     show_drive,
-    show_rebuilding,
+    show_reconstruction,
     show_recording,
     show_search,
     show_shipped,
@@ -59,17 +59,18 @@ STEPS = (
         show_drive,
     ),
     Step(
-        "Rebuild",
-        "rebuilding a drive, and putting a car in the way",
+        "Reconstruct",
+        "reconstructing a drive, and putting a car in the way",
         "A drive becomes 3-D Gaussians: a static part, and one for each moving road user. Cameras and lidar "
         "are rendered from where nobody drove, and a car stands where there was none. Every second frame was "
         "held out of the training.",
         (
-            "foredrive reconstruct data/logs/town_test/Town05_seed7 --out runs/rebuilt",
-            "foredrive drive --in runs/rebuilt --agent lidar-corridor --threat stationary --out runs/threat",
-            "foredrive view runs/rebuilt",
+            "foredrive reconstruct data/logs/town_test/Town05_seed7 --out runs/reconstructed",
+            "foredrive drive --in runs/reconstructed --agent lidar-corridor --threat stationary "
+            "--out runs/threat",
+            "foredrive view runs/reconstructed",
         ),
-        show_rebuilding,
+        show_reconstruction,
     ),
     Step(
         "Search",

@@ -11,7 +11,7 @@ import viser
 from viser.transforms import SO3
 
 from foredrive.errors import InputError
-from foredrive.methods.rebuilding.edits import (
+from foredrive.methods.reconstruction.edits import (
     Duplicate,
     Edit,
     EditedScene,
@@ -24,11 +24,11 @@ from foredrive.methods.rebuilding.edits import (
     save_edits,
     unused_id,
 )
-from foredrive.methods.rebuilding.scene_graph import SceneGraph
-from foredrive.methods.rebuilding.tracks import states_at
-from foredrive.runs.rebuild.rebuilt_run import open_rebuilt
-from foredrive.view.rebuilt_nodes import ROOT, RebuiltNodes
-from foredrive.view.rebuilt_video import describe_edit
+from foredrive.methods.reconstruction.scene_graph import SceneGraph
+from foredrive.methods.reconstruction.tracks import states_at
+from foredrive.runs.reconstruction.reconstruction_run import open_reconstruction
+from foredrive.view.reconstruction_nodes import ROOT, ReconstructedNodes
+from foredrive.view.reconstruction_video import describe_edit
 
 NO_ACTOR = "none"
 DUPLICATE_OFFSET_M = (0.0, 3.0, 0.0)
@@ -55,13 +55,13 @@ class EditPanel:
         self,
         server: viser.ViserServer,
         graph: SceneGraph,
-        nodes: RebuiltNodes,
+        nodes: ReconstructedNodes,
         file: Path,
         tell: Callable[[str], None],
         on_change: Callable[[], None],
     ) -> None:
         self._graph, self._nodes, self._tell, self._on_change = graph, nodes, tell, on_change
-        self._open = functools.lru_cache(RUNS_KEPT)(lambda run: open_rebuilt(Path(run)).scene.graph)
+        self._open = functools.lru_cache(RUNS_KEPT)(lambda run: open_reconstruction(Path(run)).scene.graph)
         # Handlers of the page run in several threads. Re-entrant: adding an edit replaces all edits
         self._changing = threading.RLock()
         self.edits: list[Edit] = []

@@ -16,7 +16,7 @@ from foredrive.driving.ncap.scenario import SafetyScenario
 from foredrive.driving.observation import FRAME_DT_S
 from foredrive.driving.replay.logged_drive import LoggedDrive
 from foredrive.geometry.se3 import inverse_se3, transform_points
-from foredrive.methods.rebuilding.tracks import boxes_at
+from foredrive.methods.reconstruction.tracks import boxes_at
 from foredrive.scene import CameraRig
 from foredrive.view import palette
 from foredrive.view.bev import draw_boxes, draw_ego, start_bev

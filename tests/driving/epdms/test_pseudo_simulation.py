@@ -19,14 +19,14 @@ from foredrive.driving.epdms.pseudo_simulation import (
 from foredrive.driving.epdms.world import Roads
 from foredrive.driving.ncap.running import Place
 from foredrive.driving.replay.logged_drive import LoggedDrive
-from foredrive.driving.replay.rebuilt import RebuiltSimulator
+from foredrive.driving.replay.reconstructed import ReconstructedSimulator
 from foredrive.driving.replay.replay_expert import ReplayExpert
 from foredrive.driving.simple_agents import StraightAgent, plan_of
 from foredrive.errors import InputError
-from foredrive.methods.rebuilding.renderer import RebuiltRenderer
-from foredrive.methods.rebuilding.scene_graph import SceneGraph
-from foredrive.methods.rebuilding.tracks import ActorTracks
-from foredrive.methods.rebuilding.vehicle import LoggedVehicle
+from foredrive.methods.reconstruction.renderer import ReconstructedRenderer
+from foredrive.methods.reconstruction.scene_graph import SceneGraph
+from foredrive.methods.reconstruction.tracks import ActorTracks
+from foredrive.methods.reconstruction.vehicle import LoggedVehicle
 from foredrive.methods.splatad import Gaussians
 from foredrive.methods.splatad.content import GaussianContent
 from foredrive.methods.splatad.scene import GaussianScene
@@ -69,7 +69,7 @@ def place(at_x: float | None = None) -> Place:
     )
     graph, vehicle = SceneGraph(tracks, GaussianContent(one, torch.zeros(1, dtype=torch.int64))), long_log()
     scene = GaussianScene(graph, cameras=1)
-    return Place(graph, vehicle, lambda changed: RebuiltRenderer(scene, changed, vehicle), {})
+    return Place(graph, vehicle, lambda changed: ReconstructedRenderer(scene, changed, vehicle), {})
 
 
 def long_log() -> LoggedVehicle:
@@ -113,7 +113,7 @@ def test_the_second_stage_starts_beside_the_path_with_a_past_of_its_own() -> Non
     places = list[tuple[float, float]]()
 
     class Looks:
-        def __init__(self, simulator: RebuiltSimulator) -> None:
+        def __init__(self, simulator: ReconstructedSimulator) -> None:
             self.simulator = simulator
 
         def act(self, observation: Clip) -> Trajectory:

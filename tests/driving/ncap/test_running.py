@@ -21,10 +21,10 @@ from foredrive.driving.replay.threats import Threat
 from foredrive.driving.simple_agents import StraightAgent
 from foredrive.errors import InputError
 from foredrive.geometry.se3 import inverse_se3, matrix_from_yaw
-from foredrive.methods.rebuilding.renderer import RebuiltRenderer
-from foredrive.methods.rebuilding.scene_graph import SceneGraph
-from foredrive.methods.rebuilding.tracks import ActorTracks, joined_tracks, states_at
-from foredrive.methods.rebuilding.vehicle import LoggedVehicle
+from foredrive.methods.reconstruction.renderer import ReconstructedRenderer
+from foredrive.methods.reconstruction.scene_graph import SceneGraph
+from foredrive.methods.reconstruction.tracks import ActorTracks, joined_tracks, states_at
+from foredrive.methods.reconstruction.vehicle import LoggedVehicle
 from foredrive.methods.splatad import Gaussians
 from foredrive.methods.splatad.content import GaussianContent
 from foredrive.methods.splatad.scene import GaussianScene
@@ -64,7 +64,7 @@ def place(category: Category = Category.CAR, parked_m: tuple[float, float] = (-5
     return Place(
         graph,
         vehicle,
-        lambda changed: RebuiltRenderer(GaussianScene(graph, cameras=1), changed, vehicle),
+        lambda changed: ReconstructedRenderer(GaussianScene(graph, cameras=1), changed, vehicle),
         {"0101": 4},
     )
 

@@ -15,7 +15,7 @@ from foredrive.driving.observation import KeyFrame, make_clip, no_images
 from foredrive.driving.replay.logged_drive import LoggedDrive
 from foredrive.driving.replay.replay_expert import ReplayExpert
 from foredrive.errors import InputError
-from foredrive.methods.rebuilding.vehicle import LoggedVehicle
+from foredrive.methods.reconstruction.vehicle import LoggedVehicle
 from foredrive.scene import BicycleState, Boxes, CameraRig, Category, Clip, Command, LidarSweep
 
 YAW = 0.7

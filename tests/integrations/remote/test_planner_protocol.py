@@ -301,11 +301,11 @@ def saved(value: object, compressed: bool = False) -> str:
     return base64.b64encode(buffer.getvalue()).decode()
 
 
-def rebuilt(rows: bytes, stride: bytes) -> bytes:
+def reconstructed(rows: bytes, stride: bytes) -> bytes:
     """The pickle of an image of one column; rows and their stride are opcodes."""
     storage = b"(X\x07\0\0\0storagectorch\nByteStorage\nX\x01\0\0\x000X\x03\0\0\0cpuK\x0ctQ"
     layout = b"(" + rows + b"K\x01K\x03t(" + stride + b"K\x03K\x01t"
-    return b"\x80\x02ctorch._utils\n_rebuild_tensor_v2\n(" + storage + b"K\0" + layout + b"\x89NtR."
+    return b"\x80\x02ctorch._utils\n_reconstruct_tensor_v2\n(" + storage + b"K\0" + layout + b"\x89NtR."
 
 
 def archive_of(description: bytes) -> str:
@@ -328,13 +328,13 @@ def test_images_run_no_code_and_are_bounded(capsys: pytest.CaptureFixture[str]) 
     large = torch.zeros(400, 400, 3, dtype=torch.uint8)
     turned = torch.arange(60, dtype=torch.uint8).reshape(3, 4, 5)[:, 1:, ::2].permute(2, 1, 0)
     assert torch.equal(decode_image(encode_tensors(turned)), turned)
-    described = archive_of(rebuilt(b"M\x10'", b"K\x03"))  # 10,000 rows of 3 bytes
+    described = archive_of(reconstructed(b"M\x10'", b"K\x03"))  # 10,000 rows of 3 bytes
     for text, told in (
         (archive_of(b"\x80\x02cbuiltins\nbytearray\nJ\xff\xff\xff\x7f\x85R."), "builtins.bytearray"),
         (archive_of(b"\x80\x02" + b"]" * 5000 + b"."), "too long"),
         (described, "may have 1 to 10,000 bytes, not 30,000"),
-        (archive_of(rebuilt(b"M\xe8\x03", b"K\x03")), "has 12 bytes, and describes 3,000"),
-        (archive_of(rebuilt(b"K\x04", b"J\xff\xff\xff\xff")), "may have 1 to"),
+        (archive_of(reconstructed(b"M\xe8\x03", b"K\x03")), "has 12 bytes, and describes 3,000"),
+        (archive_of(reconstructed(b"K\x04", b"J\xff\xff\xff\xff")), "may have 1 to"),
         (saved(Code()), "not a tensor in base64"),
         (saved(image.float()), "has to be uint8"),
         (saved([image]), "got list"),

@@ -11,7 +11,7 @@ from torch import nn
 from foredrive.errors import InputError
 from foredrive.methods.blocks.inception import InceptionFeatures, resized
 from foredrive.methods.blocks.lpips import Lpips
-from foredrive.methods.rebuilding.perceptual import PerceptualMetrics, PerceptualWeights
+from foredrive.methods.reconstruction.perceptual import PerceptualMetrics, PerceptualWeights
 
 ALEXNET = {0: (3, 64, 11), 3: (64, 192, 5), 6: (192, 384, 3), 8: (384, 256, 3), 10: (256, 256, 3)}
 """Convolutions of AlexNet: inputs, outputs, kernel."""

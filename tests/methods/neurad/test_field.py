@@ -28,9 +28,9 @@ from foredrive.methods.neurad.sampling import (
     to_distance,
     to_position,
 )
-from foredrive.methods.rebuilding.rebuilt import SensorMotion
-from foredrive.methods.rebuilding.tracks import ActorTracks
-from foredrive.methods.rebuilding.views import CameraView, SweepView
+from foredrive.methods.reconstruction.reconstructed import SensorMotion
+from foredrive.methods.reconstruction.tracks import ActorTracks
+from foredrive.methods.reconstruction.views import CameraView, SweepView
 from foredrive.scene import LidarSweep
 
 

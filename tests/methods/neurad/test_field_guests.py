@@ -17,7 +17,7 @@ from foredrive.methods.neurad.guests import (
     with_guests_in_image,
     with_guests_in_sweep,
 )
-from foredrive.methods.rebuilding.tracks import ActorTracks
+from foredrive.methods.reconstruction.tracks import ActorTracks
 
 MARGIN_M = 0.25
 """The boxes are this much longer at each end."""

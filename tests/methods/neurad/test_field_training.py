@@ -16,9 +16,9 @@ from foredrive.methods.neurad.decoders import PatchDecoderConfig
 from foredrive.methods.neurad.recipes import FieldRecipe
 from foredrive.methods.neurad.scene import FieldSceneConfig
 from foredrive.methods.neurad.training import FieldRates, FieldSchedule
-from foredrive.methods.rebuilding.tracks import ActorTracks
-from foredrive.methods.rebuilding.training import SensorViews, rebuild
-from foredrive.methods.rebuilding.views import CameraView
+from foredrive.methods.reconstruction.tracks import ActorTracks
+from foredrive.methods.reconstruction.training import SensorViews, train_representation
+from foredrive.methods.reconstruction.views import CameraView
 
 STEPS = 150
 DIRECTIONS = ((0.0, 60.0), (0.0, -40.0), (0.0, 0.0))
@@ -81,7 +81,7 @@ def test_what_was_trained_on_several_cameras_is_rendered(tmp_path: Path) -> None
         ),
     )
     scene = representation.begin(SensorViews(views, []), no_tracks(), cameras=3, reach_m=40.0)
-    rebuild(representation.training(scene, SensorViews(views, [])), tmp_path)
+    train_representation(representation.training(scene, SensorViews(views, [])), tmp_path)
     lines = read_metrics(tmp_path / "metrics.jsonl")[-STEPS // 5 :]
     trained_db = np.mean([float(line["psnr_db"]) for line in lines])
     squares = []

@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from foredrive.methods.rebuilding.scene_graph import STATIC, SceneGraph
-from foredrive.methods.rebuilding.tracks import ActorTracks
+from foredrive.methods.reconstruction.scene_graph import STATIC, SceneGraph
+from foredrive.methods.reconstruction.tracks import ActorTracks
 from foredrive.methods.splatad import Gaussians
 from foredrive.methods.splatad.content import GaussianContent
 from foredrive.methods.splatad.scene import GaussianScene

@@ -12,10 +12,10 @@ from scipy.spatial.transform import Rotation
 from foredrive.data import find_logs
 from foredrive.data.drives import read_drive
 from foredrive.errors import InputError
-from foredrive.methods.rebuilding.scene_graph import STATIC, SceneGraph
-from foredrive.methods.rebuilding.seed_points import UNSEEN_RAD, SeedPoints, colour_from_neighbours
-from foredrive.methods.rebuilding.tracks import read_tracks, states_at
-from foredrive.methods.rebuilding.views import camera_views, sweep_views
+from foredrive.methods.reconstruction.scene_graph import STATIC, SceneGraph
+from foredrive.methods.reconstruction.seed_points import UNSEEN_RAD, SeedPoints, colour_from_neighbours
+from foredrive.methods.reconstruction.tracks import read_tracks, states_at
+from foredrive.methods.reconstruction.views import camera_views, sweep_views
 from foredrive.methods.splatad import Gaussians
 from foredrive.methods.splatad.initial import InitialGaussians, initial_scene
 from foredrive.scene import Clip

@@ -4,10 +4,10 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from methods.rebuilding.test_scene_graph import graph_of, two_actors
+from methods.reconstruction.test_scene_graph import graph_of, two_actors
 from plyfile import PlyData
 
-from foredrive.methods.rebuilding.scene_graph import STATIC
+from foredrive.methods.reconstruction.scene_graph import STATIC
 from foredrive.methods.splatad.ply import SH_DEGREE_0, write_ply
 
 NAMES = (

@@ -5,8 +5,8 @@ import math
 
 import pytest
 import torch
-from methods.rebuilding.test_rebuilt import FORWARD, scene_of, view
-from methods.rebuilding.test_scene_graph import two_actors
+from methods.reconstruction.test_reconstructed import FORWARD, scene_of, view
+from methods.reconstruction.test_scene_graph import two_actors
 
 from foredrive.geometry.se3 import exp_se3
 from foredrive.methods.splatad import Gaussians

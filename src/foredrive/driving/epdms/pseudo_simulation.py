@@ -1,4 +1,4 @@
-"""Two-stage pseudo-simulation (Cao et al., CoRL 2025; NAVSIM v2) in rebuilt logs and in recorded towns.
+"""Two-stage pseudo-simulation (Cao et al., CoRL 2025; NAVSIM v2) in reconstructed logs and in recorded towns.
 
 First stage: the agent plans once from the logged state, and its plan is simulated. Second stage: it plans
 once from each of several states beside the logged path, one horizon later. These count by how near they are
@@ -31,7 +31,7 @@ from foredrive.driving.ncap.running import Place
 from foredrive.driving.observation import FRAME_DT_S
 from foredrive.driving.plans import waypoints_of
 from foredrive.driving.replay.logged_drive import LoggedDrive
-from foredrive.driving.replay.rebuilt import RebuiltScenario, RebuiltSimulator
+from foredrive.driving.replay.reconstructed import ReconstructedScenario, ReconstructedSimulator
 from foredrive.driving.replay.replay_expert import ReplayExpert
 from foredrive.driving.replay.replayed import users_at
 from foredrive.driving.simple_agents import ReplayAgent
@@ -95,7 +95,7 @@ class PseudoSimulation:
     """Pseudo-simulation in one place.
 
     Args:
-        place: a rebuilt log, or a recorded town as `Place`.
+        place: a reconstructed log, or a recorded town as `Place`.
         roads: its roads.
         agent_in: returns the agent for a simulator.
         past_frames: number of earlier key frames that the agent observes.
@@ -107,7 +107,7 @@ class PseudoSimulation:
         self,
         place: Place,
         roads: Roads,
-        agent_in: Callable[[RebuiltSimulator], Agent],
+        agent_in: Callable[[ReconstructedSimulator], Agent],
         past_frames: int,
         sensors: bool = True,
         follow_ups: tuple[Offset, ...] = FOLLOW_UPS,
@@ -165,8 +165,10 @@ class PseudoSimulation:
         yaw, xyz = torch.tensor(offset.yaw_rad), torch.tensor([offset.ahead_m, offset.left_m, 0.0])
         drive = LoggedDrive(self._place.vehicle, matrix_from_yaw(yaw, xyz))
         graph = self._place.graph
-        simulator = RebuiltSimulator(self._place.renderer(graph), graph.all_tracks, drive, self._place.lanes)
-        clip = simulator.reset(RebuiltScenario(start_s, self._sensors, self._past_frames))
+        simulator = ReconstructedSimulator(
+            self._place.renderer(graph), graph.all_tracks, drive, self._place.lanes
+        )
+        clip = simulator.reset(ReconstructedScenario(start_s, self._sensors, self._past_frames))
         state, seen = drive.state_at(start_s), stack_records([clip])
         plan = self._agent_in(simulator).act(seen)
         past, others = past_motion(drive, start_s), self._others(start_s)

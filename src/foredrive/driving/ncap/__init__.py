@@ -1,1 +1,1 @@
-"""Safety tests in rebuilt logs after NeuroNCAP: scenarios, rules, drives and scores."""
+"""Safety tests in reconstructed logs after NeuroNCAP: scenarios, rules, drives and scores."""

@@ -1,4 +1,4 @@
-"""HUGSIM's HD-Score of a drive in a rebuilt log, from its plans and the replayed vehicles.
+"""HUGSIM's HD-Score of a drive in a reconstructed log, from its plans and the replayed vehicles.
 
 It is the mean over all plans of NC · DAC · (5 TTC + 2 C) / 7, times route completion. Source: public
 repository hyzhou404/HUGSIM, `sim/utils/score_calculator.py`; Zhou et al., "HUGSIM", 2024. There collisions
@@ -21,7 +21,7 @@ from foredrive.driving.dynamics import EGO, STEP_S
 from foredrive.driving.observation import FRAME_DT_S
 from foredrive.driving.replay.replayed import users_at
 from foredrive.errors import InputError
-from foredrive.methods.rebuilding.tracks import ActorTracks
+from foredrive.methods.reconstruction.tracks import ActorTracks
 from foredrive.scene.boxes import VEHICLES
 
 AHEAD_S = (0.5, 1.0)

@@ -1,4 +1,4 @@
-"""Actors of a run in the scene of a rebuilt log: copies of the log's actors on ways of their own."""
+"""Actors of a run in the scene of a reconstructed log: copies of the log's actors on ways of their own."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -14,9 +14,9 @@ from foredrive.driving.ncap.scenario import Polyline
 from foredrive.driving.observation import FRAME_DT_S
 from foredrive.errors import InputError
 from foredrive.geometry.se3 import inverse_se3
-from foredrive.methods.rebuilding.edits import Duplicate, Remove, apply_edits, unused_id
-from foredrive.methods.rebuilding.scene_graph import SceneGraph
-from foredrive.methods.rebuilding.tracks import MOVES_M, move_at_least
+from foredrive.methods.reconstruction.edits import Duplicate, Remove, apply_edits, unused_id
+from foredrive.methods.reconstruction.scene_graph import SceneGraph
+from foredrive.methods.reconstruction.tracks import MOVES_M, move_at_least
 
 STANDS_M = 1e-3
 """An actor that moves less than this in `FRAME_DT_S`, m, stands."""

@@ -1,4 +1,4 @@
-"""Scenarios that are feasible in a rebuilt log: where and when each kind of test makes sense.
+"""Scenarios that are feasible in a reconstructed log: where and when each kind of test makes sense.
 
 Neuro-ncap's scenarios were placed by hand. Here they are found. A place is where the ego vehicle would be 4 s
 after it begins to drive itself, at constant speed on the logged path. A scenario is feasible if
@@ -32,7 +32,7 @@ from foredrive.driving.replay.replayed import users_at
 from foredrive.driving.replay.threats import Threat
 from foredrive.errors import InputError
 from foredrive.geometry.polylines import arc_lengths, points_at
-from foredrive.methods.rebuilding.tracks import states_at
+from foredrive.methods.reconstruction.tracks import states_at
 from foredrive.scene import Category
 
 PRIMING_FRAMES, EVERY_FRAMES = 2, 2
@@ -55,7 +55,7 @@ MODELS = 3
 
 
 def propose(place: Place, scene: str) -> list[SafetyScenario]:
-    """Return the feasible scenarios of a rebuilt log, in the order of their starts.
+    """Return the feasible scenarios of a reconstructed log, in the order of their starts.
 
     Args:
         scene: name of the reconstruction in the scenarios.

@@ -19,11 +19,11 @@ from foredrive.driving.observation import FRAME_DT_S, HORIZON_STEPS
 from foredrive.driving.plans import waypoints_of
 from foredrive.driving.replay.logged_drive import LoggedDrive
 from foredrive.driving.replay.logged_lanes import LoggedLanes
-from foredrive.driving.replay.rebuilt import RebuiltScenario, RebuiltSimulator
+from foredrive.driving.replay.reconstructed import ReconstructedScenario, ReconstructedSimulator
 from foredrive.driving.simple_agents import plan_of
 from foredrive.errors import InputError
-from foredrive.methods.rebuilding.scene_graph import SceneGraph
-from foredrive.methods.rebuilding.vehicle import LoggedVehicle
+from foredrive.methods.reconstruction.scene_graph import SceneGraph
+from foredrive.methods.reconstruction.vehicle import LoggedVehicle
 from foredrive.scene import BicycleState, Clip, Renderer, Step, Trajectory
 
 REFERENCE_S = 4.0
@@ -32,7 +32,7 @@ REFERENCE_S = 4.0
 
 @dataclass(frozen=True, eq=False)
 class Place:
-    """A rebuilt log in which tests are driven."""
+    """A reconstructed log in which tests are driven."""
 
     graph: SceneGraph
     """The scene without the actors of a test."""
@@ -48,8 +48,8 @@ class Place:
 class SafetyRun:
     """One run, ready to be driven."""
 
-    simulator: RebuiltSimulator
-    scenario: RebuiltScenario
+    simulator: ReconstructedSimulator
+    scenario: ReconstructedScenario
     drawn: DrawnRun
     pilot: Pilot
 
@@ -81,14 +81,14 @@ def set_up_run(
             f"{past_frames} earlier key frames, which this log has from {first_s:.1f} s on"
         )
     graph = place_actors(place.graph, drawn, T_world_scene, place.track_ids, moving_stay=rules.moving_stay)
-    simulator = RebuiltSimulator(place.renderer(graph), graph.all_tracks, drive, place.lanes)
-    start = RebuiltScenario(
+    simulator = ReconstructedSimulator(place.renderer(graph), graph.all_tracks, drive, place.lanes)
+    start = ReconstructedScenario(
         start_s, sensors, past_frames, ends_on_collision=True, length_s=length_s, contact=rules.contact
     )
     return SafetyRun(simulator, start, drawn, pilot_of(rules, simulator))
 
 
-def pilot_of(rules: Rules, simulator: RebuiltSimulator) -> Pilot:
+def pilot_of(rules: Rules, simulator: ReconstructedSimulator) -> Pilot:
     """Return the pilot that follows an agent's plans under some rules."""
     if rules.controller == "own":
         return FollowingPilot(simulator, rules.latency_s)
@@ -98,7 +98,7 @@ def pilot_of(rules: Rules, simulator: RebuiltSimulator) -> Pilot:
 class LqrPilot:
     """Follow plans by nuPlan's regulator every 0.1 s. States between two commands are interpolated."""
 
-    def __init__(self, simulator: RebuiltSimulator, rules: Rules) -> None:
+    def __init__(self, simulator: ReconstructedSimulator, rules: Rules) -> None:
         self._simulator, self._rules = simulator, rules
         self._plan: LqrPlan | None = None
         self._made_s = 0.0

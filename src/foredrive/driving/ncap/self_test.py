@@ -43,7 +43,7 @@ def self_test(
     """Drive `count` runs of each scenario without any action.
 
     Args:
-        place_of: returns the rebuilt log of a scenario; raises InputError if there is none.
+        place_of: returns the reconstructed log of a scenario; raises InputError if there is none.
     """
     passed, left_out = list[SafetyScenario](), dict[str, str]()
     for scenario in scenarios:

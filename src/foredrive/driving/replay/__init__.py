@@ -1,1 +1,1 @@
-"""Drives in rebuilt logs."""
+"""Drives in reconstructed logs."""

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from foredrive.driving.dynamics import EGO
 from foredrive.errors import InputError
-from foredrive.methods.rebuilding.vehicle import LoggedVehicle
+from foredrive.methods.reconstruction.vehicle import LoggedVehicle
 from foredrive.scene import BicycleState
 
 SPEED_OVER_S = 0.2
@@ -25,7 +25,7 @@ STEERS_FROM_MPS = 1.0
 
 @dataclass(frozen=True, eq=False)
 class LoggedDrive:
-    """The drive of a rebuilt log's ego vehicle, or of a vehicle at a fixed offset from it.
+    """The drive of a reconstructed log's ego vehicle, or of a vehicle at a fixed offset from it.
 
     Raises:
         InputError: there are fewer than two poses.

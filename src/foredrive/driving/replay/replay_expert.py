@@ -1,4 +1,4 @@
-"""Privileged expert for rebuilt logs: it is given the true boxes of all road users.
+"""Privileged expert for reconstructed logs: it is given the true boxes of all road users.
 
 Twice a second it chooses among plans along the logged path, each with one acceleration and one offset to the
 side, and each driven by the controller and the vehicle of our drives, as PDM-Closed does (Dauner et al.,
@@ -27,7 +27,7 @@ from foredrive.driving.dynamics import EGO, STEP_S, step
 from foredrive.driving.observation import FRAME_DT_S, HORIZON_STEPS
 from foredrive.driving.plans import fixed_in_world
 from foredrive.driving.replay.logged_drive import LoggedDrive
-from foredrive.driving.replay.rebuilt import RebuiltSimulator
+from foredrive.driving.replay.reconstructed import ReconstructedSimulator
 from foredrive.driving.replay.replayed import users_at
 from foredrive.driving.simple_agents import plan_of
 from foredrive.errors import InputError
@@ -65,9 +65,9 @@ class ToldWorld(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class ReplayedWorld:
-    """A `ToldWorld` of the simulator of a rebuilt log."""
+    """A `ToldWorld` of the simulator of a reconstructed log."""
 
-    simulator: RebuiltSimulator
+    simulator: ReconstructedSimulator
 
     def ego(self) -> BicycleState:
         """Return the state of the ego vehicle."""

@@ -1,4 +1,4 @@
-"""Actors of a rebuilt log. They replay their tracks whatever the ego vehicle does."""
+"""Actors of a reconstructed log. They replay their tracks whatever the ego vehicle does."""
 
 import numpy as np
 import torch
@@ -7,7 +7,7 @@ from torch import Tensor
 
 from foredrive.driving.collisions import Box, RoadUsers
 from foredrive.geometry.se3 import rotate_vectors, yaw_from_matrix
-from foredrive.methods.rebuilding.tracks import ActorTracks, states_at
+from foredrive.methods.reconstruction.tracks import ActorTracks, states_at
 
 
 def users_at(tracks: ActorTracks, T_world_scene: Float64[Tensor, "4 4"], t_s: float) -> RoadUsers:

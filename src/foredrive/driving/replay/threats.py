@@ -1,4 +1,4 @@
-"""Safety-critical situations in rebuilt logs.
+"""Safety-critical situations in reconstructed logs.
 
 After NeuroNCAP (Ljungbergh et al., "NeuroNCAP: Photorealistic Closed-loop Safety Testing for Autonomous
 Driving", 2024): a vehicle stands in the lane, comes head-on or crosses. An ego vehicle that drives on as in
@@ -16,8 +16,8 @@ from foredrive.driving.replay.logged_drive import LoggedDrive
 from foredrive.driving.route_progress import ARRIVED_M
 from foredrive.errors import InputError
 from foredrive.geometry.se3 import inverse_se3
-from foredrive.methods.rebuilding.edits import DriveStraight, Offset, unused_id
-from foredrive.methods.rebuilding.scene_graph import SceneGraph
+from foredrive.methods.reconstruction.edits import DriveStraight, Offset, unused_id
+from foredrive.methods.reconstruction.scene_graph import SceneGraph
 from foredrive.scene import Category
 
 AFTER_S = 4.0

@@ -1,4 +1,4 @@
-"""A rebuilt log as neuro-ncap's renderer server, plus sweeps by named lidars.
+"""A reconstructed log as neuro-ncap's renderer server, plus sweeps by named lidars.
 
 Source: public repository georghess/neurad-studio, `nerfstudio/scripts/closed_loop`: `/alive`, `/start_time`,
 `/get_actors`, `/update_actors`, `/render_image`. Ours are `/sensors` and `/render_sweep`. A rolling shutter
@@ -23,13 +23,13 @@ from foredrive.integrations.remote.planner_messages import nuscenes_name
 from foredrive.integrations.remote.sent_matrices import read_pose
 from foredrive.integrations.remote.sent_tensors import encode_tensors
 from foredrive.json_server import Answer, Raw, validated
-from foredrive.methods.rebuilding.edits import Edit, Remove, apply_edits
-from foredrive.methods.rebuilding.novel_views import novel_camera_view
-from foredrive.methods.rebuilding.rebuilt import RebuiltScene
-from foredrive.methods.rebuilding.renderer import render_sweep
-from foredrive.methods.rebuilding.scene_graph import SceneGraph
-from foredrive.methods.rebuilding.tracks import poses_at
-from foredrive.methods.rebuilding.vehicle import EgoState, LoggedVehicle
+from foredrive.methods.reconstruction.edits import Edit, Remove, apply_edits
+from foredrive.methods.reconstruction.novel_views import novel_camera_view
+from foredrive.methods.reconstruction.reconstructed import ReconstructedScene
+from foredrive.methods.reconstruction.renderer import render_sweep
+from foredrive.methods.reconstruction.scene_graph import SceneGraph
+from foredrive.methods.reconstruction.tracks import poses_at
+from foredrive.methods.reconstruction.vehicle import EgoState, LoggedVehicle
 from foredrive.sensors import SpinningLidar
 from foredrive.sensors.vehicle import LIDARS
 
@@ -79,17 +79,17 @@ class SweepRequest:
 
 
 class RenderService:
-    """Answers to the requests of a simulator that drives in a rebuilt log.
+    """Answers to the requests of a simulator that drives in a reconstructed log.
 
     Args:
-        scene: the rebuilt scene.
+        scene: the reconstructed scene.
         vehicle: the vehicle that recorded the log.
         names: the name of each actor by its track id.
         start_us: time of the log's start, microseconds.
     """
 
     def __init__(
-        self, scene: RebuiltScene, vehicle: LoggedVehicle, names: Mapping[int, str], start_us: int = 0
+        self, scene: ReconstructedScene, vehicle: LoggedVehicle, names: Mapping[int, str], start_us: int = 0
     ) -> None:
         self._scene, self._vehicle, self._start_us = scene, vehicle, start_us
         self._logged: SceneGraph = scene.graph

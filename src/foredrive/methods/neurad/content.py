@@ -11,8 +11,8 @@ from torch import Tensor
 from foredrive.errors import InputError
 from foredrive.methods.neurad.decoders import BeamDecoder, PatchDecoder
 from foredrive.methods.neurad.render import NeuralField
-from foredrive.methods.rebuilding.gaussians import Gaussians
-from foredrive.methods.rebuilding.scene_graph import Content, SceneGraph
+from foredrive.methods.reconstruction.gaussians import Gaussians
+from foredrive.methods.reconstruction.scene_graph import Content, SceneGraph
 from foredrive.methods.splatad.content import GaussianContent
 from foredrive.scene.record import Record
 

@@ -26,7 +26,7 @@ from foredrive.methods.neurad.render import (
     median_distance,
 )
 from foredrive.methods.neurad.sampling import first_borders, interpolated, resampled_borders
-from foredrive.methods.rebuilding.tracks import ActorTracks
+from foredrive.methods.reconstruction.tracks import ActorTracks
 from foredrive.ops.compositing import composite
 from foredrive.ops.ray_boxes import Crossings
 

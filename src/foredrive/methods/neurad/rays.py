@@ -8,8 +8,8 @@ from torch import Tensor
 
 from foredrive.geometry.projection import pixels_to_rays
 from foredrive.geometry.se3 import exp_se3, rotate_vectors, transform_points
-from foredrive.methods.rebuilding.rebuilt import SensorMotion
-from foredrive.methods.rebuilding.views import CameraView, SweepView
+from foredrive.methods.reconstruction.reconstructed import SensorMotion
+from foredrive.methods.reconstruction.views import CameraView, SweepView
 
 BEAM_DIVERGENCE_RAD = (3.0e-3, 1.5e-3)
 """Horizontal and vertical divergence of a lidar's beam, as in NeuRAD's reference implementation."""

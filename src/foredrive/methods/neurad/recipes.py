@@ -14,8 +14,8 @@ from foredrive.methods.neurad.config import FieldConfig, GridConfig, GridsConfig
 from foredrive.methods.neurad.decoders import PatchDecoderConfig
 from foredrive.methods.neurad.scene import FieldScene, FieldSceneConfig, saved_field
 from foredrive.methods.neurad.training import FieldRates, FieldSchedule, FieldTraining, FieldWeights
-from foredrive.methods.rebuilding.tracks import ActorTracks
-from foredrive.methods.rebuilding.training import SensorViews
+from foredrive.methods.reconstruction.tracks import ActorTracks
+from foredrive.methods.reconstruction.training import SensorViews
 from foredrive.methods.splatad.content import gaussians_of
 from foredrive.methods.splatad.initial import AHEAD_LEFT_UP, InitialGaussians, initial_scene
 

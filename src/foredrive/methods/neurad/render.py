@@ -10,7 +10,7 @@ from foredrive.methods.neurad.config import FieldConfig
 from foredrive.methods.neurad.network import ActorSamples, FieldLayers, Grids, ProposalDensity
 from foredrive.methods.neurad.rays import FieldRays
 from foredrive.methods.neurad.sampling import first_borders, resampled_borders, to_distance
-from foredrive.methods.rebuilding.tracks import MAX_HOLD_S, ActorTracks
+from foredrive.methods.reconstruction.tracks import MAX_HOLD_S, ActorTracks
 from foredrive.ops.compositing import composite
 from foredrive.ops.ray_boxes import Crossings, MovingBoxes, cross_boxes
 

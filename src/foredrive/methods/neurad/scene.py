@@ -1,4 +1,4 @@
-"""A rebuilt scene that is a neural field (Tonderski et al., "NeuRAD", 2024)."""
+"""A reconstructed scene that is a neural field (Tonderski et al., "NeuRAD", 2024)."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -26,12 +26,12 @@ from foredrive.methods.neurad.guests import (
 )
 from foredrive.methods.neurad.rays import FieldRays, beam_rays, pixel_rays
 from foredrive.methods.neurad.render import FieldActors, NeuralField, SeenAlongRays
-from foredrive.methods.rebuilding.gaussians import Gaussians
-from foredrive.methods.rebuilding.rebuilt import RebuiltScene, saved_tracks
-from foredrive.methods.rebuilding.rendered import RenderedImage, RenderedSweep
-from foredrive.methods.rebuilding.scene_graph import SceneGraph
-from foredrive.methods.rebuilding.tracks import ActorTracks
-from foredrive.methods.rebuilding.views import CameraView, SweepView
+from foredrive.methods.reconstruction.gaussians import Gaussians
+from foredrive.methods.reconstruction.reconstructed import ReconstructedScene, saved_tracks
+from foredrive.methods.reconstruction.rendered import RenderedImage, RenderedSweep
+from foredrive.methods.reconstruction.scene_graph import SceneGraph
+from foredrive.methods.reconstruction.tracks import ActorTracks
+from foredrive.methods.reconstruction.views import CameraView, SweepView
 from foredrive.methods.splatad.content import GaussianContent
 
 RAYS_AT_ONCE = 4096
@@ -53,7 +53,7 @@ class FieldSceneConfig:
     """Rows of an image and beams of a sweep have their own times. If False, all are simultaneous."""
 
 
-class FieldScene(RebuiltScene):
+class FieldScene(ReconstructedScene):
     """A field, its decoders, learned tracks and sensor corrections.
 
     Args:

@@ -25,7 +25,7 @@ from foredrive.methods.neurad.losses import (
 from foredrive.methods.neurad.rays import FieldRays
 from foredrive.methods.neurad.render import Intervals, SeenAlongRays
 from foredrive.methods.neurad.scene import FieldScene, tables_of
-from foredrive.methods.rebuilding.training import ParameterGroup, SensorViews, StepLosses
+from foredrive.methods.reconstruction.training import ParameterGroup, SensorViews, StepLosses
 from foredrive.methods.splatad.losses import drop_loss, intensity_loss
 
 PULSES = (0.03, 0.003)

@@ -9,7 +9,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from foredrive.geometry.se3 import exp_se3, rotate_vectors, sensor_twist
-from foredrive.methods.rebuilding.views import SweepView
+from foredrive.methods.reconstruction.views import SweepView
 from foredrive.ops.splat_points import TiledPoints, beam_points
 from foredrive.sensors import TimedRays
 

@@ -5,7 +5,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from foredrive.geometry.projection import distort, distortion_jacobian, pixels_to_rays
-from foredrive.methods.rebuilding.gaussians import Gaussians
+from foredrive.methods.reconstruction.gaussians import Gaussians
 from foredrive.methods.splatad.footprint import footprint, in_sensor, positions_in_sensor, through
 from foredrive.ops.splatting import Splats
 

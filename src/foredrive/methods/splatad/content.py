@@ -7,8 +7,8 @@ from jaxtyping import Int
 from torch import Tensor
 
 from foredrive.errors import InputError
-from foredrive.methods.rebuilding.gaussians import Gaussians, joined
-from foredrive.methods.rebuilding.scene_graph import Content, SceneGraph
+from foredrive.methods.reconstruction.gaussians import Gaussians, joined
+from foredrive.methods.reconstruction.scene_graph import Content, SceneGraph
 from foredrive.scene.record import Record
 
 

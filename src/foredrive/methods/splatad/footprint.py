@@ -10,7 +10,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from foredrive.geometry.se3 import hat
-from foredrive.methods.rebuilding.gaussians import Gaussians
+from foredrive.methods.reconstruction.gaussians import Gaussians
 
 MIN_RATIO = 1e-12
 """Lower bound of the ratio of areas. It keeps a gradient in the compensated opacity."""

@@ -13,9 +13,9 @@ from torch import Tensor
 
 from foredrive.geometry.quaternions import quaternion_from_matrix
 from foredrive.geometry.se3 import transform_points
-from foredrive.methods.rebuilding.gaussians import Gaussians, joined
-from foredrive.methods.rebuilding.scene_graph import STATIC, SceneGraph
-from foredrive.methods.rebuilding.seed_points import (
+from foredrive.methods.reconstruction.gaussians import Gaussians, joined
+from foredrive.methods.reconstruction.scene_graph import STATIC, SceneGraph
+from foredrive.methods.reconstruction.seed_points import (
     GREY,
     SeedPoints,
     colour_from_neighbours,
@@ -28,8 +28,8 @@ from foredrive.methods.rebuilding.seed_points import (
     subsample,
     subsample_static,
 )
-from foredrive.methods.rebuilding.tracks import ActorTracks
-from foredrive.methods.rebuilding.views import CameraView, SweepView
+from foredrive.methods.reconstruction.tracks import ActorTracks
+from foredrive.methods.reconstruction.views import CameraView, SweepView
 from foredrive.methods.splatad.content import GaussianContent
 from foredrive.methods.splatad.placing import mirrored
 

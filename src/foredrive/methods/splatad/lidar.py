@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from foredrive.methods.rebuilding.gaussians import Gaussians
+from foredrive.methods.reconstruction.gaussians import Gaussians
 from foredrive.methods.splatad.beams import sector_of
 from foredrive.methods.splatad.footprint import InSensor, footprint, in_sensor, positions_in_sensor, through
 from foredrive.ops.splatting import Splats

@@ -8,9 +8,9 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from foredrive.geometry.quaternions import multiply_quaternions, quaternion_from_matrix
-from foredrive.methods.rebuilding.gaussians import Gaussians, joined
-from foredrive.methods.rebuilding.scene_graph import SceneGraph
-from foredrive.methods.rebuilding.tracks import states_at
+from foredrive.methods.reconstruction.gaussians import Gaussians, joined
+from foredrive.methods.reconstruction.scene_graph import SceneGraph
+from foredrive.methods.reconstruction.tracks import states_at
 from foredrive.methods.splatad.content import gaussians_of
 from foredrive.scene.record import Record
 

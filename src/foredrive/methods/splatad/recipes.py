@@ -9,9 +9,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from foredrive.engine.learning_rates import Rate
-from foredrive.methods.rebuilding.decoders import CameraDecoderConfig
-from foredrive.methods.rebuilding.tracks import ActorTracks
-from foredrive.methods.rebuilding.training import SensorViews
+from foredrive.methods.reconstruction.decoders import CameraDecoderConfig
+from foredrive.methods.reconstruction.tracks import ActorTracks
+from foredrive.methods.reconstruction.training import SensorViews
 from foredrive.methods.splatad.initial import InitialGaussians, initial_scene
 from foredrive.methods.splatad.rates import LearningRates
 from foredrive.methods.splatad.scene import GaussianScene, saved_scene

@@ -1,4 +1,4 @@
-"""A rebuilt scene of Gaussians, with decoders of their features."""
+"""A reconstructed scene of Gaussians, with decoders of their features."""
 
 import functools
 import math
@@ -13,12 +13,12 @@ from torch import Tensor, nn
 from foredrive.errors import InputError
 from foredrive.geometry.projection import pixel_centres, pixels_to_rays
 from foredrive.geometry.se3 import exp_se3, inverse_se3, rotate_vectors
-from foredrive.methods.rebuilding.decoders import ALBEDO, CameraDecoder, LidarDecoder
-from foredrive.methods.rebuilding.gaussians import Gaussians
-from foredrive.methods.rebuilding.rebuilt import RebuiltScene, saved_tracks
-from foredrive.methods.rebuilding.rendered import RenderedImage, RenderedSweep
-from foredrive.methods.rebuilding.scene_graph import STATIC, SceneGraph
-from foredrive.methods.rebuilding.views import CameraView, SweepView
+from foredrive.methods.reconstruction.decoders import ALBEDO, CameraDecoder, LidarDecoder
+from foredrive.methods.reconstruction.gaussians import Gaussians
+from foredrive.methods.reconstruction.reconstructed import ReconstructedScene, saved_tracks
+from foredrive.methods.reconstruction.rendered import RenderedImage, RenderedSweep
+from foredrive.methods.reconstruction.scene_graph import STATIC, SceneGraph
+from foredrive.methods.reconstruction.views import CameraView, SweepView
 from foredrive.methods.splatad.beams import PreparedSweep, prepared_sweep
 from foredrive.methods.splatad.camera import project_camera
 from foredrive.methods.splatad.content import GaussianContent, gaussians_of
@@ -37,8 +37,8 @@ GAUSSIAN_PARAMETERS = ("mean_m", "quaternion", "log_scale", "opacity_logit", "al
 _LEAST_ALPHA = 1e-6
 
 
-class GaussianScene(RebuiltScene):
-    """A `RebuiltScene` of Gaussians (Kerbl et al., 2023), rendered as in SplatAD (Hess et al., 2025).
+class GaussianScene(ReconstructedScene):
+    """A `ReconstructedScene` of Gaussians (Kerbl et al., 2023), rendered as in SplatAD (Hess et al., 2025).
 
     Args:
         graph: initial scene of Gaussians.

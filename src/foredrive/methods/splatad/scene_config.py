@@ -1,9 +1,9 @@
-"""Settings of a rebuilt scene of Gaussians."""
+"""Settings of a reconstructed scene of Gaussians."""
 
 from dataclasses import dataclass, field
 from typing import Literal
 
-from foredrive.methods.rebuilding.decoders import CameraDecoderConfig
+from foredrive.methods.reconstruction.decoders import CameraDecoderConfig
 from foredrive.methods.splatad.camera import NEAR_M
 
 

@@ -10,9 +10,9 @@ from torch import Tensor, nn
 from torch.optim import Optimizer
 
 from foredrive.engine.ranges import check_at_least, check_shares
-from foredrive.methods.rebuilding.rendered import RenderedSweep
-from foredrive.methods.rebuilding.training import ParameterGroup, SensorViews, StepLosses, ViewOrder
-from foredrive.methods.rebuilding.views import SweepView
+from foredrive.methods.reconstruction.rendered import RenderedSweep
+from foredrive.methods.reconstruction.training import ParameterGroup, SensorViews, StepLosses, ViewOrder
+from foredrive.methods.reconstruction.views import SweepView
 from foredrive.methods.splatad.beams import PreparedSweep
 from foredrive.methods.splatad.losses import (
     drop_loss,

@@ -15,8 +15,8 @@ from torch import Tensor
 
 from foredrive.geometry.projection import project
 from foredrive.geometry.se3 import inverse_se3, transform_points
-from foredrive.methods.rebuilding.scene_graph import STATIC, SceneGraph
-from foredrive.methods.rebuilding.views import CameraView
+from foredrive.methods.reconstruction.scene_graph import STATIC, SceneGraph
+from foredrive.methods.reconstruction.views import CameraView
 from foredrive.methods.splatad import Gaussians
 from foredrive.methods.splatad.scene import GaussianScene
 

@@ -141,7 +141,7 @@ def _partly_true(*, lights: bool, users: bool) -> Callable[[AgentSetup], "Agent"
 
 def _build_of_log(setup: AgentSetup) -> "Agent":
     check_without_log(setup.agent)
-    raise AssertionError("`in_rebuilt` builds the agents that follow a log")
+    raise AssertionError("`in_reconstruction` builds the agents that follow a log")
 
 
 def _build_http(setup: AgentSetup) -> "Agent":

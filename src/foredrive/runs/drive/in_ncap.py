@@ -20,19 +20,19 @@ from foredrive.driving.ncap.scenario import SafetyScenario
 from foredrive.driving.ncap.scenario_file import load_scenarios, outside_protocol, save_scenarios
 from foredrive.driving.ncap.self_test import SelfTest, run_reference, self_test
 from foredrive.errors import InputError
-from foredrive.methods.rebuilding.renderer import RebuiltRenderer
+from foredrive.methods.reconstruction.renderer import ReconstructedRenderer
 from foredrive.runs.drive.agent_inputs import check_seeing
 from foredrive.runs.drive.agents import Sees, is_remote
-from foredrive.runs.drive.in_rebuilt import (
+from foredrive.runs.drive.in_reconstruction import (
     agent_in,
     check_lidar_of,
     lanes_of,
-    opened_rebuilt,
+    opened_reconstruction,
     past_frames_of,
     renders_for,
 )
 from foredrive.runs.drive.suite import DriveJob, DriveSetup, DriveSuite
-from foredrive.runs.rebuild.rebuilt_run import open_run_log
+from foredrive.runs.reconstruction.reconstruction_run import open_run_log
 from foredrive.towns.driving.drive_log import drive_log, log_frame
 
 
@@ -225,7 +225,7 @@ def _tested(source: SafetyTests) -> SelfTest:
 @functools.lru_cache(maxsize=1)  # consecutive runs share one scene
 def place_in(folder: str) -> Place:
     """Return a reconstruction as a place of tests."""
-    opened = opened_rebuilt(folder)
+    opened = opened_reconstruction(folder)
     ids = {str(track_id): track_id for track_id in opened.scene.graph.all_tracks.track_id.tolist()}
     with contextlib.suppress(InputError):  # without its log, actors are known by their numbers alone
         of_log = read_track_ids(Log(open_run_log(Path(folder))[1]))
@@ -233,7 +233,7 @@ def place_in(folder: str) -> Place:
     return Place(
         opened.scene.graph,
         opened.vehicle,
-        lambda graph: RebuiltRenderer(opened.scene, graph, opened.vehicle),
+        lambda graph: ReconstructedRenderer(opened.scene, graph, opened.vehicle),
         ids,
         lanes_of(Path(folder)),
     )

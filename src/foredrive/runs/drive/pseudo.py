@@ -12,7 +12,7 @@ from foredrive.data.road_maps import read_road_map
 from foredrive.driving.epdms.pseudo_simulation import PseudoScore, PseudoSimulation, figures_of
 from foredrive.driving.epdms.world import Roads
 from foredrive.driving.replay.logged_drive import LoggedDrive
-from foredrive.driving.replay.rebuilt import RebuiltSimulator
+from foredrive.driving.replay.reconstructed import ReconstructedSimulator
 from foredrive.engine.folder import SUMMARY
 from foredrive.engine.provenance import collect_provenance
 from foredrive.engine.summary import Summary, write_summary
@@ -20,8 +20,8 @@ from foredrive.errors import InputError
 from foredrive.runs.drive.agent_inputs import inputs_of
 from foredrive.runs.drive.agents import check_ready, is_remote
 from foredrive.runs.drive.in_ncap import place_in
-from foredrive.runs.drive.in_rebuilt import agent_in, check_lidar_of
-from foredrive.runs.rebuild.rebuilt_run import open_run_log
+from foredrive.runs.drive.in_reconstruction import agent_in, check_lidar_of
+from foredrive.runs.reconstruction.reconstruction_run import open_run_log
 
 _log = logging.getLogger(__name__)
 
@@ -54,7 +54,8 @@ def pseudo_simulate(
         drive = LoggedDrive(place.vehicle, torch.eye(4))
         # an agent that cannot be made here is an error of the caller, and no failed start
         agent_in(
-            agent, RebuiltSimulator(place.renderer(place.graph), place.graph.all_tracks, drive, place.lanes)
+            agent,
+            ReconstructedSimulator(place.renderer(place.graph), place.graph.all_tracks, drive, place.lanes),
         )
         simulation = PseudoSimulation(
             place,

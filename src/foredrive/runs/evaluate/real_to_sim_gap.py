@@ -14,12 +14,12 @@ from foredrive.data.resizing import shrink_images
 from foredrive.engine.provenance import collect_provenance
 from foredrive.engine.summary import write_summary
 from foredrive.errors import InputError
-from foredrive.methods.rebuilding.rebuilt import RebuiltScene
-from foredrive.methods.rebuilding.views import CameraView
+from foredrive.methods.reconstruction.reconstructed import ReconstructedScene
+from foredrive.methods.reconstruction.views import CameraView
 from foredrive.runs.evaluate.predict import AgentPredictor
 from foredrive.runs.open_clips import open_clips
-from foredrive.runs.rebuild.rebuilt_run import camera_indices, open_rebuilt, open_run_log
-from foredrive.runs.rebuild.reconstruct import read_reconstruction_data
+from foredrive.runs.reconstruction.reconstruct import read_reconstruction_data
+from foredrive.runs.reconstruction.reconstruction_run import camera_indices, open_reconstruction, open_run_log
 from foredrive.runs.train.run import Run, load_agent
 from foredrive.scene import Clip, Example, VoxelGrid
 from foredrive.tasks.evaluation.metric import Figures
@@ -37,7 +37,7 @@ _SAME_S = 1e-3
 
 
 def measure_gap(
-    run: Run, rebuilt: Path, out: Path, on_items: Callable[[int, int], None] = lambda done, of: None
+    run: Run, reconstructed: Path, out: Path, on_items: Callable[[int, int], None] = lambda done, of: None
 ) -> Figures:
     """Compare predictions on real and on rendered images at the held-out times of a reconstructed log.
 
@@ -48,15 +48,15 @@ def measure_gap(
 
     Args:
         run: its recipe must ask for cameras that were reconstructed.
-        rebuilt: folder of a reconstruction; its log must still exist.
+        reconstructed: folder of a reconstruction; its log must still exist.
         out: output folder.
         on_items: called with the number of finished times and of all times.
 
     Raises:
         InputError: a camera was not reconstructed, or no clip lies at a held-out time.
     """
-    scene, (recipe, log) = open_rebuilt(rebuilt).scene, open_run_log(rebuilt)
-    data = read_reconstruction_data(recipe, log, (rebuilt / "cache").absolute())
+    scene, (recipe, log) = open_reconstruction(reconstructed).scene, open_run_log(reconstructed)
+    data = read_reconstruction_data(recipe, log, (reconstructed / "cache").absolute())
     views = [*data.train.cameras, *data.held_out.cameras]
     clips = run.recipe.clips
     frames = max(clips.future_frames, round(STEPS * STEP_S / clips.frame_dt_s))
@@ -67,14 +67,16 @@ def measure_gap(
         future_images=False,
         now_stride_s=_SAME_S,
     )
-    dataset = open_clips([log], config, rebuilt / "cache")
+    dataset = open_clips([log], config, reconstructed / "cache")
     opened = Log(log)
     names = (_own_names(opened, names) for names in (data.vehicle.rig.names, dataset.camera_names))
     cameras, t_us, every = camera_indices(*names), opened.t_us, recipe.hold_out_every
     held_us = set(t_us[every - 1 :: every].tolist()) if every else set()
     moments = [k for k in range(len(dataset)) if dataset.now_us(k) in held_us]
     if not moments:
-        raise InputError(f"{rebuilt}: no clip as long as the run's clips has its present at a held-out frame")
+        raise InputError(
+            f"{reconstructed}: no clip as long as the run's clips has its present at a held-out frame"
+        )
     predictor = AgentPredictor(load_agent(run), clips.future_frames, 0)
     seen = RealToSimComparison(predictor, clips.image_hw)
     for done, index in enumerate(moments):
@@ -83,14 +85,14 @@ def measure_gap(
         seen.add(real, rendered_images(scene, real.clip, now_s, views, cameras))
         on_items(done + 1, len(moments))
     figures = seen.figures(clips.frame_dt_s) | {"moments": len(moments)}
-    origin = {"run": str(run.folder), "rebuilt": str(rebuilt), "log": log.name}
+    origin = {"run": str(run.folder), "reconstructed": str(reconstructed), "log": log.name}
     write_summary(out / GAP, figures | collect_provenance() | origin)
     return figures
 
 
 @torch.no_grad()
 def rendered_images(
-    scene: RebuiltScene, clip: Clip, now_s: float, views: Sequence[CameraView], cameras: Sequence[int]
+    scene: ReconstructedScene, clip: Clip, now_s: float, views: Sequence[CameraView], cameras: Sequence[int]
 ) -> Clip:
     """Return an unbatched clip whose images up to now are rendered from the scene.
 

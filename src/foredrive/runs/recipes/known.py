@@ -13,7 +13,11 @@ from foredrive.methods.driveworld.recipes import driveworld_base, driveworld_tin
 from foredrive.methods.nemo.ablations import nemo_ablations
 from foredrive.methods.nemo.recipes import BASE_BEV, TOWN_BEV, nemo_base, nemo_drive, nemo_tiny, nemo_town
 from foredrive.methods.recipe import Recipe
-from foredrive.runs.recipes.rebuilding import REBUILD_RECIPES, RebuildRecipe, rebuild_recipe_from
+from foredrive.runs.recipes.reconstruction import (
+    RECONSTRUCTION_RECIPES,
+    ReconstructionRecipe,
+    reconstruction_recipe_from,
+)
 from foredrive.runs.recipes.world_models import recipe_from
 
 RECIPES: dict[str, Recipe[Any, Any]] = {
@@ -27,7 +31,7 @@ RECIPES: dict[str, Recipe[Any, Any]] = {
 }
 
 
-AnyRecipe = Recipe[Any, Any] | DriverRecipe | RebuildRecipe[Any]
+AnyRecipe = Recipe[Any, Any] | DriverRecipe | ReconstructionRecipe[Any]
 T = TypeVar("T", bound=AnyRecipe)
 
 
@@ -50,8 +54,11 @@ KINDS: dict[type, _Kind] = {
         lambda values, source: validated(DriverRecipe, values, source),
         lambda values: values.get("kind") == "driver",
     ),
-    RebuildRecipe: _Kind(
-        "reconstruct", REBUILD_RECIPES, rebuild_recipe_from, lambda values: "representation" in values
+    ReconstructionRecipe: _Kind(
+        "reconstruct",
+        RECONSTRUCTION_RECIPES,
+        reconstruction_recipe_from,
+        lambda values: "representation" in values,
     ),
     Recipe: _Kind("train", RECIPES, recipe_from, lambda _: True),
 }

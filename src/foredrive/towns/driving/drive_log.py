@@ -1,4 +1,4 @@
-"""Writes drives in towns, on CARLA's server and in rebuilt logs as 123D logs, one frame per key frame."""
+"""Writes drives in towns, in CARLA and in reconstructed logs as 123D logs, one frame per key frame."""
 
 import dataclasses
 from pathlib import Path
@@ -21,7 +21,7 @@ from foredrive.towns.recorder import (
     write_town_map,
 )
 
-REBUILT_SPLIT = "rebuilt_test"
+RECONSTRUCTED_SPLIT = "reconstructed_test"
 
 
 def drive_log(
@@ -35,10 +35,10 @@ def drive_log(
 
     Args:
         rig: cameras of the log. Without them it has no images.
-        town: town whose map is written with the log. None for a drive in a rebuilt log.
+        town: town whose map is written with the log. None for a drive in a reconstructed log.
     """
     maps = None if town is None else write_town_map(town, out)
-    split = REBUILT_SPLIT if town is None else split_of(town)
+    split = RECONSTRUCTED_SPLIT if town is None else split_of(town)
     return LogWriter(out, split, name, [] if rig is None else camera_specs(rig), maps, town, route_xyz)
 
 

@@ -1,7 +1,7 @@
-"""A recorded drive of a town, seen by the town's own sensors: the truth beside the drive's rebuild.
+"""A recorded drive of a town, seen by the town's own sensors: the truth beside its reconstruction.
 
-The road users replay the recorded drive, as those of a rebuilt log do. So a test in the rebuild and one with
-this renderer differ in what the sensors show, and in nothing else.
+The road users replay the recorded drive, as those of a reconstructed log do. So a test in the
+reconstruction and one with this renderer differ in what the sensors show, and in nothing else.
 """
 
 from collections.abc import Mapping, Sequence
@@ -12,7 +12,7 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 
 from foredrive.errors import InputError
-from foredrive.methods.rebuilding.tracks import ActorTracks, states_at
+from foredrive.methods.reconstruction.tracks import ActorTracks, states_at
 from foredrive.scene import CameraRig, Category, Rendered
 from foredrive.scene.actors import ActorState
 from foredrive.towns.sensing.capture import SensorSuite

@@ -1,0 +1,209 @@
+"""Drives in a reconstructed log."""
+
+import contextlib
+import dataclasses
+import functools
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+
+from foredrive.data.logs import Log
+from foredrive.data.maps import read_lane_outlines
+from foredrive.driving.corridor_agent import CorridorAgent
+from foredrive.driving.ncap.outcome import judge
+from foredrive.driving.observation import FRAME_DT_S
+from foredrive.driving.replay.logged_drive import LoggedDrive
+from foredrive.driving.replay.logged_lanes import LoggedLanes
+from foredrive.driving.replay.reconstructed import ReconstructedScenario, ReconstructedSimulator
+from foredrive.driving.replay.replay_expert import ReplayedWorld, ReplayExpert
+from foredrive.driving.replay.threats import Threat, reference_mps, send_threat
+from foredrive.driving.route_progress import RouteLine
+from foredrive.driving.simple_agents import ReplayAgent
+from foredrive.errors import InputError
+from foredrive.methods.reconstruction.edits import Edit, load_edits
+from foredrive.methods.reconstruction.renderer import ReconstructedRenderer
+from foredrive.methods.reconstruction.vehicle import LoggedVehicle
+from foredrive.runs.drive.agent_inputs import inputs_of
+from foredrive.runs.drive.agents import CORRIDOR, EXPERT, REPLAY, Sees, is_remote, make_agent
+from foredrive.runs.drive.suite import DriveJob, DriveSetup, DriveSuite
+from foredrive.runs.reconstruction.reconstruction_run import (
+    OpenedReconstruction,
+    camera_indices,
+    edited_scene,
+    open_reconstruction,
+    open_run_log,
+)
+from foredrive.scene import Agent, Clip, Trajectory
+from foredrive.towns.driving.drive_log import drive_log, log_frame
+
+
+@dataclass(frozen=True)
+class ReconstructedRoutes:
+    """A `DriveSource` of drives in a reconstructed log: one for each start time and threat."""
+
+    run: str
+    """Folder of the reconstruction run."""
+    starts_s: tuple[float, ...] = ()
+    """Times of the log at which drives begin, s; empty: the first time with enough past frames."""
+    threats: tuple[Threat, ...] = ()
+    """Threats, each in its own drive from every start; empty: one drive without a threat."""
+    edits: str | None = None
+    """File of edits to the scene; None: no edits."""
+
+    in_turn = True
+    grows = ("starts_s", "threats")
+
+    def noted(self) -> Mapping[str, object]:
+        """Return the fields, and the run as the routes."""
+        return {**dataclasses.asdict(self), "routes": self.run}
+
+    def jobs(self, agent: str) -> Sequence[DriveJob]:
+        """Return one drive for each start and threat."""
+        past_frames = past_frames_of(agent)
+        _edits_of(self.edits)
+        return [job for job, _, _ in self._plan(past_frames)]
+
+    def _plan(self, past_frames: int) -> list[tuple[DriveJob, float, Threat | None]]:
+        first_s = float(opened_reconstruction(self.run).vehicle.t_s[0]) + past_frames * FRAME_DT_S
+        plan = []
+        for start_s in self.starts_s or (first_s,):
+            for threat in self.threats or (None,):
+                name = f"from{start_s:g}s" + ("" if threat is None else f"_{threat}")
+                plan.append((DriveJob(name, name), start_s, threat))
+        return plan
+
+    @contextlib.contextmanager
+    def set_up(self, job: DriveJob, suite: DriveSuite, out: Path) -> Iterator[DriveSetup]:
+        """Set up a drive in the reconstructed scene."""
+        opened, edits = opened_reconstruction(self.run), _edits_of(self.edits)
+        suite.faults.check_cameras(opened.vehicle.rig.names)
+        past_frames = past_frames_of(suite.agent)
+        _, start_s, threat = next(planned for planned in self._plan(past_frames) if planned[0] == job)
+        edited = edited_scene(opened.scene, edits)
+        drive = LoggedDrive(opened.vehicle, edited.T_ego_shifted.cpu())
+        graph = edited.graph
+        if threat is not None:
+            sent = send_threat(threat, graph, drive, start_s)
+            graph = edited_scene(opened.scene, [*edits, sent]).graph
+        renderer = ReconstructedRenderer(opened.scene, graph, opened.vehicle)
+        lanes = lanes_of(opened.folder)
+        simulator = ReconstructedSimulator(renderer, graph.all_tracks, drive, lanes)
+        sensors = renders_for(suite)
+        agent = agent_in(suite.agent, simulator)
+        route_xyz = drive.route_from(start_s)
+        rig = renderer.rig if sensors else None
+        with drive_log(out, job.name, route_xyz, rig) as log:
+            yield DriveSetup(
+                simulator,
+                ReconstructedScenario(start_s, sensors, past_frames, ends_on_collision=threat is not None),
+                agent,
+                route_xyz,
+                RouteLine(route_xyz).length_m,
+                log,
+                lambda: log_frame(simulator.state.frames[-1], simulator.state.ego, rig),
+                lanes_known=lanes is not None,
+                judge=lambda driven: (
+                    None if threat is None else judge(threat, driven, reference_mps(threat, drive, start_s))
+                ),
+            )
+
+
+@functools.lru_cache(maxsize=1)  # consecutive drives share one scene
+def opened_reconstruction(run: str) -> OpenedReconstruction:
+    """Open a reconstruction. Drives one after another in one log share it."""
+    return open_reconstruction(Path(run))
+
+
+def renders_for(suite: DriveSuite) -> bool:
+    """Return whether cameras and lidar are rendered: if they are asked for, or the agent is a learned one."""
+    inputs = inputs_of(suite.agent)
+    return suite.sensors or inputs.cameras or inputs.lidar
+
+
+def _edits_of(file: str | None) -> list[Edit]:
+    return [] if file is None else load_edits(Path(file))
+
+
+def past_frames_of(agent: str) -> int:
+    """Return the number of key frames before now that an agent observes."""
+    return inputs_of(agent).past_frames
+
+
+def lanes_of(folder: Path) -> LoggedLanes | None:
+    """Read the lanes from the map of a run's log; return None if the log or its map is missing."""
+    try:
+        outlines = read_lane_outlines(Log(open_run_log(folder)[1]))
+    except InputError:
+        return None
+    return None if outlines is None else LoggedLanes(outlines)
+
+
+def check_lidar_of(agent: str, sees: Sees | None, vehicle: LoggedVehicle, folder: str) -> None:
+    """Check that a reconstruction has the lidar that an agent cannot drive without.
+
+    Raises:
+        InputError: it has not.
+    """
+    if vehicle.lidar is None and (agent == CORRIDOR or sees in ("lidar", "both")):
+        raise InputError(f"{folder}: the reconstruction has no lidar, which {agent} is to see")
+
+
+@dataclass(frozen=True, eq=False)
+class _BlindedAgent:
+    """An agent that is shown its cameras alone, or its lidar alone."""
+
+    agent: Agent
+    cameras: bool
+
+    def act(self, observation: Clip) -> Trajectory:
+        """Hide the other sensors and return the agent's plan."""
+        if self.cameras:
+            hidden = dataclasses.replace(
+                observation,
+                sweep_valid=torch.zeros_like(observation.sweep_valid),
+                sweeps=observation.sweeps.map_tensors(torch.zeros_like),
+            )
+        else:
+            hidden = dataclasses.replace(
+                observation,
+                image_valid=torch.zeros_like(observation.image_valid),
+                images=torch.zeros_like(observation.images),
+            )
+        return self.agent.act(hidden)
+
+
+@dataclass(frozen=True, eq=False)
+class _SelectedCameras:
+    """An agent that receives only some of the cameras."""
+
+    agent: Agent
+    cameras: list[int]
+
+    def act(self, observation: Clip) -> Trajectory:
+        """Select the cameras and return the agent's plan."""
+        return self.agent.act(observation.through(self.cameras))
+
+
+def agent_in(name: str, simulator: ReconstructedSimulator, sees: Sees | None = None) -> Agent:
+    """Return the agent of a name, which sees only the cameras that it was trained on.
+
+    Args:
+        sees: what it is shown; None: all that it takes.
+    """
+    agent = _agent_in(name, simulator, sees)
+    return agent if sees in (None, "both") or is_remote(name) else _BlindedAgent(agent, sees == "camera")
+
+
+def _agent_in(name: str, simulator: ReconstructedSimulator, sees: Sees | None) -> Agent:
+    if name == REPLAY:
+        return ReplayAgent(simulator.drive, lambda: simulator.scenario.start_s + simulator.state.t_s)
+    if name == EXPERT:
+        return ReplayExpert(simulator.drive, ReplayedWorld(simulator))
+    if name == CORRIDOR:
+        return CorridorAgent(simulator.drive)
+    agent = make_agent(name, lambda: simulator.state.t_s, sees=sees)
+    cameras = [camera.lower() for camera in simulator.renderer.rig.names]
+    wanted = [camera.lower() for camera in inputs_of(name).camera_names or cameras]
+    return _SelectedCameras(agent, camera_indices(cameras, wanted)) if wanted != cameras else agent

@@ -1,1 +1,0 @@
-"""Rebuild logs as scenes that can be rendered."""

@@ -1,0 +1,1 @@
+"""Reconstruct logs as scenes that can be rendered."""

@@ -1,0 +1,135 @@
+"""Drives in a small log that was reconstructed, with cameras and lidar: kept, recorded, and looked at."""
+
+import dataclasses
+from pathlib import Path
+
+import pytest
+import synthetic_log as world
+import torch
+from builders import SMALLEST
+
+from foredrive.cli.main import main
+from foredrive.data import ClipConfig, ClipDataset, LogPath, find_logs
+from foredrive.data.drives import read_drive as read_log
+from foredrive.driving.replay.threats import Threat
+from foredrive.engine.summary import read_summary
+from foredrive.errors import InputError
+from foredrive.methods.reconstruction.renderer import ReconstructedRenderer
+from foredrive.runs import Run, evaluate_run
+from foredrive.runs.drive.in_reconstruction import REPLAY, ReconstructedRoutes
+from foredrive.runs.drive.suite import DriveSuite, drive_suite
+from foredrive.runs.reconstruction.reconstruction_run import open_reconstruction
+from foredrive.scene import Renderer, VoxelSpec
+from foredrive.view.drive_report import write_drive_report
+
+VOXELS = VoxelSpec(lower_m=(-8.0, -8.0, -1.0), voxel_m=2.0, shape_zyx=(2, 8, 8))
+
+
+@pytest.fixture(scope="module")
+def out(reconstructed: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("drives")
+    drive_suite(DriveSuite(REPLAY, ReconstructedRoutes(str(reconstructed))), folder)
+    return folder
+
+
+def test_a_renderer_shows_what_was_recorded(reconstructed: Path) -> None:
+    """As near as two steps of learning bring it: the boxes' colours, and the ground under the lidar."""
+    opened = open_reconstruction(reconstructed)
+    renderer = ReconstructedRenderer(opened.scene, opened.scene.graph, opened.vehicle)
+    assert isinstance(renderer, Renderer)
+    assert renderer.rig.names == ("ahead", "left")
+    log = read_log(find_logs(reconstructed.parent)[0], SMALLEST.image_hw)
+    twist = torch.tensor([world.EGO_SPEED_MPS, 0.0, 0.0, 0.0, 0.0, 0.0])
+    seen = renderer.render(log.T_world_ego[5], twist, float(log.t_s[5]))
+    off = (seen.images.float() - log.images[5].float()).abs().mean()
+    shuffled = (seen.images.flip(0).float() - log.images[5].float()).abs().mean()
+    assert float(off) < 0.9 * float(shuffled)
+    assert seen.sweep is not None
+    down = seen.sweep.returned & (seen.sweep.beam == 0)
+    expected_m = world.LIDAR_EGO_M[2] / -float(seen.sweep.dir_ego[down][0, 2])
+    assert float(seen.sweep.range_m[down].median()) == pytest.approx(expected_m, rel=0.3)
+
+
+def test_a_drive_is_kept_and_is_a_log_like_any_other(out: Path) -> None:
+    summary = read_summary(out / "summary.json")
+    assert (summary["drives"], summary["failed"], summary["endings.completed"]) == (1, 0, 1)
+    (log,) = find_logs(out)
+    assert log.name == "reconstructed_test/from0.5s"
+    dataset = ClipDataset([log], ClipConfig(1, 1, (24, 48), VOXELS, lidar=True), None)
+    example = dataset[0]
+    assert example.clip.command_valid.all()
+    assert dataset.command_source["route"] == len(dataset)
+    assert example.clip.images.float().std() > 5
+    assert bool(example.clip.misses_known.all())
+    assert example.clip.sweeps.returned.float().mean() > 0.1
+    ids = example.clip.boxes.track_id[example.clip.boxes.valid]
+    assert set(ids.tolist()) == {7, 11}
+    assert example.occupancy.known.any()
+    assert float(example.clip.ego_speed_mps[1]) == pytest.approx(world.EGO_SPEED_MPS, abs=0.5)
+
+
+def test_a_trained_run_drives_and_is_judged_on_what_was_driven(
+    trained: Run, reconstructed: Path, out: Path, tmp_path: Path
+) -> None:
+    suite = DriveSuite(str(trained.folder), ReconstructedRoutes(str(reconstructed)))
+    (drive,) = drive_suite(suite, tmp_path / "drives").drives.values()
+    assert drive.error == ""
+    assert drive.score.duration_s > 1
+    result = evaluate_run(trained, find_logs(out), tmp_path / "judged", views=False)
+    assert result.failures == ()
+    assert result.summary["command_source"] == "route"
+
+
+def test_what_lies_there_is_not_driven_again(reconstructed: Path, out: Path) -> None:
+    suite = DriveSuite(REPLAY, ReconstructedRoutes(str(reconstructed)))
+    file = out / "drives" / "from0.5s.json"
+    before = file.stat().st_mtime_ns
+    drive_suite(suite, out)
+    assert file.stat().st_mtime_ns == before
+    with pytest.raises(InputError, match="another suite"):
+        drive_suite(dataclasses.replace(suite, agent="stop"), out)
+
+
+def test_a_report_has_the_drive_and_its_film(out: Path) -> None:
+    page = write_drive_report(out).read_text()
+    assert 'id="from0.5s"' in page
+    assert (out / "videos" / "from0.5s.webp").stat().st_size > 1000
+
+
+def test_the_verb_drives_against_a_threat(
+    reconstructed: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """From 3 s on the log is too short to meet anybody."""
+    command = [
+        "drive",
+        "--agent",
+        "stop",
+        "--out",
+        str(tmp_path / "suite"),
+        "--in",
+        str(reconstructed),
+        "--no-sensors",
+    ]
+    assert main([*command, "--start", "3", "--threat", "side"]) == 2
+    assert "the log ends at 6.6 s, too early for an impact at 7.0 s" in capsys.readouterr().err
+    assert main([*command, "--start", "0.7"]) == 0
+    assert (tmp_path / "suite" / "report.html").is_file()
+    assert main(["drive", "--agent", "stop", "--out", str(tmp_path / "other"), "--start", "1"]) == 2
+    assert "--in RUN" in capsys.readouterr().err
+    assert main([*command[:2], "disturbed", "--out", str(tmp_path / "other"), *command[5:]]) == 2
+    assert "can drive only there" in capsys.readouterr().err
+    assert main([*command, "--rig", "driving"]) == 2
+    assert "do not go with --in: the cameras are the log's" in capsys.readouterr().err
+
+
+def test_scores_of_threats_stand_in_the_summary(reconstructed: Path, tmp_path: Path) -> None:
+    suite = DriveSuite(
+        REPLAY, ReconstructedRoutes(str(reconstructed), threats=(Threat.STATIONARY,)), sensors=False
+    )
+    (drive,) = drive_suite(suite, tmp_path).drives.values()
+    assert drive.threat is not None
+    assert drive.threat.reference_mps == pytest.approx(world.EGO_SPEED_MPS, abs=0.1)
+    assert drive.threat.impact_mps == pytest.approx(world.EGO_SPEED_MPS, abs=0.5)
+    assert read_summary(tmp_path / "summary.json")["threats.stationary.collision_rate"] == 1.0
+    assert drive.score.infractions[0].kind == "collision_vehicle"
+    assert LogPath(tmp_path / drive.log, tmp_path / "maps").folder.is_dir()
