@@ -166,9 +166,17 @@ def find_gaps(
 @numba.njit(cache=True)
 @no_type_check
 def _find_gaps(motion, lanes, target, side):
-    length, sides, successors = lanes
-    active, path, starts, front, rear = motion[:5]
-    count = len(active)
+    """Return leader, gap to it, follower and gap to it of each vehicle in its target lane.
+
+    Args:
+        motion: `MotionArrays` of N vehicles.
+        lanes: lengths, sides and successors of all lanes.
+        target: [N] the lane, or -1 for a vehicle that does not consider a change.
+        side: side on which the lane is.
+    """
+    length, sides, _ = lanes
+    front, rear, path = motion.front_m, motion.rear_m, motion.path
+    count = len(front)
     leader, follower = np.full(count, -1), np.full(count, -1)
     leader_gap, follower_gap = np.full(count, np.inf), np.full(count, np.inf)
     if not (target >= 0).any():
@@ -177,53 +185,79 @@ def _find_gaps(motion, lanes, target, side):
     for i in range(count):
         if target[i] < 0:
             continue
-        # The vehicle is thought into the target lane, beside its present place.
-        half = 0.5 * (front[i] - rear[i])
+        # The vehicle is thought into the target lane, beside its present place
         centre = project_to_neighbour(
             path[i, BEHIND], 0.5 * (front[i] + rear[i]), 1 if side == LEFT else -1, sides
         )
-        # Ahead: along the lanes beside the path, until the nearest leader or the end of such lanes.
-        lane, start = target[i], 0.0
-        for k in range(BEHIND + 1, WINDOW):
-            entry = on.head[lane]
-            while entry >= 0:
-                j, rear_j = on.who[entry], start + on.rear_m[entry]
-                entry = on.following[entry]
-                is_ahead = rear_j + 0.5 * (front[j] - rear[j]) >= centre
-                if j != i and is_ahead and rear_j - centre - half < leader_gap[i]:
-                    leader[i], leader_gap[i] = j, rear_j - centre - half
-            start += length[lane]
-            if path[i, k] < 0 or start - centre - half > min(leader_gap[i], LOOKAHEAD_M):
-                break
-            beside, ahead = sides.lane[side, path[i, k]], successors[lane]
-            lane = beside if beside >= 0 and (ahead == beside).any() else ahead[0]
-            if lane < 0:
-                break
-        # Behind: every vehicle whose own path leads into the target lane, however it gets there.
-        for j in range(count):
-            if not active[j] or j == i:
-                continue
-            for k in range(BEHIND, WINDOW):
-                lane_j = path[j, k]
-                if lane_j < 0 or starts[j, k] - front[j] > LOOKAHEAD_M:
-                    break
-                front_j = front[j] - starts[j, k]
-                if lane_j != target[i]:
-                    # It counts too if it is leaving the target lane and not yet clear of it.
-                    over = k > BEHIND and -front_j > motion.to_clear_m[j]
-                    if over or neighbour_lane(lane_j, motion.beside[j], sides) != target[i]:
-                        continue
-                    # Measured from its rear, as above. Otherwise in a curve no vehicle would be ahead of it
-                    # or behind it.
-                    length_j = front[j] - rear[j]
-                    front_j = (
-                        project_to_neighbour(lane_j, front_j - length_j, motion.beside[j], sides) + length_j
-                    )
-                is_behind = front_j - 0.5 * (front[j] - rear[j]) < centre
-                if is_behind and centre - half - front_j < follower_gap[i]:
-                    follower[i], follower_gap[i] = j, centre - half - front_j
-                break
+        leader[i], leader_gap[i] = _leader_beside(i, centre, motion, on, lanes, target[i], side)
+        follower[i], follower_gap[i] = _follower_beside(i, centre, motion, sides, target[i])
     return leader, leader_gap, follower, follower_gap
+
+
+@numba.njit(cache=True)
+@no_type_check
+def _leader_beside(i, centre, motion, on, lanes, target, side):
+    """Return the next vehicle ahead of vehicle i in the lane beside it, and the gap to it; -1 for none.
+
+    Args:
+        centre: distance of the vehicle's middle along the target lane.
+        on: `Occupants` of all lanes.
+    """
+    length, sides, successors = lanes
+    front, rear, path = motion.front_m, motion.rear_m, motion.path
+    half, leader, gap = 0.5 * (front[i] - rear[i]), -1, np.inf
+    # Along the lanes beside the path, until the nearest leader or the end of such lanes
+    lane, start = target, 0.0
+    for k in range(BEHIND + 1, WINDOW):
+        entry = on.head[lane]
+        while entry >= 0:
+            j, rear_j = on.who[entry], start + on.rear_m[entry]
+            entry = on.following[entry]
+            is_ahead = rear_j + 0.5 * (front[j] - rear[j]) >= centre
+            if j != i and is_ahead and rear_j - centre - half < gap:
+                leader, gap = j, rear_j - centre - half
+        start += length[lane]
+        if path[i, k] < 0 or start - centre - half > min(gap, LOOKAHEAD_M):
+            break
+        # The next lane is that beside the path, if the present one leads into it
+        beside, ahead = sides.lane[side, path[i, k]], successors[lane]
+        lane = beside if beside >= 0 and (ahead == beside).any() else ahead[0]
+        if lane < 0:
+            break
+    return leader, gap
+
+
+@numba.njit(cache=True)
+@no_type_check
+def _follower_beside(i, centre, motion, sides, target):
+    """Return the next vehicle behind vehicle i in the lane beside it, and the gap to it; -1 for none.
+
+    It is searched among all vehicles whose own path leads into the target lane, however they get there.
+    """
+    front, rear, path, starts = motion.front_m, motion.rear_m, motion.path, motion.starts_m
+    half, follower, gap = 0.5 * (front[i] - rear[i]), -1, np.inf
+    for j in range(len(front)):
+        if not motion.active[j] or j == i:
+            continue
+        for k in range(BEHIND, WINDOW):
+            lane_j = path[j, k]
+            if lane_j < 0 or starts[j, k] - front[j] > LOOKAHEAD_M:
+                break
+            front_j = front[j] - starts[j, k]
+            if lane_j != target:
+                # It counts too if it is leaving the target lane and not yet clear of it
+                is_clear = k > BEHIND and -front_j > motion.to_clear_m[j]
+                if is_clear or neighbour_lane(lane_j, motion.beside[j], sides) != target:
+                    continue
+                # Measured from its rear, as above. Otherwise in a curve no vehicle would be ahead of it or
+                # behind it
+                length_j = front[j] - rear[j]
+                front_j = project_to_neighbour(lane_j, front_j - length_j, motion.beside[j], sides) + length_j
+            is_behind = front_j - 0.5 * (front[j] - rear[j]) < centre
+            if is_behind and centre - half - front_j < gap:
+                follower, gap = j, centre - half - front_j
+            break
+    return follower, gap
 
 
 def incentive(
