@@ -45,5 +45,5 @@ def test_the_verb_writes_a_picture_and_says_how_good_it_is(
 def test_an_unknown_recipe_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     log = world.write(tmp_path, frames=2)
     assert main(["reconstruct", str(log), "--out", str(tmp_path / "run"), "--recipe", "huge"]) == 2
-    assert "no recipe 'huge' to reconstruct logs; `foredrive recipes` lists all" in capsys.readouterr().err
+    assert "no recipe 'huge'; `foredrive recipes` lists all" in capsys.readouterr().err
     assert not (tmp_path / "run").exists()
