@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -11,6 +12,7 @@ from hypothesis import strategies as st
 from foredrive.errors import InputError
 from foredrive.search.find import collapse, find
 from foredrive.search.index import FrameIndex, IndexSettings, Part
+from foredrive.search.projection import project_scenes
 from foredrive.search.query import Query
 from foredrive.search.rows import row_schema
 from foredrive.search.saved import add_tag, remove_tag, save_query, saved_queries, tagged
@@ -202,6 +204,30 @@ def test_parts_are_put_in_once(index: FrameIndex) -> None:
     index.drop(LOGS[0])
     assert {part.log for part in index.parts()} == set(LOGS[1:])
     assert index.count() == 4 * FRAMES
+
+
+@pytest.mark.parametrize(("spacing", "most"), [(1, 119), (5, 24), (1, 7)])
+def test_of_too_many_scenes_an_even_part_is_on_the_plane(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, spacing: int, most: int
+) -> None:
+    """The index has 120 scenes whose frames are `spacing` apart; 24 is every fifth."""
+    monkeypatch.setattr("foredrive.search.projection.MOST_POINTS", most)
+    rows = made_rows()
+    frame = rows.schema.get_field_index("frame")
+    rows = rows.set_column(frame, rows.schema[frame], pc.multiply(rows["frame"], spacing).cast("int32"))
+    backwards = rows.take(np.arange(len(rows))[::-1])
+    chosen = []
+    for name, order in (("one", rows), ("other", backwards)):
+        index = FrameIndex.make(str(tmp_path / name), MAKING)
+        index.add([(Part("all", 0, spacing * (FRAMES - 1), "digest"), order)])
+        plane = project_scenes(index)
+        assert plane.total == len(LOGS) * FRAMES
+        assert most / 2 <= len(plane.rows) <= most
+        assert len(plane.xy) == len(plane.rows)
+        chosen.append(sorted(row.key for row in plane.rows))
+        count = [sum(row.log == log for row in plane.rows) for log in LOGS]
+        assert max(count) - min(count) <= 1
+    assert chosen[0] == chosen[1]  # whatever the order of the rows
 
 
 def test_an_index_is_its_towers_own(index: FrameIndex, tmp_path: Path) -> None:
