@@ -6,6 +6,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 import pytest
+from full_disk import files_up_to
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -178,6 +179,40 @@ def test_scores_rank_and_mix_with_likeness(index: FrameIndex, target: Target) ->
     assert [hit.row.t_us for hit in alone] == [hit.row.t_us for hit in worst]
     mixed = find(index, Query(text="x", by="score_missed", mix=0.5, top=1), target).hits[0]
     assert mixed.row.log == LOGS[1]
+
+
+FULL_AT = [0, *(2**n for n in range(6, 18))]
+"""Sizes of files, bytes, from one at which nothing can be written to one at which everything can."""
+
+
+def test_scores_on_a_full_disk_lose_no_rows(index: FrameIndex) -> None:
+    missed = {f"{log}@{1_000_000 + 500_000 * n}": {"missed": float(n)} for log in LOGS for n in range(FRAMES)}
+    full = []
+    for size in FULL_AT:
+        try:
+            with files_up_to(size):
+                index.set_scores(missed)
+        except (OSError, RuntimeError):
+            full.append(size)
+        left = FrameIndex(index.uri)
+        assert left.count() == 6 * FRAMES
+        assert left.count("image IS NOT NULL") == 6 * FRAMES
+        assert left.count("lidar IS NOT NULL") == 4 * FRAMES
+        assert left.count("score_missed IS NOT NULL") == (0 if size in full else 6 * FRAMES)
+    assert 0 < len(full) < len(FULL_AT)
+
+
+def test_a_query_on_a_full_disk_leaves_the_older_one(index: FrameIndex) -> None:
+    save_query(index.uri, "wet", "old")
+    full = []
+    for size in FULL_AT:
+        try:
+            with files_up_to(size):
+                save_query(index.uri, "wet", "new")
+        except (OSError, RuntimeError):
+            full.append(size)
+        assert saved_queries(index.uri) == {"wet": "old" if size in full else "new"}
+    assert 0 < len(full) < len(FULL_AT)
 
 
 def test_tags_and_queries_are_kept(index: FrameIndex, target: Target) -> None:
