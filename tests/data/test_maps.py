@@ -1,8 +1,10 @@
 """Maps shared by many logs, and the patch around the ego vehicle."""
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
+import pytest
 import synthetic_log as world
 import torch
 from py123d.datatypes import BaseMapObject, Crosswalk, Lane, LaneGroup, LaneType, RoadEdge, RoadEdgeType
@@ -12,7 +14,7 @@ from foredrive.data import ClipConfig, ClipDataset, find_logs
 from foredrive.data.log_writer import LogWriter
 from foredrive.data.logs import Log
 from foredrive.data.maps import RADIUS_M, VERTICES, read_lane_outlines, read_map_patch, write_map
-from foredrive.data.road_maps import read_road_map
+from foredrive.data.road_maps import BEYOND_M, read_road_map
 from foredrive.scene import MapKind, MapPatch, VoxelSpec
 
 
@@ -130,3 +132,27 @@ def test_roads_have_a_route_and_a_centreline(tmp_path: Path) -> None:
     assert roads.centreline[0, 0] < 50.0
     assert roads.centreline[-1, 0] > 160.0
     assert len(roads.drivable) == 5
+
+
+@pytest.mark.parametrize("wobble_m", [0.0, 0.001])
+@pytest.mark.parametrize("lane_y_m", [0.5, 50.0])
+def test_the_centreline_of_a_vehicle_that_stands_goes_straight_on(
+    tmp_path: Path, lane_y_m: float, wobble_m: float
+) -> None:
+    """It points 30° to the left, in a lane or beside all lanes; its measured positions may wobble."""
+    sides = (line(lane_y_m + 1.75), line(lane_y_m - 1.75))
+    lane = Lane(1, LaneType.SURFACE_STREET, *sides, line(lane_y_m), lane_group_id=1)
+    maps_dir = write_map([lane], "Flatland", tmp_path)
+    heading = np.array([np.cos(np.pi / 6), np.sin(np.pi / 6)])
+    T_world_ego = np.eye(4)
+    T_world_ego[:2, :2] = np.stack([heading, [-heading[1], heading[0]]], axis=1)
+    with LogWriter(tmp_path, "flat_train", "log", [], maps_dir, "Flatland", None) as writer:
+        for index in range(11):
+            T_world_ego[:3, 3] = world.WORLD_OFFSET + np.array([0.0, -wobble_m * index, 0.0])
+            writer.write(dataclasses.replace(world.frame(index, []), T_world_ego=T_world_ego.copy()))
+    roads = read_road_map(Log(find_logs(tmp_path)[0]))
+    assert roads is not None
+    assert roads.on_route == (lane_y_m < 1.75,)
+    middle = world.WORLD_OFFSET[:2] + np.array([0.0, lane_y_m if roads.on_route[0] else 0.0])
+    expected = [middle - BEYOND_M * heading, middle, middle + BEYOND_M * heading]
+    np.testing.assert_allclose(roads.centreline, expected, atol=1e-6)

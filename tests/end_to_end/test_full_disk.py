@@ -3,13 +3,12 @@
 The disk is made full by the operating system: beyond a limit on the size of files every write fails.
 """
 
-import contextlib
-import resource
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from full_disk import files_up_to
 from torch._utils import ExceptionWrapper
 
 from foredrive.cli import main as program
@@ -21,17 +20,6 @@ from foredrive.runs import Run
 Program = Callable[..., tuple[int, str]]
 RECORD = ("record", "--town", "Town02", "--seconds", "1", "--rate", "2", "--image-size", "36", "64")
 FULL = "larger than files may be here"
-
-
-@contextlib.contextmanager
-def files_up_to(size: int) -> Iterator[None]:
-    """Every write beyond `size` bytes of a file fails with EFBIG, as Python ignores SIGXFSZ."""
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
 def all_files(folder: Path) -> set[str]:

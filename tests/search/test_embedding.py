@@ -1,6 +1,7 @@
 """Rows of an index, on a log whose geometry is known in closed form."""
 
 import math
+from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
@@ -13,10 +14,12 @@ from foredrive.data import LogPath
 from foredrive.data.cameras import pinhole_cameras, read_camera
 from foredrive.data.lidar import read_sweep
 from foredrive.data.logs import Log
+from foredrive.errors import InputError
 from foredrive.geometry.projection import project
 from foredrive.geometry.se3 import inverse_se3, transform_points
 from foredrive.search.crops import Crop
 from foredrive.search.embedding import embed_frames, mean_direction, read_views
+from foredrive.search.index import FrameIndex, IndexSettings, Part
 from foredrive.search.query import Like
 from foredrive.search.rows import FACTS, WHOLE, row_schema
 from foredrive.search.sectors import Sector, blind_sectors
@@ -130,6 +133,29 @@ def test_the_crop_of_towers_applies_to_a_part_of_an_image(log: LogPath) -> None:
     assert torch.equal(part.image, camera.image[:, 4:44, 20:60])
     assert part.sector.camera is not None
     torch.testing.assert_close(part.sector.camera.K[:2, 2], camera.K[:2, 2] - torch.tensor([20.0, 4.0]))
+
+
+def test_the_name_of_an_indexed_log_is_taken_literally(
+    log: LogPath, rows: pa.Table, towers: Towers, tmp_path: Path
+) -> None:
+    index = FrameIndex.make(str(tmp_path), IndexSettings(towers.name, towers.fingerprint, towers.dim, 0.5))
+    column = rows.schema.get_field_index("log")
+    for name in ("train/a_b", "train/a-b", "train/a%b", "train/same", "val/same"):
+        named = rows.slice(0, 3).set_column(column, "log", pa.array([name] * 3))
+        key = pa.array([f"{name}@0"] * 3)
+        named = named.set_column(rows.schema.get_field_index("key"), "key", key)
+        index.add([(Part(name, 0, 0, "digest"), named)])
+
+    def moment(name: str) -> tuple[str, int]:
+        return example_views(index, Like(name, 0.0, WHOLE, None), towers).moment
+
+    for name in ("a_b", "a-b", "a%b", "train/a_b", "val/same"):
+        assert moment(name) == (log.name, Log(log).t_us[0])
+    for name in ("a+b", "%b", "b", "_ame"):
+        with pytest.raises(InputError, match="no log of this name"):
+            moment(name)
+    with pytest.raises(InputError, match="several logs have this name: train/same, val/same; add the split"):
+        moment("same")
 
 
 def test_sectors_without_cameras_share_every_return(log: LogPath) -> None:

@@ -4,13 +4,16 @@ from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 import pytest
+from full_disk import files_up_to
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from foredrive.errors import InputError
 from foredrive.search.find import collapse, find
 from foredrive.search.index import FrameIndex, IndexSettings, Part
+from foredrive.search.projection import project_scenes
 from foredrive.search.query import Query
 from foredrive.search.rows import row_schema
 from foredrive.search.saved import add_tag, remove_tag, save_query, saved_queries, tagged
@@ -178,6 +181,40 @@ def test_scores_rank_and_mix_with_likeness(index: FrameIndex, target: Target) ->
     assert mixed.row.log == LOGS[1]
 
 
+FULL_AT = [0, *(2**n for n in range(6, 18))]
+"""Sizes of files, bytes, from one at which nothing can be written to one at which everything can."""
+
+
+def test_scores_on_a_full_disk_lose_no_rows(index: FrameIndex) -> None:
+    missed = {f"{log}@{1_000_000 + 500_000 * n}": {"missed": float(n)} for log in LOGS for n in range(FRAMES)}
+    full = []
+    for size in FULL_AT:
+        try:
+            with files_up_to(size):
+                index.set_scores(missed)
+        except (OSError, RuntimeError):
+            full.append(size)
+        left = FrameIndex(index.uri)
+        assert left.count() == 6 * FRAMES
+        assert left.count("image IS NOT NULL") == 6 * FRAMES
+        assert left.count("lidar IS NOT NULL") == 4 * FRAMES
+        assert left.count("score_missed IS NOT NULL") == (0 if size in full else 6 * FRAMES)
+    assert 0 < len(full) < len(FULL_AT)
+
+
+def test_a_query_on_a_full_disk_leaves_the_older_one(index: FrameIndex) -> None:
+    save_query(index.uri, "wet", "old")
+    full = []
+    for size in FULL_AT:
+        try:
+            with files_up_to(size):
+                save_query(index.uri, "wet", "new")
+        except (OSError, RuntimeError):
+            full.append(size)
+        assert saved_queries(index.uri) == {"wet": "old" if size in full else "new"}
+    assert 0 < len(full) < len(FULL_AT)
+
+
 def test_tags_and_queries_are_kept(index: FrameIndex, target: Target) -> None:
     moments = [f"{LOGS[2]}@1500000", f"{LOGS[0]}@1000000"]
     add_tag(index.uri, "odd", moments)
@@ -202,6 +239,30 @@ def test_parts_are_put_in_once(index: FrameIndex) -> None:
     index.drop(LOGS[0])
     assert {part.log for part in index.parts()} == set(LOGS[1:])
     assert index.count() == 4 * FRAMES
+
+
+@pytest.mark.parametrize(("spacing", "most"), [(1, 119), (5, 24), (1, 7)])
+def test_of_too_many_scenes_an_even_part_is_on_the_plane(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, spacing: int, most: int
+) -> None:
+    """The index has 120 scenes whose frames are `spacing` apart; 24 is every fifth."""
+    monkeypatch.setattr("foredrive.search.projection.MOST_POINTS", most)
+    rows = made_rows()
+    frame = rows.schema.get_field_index("frame")
+    rows = rows.set_column(frame, rows.schema[frame], pc.multiply(rows["frame"], spacing).cast("int32"))
+    backwards = rows.take(np.arange(len(rows))[::-1])
+    chosen = []
+    for name, order in (("one", rows), ("other", backwards)):
+        index = FrameIndex.make(str(tmp_path / name), MAKING)
+        index.add([(Part("all", 0, spacing * (FRAMES - 1), "digest"), order)])
+        plane = project_scenes(index)
+        assert plane.total == len(LOGS) * FRAMES
+        assert most / 2 <= len(plane.rows) <= most
+        assert len(plane.xy) == len(plane.rows)
+        chosen.append(sorted(row.key for row in plane.rows))
+        count = [sum(row.log == log for row in plane.rows) for log in LOGS]
+        assert max(count) - min(count) <= 1
+    assert chosen[0] == chosen[1]  # whatever the order of the rows
 
 
 def test_an_index_is_its_towers_own(index: FrameIndex, tmp_path: Path) -> None:

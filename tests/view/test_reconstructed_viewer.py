@@ -1,9 +1,12 @@
 """The page of a reconstructed log: what is on it, what its controls do, what it says of faults."""
 
+import contextlib
 import dataclasses
 import threading
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -107,6 +110,32 @@ def test_an_actor_stays_where_it_is_dragged(page: Page) -> None:
     assert node(page, f"/scene/actors/{PARKED}").position == pytest.approx(
         start + np.array([2.0, -1.0, 0.0]), abs=0.05
     )
+
+
+def test_an_actor_may_be_removed_while_the_log_plays(page: Page, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One thread waits in the middle of drawing until the other edits, unless they keep each other out."""
+    both, draw = threading.Barrier(2), page.nodes.show
+
+    def meet(*_: object) -> None:
+        with contextlib.suppress(threading.BrokenBarrierError):
+            both.wait(timeout=1.0)
+
+    def draw_together(*args: Any) -> None:
+        meet()
+        draw(*args)
+
+    monkeypatch.setattr(page.nodes, "show", draw_together)
+    page.edits.actor.on_update(meet)  # called while the list of actors is set anew
+    steps = (partial(page.show, 0.2), partial(page.edits.add, Remove(MOVING)))
+    threads = [threading.Thread(target=step, daemon=True) for step in steps]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(timeout=30.0)
+    assert [thread.is_alive() for thread in threads] == [False, False]
+    assert page.edits.edits == [Remove(MOVING)]
+    assert node(page, f"/scene/actors/{MOVING}") is None
+    assert node(page, "/scene").position[0] == pytest.approx(-0.2 * world.EGO_SPEED_MPS, abs=0.02)
 
 
 def test_copies_are_chosen_and_have_ids_of_their_own(page: Page, run: OpenedReconstruction) -> None:

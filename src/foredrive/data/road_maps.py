@@ -21,7 +21,8 @@ def read_road_map(log: Log) -> RoadMap | None:
     """Read the roads within `RADIUS_M` of a log's drive. Return None without a map, or without lanes.
 
     Lanes of the route are those that the log drives along, and the others of their lane groups. The
-    centreline is the middle of the driven lanes; where the log drives in no lane, it is the driven path.
+    centreline is the middle of the driven lanes; where the log drives in no lane, it is the driven path. It
+    goes straight on along the heading of a vehicle that stands.
 
     Raises:
         InputError: the map cannot be read.
@@ -52,7 +53,7 @@ def read_road_map(log: Log) -> RoadMap | None:
         on_route=on_route,
         drivable=(*outlines, *(ring for rings in areas.values() for ring in rings)),
         intersections=areas[MapLayer.INTERSECTION],
-        centreline=_centreline(lanes, along, driven),
+        centreline=_centreline(lanes, along, log),
     )
 
 
@@ -79,21 +80,21 @@ def _driven_along(lane: Lane, ring: Float64[np.ndarray, "V 2"], log: Log) -> Boo
     return np.asarray(inside & ((step * forward).sum(axis=1) > 0))
 
 
-def _centreline(
-    lanes: list[Lane], along: Bool[np.ndarray, "L F"], driven: Float64[np.ndarray, "F 2"]
-) -> Float64[np.ndarray, "N 2"]:
-    points = [driven[0]]
-    for frame, xy in enumerate(driven):
+def _centreline(lanes: list[Lane], along: Bool[np.ndarray, "L F"], log: Log) -> Float64[np.ndarray, "N 2"]:
+    points = list[np.ndarray]()
+    for frame, xy in enumerate(log.T_world_ego[:, :2, 3]):
         rows = np.flatnonzero(along[:, frame]).tolist()
         spot, lines = shapely.Point(xy), [lanes[row].centerline_2d.linestring for row in rows]
         nearest = min(lines, key=spot.distance, default=None)
         if nearest is not None:
             xy = np.array(nearest.interpolate(nearest.project(spot)).coords[0][:2])
         # Points of a slow vehicle are thinned out, so that the direction between them is defined
-        if np.hypot(*(xy - points[-1])) >= SPACING_M or frame == 0:
+        if not points or np.hypot(*(xy - points[-1])) >= SPACING_M:
             points.append(xy)
-    line = np.stack(points[1:] if len(points) > 2 else [driven[0], driven[-1]])
-    first, last = line[1] - line[0], line[-1] - line[-2]
+    line = np.stack(points)
+    # A vehicle that stands has no direction of motion, or that of the noise in its positions
+    heading = log.T_world_ego[0, :2, 0]
+    first, last = (line[1] - line[0], line[-1] - line[-2]) if len(line) > 1 else (heading, heading)
     return np.vstack(
         [line[0] - BEYOND_M * first / np.hypot(*first), line, line[-1] + BEYOND_M * last / np.hypot(*last)]
     )

@@ -29,6 +29,8 @@ _REMEMBERED = b"foredrive"
 _PART_SCHEMA = pa.schema(
     [("log", pa.string()), ("first", pa.int32()), ("last", pa.int32()), ("digest", pa.string())]
 )
+BAD_VECTORS = "null"
+"""Rows may lack an embedding. By default LanceDB rejects them."""
 Scores = Mapping[str, Mapping[str, float]]
 """Scores by the key of a moment, then by the names in `rows.SCORES`."""
 SCORED_AT_ONCE = 2000
@@ -122,7 +124,7 @@ class FrameIndex:
         with naming(self.uri):
             # The list of parts is written last: the next call replaces what an interrupted one has added
             self._frames.delete(f"key IN ({quoted_list(rows['key'].unique().to_pylist())})")
-            self._put(rows)
+            self._frames.add(rows, on_bad_vectors=BAD_VECTORS)
             make_table(self.uri, PARTS, _PART_SCHEMA).add(part_table)
 
     def drop(self, log: str) -> None:
@@ -219,10 +221,9 @@ class FrameIndex:
                 values = [scores[key].get(name) for key in rows["key"].to_pylist()]
                 column = rows.schema.get_field_index(field.name)
                 rows = rows.set_column(column, field, pa.array(values, field.type))
-            self._frames.delete(where)
-            self._put(rows)
+            with naming(self.uri):
+                # One transaction: a process stopped between deleting and adding would lose the rows
+                replacing = self._frames.merge_insert(["key", "view"]).when_matched_update_all()
+                replacing.execute(rows, on_bad_vectors=BAD_VECTORS)
             changed += len(rows)
         return changed
-
-    def _put(self, rows: pa.Table) -> None:
-        self._frames.add(rows, on_bad_vectors="null")  # By default rows without an embedding are rejected

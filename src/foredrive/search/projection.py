@@ -9,7 +9,7 @@ from numpy import ndarray
 from foredrive.search.find import vectors_of
 from foredrive.search.index import FrameIndex
 from foredrive.search.rows import FACTS, WHOLE, IndexRow
-from foredrive.search.tables import quoted
+from foredrive.search.tables import quoted, quoted_list
 
 MOST_POINTS = 5000
 
@@ -30,9 +30,10 @@ def project_scenes(index: FrameIndex) -> Plane:
     """Compute the principal components of the image embeddings of whole scenes."""
     where = f"view = {quoted(WHOLE)} AND image IS NOT NULL"
     total = index.count(where)
-    step = -(-total // MOST_POINTS) if total else 1
-    if step > 1:
-        where += f" AND frame % {step} = 0"
+    if total > MOST_POINTS:
+        # Sorted, so that the choice depends neither on the order of rows nor on the spacing of frames
+        keys = sorted(index.select(where, ["key"])["key"].to_pylist())
+        where += f" AND key IN ({quoted_list(keys[:: -(-total // MOST_POINTS)])})"
     rows = index.select(where, [*FACTS.names, "image"])
     vectors = vectors_of(rows, "image")
     if len(vectors) < 2:

@@ -44,9 +44,11 @@ def where_tagged(uri: str, tag: str) -> str:
 def save_query(uri: str, name: str, query: str) -> None:
     """Save a query. It replaces a query of the same name."""
     with naming(uri):
-        table = make_table(uri, "queries", _QUERIES)
-        table.delete(f"name = {quoted(name)}")
-        table.add(pa.Table.from_pylist([{"name": name, "query": query}], schema=_QUERIES))
+        # One transaction, so that the older query is there until the new one is
+        replacing = make_table(uri, "queries", _QUERIES).merge_insert("name")
+        replacing.when_matched_update_all().when_not_matched_insert_all().execute(
+            pa.Table.from_pylist([{"name": name, "query": query}], schema=_QUERIES)
+        )
 
 
 def saved_queries(uri: str) -> dict[str, str]:

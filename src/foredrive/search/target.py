@@ -108,9 +108,10 @@ def _find_log(index: FrameIndex | None, name: str) -> LogPath:
     if index is None:
         raise InputError(f"{name}: no folder of a log")
     # The name without its split is accepted if only one log of the index has it
-    ends = quoted("%/" + name.replace("%", ""))
+    end = quoted("/" + name)
     rows = index.select(
-        f"view = {quoted(WHOLE)} AND (log = {quoted(name)} OR log LIKE {ends})", ["log", "folder", "maps_dir"]
+        f"view = {quoted(WHOLE)} AND (log = {quoted(name)} OR ends_with(log, {end}))",
+        ["log", "folder", "maps_dir"],
     ).to_pylist()
     logs = {row["log"]: LogPath(Path(row["folder"]), Path(row["maps_dir"])) for row in rows}
     if len(logs) != 1:

@@ -62,8 +62,11 @@ class EditPanel:
     ) -> None:
         self._graph, self._nodes, self._tell, self._on_change = graph, nodes, tell, on_change
         self._open = functools.lru_cache(RUNS_KEPT)(lambda run: open_reconstruction(Path(run)).scene.graph)
-        # Handlers of the page run in several threads. Re-entrant: adding an edit replaces all edits
-        self._changing = threading.RLock()
+        self.lock = threading.RLock()
+        """Held while the scene is edited or drawn, because handlers of the page run in several threads.
+
+        One lock for both: editing draws, and drawing shows the chosen actor. It is re-entrant.
+        """
         self.edits: list[Edit] = []
         self.edited: EditedScene = apply_edits(graph, [])
         self._t_s = 0.0
@@ -95,7 +98,7 @@ class EditPanel:
 
     def replace(self, edits: Sequence[Edit]) -> bool:
         """Replace the edits; return whether they can be made."""
-        with self._changing:
+        with self.lock:
             try:
                 # All edits are applied to the unedited scene, so a failure leaves the present scene unchanged
                 edited = apply_edits(self._graph, edits, self._open)
@@ -114,12 +117,12 @@ class EditPanel:
 
     def add(self, edit: Edit) -> bool:
         """Make one more edit; return whether it can be made."""
-        with self._changing:
+        with self.lock:
             return self.replace([*self.edits, edit])
 
     def drop(self) -> None:
         """Leave the chosen actor at the pose of the gizmo."""
-        with self._changing:
+        with self.lock:
             if self.chosen is None:
                 return
             tracks = self.edited.graph.tracks
@@ -203,7 +206,7 @@ class EditPanel:
             self.choose(edit.copy)
 
     def _show_chosen(self) -> None:
-        with self._changing:
+        with self.lock:
             chosen, tracks = self.chosen, self.edited.graph.tracks
             self._nodes.choose(chosen)
             states = states_at(tracks, self._t_s)

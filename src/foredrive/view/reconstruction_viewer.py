@@ -1,6 +1,5 @@
 """A page for a reconstructed log: over time, from any viewpoint, with edits."""
 
-import threading
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -157,8 +156,6 @@ class ReconstructedViewer(Page):
         super().__init__(run.folder.name, host, port)
         self.run = run
         self.server.initial_camera.far = FAR_M
-        # Handlers of the page run in several threads
-        self._showing = threading.RLock()
         self.jobs = JobRunner(self.tell)
         show_ego(self.server.scene)
         # Without gradients, because the scene is only shown
@@ -181,7 +178,7 @@ class ReconstructedViewer(Page):
 
     def show_now(self) -> None:
         """Draw the scene as it is now; the sensors' pictures follow."""
-        with self._showing, self.server.atomic():
+        with self.edits.lock, self.server.atomic():
             t_s, edited = float(self.time_s.value), self.edits.edited
             ego = self.run.vehicle.at(t_s).shifted(edited.T_ego_shifted.cpu())
             self.nodes.show(edited.graph, ego.T_scene_ego, t_s)
