@@ -305,7 +305,7 @@ def reconstructed(rows: bytes, stride: bytes) -> bytes:
     """The pickle of an image of one column; rows and their stride are opcodes."""
     storage = b"(X\x07\0\0\0storagectorch\nByteStorage\nX\x01\0\0\x000X\x03\0\0\0cpuK\x0ctQ"
     layout = b"(" + rows + b"K\x01K\x03t(" + stride + b"K\x03K\x01t"
-    return b"\x80\x02ctorch._utils\n_reconstruct_tensor_v2\n(" + storage + b"K\0" + layout + b"\x89NtR."
+    return b"\x80\x02ctorch._utils\n_rebuild_tensor_v2\n(" + storage + b"K\0" + layout + b"\x89NtR."
 
 
 def archive_of(description: bytes) -> str:

@@ -63,7 +63,7 @@ class _ImageUnpickler(pickle.Unpickler):
     """Reads the description of one uint8 tensor, and calls nothing else."""
 
     def find_class(self, module: str, name: str) -> Any:
-        if (module, name) == ("torch._utils", "_reconstruct_tensor_v2"):
+        if (module, name) == ("torch._utils", "_rebuild_tensor_v2"):
             return lambda member, offset, size, stride, *_: _Strided(member, offset, size, stride)
         if (module, name) == ("collections", "OrderedDict"):  # hooks of gradients, of which there are none
             return lambda: None
