@@ -56,8 +56,8 @@ def results(out: Path) -> dict[str, float]:
     for part in ("driven", "driven_expert"):
         summary = numbers(read_summary(out / part / "summary.json"))
         figures |= {f"{part}.{key}": summary[key] for key in ("driving_score_1_0", "completion")}
-    rebuilt = numbers(read_summary(out / "rebuilt" / "summary.json"))
-    figures |= {f"rebuilt.{key}": rebuilt[key] for key in ("psnr_db", "nearest.psnr_db", "minutes")}
+    reconstructed = numbers(read_summary(out / "reconstructed" / "summary.json"))
+    figures |= {f"rebuilt.{key}": reconstructed[key] for key in ("psnr_db", "nearest.psnr_db", "minutes")}
     return figures
 
 

@@ -54,7 +54,7 @@ KILLS = {
 """Kills of each command; fewer of those that take long."""
 KILLS_A_RUN = 3
 TOWN, IMAGE_HW = "Town02", (36, 64)
-TRAIN_STEPS, REBUILD_STEPS, BATCH_SIZE = 4, 6, 2
+TRAIN_STEPS, RECONSTRUCT_STEPS, BATCH_SIZE = 4, 6, 2
 ROUTE_M = 20.0
 START_S = 1200.0
 BAD_INPUTS = (
@@ -114,11 +114,11 @@ def train(recipe: str) -> Command:
 
 
 def reconstruct() -> Command:
-    """Rebuild the recording with few Gaussians."""
+    """Reconstruct the recording with few Gaussians."""
     out, log = ROOT / "reconstruct", str(_town().folder)
     few = {
         "initial.lidar_points": 1100, "initial.unseen_points": 400, "initial.pixel_points": 1000,
-        "initial.actor_points": 40, "schedule.steps": REBUILD_STEPS, "schedule.checkpoint_every": 1,
+        "initial.actor_points": 40, "schedule.steps": RECONSTRUCT_STEPS, "schedule.checkpoint_every": 1,
         "schedule.max_gaussians": 3000, "schedule.grow_from": 2, "schedule.grow_every": 2,
     }  # fmt: skip
     entries = [f"representation.{name}={value}" for name, value in few.items()]
@@ -269,7 +269,7 @@ BENCHMARK = Benchmark(
         "town": TOWN,
         "image_hw": IMAGE_HW,
         "train_steps": TRAIN_STEPS,
-        "rebuild_steps": REBUILD_STEPS,
+        "rebuild_steps": RECONSTRUCT_STEPS,
         "route_m": ROUTE_M,
         "bad_inputs": BAD_INPUTS,
     },

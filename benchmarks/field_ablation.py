@@ -59,7 +59,7 @@ CONFIG = {"arms": {arm: dataclasses.asdict(recipe) for arm, recipe in ARMS.items
 WORK = ROOT / study_identity(CONFIG, DECIDED_BY)
 
 
-def rebuilt(arm: str) -> Callable[[int], dict[str, float]]:
+def reconstructed(arm: str) -> Callable[[int], dict[str, float]]:
     """Return the measurement of one arm."""
 
     def measure(seed: int) -> dict[str, float]:
@@ -72,7 +72,7 @@ def rebuilt(arm: str) -> Callable[[int], dict[str, float]]:
 
 BENCHMARK = Benchmark(
     question="What are rolling shutter, ray drop, appearance codes, density and actors worth to a field?",
-    arms={arm: rebuilt(arm) for arm in ARMS},
+    arms={arm: reconstructed(arm) for arm in ARMS},
     config=CONFIG,
     decided_by=DECIDED_BY,
 )

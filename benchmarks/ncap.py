@@ -1,8 +1,8 @@
-"""Safety tests after NeuroNCAP in rebuilt towns and in PandaSet 002: `foredrive bench ncap`, hours.
+"""Safety tests after NeuroNCAP in reconstructed towns and in PandaSet 002: `foredrive bench ncap`, hours.
 
-Three drives of 20 s are recorded with six cameras and a lidar, and rebuilt in runs/safety_rebuilds, for
-`ncap-transfer` too. In each rebuild, four scenarios of each kind are driven ten times by each agent, under
-our rules, and by some under those of the paper and of its released code. `suite_minutes` counts the drives of
+Three drives of 20 s are recorded with six cameras and a lidar, and reconstructed in runs/safety_rebuilds, for
+`ncap-transfer` too. In each reconstruction, four scenarios of each kind are driven ten times by each agent,
+under our rules, and by some under those of the paper and of its released code. `suite_minutes` counts the drives of
 one suite alone, with the sensors that the agent needs. Intervals (`score_low`, `score_high`) hold 95 % over
 the runs of a town; the figures of an arm are means over its towns. PandaSet 002 lasts 5.5 s, and a proposed
 scenario 6 s or more: its arm counts the scenarios that are feasible there.
@@ -15,7 +15,13 @@ import functools
 import os
 from pathlib import Path
 
-from benchmarks.common.safety_suites import DRIVES, REBUILDING, SuiteSize, driven_suite, rebuilt_town
+from benchmarks.common.safety_suites import (
+    DRIVES,
+    RECONSTRUCTION,
+    SuiteSize,
+    driven_suite,
+    reconstructed_town,
+)
 from benchmarks.common.study import pandaset_log
 from foredrive.engine.bench import Benchmark, study_identity
 from foredrive.errors import InputError
@@ -42,7 +48,7 @@ AGENTS = {
 }
 """Agent and rules of each arm."""
 CONFIG = {
-    "rebuilding": REBUILDING,
+    "rebuilding": RECONSTRUCTION,
     "size": dataclasses.asdict(SIZE),
     "agents": {arm: list(of) for arm, of in AGENTS.items()},
 }
@@ -60,10 +66,10 @@ WORK = Path("runs/ncap") / study_identity(CONFIG, DECIDED_BY)
 
 
 def in_town(arm: str, town: str, _: int) -> dict[str, float]:
-    """Return the figures of a suite in a rebuilt town."""
+    """Return the figures of a suite in a reconstructed town."""
     drive = next(drive for drive in DRIVES if drive.town == town)
     agent, rules = AGENTS[arm]
-    return driven_suite(agent, rules, rebuilt_town(drive), SIZE, WORK, arm, WORKERS)
+    return driven_suite(agent, rules, reconstructed_town(drive), SIZE, WORK, arm, WORKERS)
 
 
 def in_pandaset(_: int) -> dict[str, float]:
@@ -78,7 +84,8 @@ def in_pandaset(_: int) -> dict[str, float]:
 
 
 BENCHMARK = Benchmark(
-    question="How safely do agents drive where a vehicle stands, comes head-on or crosses, in rebuilt logs?",
+    question="How safely do agents drive where a vehicle stands, comes head-on or crosses, in a "
+    "reconstruction?",
     arms={
         f"{arm}@{drive.town}": functools.partial(in_town, arm, drive.town)
         for drive in DRIVES

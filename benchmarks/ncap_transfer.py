@@ -1,8 +1,8 @@
-"""Whether a test in a rebuilt world predicts the real one: `foredrive bench ncap-transfer`, hours.
+"""Whether a test in a reconstructed world predicts the real one: `foredrive bench ncap-transfer`, hours.
 
-The same safety tests are driven in a town and in the rebuild of a recorded drive there. Actors and traffic
-replay in both, so that they differ in what the sensors show alone. Each agent that looks at its sensors
-drives each test once in each world. `collision_agreement` is the share of the pairs in which both or neither
+The same safety tests are driven in a town and in the reconstruction of a recorded drive there. Actors and
+traffic replay in both, so that they differ in what the sensors show alone. Each agent that looks at its
+sensors drives each test once in each world. `collision_agreement` is the share of the pairs in which both or neither
 end in a collision, and `score_correlation` is that of the scores (Pearson). Arms are AGENT_KIND@TOWN; without
 a kind or a town they are over all, and `all` is both agents. They tell where it breaks.
 
@@ -13,14 +13,14 @@ import dataclasses
 import functools
 from pathlib import Path
 
-from benchmarks.common.rebuilt_towns import TownDrive
+from benchmarks.common.reconstructed_towns import TownDrive
 from benchmarks.common.safety_pairs import Pair, PairedTests, agreement
 from benchmarks.common.safety_suites import (
     DRIVES,
-    REBUILDING,
+    RECONSTRUCTION,
     SuiteSize,
     chosen_scenarios,
-    rebuilt_town,
+    reconstructed_town,
 )
 from foredrive.driving.ncap.scenario_file import load_scenarios
 from foredrive.driving.replay.threats import Threat
@@ -30,7 +30,7 @@ SIZE = SuiteSize(runs=3)
 """3 towns x 3 kinds x 4 starts x 3 runs: 108 pairs of each agent, if all kinds are feasible four times."""
 AGENTS = {"nemo_cameras": "embedded:nemo_town", "corridor_lidar": "lidar-corridor"}
 CONFIG = {
-    "rebuilding": REBUILDING,
+    "rebuilding": RECONSTRUCTION,
     "size": dataclasses.asdict(SIZE),
     "agents": AGENTS,
 }
@@ -52,7 +52,7 @@ WORK = Path("runs/ncap_transfer") / study_identity(CONFIG, DECIDED_BY)
 @functools.lru_cache(maxsize=1)
 def tests_in(drive: TownDrive) -> PairedTests:
     """Return the paired tests of one town; the next town replaces it."""
-    return PairedTests(drive, rebuilt_town(drive))
+    return PairedTests(drive, reconstructed_town(drive))
 
 
 def pairs_of(agent: str, drive: TownDrive) -> list[Pair]:
@@ -61,7 +61,7 @@ def pairs_of(agent: str, drive: TownDrive) -> list[Pair]:
         tests_in(drive).pair(
             AGENTS[agent], scenario, number, WORK / agent / drive.town / f"{scenario.label}_rep{number}.json"
         )
-        for scenario in load_scenarios(chosen_scenarios(rebuilt_town(drive), SIZE, WORK))
+        for scenario in load_scenarios(chosen_scenarios(reconstructed_town(drive), SIZE, WORK))
         for number in range(SIZE.runs)
     ]
 
@@ -77,7 +77,7 @@ def transfer(
 EVERYONE = {"all": tuple(AGENTS), **{agent: (agent,) for agent in AGENTS}}
 EVERYWHERE = {"": DRIVES, **{f"@{drive.town}": (drive,) for drive in DRIVES}}
 BENCHMARK = Benchmark(
-    question="Does a safety test in a rebuilt world predict the same test in the real one?",
+    question="Does a safety test in a reconstructed world predict the same test in the real one?",
     arms={
         f"{who}{of_kind}{where}": functools.partial(transfer, agents, drives, kind)
         for where, drives in EVERYWHERE.items()

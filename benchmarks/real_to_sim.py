@@ -1,16 +1,16 @@
 """The real-to-sim gap: what the shipped NeMo sees and plans on recorded and on rendered images of one log.
 
 `foredrive bench real-to-sim`, with the raw PandaSet log in FOREDRIVE_REAL_DATA/pandaset. Six cameras and the
-lidar are rebuilt from every second frame; figures are of the other frames (`foredrive evaluate --in`). A seed
-is another drive of Town05 and another seed of the reconstruction; of PandaSet the reconstruction alone. Runs
-are kept in runs/real_to_sim/COMMIT, where an interrupted study continues.
+lidar are reconstructed from every second frame; figures are of the other frames (`foredrive evaluate --in`).
+A seed is another drive of Town05 and another seed of the reconstruction; of PandaSet the reconstruction alone.
+Runs are kept in runs/real_to_sim/COMMIT, where an interrupted study continues.
 """
 
 import dataclasses
 import functools
 from pathlib import Path
 
-from benchmarks.common.rebuilt_towns import TownDrive
+from benchmarks.common.reconstructed_towns import TownDrive
 from benchmarks.common.study import pandaset_log, work_folder
 from foredrive.data import LogPath
 from foredrive.engine.bench import Benchmark
@@ -45,7 +45,7 @@ LOGS = {"town05": town, "pandaset": pandaset}
 
 
 def gap(name: str, seed: int) -> dict[str, float]:
-    """Rebuild a log; return the figures of `measure_gap`, and what the reconstruction took."""
+    """Reconstruct a log; return the figures of `measure_gap`, and what the reconstruction took."""
     log, image_hw = LOGS[name](seed)
     recipe = rescheduled_recipe(dataclasses.replace(RECIPE, image_hw=image_hw), seed=seed)
     folder = WORK / f"{name}_seed{seed}"

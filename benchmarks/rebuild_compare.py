@@ -1,8 +1,8 @@
-"""Compare the representations of rebuilt logs, in quality over CPU time: `foredrive bench rebuild-compare`.
+"""Compare representations of reconstructed logs, in quality over CPU time: `foredrive bench rebuild-compare`.
 
-Each representation rebuilds PandaSet 002 (raw, in FOREDRIVE_REAL_DATA/pandaset) from the front camera and
+Each representation reconstructs PandaSet 002 (raw, in FOREDRIVE_REAL_DATA/pandaset) from the front camera and
 the lidar of every second frame, and the drive of `rebuild_town.py`, which is judged at the held-out poses,
-2 m and 3 m beside them, and after edits. ARM@kitti rebuilds a drive of 16 s without boxes,
+2 m and 3 m beside them, and after edits. ARM@kitti reconstructs a drive of 16 s without boxes,
 2011_09_26_drive_0005 (raw, in FOREDRIVE_REAL_DATA/kitti_raw). An arm ARM@LENGTH is one point of a curve: a
 whole training of a share of the recipe's steps, with its own schedule. CPU time is that of the training
 alone, on all threads.
@@ -40,7 +40,7 @@ KITTI_HW = (120, 400)
 RENAMED = {"moving.psnr_db": "psnr_driving_db", "moving.nearest.psnr_db": "nearest.psnr_driving_db"}
 DECIDED_BY = (
     "benchmarks.rebuild_town",
-    "benchmarks.common.rebuilt_towns",
+    "benchmarks.common.reconstructed_towns",
     "foredrive.geometry",
     "foredrive.methods.neurad.losses",
     "foredrive.methods.splatad.losses",
@@ -86,7 +86,7 @@ def on_pandaset(arm: str, length: str) -> Callable[[int], dict[str, float]]:
     def measure(seed: int) -> dict[str, float]:
         recipe = dataclasses.replace(shortened(RECIPES[arm], LENGTHS[length]), cameras=("pcam_f0",))
         log, folder = pandaset_log(ROOT / "pandaset"), WORK / f"{arm}_{length}_seed{seed}"
-        return {name + end: value for name, value in rebuilt(recipe, log, folder, seed).items()}
+        return {name + end: value for name, value in reconstructed(recipe, log, folder, seed).items()}
 
     return measure
 
@@ -96,13 +96,15 @@ def on_kitti(arm: str) -> Callable[[int], dict[str, float]]:
 
     def measure(seed: int) -> dict[str, float]:
         recipe = dataclasses.replace(RECIPES[arm], cameras=("image_02",), image_hw=KITTI_HW)
-        found = rebuilt(recipe, kitti_drive(ROOT / "kitti"), WORK / f"{arm}_kitti_seed{seed}", seed)
+        found = reconstructed(recipe, kitti_drive(ROOT / "kitti"), WORK / f"{arm}_kitti_seed{seed}", seed)
         return {f"kitti.{name}": value for name, value in found.items()}
 
     return measure
 
 
-def rebuilt(recipe: ReconstructionRecipe[Any], log: LogPath, folder: Path, seed: int) -> dict[str, float]:
+def reconstructed(
+    recipe: ReconstructionRecipe[Any], log: LogPath, folder: Path, seed: int
+) -> dict[str, float]:
     """Return the figures of a reconstruction, with its peak memory."""
     forget_peak("cpu")
     summary = reconstruct(rescheduled_recipe(recipe, seed=seed), log, folder, ROOT / "cache").summary
@@ -112,7 +114,7 @@ def rebuilt(recipe: ReconstructionRecipe[Any], log: LogPath, folder: Path, seed:
 
 
 def in_town(arm: str) -> Callable[[int], dict[str, float]]:
-    """Return the measurement of the views of a rebuilt town: figures VIEWS.KEY."""
+    """Return the measurement of the views of a reconstructed town: figures VIEWS.KEY."""
 
     def measure(seed: int) -> dict[str, float]:
         recipe = rescheduled_recipe(RECIPES[arm], seed=seed)
@@ -124,7 +126,7 @@ def in_town(arm: str) -> Callable[[int], dict[str, float]]:
 
 
 BENCHMARK = Benchmark(
-    question="Which representation of a rebuilt log is better: for how much CPU time, and from where?",
+    question="Which representation of a reconstructed log is better: for how much CPU time, and from where?",
     arms={f"{arm}@{length}": on_pandaset(arm, length) for length in LENGTHS for arm in RECIPES}
     | {
         f"{arm}@{where}": of(arm) for where, of in (("town", in_town), ("kitti", on_kitti)) for arm in RECIPES

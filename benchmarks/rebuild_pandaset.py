@@ -49,7 +49,7 @@ ego vehicle drives.
 """
 
 
-def rebuilt(arm: str) -> Callable[[int], dict[str, float]]:
+def reconstructed(arm: str) -> Callable[[int], dict[str, float]]:
     def measure(seed: int) -> dict[str, float]:
         recipe = rescheduled_recipe(ARMS[arm], seed=seed)
         summary = reconstruct(
@@ -61,7 +61,7 @@ def rebuilt(arm: str) -> Callable[[int], dict[str, float]]:
 
 
 BENCHMARK = Benchmark(
-    question="How well is a real log rebuilt, and what is each part of the sensor models worth?",
-    arms={arm: rebuilt(arm) for arm in ARMS},
+    question="How well is a real log reconstructed, and what is each part of the sensor models worth?",
+    arms={arm: reconstructed(arm) for arm in ARMS},
     config={"arms": {arm: dataclasses.asdict(recipe) for arm, recipe in ARMS.items()}},
 )

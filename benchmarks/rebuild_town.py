@@ -16,7 +16,7 @@ from typing import Any
 from jaxtyping import Bool
 from torch import Tensor
 
-from benchmarks.common.rebuilt_towns import TownDrive, TownTruth, TrueViews
+from benchmarks.common.reconstructed_towns import TownDrive, TownTruth, TrueViews
 from benchmarks.common.study import work_folder
 from foredrive.engine.bench import Benchmark
 from foredrive.engine.summary import numbers
@@ -99,7 +99,7 @@ def true_views(name: str) -> list[TrueViews]:
     return [truth().seen(frame, edits_of(name)) for frame in range(1, DRIVE.frames, JUDGED_EVERY)]
 
 
-def rebuilt(arm: str, seed: int) -> dict[str, float]:
+def reconstructed(arm: str, seed: int) -> dict[str, float]:
     """Return the metrics of one run, see `judged_town`, and its minutes."""
     recipe = rescheduled_recipe(ARMS[arm], seed=seed)
     run = reconstruct(recipe, DRIVE.recorded(WORK / "town"), WORK / f"{arm}_seed{seed}", WORK / "cache")
@@ -168,8 +168,8 @@ def named(prefix: str, figures: Mapping[str, float]) -> dict[str, float]:
 
 
 BENCHMARK = Benchmark(
-    question="How true is a rebuilt town off the driven lane, and with a road user removed or moved?",
-    arms={arm: functools.partial(rebuilt, arm) for arm in ARMS},
+    question="How true is a reconstructed town off the driven lane, and with a road user removed or moved?",
+    arms={arm: functools.partial(reconstructed, arm) for arm in ARMS},
     config={
         "drive": dataclasses.asdict(DRIVE),
         "views": NAMES,

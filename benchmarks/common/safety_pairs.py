@@ -1,4 +1,4 @@
-"""One safety test twice: seen by the town's own sensors, and by those of the town's rebuild."""
+"""One safety test twice: seen by the town's own sensors, and by those of the town's reconstruction."""
 
 import dataclasses
 import json
@@ -13,7 +13,7 @@ import shapely
 from jaxtyping import Float64
 from scipy import stats
 
-from benchmarks.common.rebuilt_towns import TownDrive, TownTruth
+from benchmarks.common.reconstructed_towns import TownDrive, TownTruth
 from foredrive.driving.drive import Drive, drive_route
 from foredrive.driving.dynamics import EGO, STEP_S
 from foredrive.driving.ncap.drawing import DrawnRun, draw_run
@@ -46,11 +46,11 @@ class Driven:
 
 @dataclass(frozen=True)
 class Pair:
-    """One test in the town and in its rebuild."""
+    """One test in the town and in its reconstruction."""
 
     kind: str
     town: Driven
-    rebuilt: Driven
+    reconstructed: Driven
 
 
 class PairedTests:
@@ -58,11 +58,11 @@ class PairedTests:
 
     Args:
         drive: the recorded drive.
-        rebuilt: folder of its rebuild.
+        reconstructed: folder of its reconstruction.
     """
 
-    def __init__(self, drive: TownDrive, rebuilt: Path) -> None:
-        self._truth, self._place = TownTruth(drive), place_in(str(rebuilt))
+    def __init__(self, drive: TownDrive, reconstructed: Path) -> None:
+        self._truth, self._place = TownTruth(drive), place_in(str(reconstructed))
 
     def pair(self, agent: str, scenario: SafetyScenario, number: int, file: Path) -> Pair:
         """Return a pair; drive it unless its file is there."""
@@ -135,28 +135,28 @@ def outline(
 
 def read_pair(written: Mapping[str, Any]) -> Pair:
     """Return a pair as `PairedTests.pair` wrote it."""
-    town, rebuilt = (Driven(**written[name]) for name in ("town", "rebuilt"))
-    return Pair(written["kind"], town, rebuilt)
+    town, reconstructed = (Driven(**written[name]) for name in ("town", "reconstructed"))
+    return Pair(written["kind"], town, reconstructed)
 
 
 def agreement(pairs: Sequence[Pair]) -> dict[str, float]:
-    """Return how well tests in a rebuild predict those in the town.
+    """Return how well tests in a reconstruction predict those in the town.
 
     Pairs with a failed drive are counted and left out. Correlations are Pearson's; one without spread on one
     side is left out, since it has no value.
     """
-    whole = [pair for pair in pairs if pair.town.score is not None and pair.rebuilt.score is not None]
+    whole = [pair for pair in pairs if pair.town.score is not None and pair.reconstructed.score is not None]
     figures = {"pairs": float(len(whole)), "failed": float(len(pairs) - len(whole))}
     if not whole:
         return figures
-    collided = [[drive.outcome == "collided" for drive in (pair.town, pair.rebuilt)] for pair in whole]
-    scores = np.array([[pair.town.score, pair.rebuilt.score] for pair in whole], dtype=float)
-    away_m = np.array([[pair.town.min_distance_m, pair.rebuilt.min_distance_m] for pair in whole])
+    collided = [[drive.outcome == "collided" for drive in (pair.town, pair.reconstructed)] for pair in whole]
+    scores = np.array([[pair.town.score, pair.reconstructed.score] for pair in whole], dtype=float)
+    away_m = np.array([[pair.town.min_distance_m, pair.reconstructed.min_distance_m] for pair in whole])
     figures |= {
-        "collision_agreement": float(np.mean([town == rebuilt for town, rebuilt in collided])),
-        "outcome_agreement": float(np.mean([p.town.outcome == p.rebuilt.outcome for p in whole])),
+        "collision_agreement": float(np.mean([town == reconstructed for town, reconstructed in collided])),
+        "outcome_agreement": float(np.mean([p.town.outcome == p.reconstructed.outcome for p in whole])),
         "collisions_in_town": float(np.mean([town for town, _ in collided])),
-        "collisions_in_rebuild": float(np.mean([rebuilt for _, rebuilt in collided])),
+        "collisions_in_rebuild": float(np.mean([reconstructed for _, reconstructed in collided])),
         "score_in_town": float(scores[:, 0].mean()),
         "score_in_rebuild": float(scores[:, 1].mean()),
         "score_difference": float(np.abs(scores[:, 0] - scores[:, 1]).mean()),

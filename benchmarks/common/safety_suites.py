@@ -1,4 +1,4 @@
-"""Safety tests in rebuilt towns: the recorded drives, their rebuilds, and scenarios chosen from proposals."""
+"""Safety tests in reconstructed towns: recorded drives, reconstructions, scenarios chosen from proposals."""
 
 import dataclasses
 from collections.abc import Mapping, Sequence
@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.common.rebuilt_towns import TownDrive
+from benchmarks.common.reconstructed_towns import TownDrive
 from foredrive.driving.drive_record import DriveRecord
 from foredrive.driving.ncap.aggregation import SafetyFigures, aggregate
 from foredrive.driving.ncap.scenario import SafetyScenario
@@ -28,7 +28,7 @@ CAMERAS = ("PCAM_F0", "PCAM_L0", "PCAM_R0", "PCAM_L1", "PCAM_R1", "PCAM_B0")
 
 @dataclass(frozen=True)
 class SuiteSize:
-    """Sizes of a benchmark of safety tests in one rebuilt town."""
+    """Sizes of a benchmark of safety tests in one reconstructed town."""
 
     starts: int = 4
     """Largest number of scenarios of each kind."""
@@ -37,7 +37,7 @@ class SuiteSize:
 
 
 def safety_drive(town: str, seed: int, seconds: float = 20.0) -> TownDrive:
-    """Return a drive to rebuild: six cameras of 160 by 96 px and a lidar of 32 channels, at 10 Hz."""
+    """Return a drive to reconstruct: six cameras of 160 by 96 px and a lidar of 32 channels, at 10 Hz."""
     traffic = BackgroundTraffic(vehicles=40, pedestrians=20)
     return TownDrive(
         town, seed, seconds, background_traffic=traffic, cameras=CAMERAS, image_hw=(96, 160), lidar="hdl32e"
@@ -45,13 +45,13 @@ def safety_drive(town: str, seed: int, seconds: float = 20.0) -> TownDrive:
 
 
 DRIVES = tuple(safety_drive(town, seed) for town, seed in (("Town10HD", 3), ("Town03", 4), ("Town05", 5)))
-"""The drives that benchmarks of safety tests rebuild."""
-REBUILDING = {
+"""The drives that benchmarks of safety tests reconstruct."""
+RECONSTRUCTION = {
     "drives": [dataclasses.asdict(drive) for drive in DRIVES],
     "recipe": dataclasses.asdict(gaussians_tiny()),
 }
 WORK = Path("runs/safety_rebuilds") / study_identity(
-    REBUILDING,
+    RECONSTRUCTION,
     (
         "foredrive.methods.reconstruction",
         "foredrive.methods.splatad.training",
@@ -60,8 +60,8 @@ WORK = Path("runs/safety_rebuilds") / study_identity(
 )
 
 
-def rebuilt_town(drive: TownDrive) -> Path:
-    """Return the folder of the rebuild of a drive; record and rebuild what is missing."""
+def reconstructed_town(drive: TownDrive) -> Path:
+    """Return the folder of the reconstruction of a drive; record and reconstruct what is missing."""
     folder = WORK / "rebuilt" / drive.town
     if (folder / SUMMARY).is_file():
         return folder  # the first step of `reconstruct` takes a minute, even if nothing is left to do
@@ -70,18 +70,18 @@ def rebuilt_town(drive: TownDrive) -> Path:
     return folder
 
 
-def chosen_scenarios(rebuilt: Path, size: SuiteSize, work: Path) -> Path:
-    """Return the file of scenarios of a rebuild: of each kind some proposals, spread over the log.
+def chosen_scenarios(reconstructed: Path, size: SuiteSize, work: Path) -> Path:
+    """Return the file of scenarios of a reconstruction: of each kind some proposals, spread over the log.
 
     Raises:
         InputError: no scenario is feasible.
     """
-    file = work / "scenarios" / f"{rebuilt.name}.yaml"
+    file = work / "scenarios" / f"{reconstructed.name}.yaml"
     if not file.is_file():
-        proposed = file.with_name(f"{rebuilt.name}_proposed.yaml")
+        proposed = file.with_name(f"{reconstructed.name}_proposed.yaml")
         if not proposed.is_file():
             file.parent.mkdir(parents=True, exist_ok=True)
-            propose_scenarios((str(rebuilt),), proposed, "ours", size.runs)
+            propose_scenarios((str(reconstructed),), proposed, "ours", size.runs)
         found = load_scenarios(proposed)
         kept = [each for kind in Threat for each in spread([s for s in found if s.kind is kind], size.starts)]
         save_scenarios(kept, file)
@@ -96,9 +96,9 @@ def spread(scenarios: Sequence[SafetyScenario], count: int) -> list[SafetyScenar
 
 
 def driven_suite(
-    agent: str, rules: str, rebuilt: Path, size: SuiteSize, work: Path, arm: str, workers: int
+    agent: str, rules: str, reconstructed: Path, size: SuiteSize, work: Path, arm: str, workers: int
 ) -> dict[str, float]:
-    """Drive what is missing of the suite of a rebuild; return its figures.
+    """Drive what is missing of the suite of a reconstruction; return its figures.
 
     Args:
         work: folder of the study.
@@ -107,9 +107,9 @@ def driven_suite(
     Raises:
         InputError: no scenario is feasible, or a drive broke off.
     """
-    scenarios = chosen_scenarios(rebuilt, size, work)
-    source = SafetyTests((str(rebuilt),), str(scenarios), rules, size.runs, workers > 1)
-    driven = drive_suite(DriveSuite(agent, source, sensors=False), work / arm / rebuilt.name, workers)
+    scenarios = chosen_scenarios(reconstructed, size, work)
+    source = SafetyTests((str(reconstructed),), str(scenarios), rules, size.runs, workers > 1)
+    driven = drive_suite(DriveSuite(agent, source, sensors=False), work / arm / reconstructed.name, workers)
     if driven.broken:
         job, why = next(iter(driven.broken.items()))
         raise InputError(f"{len(driven.broken)} drives broke off, {job.name}: {why}")
