@@ -50,13 +50,13 @@ def fetch_av2(
         print("\n".join(ids[:SHOWN]))
         print(f"{min(SHOWN, len(ids))} of the {len(ids)} logs of {split}; fetch some by --log ID")
         return
-    wanted = [find_log(one, bucket, seconds=seconds, images=images) for one in log]
-    for one in wanted:
-        print(f"{one.log_id} ({one.split}): {len(one.files)} files, {_size(one.size)}", flush=True)
+    wanted = [find_log(log_id, bucket, seconds=seconds, images=images) for log_id in log]
+    for entry in wanted:
+        print(f"{entry.log_id} ({entry.split}): {len(entry.files)} files, {_size(entry.size)}", flush=True)
     if dry_run:
         return
-    with _progress(sum(one.size for one in wanted)) as tick:
-        folders = [fetch_log(one, out, at_a_time, tick, bucket) for one in wanted]
+    with _progress(sum(entry.size for entry in wanted)) as tick:
+        folders = [fetch_log(entry, out, at_a_time, tick, bucket) for entry in wanted]
     for folder in folders:
         print(f"fetched {folder}")
     print(f"next: foredrive convert av2 {folders[0]} --out data")

@@ -72,15 +72,15 @@ def rig_of_log(log: Log) -> RigPlan:
     cameras = pinhole_cameras(log).values()
     if not cameras:
         raise InputError(f"{log.path.folder}: no pinhole cameras")
-    mounted = [camera_mount(log, one) for one in cameras]
-    height, width = next((one.height, one.width) for one in cameras)
+    mounted = [camera_mount(log, camera) for camera in cameras]
+    height, width = next((camera.height, camera.width) for camera in cameras)
     return rig_of_cameras(
         CameraRig(
-            K=torch.stack([_scaled_intrinsics(one, (height, width)) for one in cameras]),
+            K=torch.stack([_scaled_intrinsics(camera, (height, width)) for camera in cameras]),
             T_ego_cam=torch.from_numpy(np.stack(mounted)),
             dist=torch.zeros(len(cameras), 5),
             readout_s=torch.zeros(len(cameras)),
-            names=tuple(one.camera_id.name for one in cameras),
+            names=tuple(camera.camera_id.name for camera in cameras),
             size_hw=(height, width),
         )
     )

@@ -114,8 +114,8 @@ def meets_somebody(along_m: Float64[np.ndarray, "T"], occupied: Bool[np.ndarray,
     moving = np.diff(along_m, prepend=0.0) / LATER_DT_S > STANDS_MPS
     start_m = CELL_M * np.arange(CELLS)
     front_m = along_m[:, None] + MARGIN_M
-    own = (start_m < front_m) & (start_m + CELL_M > front_m - MARGIN_M - EGO.length_m)
-    return bool((own & occupied[1:] & moving[:, None]).any())
+    ego_cells = (start_m < front_m) & (start_m + CELL_M > front_m - MARGIN_M - EGO.length_m)
+    return bool((ego_cells & occupied[1:] & moving[:, None]).any())
 
 
 def slowed_m(

@@ -101,15 +101,15 @@ def read_hash_grid(
     needed = max(level.first_row + level.rows for level in levels)
     if needed > len(table):
         raise ValueError(f"read_hash_grid: levels need {needed} rows, the table has {len(table)}")
-    given = (table, points) if footprint is None else (table, points, footprint)
-    if table.shape[1] in FEATURES and triton_supports(*given):
+    inputs = (table, points) if footprint is None else (table, points, footprint)
+    if table.shape[1] in FEATURES and triton_supports(*inputs):
         from foredrive.ops.hash_grid_triton import read_hash_grid_triton  # Triton may be missing
 
         return read_hash_grid_triton(table, points, levels, footprint, actor)
     small = table.numel() < MAX_ITEM_SIZE
-    if not (small and table.shape[1] in FEATURES and numba_supports(*given)):
+    if not (small and table.shape[1] in FEATURES and numba_supports(*inputs)):
         return read_hash_grid_reference(table, points, levels, footprint, actor)
-    with full_precision(*given) as (table, points, *_):
+    with full_precision(*inputs) as (table, points, *_):
         out: Tensor = _ReadHashGrid.apply(
             table, points, tuple(levels), None if footprint is None else footprint.detach().float(), actor
         )

@@ -34,11 +34,11 @@ def attend_within(
         order: indices of the tokens, set by set.
         counts: number of tokens in each set, at least 1.
     """
-    given = (query_key, value)
+    inputs = (query_key, value)
     # The kernel has no backward pass, and reads exactly one row of 16 channels per head
-    wanted = torch.is_grad_enabled() and any(t.requires_grad for t in given)
-    single = all(t.dtype == torch.float32 for t in given)
-    if wanted or not single or value.shape[1] != heads * ROW or not numba_supports(*given, order):
+    wanted = torch.is_grad_enabled() and any(t.requires_grad for t in inputs)
+    single = all(t.dtype == torch.float32 for t in inputs)
+    if wanted or not single or value.shape[1] != heads * ROW or not numba_supports(*inputs, order):
         return attend_within_reference(query_key, value, order, counts, heads)
     out = torch.empty_like(value, memory_format=torch.contiguous_format)
     # Start of each set in `order`, and the end of the last one

@@ -194,13 +194,13 @@ def neighbours(x, size):
     )
 
 
-def _unary(emit: Emit, given: types.Type = float32x16, result: types.Type = float32x16) -> Any:
+def _unary(emit: Emit, argument_type: types.Type = float32x16, result: types.Type = float32x16) -> Any:
     """Return an intrinsic of one argument."""
 
     @intrinsic
     @no_type_check
     def apply(typing_context, value):
-        return result(given), lambda context, builder, signature, args: emit(builder, *args)
+        return result(argument_type), lambda context, builder, signature, args: emit(builder, *args)
 
     return apply
 
@@ -257,7 +257,7 @@ minimum = _elementwise(_select("<"))
 """Elementwise minimum. It returns the second argument where one is NaN."""
 maximum = _elementwise(_select(">"))
 """Elementwise maximum. It returns the second argument where one is NaN."""
-broadcast = _unary(_broadcast, given=types.float32)
+broadcast = _unary(_broadcast, argument_type=types.float32)
 """Row with sixteen copies of a float32."""
 
 
@@ -269,7 +269,7 @@ greater_mask = _elementwise(_mask, result=types.uint32)
 """Integer with bit k set where a > b in lane k."""
 lowest_set_bit = _unary(
     lambda builder, bits: builder.zext(builder.cttz(bits, ir.Constant(ir.IntType(1), 1)), cgutils.intp_t),
-    given=types.uint32,
+    argument_type=types.uint32,
     result=types.intp,
 )
 """Position of the lowest set bit of a non-zero integer."""

@@ -78,8 +78,8 @@ def _counted(things: tuple[Thing, ...]) -> Iterator[str]:
     for noun in {thing.noun for thing in things}:
         manners = [thing.manners for thing in things if thing.noun == noun]
         # The empty manner stands for all objects of the noun
-        for manner in {"", *(manner for those in manners for manner in those)}:
-            count = len(manners) if not manner else sum(manner in those for those in manners)
+        for manner in {"", *(manner for thing_manners in manners for manner in thing_manners)}:
+            count = len(manners) if not manner else sum(manner in thing_manners for thing_manners in manners)
             what = f"{manner} {noun}".strip()
             yield what
             yield f"{COUNTS.get(count, MANY)} {what}"

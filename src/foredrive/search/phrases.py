@@ -89,7 +89,7 @@ def _counted(manners: Sequence[Sequence[str]], noun: str) -> str:
     """Return the number of objects of a noun, with the property of `TOLD` that all of them have."""
     number = COUNTS.get(len(manners), MANY)
     name = noun if len(manners) == 1 else PLURALS.get(noun, f"{noun}s")
-    shared = [manner for manner in TOLD if all(manner in those for those in manners)]
+    shared = [manner for manner in TOLD if all(manner in thing_manners for thing_manners in manners)]
     return MANNERS[shared[0]][0].format(f"{number} {name}") if shared else f"{number} {name}"
 
 
@@ -103,8 +103,8 @@ def _phrase(view: ViewFacts, rng: np.random.Generator) -> Phrase:
     else:
         subject, facts = _subject(view, rng)
     spoken = [_setting(fact, rng) for fact in kept]
-    said = " ".join(words for words, _ in spoken)
-    text = f"{subject} {said}".strip() if subject else _pick(ALONE, rng).format(said)
+    settings_text = " ".join(words for words, _ in spoken)
+    text = f"{subject} {settings_text}".strip() if subject else _pick(ALONE, rng).format(settings_text)
     if rng.random() < _WORDED:
         text = _pick(PROMPTS, rng).format(text)
     return Phrase(text, frozenset(facts.union(*(means for _, means in spoken))))
@@ -133,17 +133,17 @@ def _group(view: ViewFacts, noun: str, rng: np.random.Generator) -> tuple[str, s
     """Return a text and a fact about the objects of one noun with a common property."""
     assert view.things is not None
     manners = [thing.manners for thing in view.things if thing.noun == noun]
-    shared = ["", *sorted({manner for those in manners for manner in those})]
+    shared = ["", *sorted({manner for thing_manners in manners for manner in thing_manners})]
     manner = shared[int(rng.integers(len(shared)))]
-    count = len(manners) if not manner else sum(manner in those for those in manners)
+    count = len(manners) if not manner else sum(manner in thing_manners for thing_manners in manners)
     ways = ON_FOOT.get(manner, MANNERS[manner]) if noun == "pedestrian" else MANNERS[manner]
-    name, how = _pick(NAMES.get(noun, (noun,)), rng), _pick(ways, rng)
+    name, template = _pick(NAMES.get(noun, (noun,)), rng), _pick(ways, rng)
     fact = f"{manner} {noun}".strip()
     if count == 1 or rng.random() < 0.5:
-        words = how.format(name)
+        words = template.format(name)
         return f"{'an' if words[0] in 'aeio' else 'a'} {words}", fact
     number = COUNTS.get(count, MANY)
-    return f"{number} {how.format(PLURALS.get(name, f'{name}s'))}", f"{number} {fact}"
+    return f"{number} {template.format(PLURALS.get(name, f'{name}s'))}", f"{number} {fact}"
 
 
 def _pick(ways: Sequence[str], rng: np.random.Generator) -> str:

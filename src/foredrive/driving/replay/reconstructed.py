@@ -204,8 +204,10 @@ class ReconstructedSimulator:
         box = ego_box(self.drive.on_ground(moved), moved, contact.vehicle)
         behind = comes_from_behind(box, users) & (not contact.struck_counts)
         before = users.without(users.track_id[behind])
-        events, met = collide(box, moved, before, state.contacts.users, t_s)
-        struck, met = collide(box, moved, users.without(users.track_id[~behind]), met, t_s)
+        events, contact_users = collide(box, moved, before, state.contacts.users, t_s)
+        struck, contact_users = collide(
+            box, moved, users.without(users.track_id[~behind]), contact_users, t_s
+        )
         # An obstacle in front stops the vehicle where it was
         if blocked(box, before):
             moved = dataclasses.replace(state.ego, speed_mps=0.0, acceleration_mps2=0.0)
@@ -222,7 +224,7 @@ class ReconstructedSimulator:
             state,
             step_index=index,
             ego=moved,
-            contacts=Contacts(met),
+            contacts=Contacts(contact_users),
             progress=progress,
             driven_m=state.driven_m + way_m,
             outside_m=state.outside_m + way_m * outside,

@@ -29,7 +29,7 @@ _SHOWN = InitialGaussians(
     features=0,
 )
 """Coloured points for viewers."""
-_OF_A_SAMPLE, _OF_A_PIXEL = 400, 300
+_FLOATS_PER_SAMPLE, _FLOATS_PER_PIXEL = 400, 300
 """Floats that autograd keeps for each sample of the field, and for each pixel of a patch."""
 _COPIES = 4
 """Copies of each number of a grid: the value, its gradient, two moments."""
@@ -76,8 +76,8 @@ class FieldRecipe:
         rays = schedule.patches * schedule.patch**2 + schedule.beams
         # Four proposal samples are counted as one sample of the field
         samples = rays * (sizes.samples + sum(sizes.proposal_samples) / 4)
-        of_patches = 9 * schedule.patches * schedule.patch**2 * _OF_A_PIXEL
-        return 4 * (entries * _COPIES + samples * _OF_A_SAMPLE + of_patches) / 1024**3
+        patch_floats = 9 * schedule.patches * schedule.patch**2 * _FLOATS_PER_PIXEL
+        return 4 * (entries * _COPIES + samples * _FLOATS_PER_SAMPLE + patch_floats) / 1024**3
 
 
 def padded_scale_m(views: SensorViews, middle_m: Float[Tensor, "3"]) -> float:

@@ -260,18 +260,18 @@ class FieldTraining:
         for patch, part in zip(patches, parts, strict=True):
             groups[patch.size_hw].append((part.view(*patch.size_hw, -1), patch))
         squares, likeness, count = feature.new_zeros(()), feature.new_zeros(()), 0
-        for alike in groups.values():
+        for patches_of_size in groups.values():
             rgb = self._decoded(
-                torch.stack([part for part, _ in alike]),
-                torch.tensor([patch.camera for _, patch in alike], device=feature.device),
+                torch.stack([part for part, _ in patches_of_size]),
+                torch.tensor([patch.camera for _, patch in patches_of_size], device=feature.device),
             )
-            real = torch.stack([patch.rgb for _, patch in alike]).to(rgb)
+            real = torch.stack([patch.rgb for _, patch in patches_of_size]).to(rgb)
             squares, count = squares + ((rgb - real) ** 2).sum(), count + rgb.numel()
             if self._vgg is not None:
                 with torch.no_grad():
                     wanted = self._vgg(real)
                 # Each group counts by its number of patches
-                share = len(alike) / len(patches)
+                share = len(patches_of_size) / len(patches)
                 likeness = likeness + share * weighted_feature_loss(self._vgg(rgb), wanted)
         losses = {"rgb": squares / count}
         return losses if self._vgg is None else losses | {"perceptual": likeness}

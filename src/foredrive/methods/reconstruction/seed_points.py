@@ -190,8 +190,8 @@ def subsample(points: SeedPoints, most: int, generator: torch.Generator) -> Seed
     order = torch.randperm(len(points.seen), generator=generator)
     seen, unseen = order[points.seen[order]], order[~points.seen[order]]
     # If unseen points are too few for their share, seen ones fill it
-    of_seen = max(round(SEEN_SHARE * most), most - len(unseen))
-    picked = torch.cat([seen[:of_seen], unseen[: most - min(of_seen, len(seen))]])
+    seen_count = max(round(SEEN_SHARE * most), most - len(unseen))
+    picked = torch.cat([seen[:seen_count], unseen[: most - min(seen_count, len(seen))]])
     return points[picked]
 
 

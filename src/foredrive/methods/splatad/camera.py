@@ -58,20 +58,20 @@ def project_camera(
             seen &= (across - low * z) / (1 + low * low).sqrt() > -reach_m
             seen &= (high * z - across) / (1 + high * high).sqrt() > -reach_m
         chosen = seen.nonzero()[:, 0]
-    them = in_sensor(gaussians, position, chosen, T_cam_scene, velocity_mps, twist_cam)
+    in_view = in_sensor(gaussians, position, chosen, T_cam_scene, velocity_mps, twist_cam)
     # Linear images of the covariances at the centres: Σ' = J M (J M)ᵀ + ε I
-    uv, jacobian = _project(them.position_m, K, dist, lower, upper)
-    spread = footprint(through(jacobian, them.factor_m), SPREAD_PX2)
+    uv, jacobian = _project(in_view.position_m, K, dist, lower, upper)
+    spread = footprint(through(jacobian, in_view.factor_m), SPREAD_PX2)
     return Splats(
         mean=uv,
         inverse_covariance=spread.inverse,
-        opacity=them.opacity * spread.compensation if compensate else them.opacity,
-        range_m=them.position_m[2],
+        opacity=in_view.opacity * spread.compensation if compensate else in_view.opacity,
+        range_m=in_view.position_m[2],
         range_slope=torch.zeros_like(uv),
         # Velocity on the image (px/s) and along the axis, for rolling shutter
-        velocity=(jacobian * them.velocity_mps).sum(1).T,
-        range_rate_mps=them.velocity_mps[2],
-        feature=them.feature,
+        velocity=(jacobian * in_view.velocity_mps).sum(1).T,
+        range_rate_mps=in_view.velocity_mps[2],
+        feature=in_view.feature,
     )
 
 

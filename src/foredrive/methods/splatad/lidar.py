@@ -55,16 +55,16 @@ def project_lidar(
         # Within reach, and not straight above or below, where the azimuth has no derivative
         seen = (range2 > NEAR_M**2) & (range2 <= reach_m**2) & (level2 > UPRIGHT**2 * range2)
         chosen = seen.nonzero()[:, 0]
-    them = in_sensor(gaussians, position, chosen, T_lidar_scene, velocity_mps, twist_lidar)
+    in_view = in_sensor(gaussians, position, chosen, T_lidar_scene, velocity_mps, twist_lidar)
     # Motion of the centre over the angles and the range: tangent at time 0, or a line through two places
     if scan_s is None:
-        angles, range_m, jacobian = _project(them.position_m)
-        centre = _Centre(angles, range_m, (jacobian * them.velocity_mps).sum(1))
+        angles, range_m, jacobian = _project(in_view.position_m)
+        centre = _Centre(angles, range_m, (jacobian * in_view.velocity_mps).sum(1))
     else:
-        twist = them.position_m.new_zeros(6) if twist_lidar is None else twist_lidar
-        centre, jacobian = _scanned(them, twist, scan_s)
+        twist = in_view.position_m.new_zeros(6) if twist_lidar is None else twist_lidar
+        centre, jacobian = _scanned(in_view, twist, scan_s)
     # J M for azimuth, elevation and range; the first two rows give the footprint
-    spread = through(jacobian, them.factor_m)
+    spread = through(jacobian, in_view.factor_m)
     shape = footprint(spread[:2], SPREAD_RAD2)
     # Covariance of the range with both angles
     with_azimuth, with_elevation = (spread[:2] * spread[2]).sum(1)
@@ -72,7 +72,7 @@ def project_lidar(
     return Splats(
         mean=centre.angles,
         inverse_covariance=shape.inverse,
-        opacity=them.opacity * shape.compensation if compensate else them.opacity,
+        opacity=in_view.opacity * shape.compensation if compensate else in_view.opacity,
         range_m=centre.range_m,
         # Slope of the conditional mean of range over the angles:
         # Σ'_range,angles times the inverse footprint
@@ -81,7 +81,7 @@ def project_lidar(
         ),
         velocity=centre.velocity[:2].T,
         range_rate_mps=centre.velocity[2],
-        feature=them.feature,
+        feature=in_view.feature,
     )
 
 
@@ -97,7 +97,7 @@ class _Centre(NamedTuple):
 
 
 def _scanned(
-    them: InSensor, twist_lidar: Float[Tensor, "6"], scan_s: Float[Tensor, "S"]
+    in_view: InSensor, twist_lidar: Float[Tensor, "6"], scan_s: Float[Tensor, "S"]
 ) -> tuple[_Centre, Float[Tensor, "3 3 N"]]:
     """Return the centres such that they are right when they are scanned, and the Jacobian at that time.
 
@@ -107,14 +107,14 @@ def _scanned(
     """
     with torch.no_grad():
         # First guess of the scan time from the azimuth at time 0, refined once after moving there
-        time_s = scan_s[sector_of(torch.atan2(them.position_m[1], them.position_m[0]))]
-        x, y, _ = _moved(them.position_m, them.velocity_mps, twist_lidar, time_s)
+        time_s = scan_s[sector_of(torch.atan2(in_view.position_m[1], in_view.position_m[0]))]
+        x, y, _ = _moved(in_view.position_m, in_view.velocity_mps, twist_lidar, time_s)
         time_s = scan_s[sector_of(torch.atan2(y, x))]
         turn_s = scan_s.max() - scan_s.min()
         # The same azimuth a turn earlier or later, at the other side of the seam
         other_s = torch.where(time_s > 0, time_s - turn_s, time_s + turn_s)
     here, beyond = (
-        _project(_moved(them.position_m, them.velocity_mps, twist_lidar, when_s))
+        _project(_moved(in_view.position_m, in_view.velocity_mps, twist_lidar, when_s))
         for when_s in (time_s, other_s)
     )
     azimuth, elevation = (beyond[0] - here[0]).T

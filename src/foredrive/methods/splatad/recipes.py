@@ -23,7 +23,7 @@ _COPIES = 14
 """Copies of each number of a Gaussian: the value, its gradient, two moments, and the tensors that autograd
 keeps in a step.
 """
-_OF_A_PIXEL = 600
+_FLOATS_PER_PIXEL = 600
 """Floats that autograd keeps for each pixel: features, the decoder's hidden layers, SSIM."""
 
 
@@ -59,8 +59,9 @@ class GaussianRecipe:
     def learning_gib(self, pixels: int) -> float:
         """Estimate the memory that training takes besides its data, GiB, with images of so many pixels."""
         # Numbers of one Gaussian: mean, quaternion, scale, opacity, albedo, features
-        of_one = 3 + 4 + 3 + 1 + 3 + self.initial.features
-        return 4 * (self.schedule.max_gaussians * of_one * _COPIES + pixels * _OF_A_PIXEL) / 1024**3
+        floats_per_gaussian = 3 + 4 + 3 + 1 + 3 + self.initial.features
+        floats = self.schedule.max_gaussians * floats_per_gaussian * _COPIES + pixels * _FLOATS_PER_PIXEL
+        return 4 * floats / 1024**3
 
 
 def tiny_gaussians() -> GaussianRecipe:

@@ -122,12 +122,12 @@ def volumes_of(
     # Imagining is costly and runs only for heads that read it
     imagined, T_now_later = imagined_volumes(world, belief, later) if later else (None, None)
     past = None if belief.T_past_now is None or belief.history is None else belief.history[:, -2]
-    made: dict[int, TaskVolume] = {}
+    shared_volumes: dict[int, TaskVolume] = {}
     by_task: dict[Task, TaskVolume] = {}
     for task in tasks:
         volume = world.volume_for(belief, task)
         # Tasks with the same volume share one record, and with it the planes made of it
-        by_task[task] = made.setdefault(
+        by_task[task] = shared_volumes.setdefault(
             id(volume),
             TaskVolume(volume, past, belief.T_past_now, imagined, T_now_later),
         )

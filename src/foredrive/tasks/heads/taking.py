@@ -28,18 +28,18 @@ def take_proposals(
     away_m = torch.cdist(carried_m, proposals_m)
     away_m = torch.where(away_m <= reach_m, away_m, torch.inf)
     taken = torch.full((batch, count), -1, dtype=torch.long, device=carried_m.device)
-    left = torch.ones(proposals_m.shape[:2], dtype=torch.bool, device=carried_m.device)
+    is_free = torch.ones(proposals_m.shape[:2], dtype=torch.bool, device=carried_m.device)
     # Agents choose in order, in all items of the batch at once
     for agent in range(count):
-        away, nearest = torch.where(left, away_m[:, agent], torch.inf).min(dim=-1)
+        away, nearest = torch.where(is_free, away_m[:, agent], torch.inf).min(dim=-1)
         near = away.isfinite()
         taken[near, agent] = nearest[near]
         # Proposals next to the taken one are the same object as another class
         at_m = proposals_m[item, nearest][:, None]
         same = (proposals_m - at_m).norm(dim=-1) < SAME_M
         same[item, nearest] = True
-        left = left & ~(same & near[:, None])
-    group = (~left).int().scatter_add(1, taken.clamp_min(0), (taken >= 0).int())  # 0 left, 1 same, 2 taken
+        is_free = is_free & ~(same & near[:, None])
+    group = (~is_free).int().scatter_add(1, taken.clamp_min(0), (taken >= 0).int())  # 0 left, 1 same, 2 taken
     # A stable sort keeps the order of probability within each group
     order = group.argsort(dim=-1, stable=True)
     return taken, order[:, : proposals_m.shape[1] - count]

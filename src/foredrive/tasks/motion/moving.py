@@ -53,8 +53,8 @@ def score_moving(predicted: PredictedAgents, true: TrueAgents) -> dict[str, Movi
     true = true[np.isin(true.category, ANY_VEHICLE)]
     moving = is_moving(true)
     # Predictions on vehicles that do not move are left out
-    beside = match_by_distance(predicted, true, within_m=MATCH_M)
-    predicted = _likeliest(predicted[(beside < 0) | moving[beside] if len(moving) else beside < 0])
+    true_row = match_by_distance(predicted, true, within_m=MATCH_M)
+    predicted = _likeliest(predicted[(true_row < 0) | moving[true_row] if len(moving) else true_row < 0])
     true = true[moving]
     scores, errors = {}, []
     for name, category in CLASSES.items():

@@ -132,10 +132,10 @@ def clear_mot(
     """
     for rows, name in ((true, "true"), (predicted, "found")):
         _check_rows(rows, name)
-    some = np.ones(len(predicted), bool) if active is None else active
+    is_active = np.ones(len(predicted), bool) if active is None else active
     layout = lay_out(true, predicted, candidates)
-    events = ClearEvents(*follow(layout, some))
-    return events, count_events(layout, events, some)
+    events = ClearEvents(*follow(layout, is_active))
+    return events, count_events(layout, events, is_active)
 
 
 def _check_rows(rows: TrackRows, name: str) -> None:

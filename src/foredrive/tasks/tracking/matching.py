@@ -44,14 +44,14 @@ def held_objects(
         away_m: distance of each query from each object, m.
     """
     # Object that the query carried on, if any
-    mine = torch.where(source >= 0, owner[source.clamp_min(0)], NOBODY)
+    query_track = torch.where(source >= 0, owner[source.clamp_min(0)], NOBODY)
     # Its row among the objects at now
-    same = (mine[:, None] == track_id) & (mine[:, None] != NOBODY)
+    has_same_track = (query_track[:, None] == track_id) & (query_track[:, None] != NOBODY)
     # A query that is far from its object is free, and the object is free as well
-    lost = (same & (away_m >= RELEASED_M)).any(dim=1)
-    same = same & ~lost[:, None]
-    query, match = same.nonzero(as_tuple=True)
-    return Held(query, match, (mine != NOBODY) & ~lost)
+    is_released = (has_same_track & (away_m >= RELEASED_M)).any(dim=1)
+    has_same_track = has_same_track & ~is_released[:, None]
+    query, match = has_same_track.nonzero(as_tuple=True)
+    return Held(query, match, (query_track != NOBODY) & ~is_released)
 
 
 def matching_beside(

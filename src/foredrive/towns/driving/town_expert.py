@@ -91,7 +91,7 @@ class TownExpert:
         halts = self._imagined[-1].traffic.vehicles.speed_mps[0] < HALT_MPS
         if halts and traffic.lacks_change_room(now.traffic):
             return _in_ego_frame(self._edged_over(traffic, here)[EVERY - 1 :: EVERY], here)
-        path = np.stack([traffic.poses(then.traffic).axle_xyz[0, :2] for then in self._imagined])
+        path = np.stack([traffic.poses(imagined.traffic).axle_xyz[0, :2] for imagined in self._imagined])
         path = self._not_into_anybody(traffic, _rejoined(path, here.axle_xyz[:2]), here)
         # Every second point of the simulated path, without the present one
         return _in_ego_frame(path[EVERY::EVERY], here)
@@ -104,7 +104,7 @@ class TownExpert:
         leader = find_leaders(graph, v, path_starts(graph, v.path)).leader
         behind = v.track_id[leader == 0]  # vehicles behind take care themselves
         # The others in each simulated step, without those that follow this vehicle
-        users = [road_users(traffic, then.traffic).without(behind) for then in self._imagined]
+        users = [road_users(traffic, imagined.traffic).without(behind) for imagined in self._imagined]
         arc_m = arc_lengths(path)
         t_s = DECISION_S * np.arange(len(path))
         # Distances over time: the simulated motion first, then braking at two rates
@@ -126,7 +126,7 @@ class TownExpert:
         arc_m = arc_lengths(xyz[:, :2])
         max_m = traffic.to_light_m(now.traffic)
         way_m, speed, points = 0.0, here.speed_mps, [here.axle_xyz[:2]]
-        for then in self._imagined[1:]:
+        for imagined in self._imagined[1:]:
             speed = min(speed + EDGES_MPS2 * DECISION_S, EDGES_MPS)
             way_m = min(way_m + speed * DECISION_S, max(max_m, way_m))
             # Position on the route and a point ahead, from which the heading is taken
@@ -136,7 +136,7 @@ class TownExpert:
             middle = np.array([x, y, here.axle_xyz[2]])
             middle[:2] += EGO.axle_to_centre_m * np.array([math.cos(yaw), math.sin(yaw)])
             half = 0.5 * np.array([EGO.length_m, EGO.width_m]) + CLEAR_M
-            others = road_users(traffic, then.traffic)
+            others = road_users(traffic, imagined.traffic)
             # Stop at the first contact; wait in place if the other one moves
             met = touched(Box(middle, yaw, half), others)
             if (np.hypot(*others.velocity_mps[met].T) > HALT_MPS).any():
@@ -150,11 +150,11 @@ class TownExpert:
     def _gone_on(self, traffic: Traffic, state: TrafficState, here: EgoPose) -> TrafficState:
         """Keep the planned path and lane change, if the vehicle is where they lead."""
         # The imagined state of this very time from the last plan, if there is one
-        imagined = (then.traffic for then in self._imagined)
-        meant = next((then for then in imagined if abs(then.time_s - state.time_s) < 0.5 * DECISION_S), None)
-        if meant is None:
+        states = (imagined.traffic for imagined in self._imagined)
+        planned_state = next((s for s in states if abs(s.time_s - state.time_s) < 0.5 * DECISION_S), None)
+        if planned_state is None:
             return state
-        poses = traffic.poses(meant)
+        poses = traffic.poses(planned_state)
         # Offset of the real vehicle from that state, along and across its heading
         offset = here.axle_xyz[:2] - poses.axle_xyz[0, :2]
         ahead_m = float(offset @ here.forward[:2])
@@ -163,7 +163,7 @@ class TownExpert:
             return state
         # Take the path and lane change from the plan; speed and right of way are those of the real vehicle
         first = np.array([0])
-        wanted, real = meant.vehicles.rows(first), state.vehicles.rows(first)
+        wanted, real = planned_state.vehicles.rows(first), state.vehicles.rows(first)
         row = dataclasses.replace(
             wanted.moved(np.array([ahead_m])),
             speed_mps=real.speed_mps,

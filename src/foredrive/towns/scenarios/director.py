@@ -71,10 +71,12 @@ def would_hit(actor: ScriptedActor, pace_mps: float, others: MovingBoxes) -> boo
     to_go_m = actor.length_m - actor.s_m if pace_mps > 0 else actor.s_m
     # Time until the actor has left the road, and times to collision if it goes on or stands
     left_s = to_go_m / abs(pace_mps)
-    goes = time_to_collision_s(_box(actor, pace_mps), others).min(initial=np.inf)
-    stands = time_to_collision_s(_box(actor, 0.0), others).min(initial=np.inf)
+    collision_if_moving_s = time_to_collision_s(_box(actor, pace_mps), others).min(initial=np.inf)
+    collision_if_standing_s = time_to_collision_s(_box(actor, 0.0), others).min(initial=np.inf)
     # It hits only by going on: waiting would avoid it
-    return bool(goes < min(left_s, SAFE_S) and stands > goes)
+    return bool(
+        collision_if_moving_s < min(left_s, SAFE_S) and collision_if_standing_s > collision_if_moving_s
+    )
 
 
 def pace_among(actor: ScriptedActor, pace_mps: float, others: MovingBoxes) -> float:

@@ -233,17 +233,21 @@ def _order_meeting(context: ScenarioContext, lead_m: float) -> ScenarioContext:
     room_m = ego.front_gap_m(scenario.at_m - ROOM_M)
     # Others react to the ego vehicle only if it stands in their way
     context.orders.ignores_ego[list(progress.slots)] = ego.speed_mps > MOVES_MPS or room_m > 0.0
-    comes = ego.speed_mps > MOVES_MPS and ego.middle_gap_m(scenario.at_m) > 0.0
+    is_ego_approaching = ego.speed_mps > MOVES_MPS and ego.middle_gap_m(scenario.at_m) > 0.0
     # Begun: a red light runner keeps its speed; oncoming traffic keeps adjusting its arrival
     if progress.since_s is not None:
         if runs:
             context.towards_mps(slot, progress.cruise_mps)
             return _order_run(context, slot, line_m)
-        return _order_arrival(context, lead_m, 1.0) if comes and room_m > 0.0 else context
+        return _order_arrival(context, lead_m, 1.0) if is_ego_approaching and room_m > 0.0 else context
     if progress.waited_s > MAX_WAIT_S:
         return _ended(context)
     # Wait until the ego vehicle comes, has no red light, and it is time to go
-    if not comes or not is_let_go(context, ego.arrival_s(scenario)) or (runs and _has_time(context, lead_m)):
+    if (
+        not is_ego_approaching
+        or not is_let_go(context, ego.arrival_s(scenario))
+        or (runs and _has_time(context, lead_m))
+    ):
         _order_wait(context, slot, line_m if runs else context.way.meet_m - lead_m)
         return context
     # Approach so that both arrive together

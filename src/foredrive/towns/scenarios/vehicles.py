@@ -74,9 +74,9 @@ def place_vehicles(context: ScenarioContext, at_start: bool) -> ScenarioContext:
         begin_m, speed_mps = _begin(context, way, gap_m, at_start)
         if begin_m is None or begin_m < BEGIN_M:
             continue
-        called = _placed(context, number, begin_m, speed_mps, at_start)
-        if called is not None:
-            return called
+        placed_context = _placed(context, number, begin_m, speed_mps, at_start)
+        if placed_context is not None:
+            return placed_context
     return context
 
 
