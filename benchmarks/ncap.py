@@ -1,11 +1,11 @@
 """Safety tests after NeuroNCAP in reconstructed towns and in PandaSet 002: `foredrive bench ncap`, hours.
 
-Three drives of 20 s are recorded with six cameras and a lidar, and reconstructed in runs/safety_rebuilds, for
-`ncap-transfer` too. In each reconstruction, four scenarios of each kind are driven ten times by each agent,
-under our rules, and by some under those of the paper and of its released code. `suite_minutes` counts the drives of
-one suite alone, with the sensors that the agent needs. Intervals (`score_low`, `score_high`) hold 95 % over
-the runs of a town; the figures of an arm are means over its towns. PandaSet 002 lasts 5.5 s, and a proposed
-scenario 6 s or more: its arm counts the scenarios that are feasible there.
+Three drives of 20 s are recorded with six cameras and a lidar, and reconstructed in runs/safety_rebuilds,
+for `ncap-transfer` too. In each reconstruction, four scenarios of each kind are driven ten times by each
+agent, under our rules, and by some under those of the paper and of its released code. `suite_minutes`
+counts the drives of one suite alone, with the sensors that the agent needs. Intervals (`score_low`,
+`score_high`) hold 95 % over the runs of a town; the figures of an arm are means over its towns. PandaSet
+002 lasts 5.5 s, and a proposed scenario 6 s or more: its arm counts the scenarios that are feasible there.
 
 An arm AGENT@TOWN is a suite of drives in runs/ncap; an interrupted one goes on with the next drive.
 """

@@ -2,9 +2,10 @@
 
 The same safety tests are driven in a town and in the reconstruction of a recorded drive there. Actors and
 traffic replay in both, so that they differ in what the sensors show alone. Each agent that looks at its
-sensors drives each test once in each world. `collision_agreement` is the share of the pairs in which both or neither
-end in a collision, and `score_correlation` is that of the scores (Pearson). Arms are AGENT_KIND@TOWN; without
-a kind or a town they are over all, and `all` is both agents. They tell where it breaks.
+sensors drives each test once in each world. `collision_agreement` is the share of the pairs in which both
+or neither end in a collision, and `score_correlation` is that of the scores (Pearson). Arms are
+AGENT_KIND@TOWN; without a kind or a town they are over all, and `all` is both agents. They tell where it
+breaks.
 
 Pairs are kept in runs/ncap_transfer, so that an interrupted arm goes on with the next pair.
 """

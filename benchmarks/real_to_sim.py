@@ -1,9 +1,9 @@
 """The real-to-sim gap: what the shipped NeMo sees and plans on recorded and on rendered images of one log.
 
-`foredrive bench real-to-sim`, with the raw PandaSet log in FOREDRIVE_REAL_DATA/pandaset. Six cameras and the
-lidar are reconstructed from every second frame; figures are of the other frames (`foredrive evaluate --in`).
-A seed is another drive of Town05 and another seed of the reconstruction; of PandaSet the reconstruction alone.
-Runs are kept in runs/real_to_sim/COMMIT, where an interrupted study continues.
+`foredrive bench real-to-sim`, with the raw PandaSet log in FOREDRIVE_REAL_DATA/pandaset. Six cameras and
+the lidar are reconstructed from every second frame; figures are of the other frames (`foredrive evaluate
+--in`). A seed is another drive of Town05 and another seed of the reconstruction; of PandaSet the
+reconstruction alone. Runs are kept in runs/real_to_sim/COMMIT, where an interrupted study continues.
 """
 
 import dataclasses
