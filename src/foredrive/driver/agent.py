@@ -24,8 +24,9 @@ from foredrive.scene.traffic_light import LightState
 
 SEEN = 0.5
 """Probability of a lamp from which the light of a frame counts."""
-FADES, LONGEST = 0.5, 5.0
-"""Share of the evidence for a stop that is kept from plan to plan, and its bound (logit)."""
+FADES, LONGEST, DOUBT = 0.5, 5.0, 0.2
+"""Share of the evidence for a stop that is kept from plan to plan, its bound (logit), and the evidence below
+which a light that is not seen is forgotten."""
 NEAR_M, OTHER_M = 7.0, 12.0
 """A light that is not seen is remembered within the first distance before its line. A distance that differs
 by more than the second is that of another light: at once if it is nearer, else when it is read again."""
@@ -89,7 +90,9 @@ class LightMemory:
         if self._line_m is not None:
             self._line_m -= moved_m
         stops = p[LightState.RED] + p[LightState.YELLOW]
-        if 1 - p[LightState.NONE] > SEEN:
+        # What is seen beyond the line of a green light are the lamps of somebody else
+        is_through = self._line_m is not None and self._line_m < 0 and self._evidence < 0
+        if 1 - p[LightState.NONE] > SEEN and not is_through:
             # Odds given that there is a light: the probability of NONE is no evidence for green
             odds = float(np.log((stops + 0.02) / (p[LightState.GREEN] + 0.02)))
             self._evidence = float(np.clip(FADES * self._evidence + odds, -LONGEST, LONGEST))
@@ -100,6 +103,8 @@ class LightMemory:
             self._unseen += moved_m > STILL_M  # a standing vehicle waits for the light
             near = self._line_m is not None and -PASSED_M < self._line_m < NEAR_M
             self._evidence *= 1.0 if near else FADES
+            if not near and abs(self._evidence) < DOUBT:
+                self.forget()
         if self._unseen > FORGETS or (self._line_m is not None and self._line_m < -PASSED_M):
             self.forget()
         if self._line_m is None:
