@@ -103,6 +103,16 @@ def test_a_light_that_was_seen_far_away_and_vanishes_fades() -> None:
     assert state(views[-1]) is LightState.NONE  # who stands would else wait for it
 
 
+def test_a_line_behind_is_no_new_one_unless_the_drive_begins_there() -> None:
+    assert state(LightMemory().update(estimate(LightState.RED, 0.5), 0.0)) is LightState.RED
+    memory = LightMemory()
+    for line_m in (3.0, 1.0, -1.0, -3.0, -5.0):
+        memory.update(estimate(LightState.GREEN, line_m), 2.0)
+    for _ in range(3):
+        assert state(memory.update(estimate(LightState.RED, -2.5), 0.1)) is LightState.NONE
+    assert state(memory.update(estimate(LightState.RED, 12.0), 0.1)) is LightState.RED
+
+
 def test_a_green_light_that_was_crossed_does_not_turn_red() -> None:
     for before, after in ((LightState.GREEN, LightState.RED), (LightState.RED, LightState.RED)):
         memory = LightMemory()

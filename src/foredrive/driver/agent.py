@@ -40,6 +40,8 @@ vehicle stops: at the line itself half of the lamps are out of view."""
 FORGETS, STILL_M = 30, 0.02
 """Plans without a lamp after which a light is forgotten; those over which the vehicle has moved less do not
 count."""
+AHEAD_M = 2.0
+"""Least distance at which a line becomes the next one, unless the drive begins at it."""
 STANDS_MPS = 0.2
 WAITS, CREEPS, IMPATIENT = 10, 8, 70
 """Plans that the vehicle stands without a red light before it creeps, for which it creeps, and after which it
@@ -75,7 +77,7 @@ class LightMemory:
         """Logarithm of the odds that the light stops the vehicle."""
         self._line_m: float | None = None
         self._unseen, self._farther, self._yellow = 0, 0, False
-        self._was_seen = False
+        self._was_seen, self._has_moved = False, False
 
     def update(self, view: PathEstimate, moved_m: float, *, line_seen: bool = False) -> PathEstimate:
         """Return the view with the light that is seen or remembered.
@@ -92,7 +94,10 @@ class LightMemory:
         stops = p[LightState.RED] + p[LightState.YELLOW]
         # What is seen beyond the line of a green light are the lamps of somebody else
         is_through = self._line_m is not None and self._line_m < 0 and self._evidence < 0
-        if 1 - p[LightState.NONE] > SEEN and not is_through:
+        # A new line is seen from afar: one that is read at the bumper has just been crossed
+        self._has_moved = self._has_moved or moved_m > STILL_M
+        is_behind = self._line_m is None and line_m < AHEAD_M and self._has_moved
+        if 1 - p[LightState.NONE] > SEEN and not (is_through or is_behind):
             # Odds given that there is a light: the probability of NONE is no evidence for green
             odds = float(np.log((stops + 0.02) / (p[LightState.GREEN] + 0.02)))
             self._evidence = float(np.clip(FADES * self._evidence + odds, -LONGEST, LONGEST))
