@@ -39,14 +39,14 @@ def state(view: PathEstimate) -> LightState:
 
 def test_a_red_light_is_remembered_at_its_line_and_forgotten_beyond_it() -> None:
     memory = LightMemory()
-    assert state(memory.update(estimate(LightState.RED, 9.0), 0.0)) is LightState.RED
+    assert state(memory.update(estimate(LightState.RED, 9.0), 0.0, line_seen=True)) is LightState.RED
     view = memory.update(estimate(LightState.NONE), 4.0)  # at 5 m the lamps are out of the image
     assert state(view) is LightState.RED
     assert float(view.light_m) == pytest.approx(5.0 - BEFORE_LINE_M)
     for _ in range(60):  # it waits for half a minute
         view = memory.update(estimate(LightState.NONE), 0.0)
     assert state(view) is LightState.RED
-    assert state(memory.update(estimate(LightState.GREEN, 5.0), 0.0)) is LightState.GREEN
+    assert state(memory.update(estimate(LightState.GREEN, 5.0), 0.0, line_seen=True)) is LightState.GREEN
     assert state(memory.update(estimate(LightState.NONE), 12.0)) is LightState.NONE  # beyond the line
 
 
@@ -92,6 +92,15 @@ def test_lamps_do_not_move_a_line_that_was_seen_itself() -> None:
         assert float(view.light_m) == pytest.approx(7.0 - BEFORE_LINE_M), count
         view = memory.update(estimate(LightState.RED, 30.0), 0.0, line_seen=True)
     assert float(view.light_m) == pytest.approx(30.0 - BEFORE_LINE_M)
+
+
+def test_a_line_that_was_told_by_lamps_alone_is_not_waited_for() -> None:
+    memory = LightMemory()
+    for _ in range(4):
+        assert state(memory.update(estimate(LightState.RED, 5.8), 0.0)) is LightState.RED
+    for _ in range(8):
+        view = memory.update(estimate(LightState.NONE), 0.0)
+    assert state(view) is LightState.NONE  # at 5.8 m the line would be in view
 
 
 def test_a_light_that_was_seen_far_away_and_vanishes_fades() -> None:

@@ -106,7 +106,9 @@ class LightMemory:
         else:
             # Unseen plans count only while the vehicle moves
             self._unseen += moved_m > STILL_M  # a standing vehicle waits for the light
-            near = self._line_m is not None and -PASSED_M < self._line_m < NEAR_M
+            # A line that was never seen itself is held only where it would be out of view
+            near_m = NEAR_M if self._was_seen else AHEAD_M
+            near = self._line_m is not None and -PASSED_M < self._line_m < near_m
             self._evidence *= 1.0 if near else FADES
             if not near and abs(self._evidence) < DOUBT:
                 self.forget()
