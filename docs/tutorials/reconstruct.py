@@ -22,8 +22,8 @@
 # are enough to see how it works.
 
 # %% language="bash"
-# foredrive reconstruct data --out reconstructed --image-size 96 160 --set
-# representation.schedule.steps=200
+# foredrive reconstruct data --out reconstructed --image-size 96 160 \
+#     --set representation.schedule.steps=200
 
 # %% [markdown]
 # Held-out frames: recorded, rendered, their difference, and the range.
