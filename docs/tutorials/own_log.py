@@ -2,8 +2,7 @@
 # # Your own log in ten lines
 #
 # Images, calibration, poses and lidar points of any vehicle become a log that every verb reads. This
-# notebook first makes such a recording, because it cannot know yours: a street with a striped wall on
-# each
+# notebook first makes such a recording, because it cannot know yours: a street with a striped wall on each
 # side. Replace that cell by your files.
 #
 # ## A recording
@@ -66,16 +65,14 @@ print(log.name)
 # %% [markdown]
 # ## Is it right?
 #
-# `foredrive check` says what a log holds, and what looks wrong in it. Here nothing is, except what we
-# left
+# `foredrive check` says what a log holds, and what looks wrong in it. Here nothing is, except what we left
 # out.
 
 # %% language="bash"
 # foredrive check data/logs/own_train/my_street
 
 # %% [markdown]
-# An error in the data is found before anything is trained on it. Here the camera's calibration is
-# turned by
+# An error in the data is found before anything is trained on it. Here the camera's calibration is turned by
 # about six degrees:
 
 # %%
@@ -105,6 +102,6 @@ Image("street.png")
 # ## Then
 #
 # The log can be [reconstructed](../reconstruction.md), [searched](../search.md) and
-# [trained on](../how-to/train.md). What else `write_log` takes (exposure times, motion within a sweep,
-# rolling shutter, distortion) is on the
+# [trained on](../how-to/train.md).
+# What else `write_log` takes (exposure times, motion within a sweep, rolling shutter, distortion) is on the
 # page about [data](../data.md#your-own-data).

@@ -1,10 +1,8 @@
 # %% [markdown]
 # # Reconstruct a log and put a car in the way
 #
-# A recorded drive becomes a scene of 3-D Gaussians: a static part, and one for each road user that
-# moves. The
-# scene renders cameras and lidar from places where nobody drove. So a planner can be tested there on
-# what
+# A recorded drive becomes a scene of 3-D Gaussians: a static part, and one for each road user that moves. The
+# scene renders cameras and lidar from places where nobody drove. So a planner can be tested there on what
 # never happened: here, a car that stands in the lane.
 #
 # ## A drive
@@ -17,13 +15,11 @@
 # %% [markdown]
 # ## Reconstruct it
 #
-# Every second frame is held out, and the scene is judged on those frames. Two hundred steps on small
-# images
+# Every second frame is held out, and the scene is judged on those frames. Two hundred steps on small images
 # are enough to see how it works.
 
 # %% language="bash"
-# foredrive reconstruct data --out reconstructed --image-size 96 160 \
-#     --set representation.schedule.steps=200
+# foredrive reconstruct data --out reconstructed --image-size 96 160 --set representation.schedule.steps=200
 
 # %% [markdown]
 # Held-out frames: recorded, rendered, their difference, and the range.
@@ -34,8 +30,8 @@ from IPython.display import Image
 Image("reconstructed/held_out.png")
 
 # %% [markdown]
-# The figure to compare with is that of the nearest recorded image in time: a reconstruction that is no
-# better than it has learned nothing.
+# The figure to compare with is that of the nearest recorded image in time: a reconstruction that is
+# no better than it has learned nothing.
 
 # %%
 import json
@@ -47,8 +43,7 @@ print(f"rendered {summary['psnr_db']:.1f} dB, nearest image {summary['nearest.ps
 # %% [markdown]
 # ## Change it
 #
-# The ego vehicle's path two metres to the left, beside the drive as it was; below the cameras, the
-# lidar.
+# The ego vehicle's path two metres to the left, beside the drive as it was; below the cameras, the lidar.
 
 # %% language="bash"
 # foredrive render reconstructed --shift-left 2 --cameras pcam_f0 --rate-hz 2 --out shifted.webp
@@ -59,12 +54,9 @@ Image("shifted.webp")
 # %% [markdown]
 # ## Put a car in the way
 #
-# `--threat stationary` takes the best observed car of the scene and puts it where the ego vehicle will
-# be in
-# four seconds. Two agents meet it. `log` drives on as recorded. `lidar-corridor` follows the recorded
-# path
-# too, but stops if the rendered lidar sees something in it. The safety score is that of NeuroNCAP: 5
-# for a
+# `--threat stationary` takes the best observed car of the scene and puts it where the ego vehicle will be in
+# four seconds. Two agents meet it. `log` drives on as recorded. `lidar-corridor` follows the recorded path
+# too, but stops if the rendered lidar sees something in it. The safety score is that of NeuroNCAP: 5 for a
 # drive without a collision, less the faster the impact.
 
 # %% language="bash"
@@ -78,12 +70,10 @@ Image(film)
 # %% [markdown]
 # ## Look around
 #
-# `foredrive view reconstructed` opens the scene in the browser: move the camera and the time, drag road
-# users
+# `foredrive view reconstructed` opens the scene in the browser: move the camera and the time, drag road users
 # that moved, remove and add some. `reconstructed/static.ply` opens in other viewers of 3-D Gaussians.
 #
 # ## Then
 #
 # [Reconstruction](../reconstruction.md) says how well it works, and what for.
-# [Safety tests](../safety-tests.md) has whole sets of such threats, planners and renderers of other
-# programs, and NAVSIM's scores of single plans.
+# [Safety tests](../safety-tests.md) has whole sets of such threats, planners and renderers of other programs, and NAVSIM's scores of single plans.
