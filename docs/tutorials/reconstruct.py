@@ -76,4 +76,5 @@ Image(film)
 # ## Then
 #
 # [Reconstruction](../reconstruction.md) says how well it works, and what for.
-# [Safety tests](../safety-tests.md) has whole sets of such threats, planners and renderers of other programs, and NAVSIM's scores of single plans.
+# [Safety tests](../safety-tests.md) has whole sets of such threats, planners and renderers of other
+# programs, and NAVSIM's scores of single plans.
