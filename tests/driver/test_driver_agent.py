@@ -40,11 +40,11 @@ def state(view: PathEstimate) -> LightState:
 def test_a_red_light_is_remembered_at_its_line_and_forgotten_beyond_it() -> None:
     memory = LightMemory()
     assert state(memory.update(estimate(LightState.RED, 9.0), 0.0, line_seen=True)) is LightState.RED
-    view = memory.update(estimate(LightState.NONE), 4.0)  # at 5 m the lamps are out of the image
+    view = memory.update(estimate(LightState.NONE, 5.5), 4.0, line_seen=True)  # the lamps are out of view
     assert state(view) is LightState.RED
     assert float(view.light_m) == pytest.approx(5.0 - BEFORE_LINE_M)
     for _ in range(60):  # it waits for half a minute
-        view = memory.update(estimate(LightState.NONE), 0.0)
+        view = memory.update(estimate(LightState.NONE, 5.5), 0.0, line_seen=True)
     assert state(view) is LightState.RED
     assert state(memory.update(estimate(LightState.GREEN, 5.0), 0.0, line_seen=True)) is LightState.GREEN
     assert state(memory.update(estimate(LightState.NONE), 12.0)) is LightState.NONE  # beyond the line
@@ -101,6 +101,15 @@ def test_a_line_that_was_told_by_lamps_alone_is_not_waited_for() -> None:
     for _ in range(8):
         view = memory.update(estimate(LightState.NONE), 0.0)
     assert state(view) is LightState.NONE  # at 5.8 m the line would be in view
+    memory = LightMemory()
+    memory.update(estimate(LightState.RED, 9.0), 0.0, line_seen=True)
+    for moved_m in (3.0, *[0.0] * 8):
+        view = memory.update(estimate(LightState.NONE, 12.0), moved_m, line_seen=True)
+    assert state(view) is LightState.NONE  # no line is where one was remembered
+    memory.update(estimate(LightState.RED, 9.0), 0.0, line_seen=True)
+    for moved_m in (6.0, *[0.0] * 60):
+        view = memory.update(estimate(LightState.NONE, 12.0), moved_m)
+    assert state(view) is LightState.RED  # it is below the image
 
 
 def test_a_light_that_was_seen_far_away_and_vanishes_fades() -> None:

@@ -40,8 +40,9 @@ vehicle stops: at the line itself half of the lamps are out of view."""
 FORGETS, STILL_M = 30, 0.02
 """Plans without a lamp after which a light is forgotten; those over which the vehicle has moved less do not
 count."""
-AHEAD_M = 2.0
-"""Least distance at which a line becomes the next one, unless the drive begins at it."""
+AHEAD_M, HELD_M = 2.0, 4.0
+"""Least distance at which a line becomes the next one, unless the drive begins at it; and the distance from
+which a line that was seen need not be seen any more."""
 STANDS_MPS = 0.2
 WAITS, CREEPS, IMPATIENT = 10, 8, 70
 """Plans that the vehicle stands without a red light before it creeps, for which it creeps, and after which it
@@ -106,9 +107,7 @@ class LightMemory:
         else:
             # Unseen plans count only while the vehicle moves
             self._unseen += moved_m > STILL_M  # a standing vehicle waits for the light
-            # A line that was never seen itself is held only where it would be out of view
-            near_m = NEAR_M if self._was_seen else AHEAD_M
-            near = self._line_m is not None and -PASSED_M < self._line_m < near_m
+            near = self._is_near(line_m, line_seen)
             self._evidence *= 1.0 if near else FADES
             if not near and abs(self._evidence) < DOUBT:
                 self.forget()
@@ -125,6 +124,14 @@ class LightMemory:
         # Beyond the line the true distance counts: a red light holds until the judged point has crossed.
         stop_m = max(self._line_m - BEFORE_LINE_M, min(self._line_m, 0.0))
         return PathEstimate(light[None].to(view.light), torch.full_like(view.light_m, stop_m), view.occupied)
+
+    def _is_near(self, line_m: float, line_seen: bool) -> bool:
+        """Return whether the light is waited for though it is not seen: its line is near, and not in doubt."""
+        if self._line_m is None or not -PASSED_M < self._line_m < NEAR_M:
+            return False
+        # A line that is in view must be seen in its place
+        is_confirmed = line_seen and abs(line_m - self._line_m) < SEEN_OTHER_M
+        return is_confirmed or self._line_m < (HELD_M if self._was_seen else AHEAD_M)
 
     def _move_line(self, line_m: float, line_seen: bool) -> None:
         """Take in a reading of the distance of the line."""
