@@ -126,7 +126,7 @@ class LightMemory:
         return PathEstimate(light[None].to(view.light), torch.full_like(view.light_m, stop_m), view.occupied)
 
     def _is_near(self, line_m: float, line_seen: bool) -> bool:
-        """Return whether the light is waited for though it is not seen: its line is near, and not in doubt."""
+        """Return whether a light that is not seen is waited for: its line is near, and not in doubt."""
         if self._line_m is None or not -PASSED_M < self._line_m < NEAR_M:
             return False
         # A line that is in view must be seen in its place
