@@ -1,4 +1,4 @@
-"""Whether a test in a reconstructed world predicts the real one: `foredrive bench ncap-transfer`, hours.
+"""Test whether a reconstructed world predicts the real one: `foredrive bench ncap-transfer`, hours.
 
 The same safety tests are driven in a town and in the reconstruction of a recorded drive there. Actors and
 traffic replay in both, so that they differ in what the sensors show alone. Each agent that looks at its

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from full_disk import files_up_to
 
 from foredrive.cli.main import main
 from foredrive.engine import debugging
@@ -43,11 +44,11 @@ def events(file: Path) -> set[str]:
 
 
 def test_flags_go_with_every_verb_at_any_place() -> None:
-    rest = take_debugging(["--verbose", "train", "nemo_tiny", "--profile", "a/b.json.gz:1:2", "--out", "c"])
+    rest = take_debugging(["--verbose", "train", "nemo_tiny", "--profile", "b.json.gz:1:2", "--out", "c"])
     assert rest == ["train", "nemo_tiny", "--out", "c"]
     assert debugging.is_verbose()
     plan = ProfilePlan.parse(os.environ[debugging.PROFILE])
-    assert plan == ProfilePlan(Path("a/b.json.gz").absolute(), 1.0, 2.0)
+    assert plan == ProfilePlan(Path("b.json.gz").absolute(), 1.0, 2.0)
     assert take_debugging(["models"]) == ["models"]
     assert not debugging.is_verbose()
     assert debugging.PROFILE not in os.environ
@@ -59,6 +60,19 @@ def test_flags_go_with_every_verb_at_any_place() -> None:
 def test_profiles_that_are_not_understood_are_refused(text: str) -> None:
     with pytest.raises(InputError, match=r"--profile takes FILE\.json\.gz"):
         take_debugging(["train", "--profile", text])
+
+
+def test_trace_that_cannot_be_written_is_refused_before_the_work(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"--profile: .*nowhere: no such folder"):
+        take_debugging(["train", "--profile", str(tmp_path / "nowhere" / "trace.json.gz")])
+
+
+def test_full_disk_costs_the_trace_and_not_the_work(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    take_debugging(["train", f"--profile={tmp_path / 'trace.json.gz'}:0.1:0.2"])
+    with files_up_to(1000), debugging.debugging():
+        assert busy_for(1.0) > 0
+    assert "trace.json.gz was not written: " in caplog.text
+    assert not list(tmp_path.iterdir())
 
 
 def test_trace_has_operators_and_functions(tmp_path: Path) -> None:

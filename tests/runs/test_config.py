@@ -134,6 +134,11 @@ def test_recipes_of_reconstructions_take_files_and_settings(tmp_path: Path) -> N
     gaussians = chosen.representation
     assert (gaussians.schedule.steps, gaussians.scene.rolling) == (7, False)
     assert gaussians.initial == find_recipe("gaussians_tiny", (), ReconstructionRecipe).representation.initial
+    short = tmp_path / "short.yaml"  # what a file leaves out may be set too
+    entries = yaml.safe_load(own.read_text())
+    del entries["moves_m"]
+    short.write_text(yaml.safe_dump(entries))
+    assert find_recipe(str(short), ("moves_m=0.25",), ReconstructionRecipe).moves_m == 0.25
     with pytest.raises(InputError, match=r"no entry 'schedule'; did you mean representation\.schedule"):
         find_recipe("gaussians_tiny", ("schedule.steps=7",), ReconstructionRecipe)
     with pytest.raises(InputError, match="near: gaussians_tiny"):

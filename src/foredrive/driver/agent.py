@@ -27,16 +27,17 @@ SEEN = 0.5
 FADES, LONGEST, DOUBT = 0.5, 5.0, 0.2
 """Share of the evidence for a stop that is kept from plan to plan, its bound (logit), and the evidence below
 which a light that is not seen is forgotten."""
-NEAR_M, OTHER_M = 7.0, 12.0
-"""A light that is not seen is remembered within the first distance before its line. A distance that differs
-by more than the second is that of another light: at once if it is nearer, else when it is read again."""
-CONFIRMED = 3
-"""Readings in a row that make a farther light the next one."""
-SEEN_OTHER_M, SEEN_SHARE = 4.0, 0.5
-"""The same for a line that is seen itself, and the share by which such a reading moves it."""
-NEARER, FARTHER, BEFORE_LINE_M = 0.5, 0.15, 2.5
-"""Shares by which a line that is seen nearer or farther than remembered moves it, and how far before it the
-vehicle stops: at the line itself half of the lamps are out of view."""
+NEAR_M = 7.0
+"""Distance before its line within which a light that is not seen is remembered."""
+OTHER_M, SEEN_OTHER_M, CONFIRMED = 12.0, 4.0, 3
+"""Differences from the remembered distance by which a reading is of another light: of a line read at its
+lamps, and of one that is seen itself. A nearer light is the next one at once, a farther one after so many
+readings in a row."""
+NEARER, FARTHER, SEEN_SHARE = 0.5, 0.15, 0.5
+"""Shares by which readings of the same line move it: at lamps nearer or farther than remembered, and on the
+ground."""
+BEFORE_LINE_M = 2.5
+"""Distance before the line at which the vehicle stops: at the line half of the lamps are out of view."""
 FORGETS, STILL_M = 30, 0.02
 """Plans without a lamp after which a light is forgotten; those over which the vehicle has moved less do not
 count."""

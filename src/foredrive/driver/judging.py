@@ -24,7 +24,7 @@ FALSE_AT_MOST = 0.1
 
 
 class Moment(NamedTuple):
-    """What is judged of one clip."""
+    """Judgement of one clip."""
 
     state: int
     """True `LightState`."""

@@ -23,7 +23,7 @@ LINE_CELLS, LINE_CELL_M = 48, 1.0
 LINE_BESIDE_M = (-2.4, -0.8, 0.8, 2.4)
 """Cells of the ground in which the stop line of the next light is looked for: a line is 0.4 m wide."""
 LINE_FROM_M = 2.0
-"""A line that is nearer to the front bumper is below the image."""
+"""Distance from the front bumper within which a line is below the image of `front_tele`'s wide camera."""
 
 
 def route_cells(

@@ -22,7 +22,7 @@ FADES_M = 1.5
 """Distance beyond half the width of the path over which a road user beside it counts less, m."""
 RARE_LOGIT, NONE_LOGIT = -4.0, -2.0
 LIGHT_SCALE_M, LINE_BEFORE_LAMP_M = 20.0, 4.0
-"""Where no line is seen, its distance is read at the lamp: a logarithm from some metres before the line."""
+"""Scale of a stop line's distance as it is read at a lamp, where the line is not seen: log((m + 4) / 20)."""
 
 
 @dataclass(frozen=True)
@@ -36,11 +36,11 @@ class Sight(Record):
     lamp_line: Float[Tensor, "b C h w"]
     """The distance of the stop line as it is read at each place: log((m + 4) / 20)."""
     line_logits: Float[Tensor, f"b {LINE_CELLS + 1}"]
-    """Where the stop line of the next light is seen: in each of the `LINE_CELLS`, or in none of them."""
+    """Logits of the stop line of the next light in each of the `LINE_CELLS`, and of none in any."""
     occupied_logits: Float[Tensor, "b T G"]
     user_pixels: Float[Tensor, "b C K h w"]
-    """Whether a road user of each kind is at a place of an image. It is used in training only, so that the
-    features contain where road users are."""
+    """Logits of a road user of each kind at each place of an image. They are used in training only, so that
+    the features contain where road users are."""
     user_cells: Float[Tensor, "b U G L"]
     """The same for the cells along and beside the route; then the velocity along the route and to its left,
     in `VELOCITY_SCALE_MPS`."""
@@ -212,7 +212,7 @@ class LineHead(nn.Module):
     def __init__(self, channels: int, context: int, width: int = 48) -> None:
         super().__init__()
         self.ground = nn.Conv1d(channels * len(LINE_BESIDE_M) + 1, width, 1)
-        # Each layer sees twice as far along the route, in the end 28 m
+        # Each layer sees twice as far along the route as that before; all together 29 m
         self.along = nn.Sequential(
             nn.ReLU(),
             *(

@@ -1,4 +1,4 @@
-"""What `--verbose` and `--profile` do, in the process of a command and in its workers.
+"""Logs and profiles of commands and of their workers: `--verbose` and `--profile`.
 
 Workers learn of both from the environment, so no code between a command and its workers passes them on.
 """
@@ -6,8 +6,10 @@ Workers learn of both from the environment, so no code between a command and its
 import contextlib
 import dataclasses
 import functools
+import gzip
 import logging
 import os
+import shutil
 import signal
 import tempfile
 from collections.abc import Iterator, Sequence
@@ -26,7 +28,7 @@ DEFAULT_START_S, DEFAULT_LENGTH_S = 30.0, 5.0
 
 @dataclasses.dataclass(frozen=True)
 class ProfilePlan:
-    """What is profiled.
+    """File and time of a profile.
 
     Args:
         file: where the trace goes, gzipped JSON that Perfetto opens. Workers add their process number.
@@ -73,6 +75,10 @@ def take_debugging(args: Sequence[str]) -> list[str]:
             os.environ[VERBOSE] = "1"
         elif flag == "--profile":
             plan = ProfilePlan.parse(value if equals else next(words, ""))
+            if not os.access(plan.file.parent, os.W_OK):  # the command would do its work and lose the trace
+                raise InputError(
+                    f"--profile: {plan.file.parent}: no such folder, or nothing can be written there"
+                )
             os.environ[PROFILE] = f"{plan.file}:{plan.start_s}:{plan.length_s}"
         else:
             rest.append(word)
@@ -143,7 +149,10 @@ class _Recording:
         signal.setitimer(signal.ITIMER_REAL, self._plan.length_s)
 
     def end(self) -> None:
-        """Write the trace, once. A command that ends before its recording starts says so."""
+        """Write the trace, once. A command that ends before its recording starts says so.
+
+        A full disk costs the trace, and not the work of the command that is interrupted here.
+        """
         if self._is_over:
             return
         self._is_over = True
@@ -152,10 +161,28 @@ class _Recording:
             _log.warning("%s was not written: the process ended before %g s", file, self._plan.start_s)
             return
         self._profiler.stop()
-        file.parent.mkdir(parents=True, exist_ok=True)
-        # Written beside its place and renamed, so that the file is complete when it appears
-        with tempfile.TemporaryDirectory(dir=file.parent) as folder:
-            written = Path(folder) / file.name
-            self._profiler.export_chrome_trace(str(written))
-            written.replace(file)
+        try:
+            # Written beside its place and renamed, so that the file is complete when it appears
+            with tempfile.TemporaryDirectory(dir=file.parent) as folder:
+                plain, written = Path(folder) / "trace.json", Path(folder) / file.name
+                self._profiler.export_chrome_trace(str(plain))
+                _check_whole(plain)
+                with plain.open("rb") as source, gzip.open(written, "wb", compresslevel=5) as packed:
+                    shutil.copyfileobj(source, packed)
+                written.replace(file)
+        except OSError as error:
+            _log.warning("%s was not written: %s", file, error.strerror or error)
+            return
         _log.warning("profile of %g s: %s (open it at https://ui.perfetto.dev)", self._plan.length_s, file)
+
+
+def _check_whole(trace: Path) -> None:
+    """Check that a trace has its end: the profiler leaves it cut off on a full disk, and returns.
+
+    Raises:
+        OSError: it is cut off.
+    """
+    with trace.open("rb") as file:
+        file.seek(-min(16, trace.stat().st_size), os.SEEK_END)
+        if not file.read().rstrip().endswith(b"}"):
+            raise OSError("it was cut off; is the disk full?")

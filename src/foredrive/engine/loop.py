@@ -195,8 +195,8 @@ def train(
             return
         if fabric.is_global_zero:
             write_conditions(folder, fabric, parts)
-        weights_m = sum(p.numel() for p in objective.parameters()) / 1e6
-        _log.info("%s: steps %d to %d on %s, %.2f M weights", folder, done, total, fabric.device, weights_m)
+        weights_count = sum(p.numel() for p in objective.parameters())
+        _log.info("%s: steps %d to %d on %s, %d weights", folder, done, total, fabric.device, weights_count)
         # Skip the batches of finished steps
         batches = itertools.islice(
             batch_order(items, schedule.batch_size, schedule.seed, weights), done, total

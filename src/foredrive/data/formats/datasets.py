@@ -19,7 +19,7 @@ class RawDataset:
     layout: str
     """What a folder of the data set contains, for messages."""
     note: str = ""
-    """What its name does not say, for help."""
+    """Remark behind the name in the help text."""
 
     def find(self, source: Path) -> "Iterator[RawLog]":
         """Yield the raw logs of a folder: of its root, of one log, or of one or two levels above them.

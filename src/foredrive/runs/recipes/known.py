@@ -85,18 +85,27 @@ def find_recipe(name: str, settings: Sequence[str] = (), *kinds: type) -> Any:
         InputError: there is no such recipe, it is of another kind, or a setting does not fit it.
     """
     wanted = kinds or (Recipe,)
+    kind, values = _values_of(name, wanted)
+    if kind not in wanted:
+        raise InputError(f"{name}: this recipe is for `foredrive {KINDS[kind].verb}`")
+    recipe = KINDS[kind].read(values, name)
+    # Entries that a file leaves out have their defaults by now, so that settings may replace these too
+    return KINDS[kind].read(overridden(asdict(recipe), settings), name) if settings else recipe
+
+
+def _values_of(name: str, wanted: Sequence[type]) -> tuple[type, Any]:
+    """Return the kind and the plain values of a recipe by its name or from a YAML file.
+
+    Raises:
+        InputError: there is none. The message has near names of recipes for the same verbs.
+    """
     if is_recipe_file(name):
         values = read_values(Path(name))
         fields = values if isinstance(values, Mapping) else {}
-        kind = next(kind for kind, row in KINDS.items() if row.fits(fields))
-    else:
-        kinds_with_name = [kind for kind, row in KINDS.items() if name in row.recipes]
-        if not kinds_with_name:
-            verbs = {KINDS[kind].verb for kind in wanted}
-            names = [known for row in KINDS.values() if row.verb in verbs for known in row.recipes]
-            raise InputError(f"no recipe {name!r}{nearest_name(name, names)}")
-        kind = kinds_with_name[0]
-        values = asdict(KINDS[kind].recipes[name])
-    if kind not in wanted:
-        raise InputError(f"{name}: this recipe is for `foredrive {KINDS[kind].verb}`")
-    return KINDS[kind].read(overridden(values, settings) if settings else values, name)
+        return next(kind for kind, row in KINDS.items() if row.fits(fields)), values
+    for kind, row in KINDS.items():
+        if name in row.recipes:
+            return kind, asdict(row.recipes[name])
+    verbs = {KINDS[kind].verb for kind in wanted}
+    names = [recipe for row in KINDS.values() if row.verb in verbs for recipe in row.recipes]
+    raise InputError(f"no recipe {name!r}{nearest_name(name, names)}")
