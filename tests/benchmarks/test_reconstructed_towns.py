@@ -6,9 +6,9 @@ import math
 import numpy as np
 import pytest
 import torch
-from benchmarks.common.reconstructed_towns import TownDrive, TownTruth, TrueViews
 from scipy.spatial import cKDTree
 
+from benchmarks.common.reconstructed_towns import TownDrive, TownTruth, TrueViews
 from foredrive.errors import InputError
 from foredrive.geometry.se3 import exp_se3, inverse_se3, transform_points
 from foredrive.methods.reconstruction.calibration import with_images_from

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from benchmarks.common.reconstructed_towns import TownDrive, TownTruth
 
+from benchmarks.common.reconstructed_towns import TownDrive, TownTruth
 from benchmarks.common.safety_pairs import Driven, Pair, agreement, outline, read_pair
 from benchmarks.common.safety_suites import spread
 from foredrive.driving.ncap.scenario import Polyline, SafetyScenario, ScenarioActor
