@@ -42,7 +42,7 @@ from foredrive.cli.search_index import search_index, search_train
 from foredrive.cli.serve import serve
 from foredrive.cli.train import train
 from foredrive.cli.view import view
-from foredrive.engine.debugging import debugging, is_verbose, take_debugging
+from foredrive.debugging import debugging, is_verbose, take_debugging
 from foredrive.errors import InputError
 from foredrive.files import WHILE_WRITING
 from foredrive.interrupts import LastingInterrupt

@@ -71,6 +71,7 @@ from foredrive.data.modalities import (
 from foredrive.data.notices import write_notices
 from foredrive.data.setting import Setting, pack_setting
 from foredrive.data.written_boxes import box_modalities
+from foredrive.debugging import profile_step
 from foredrive.errors import InputError
 from foredrive.files import atomic_path
 from foredrive.geometry.se3 import log_so3
@@ -214,6 +215,7 @@ class LogWriter:
 
     def write(self, frame: Frame) -> None:
         """Append a frame. Times must increase."""
+        profile_step()
         if not np.isfinite(frame.T_world_ego).all():
             raise InputError(f"{self.folder}: the ego pose at {frame.t_us} µs is not finite")
         if self._previous is not None and frame.t_us <= self._previous.t_us:

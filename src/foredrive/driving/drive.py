@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from foredrive.data.batches import stack_records
+from foredrive.debugging import profile_step
 from foredrive.driving.comfort import JERK_S, Comfort, comfort_of
 from foredrive.driving.controller import ControllerState, follow
 from foredrive.driving.dynamics import EGO, STEP_S
@@ -137,6 +138,7 @@ def drive_route(
     pilot, ending, error = pilot or FollowingPilot(simulator, pace.latency_s), None, ""
     while ending is None:
         index = len(states) - 1
+        profile_step()
         # Plan at the multiples of the planning period
         if index % pace.steps == 0:
             began = time.perf_counter()

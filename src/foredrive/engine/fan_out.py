@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import rich
 
-from foredrive.engine.debugging import debugging
+from foredrive.debugging import debugging
 from foredrive.engine.interrupts import end_with_parent, hold_interrupts, start_fork_server
 from foredrive.errors import InputError
 from foredrive.interrupts import LastingInterrupt

@@ -16,6 +16,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from torch import Tensor, nn
 from torch.utils.data import DataLoader, Dataset
 
+from foredrive.debugging import profile_step
 from foredrive.engine.checkpoints import latest_checkpoint, load_checkpoint, remove_older, save_checkpoint
 from foredrive.engine.interrupts import end_with_parent, hold_interrupts, start_fork_server
 from foredrive.engine.metrics_log import MetricsLog
@@ -269,6 +270,7 @@ def step_counter(
         def end_step(losses: dict[str, Tensor], note: str) -> bool:
             nonlocal step
             step += 1
+            profile_step()
             if log is not None:
                 log.add(step, losses)
             progress.update(task, completed=step, note=note)

@@ -16,6 +16,7 @@ from foredrive.data.cameras import CameraFrame, pinhole_cameras, read_camera
 from foredrive.data.lidar import read_sweep
 from foredrive.data.logs import Log
 from foredrive.data.recorded import read_caption, read_setting
+from foredrive.debugging import profile_step
 from foredrive.scene import Category, LidarSweep
 from foredrive.search.crops import Crop
 from foredrive.search.rows import COUNTS, FACTS, SCORES, WHOLE, row_schema
@@ -92,6 +93,7 @@ def _embed_by_name(
     """
     vectors: dict[tuple[int, str], np.ndarray] = {}
     for name in {name for views in seen for name in views}:
+        profile_step()
         moments = [now for now, views in enumerate(seen) if name in views]
         embedded = embed_views(towers, [seen[now][name] for now in moments])
         vectors |= {(now, name): pair for now, pair in zip(moments, embedded, strict=True)}

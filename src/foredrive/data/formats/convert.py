@@ -16,6 +16,7 @@ from foredrive.data.formats.guard import SensorFiles, check_finite, check_inside
 from foredrive.data.formats.raw_log import OwnLog, RawLog
 from foredrive.data.log_paths import LogPath
 from foredrive.data.notices import collecting, write_notices
+from foredrive.debugging import profile_step
 from foredrive.errors import InputError
 from foredrive.files import atomic_path
 
@@ -129,6 +130,7 @@ def _write_frames(
         writer.write_sync(ModalitiesSync(frame.timestamp, loaded))
         frames += 1
         tick()
+        profile_step()
     # A sensor of which nothing can be read is an error
     files.check()
     writer.close()

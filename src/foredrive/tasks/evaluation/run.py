@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Bool, Int
 from torch import Tensor
 
+from foredrive.debugging import profile_step
 from foredrive.engine.provenance import peak_rss_gib
 from foredrive.errors import InputError
 from foredrive.scene import Agent, Example, Trajectory
@@ -125,6 +126,7 @@ def predict_batches(
     batches = iter(loader)
     batch_size = getattr(loader, "batch_size", None) or 1
     while True:
+        profile_step()
         try:
             example = next(batches).to(device)
         except StopIteration:

@@ -11,9 +11,9 @@ import pytest
 import torch
 from full_disk import files_up_to
 
+from foredrive import debugging
 from foredrive.cli.main import main
-from foredrive.engine import debugging
-from foredrive.engine.debugging import ProfilePlan, take_debugging
+from foredrive.debugging import ProfilePlan, take_debugging
 from foredrive.engine.fan_out import fan_out
 from foredrive.errors import InputError
 
@@ -23,14 +23,15 @@ def own_environment(monkeypatch: pytest.MonkeyPatch) -> None:
     for variable in (debugging.VERBOSE, debugging.PROFILE):
         monkeypatch.setenv(variable, "")
         monkeypatch.delenv(variable)
-    monkeypatch.setattr(debugging._Recording, "is_made", False)
+    monkeypatch.setattr(debugging._Recording, "current", None)
 
 
 def busy_for(seconds: float) -> float:
-    """Work in PyTorch and in Python's own functions."""
+    """Work in PyTorch and in Python's own functions, in steps."""
     end, total = time.monotonic() + seconds, 0.0
     while time.monotonic() < end:
         total += float(torch.ones(8, 8).matmul(torch.ones(8, 8)).sum()) + sum_of_squares(20)
+        debugging.profile_step()
     return total
 
 
@@ -98,7 +99,10 @@ def test_command_that_ends_before_its_recording_says_so(
     take_debugging(["train", f"--profile={tmp_path / 'trace.json.gz'}:60"])
     with debugging.debugging():
         pass
-    assert "was not written: the process ended before 60 s" in caplog.text
+    assert (
+        "was not written: no step of training, driving, evaluating or recording began after 60 s"
+        in caplog.text
+    )
     assert not list(tmp_path.iterdir())
 
 

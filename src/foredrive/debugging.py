@@ -5,17 +5,15 @@ Workers learn of both from the environment, so no code between a command and its
 
 import contextlib
 import dataclasses
-import functools
 import gzip
 import logging
 import os
 import shutil
-import signal
 import tempfile
+import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from types import FrameType
-from typing import Any
+from typing import ClassVar
 
 from foredrive.errors import InputError
 
@@ -33,7 +31,7 @@ class ProfilePlan:
     Args:
         file: where the trace goes, gzipped JSON that Perfetto opens. Workers add their process number.
         start_s: time from the start of a process to that of its recording.
-        length_s: length of the recording; every second takes some 10 MB of memory or more.
+        length_s: length of the recording. A second takes 1 MB to 1.5 GB of memory, by the number of operators.
     """
 
     file: Path
@@ -100,7 +98,7 @@ def debugging(worker: bool = False) -> Iterator[None]:
     if is_verbose():
         logging.basicConfig(format="%(relativeCreated)7d ms %(process)d %(name)s: %(message)s")
         logging.getLogger("foredrive").setLevel(logging.DEBUG)
-    if PROFILE not in os.environ or _Recording.is_made:
+    if PROFILE not in os.environ or _Recording.current is not None:  # A worker records in its first job
         yield
         return
     plan = ProfilePlan.parse(os.environ[PROFILE])
@@ -109,56 +107,65 @@ def debugging(worker: bool = False) -> Iterator[None]:
         plan = dataclasses.replace(
             plan, file=plan.file.with_suffix("").with_suffix(f".{os.getpid()}.json.gz")
         )
-    recording = _Recording(plan)
-    # An alarm of wall-clock time starts the recording in whatever code runs then
-    signal.signal(signal.SIGALRM, recording)
-    signal.setitimer(signal.ITIMER_REAL, plan.start_s)
+    _Recording.current = recording = _Recording(plan)
     try:
         yield
     finally:
-        # No alarm may arrive while the trace is written
-        signal.setitimer(signal.ITIMER_REAL, 0)
         recording.end()
 
 
-class _Recording:
-    """A handler of alarms. The first one starts the profiler, the second one writes the trace."""
+def profile_step() -> None:
+    """Start or end the recording of `--profile` if it is time. Long loops call this once a step.
 
-    is_made = False
-    """Whether this process has had its recording: a worker records in its first job."""
+    A signal or a timer would do so in the middle of an operator, which crashes PyTorch's profiler.
+    """
+    if _Recording.current is not None:
+        _Recording.current.step()
+
+
+class _Recording:
+    """The profile of this process."""
+
+    current: "ClassVar[_Recording | None]" = None
 
     def __init__(self, plan: ProfilePlan) -> None:
-        # Not imported in the handler, which may interrupt an import halfway
         from torch.profiler import profile
 
-        # With stacks, the trace has Python's own functions as well as those of PyTorch
-        self._made = functools.partial(profile, with_stack=True)
         # A first, empty profile: the first one of a process loses operators while the profiler sets itself up
-        with self._made():
+        with profile(with_stack=True):
             pass
-        self._plan, _Recording.is_made = plan, True
-        self._profiler: Any = None
+        # With stacks, the trace has Python's own functions as well as those of PyTorch
+        self._profiler = profile(with_stack=True)
+        self._plan, self._begins_s = plan, time.monotonic() + plan.start_s
+        self._ends_s: float | None = None
         self._is_over = False
 
-    def __call__(self, number: int, frame: FrameType | None) -> None:
-        if self._profiler is not None:
-            self.end()
+    def step(self) -> None:
+        """Start the profiler at its time, and write the trace when the recording is long enough."""
+        now_s = time.monotonic()
+        if self._is_over or now_s < self._begins_s:
             return
-        self._profiler = self._made()
-        self._profiler.start()
-        signal.setitimer(signal.ITIMER_REAL, self._plan.length_s)
+        if self._ends_s is None:
+            self._ends_s = now_s + self._plan.length_s
+            self._profiler.start()
+        elif now_s >= self._ends_s:
+            self.end()
 
     def end(self) -> None:
         """Write the trace, once. A command that ends before its recording starts says so.
 
-        A full disk costs the trace, and not the work of the command that is interrupted here.
+        A full disk costs the trace, and not the work of the command.
         """
         if self._is_over:
             return
         self._is_over = True
         file = self._plan.file
-        if self._profiler is None:
-            _log.warning("%s was not written: the process ended before %g s", file, self._plan.start_s)
+        if self._ends_s is None:
+            _log.warning(
+                "%s was not written: no step of training, driving, evaluating or recording began after %g s",
+                file,
+                self._plan.start_s,
+            )
             return
         self._profiler.stop()
         try:
@@ -173,7 +180,7 @@ class _Recording:
         except OSError as error:
             _log.warning("%s was not written: %s", file, error.strerror or error)
             return
-        _log.warning("profile of %g s: %s (open it at https://ui.perfetto.dev)", self._plan.length_s, file)
+        _log.warning("profile: %s (open it at https://ui.perfetto.dev)", file)
 
 
 def _check_whole(trace: Path) -> None:
