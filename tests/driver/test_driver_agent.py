@@ -112,6 +112,19 @@ def test_a_line_that_was_told_by_lamps_alone_is_not_waited_for() -> None:
     assert state(view) is LightState.RED  # it is below the image
 
 
+@pytest.mark.parametrize(("line_m", "p", "waits"), [(3.0, 0.97, True), (3.0, 0.6, False), (-1.5, 0.97, False)])
+def test_a_light_hardly_seen_or_far_beyond_its_line_is_waited_for_a_while(
+    line_m: float, p: float, waits: bool
+) -> None:
+    memory = LightMemory()
+    memory.update(estimate(LightState.RED, 8.0, p), 0.0, line_seen=True)
+    view = memory.update(estimate(LightState.NONE, 12.0), 8.0 - line_m)
+    assert state(view) is LightState.RED
+    for _ in range(30):
+        view = memory.update(estimate(LightState.NONE, 12.0), 0.0)
+    assert (state(view) is LightState.RED) == waits
+
+
 def test_a_light_that_was_seen_far_away_and_vanishes_fades() -> None:
     memory = LightMemory()
     memory.update(estimate(LightState.RED, 30.0, p=0.7), 0.0)

@@ -27,6 +27,9 @@ SEEN = 0.5
 FADES, LONGEST, DOUBT = 0.5, 5.0, 0.2
 """Share of the evidence for a stop that is kept from plan to plan, its bound (logit), and the evidence below
 which a light that is not seen is forgotten."""
+WEAK, WEAKLY, BEYOND_M = 2.0, 0.9, 1.0
+"""Evidence below which a light at its line is waited for only for a while, the share of it that is kept from
+plan to plan, and the distance beyond the line from which that holds for each light: its lamps are in view."""
 NEAR_M = 7.0
 """Distance before its line within which a light that is not seen is remembered."""
 OTHER_M, SEEN_OTHER_M, CONFIRMED = 12.0, 4.0, 3
@@ -108,9 +111,8 @@ class LightMemory:
         else:
             # Unseen plans count only while the vehicle moves
             self._unseen += moved_m > STILL_M  # a standing vehicle waits for the light
-            near = self._is_near(line_m, line_seen)
-            self._evidence *= 1.0 if near else FADES
-            if not near and abs(self._evidence) < DOUBT:
+            self._evidence *= self._kept(line_m, line_seen)
+            if abs(self._evidence) < DOUBT:
                 self.forget()
         if self._unseen > FORGETS or (self._line_m is not None and self._line_m < -PASSED_M):
             self.forget()
@@ -126,13 +128,16 @@ class LightMemory:
         stop_m = max(self._line_m - BEFORE_LINE_M, min(self._line_m, 0.0))
         return PathEstimate(light[None].to(view.light), torch.full_like(view.light_m, stop_m), view.occupied)
 
-    def _is_near(self, line_m: float, line_seen: bool) -> bool:
-        """Return whether a light that is not seen is waited for: its line is near, and not in doubt."""
+    def _kept(self, line_m: float, line_seen: bool) -> float:
+        """Return the share of the evidence that is kept of a light that is not seen."""
         if self._line_m is None or not -PASSED_M < self._line_m < NEAR_M:
-            return False
+            return FADES
         # A line that is in view must be seen in its place
         is_confirmed = line_seen and abs(line_m - self._line_m) < SEEN_OTHER_M
-        return is_confirmed or self._line_m < (HELD_M if self._was_seen else AHEAD_M)
+        if not is_confirmed and self._line_m >= (HELD_M if self._was_seen else AHEAD_M):
+            return FADES
+        # Who stands for a light that was hardly seen, or far beyond its line, would wait until it is impatient
+        return WEAKLY if abs(self._evidence) < WEAK or self._line_m < -BEYOND_M else 1.0
 
     def _move_line(self, line_m: float, line_seen: bool) -> None:
         """Take in a reading of the distance of the line."""
