@@ -31,7 +31,7 @@ class ProfilePlan:
     Args:
         file: where the trace goes, gzipped JSON that Perfetto opens. Workers add their process number.
         start_s: time from the start of a process to that of its recording.
-        length_s: length of the recording. A second takes 1 MB to 1.5 GB of memory, by the number of operators.
+        length_s: length of the recording. A second takes 1 MB to 1.5 GB of memory; operators are recorded.
     """
 
     file: Path

@@ -112,7 +112,9 @@ def test_a_line_that_was_told_by_lamps_alone_is_not_waited_for() -> None:
     assert state(view) is LightState.RED  # it is below the image
 
 
-@pytest.mark.parametrize(("line_m", "p", "waits"), [(3.0, 0.97, True), (3.0, 0.6, False), (-1.5, 0.97, False)])
+@pytest.mark.parametrize(
+    ("line_m", "p", "waits"), [(3.0, 0.97, True), (3.0, 0.6, False), (-1.5, 0.97, False)]
+)
 def test_a_light_hardly_seen_or_far_beyond_its_line_is_waited_for_a_while(
     line_m: float, p: float, waits: bool
 ) -> None:

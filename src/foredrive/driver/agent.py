@@ -136,7 +136,7 @@ class LightMemory:
         is_confirmed = line_seen and abs(line_m - self._line_m) < SEEN_OTHER_M
         if not is_confirmed and self._line_m >= (HELD_M if self._was_seen else AHEAD_M):
             return FADES
-        # Who stands for a light that was hardly seen, or far beyond its line, would wait until it is impatient
+        # Who stands for a light hardly seen, or far beyond its line, would wait until it is impatient
         return WEAKLY if abs(self._evidence) < WEAK or self._line_m < -BEYOND_M else 1.0
 
     def _move_line(self, line_m: float, line_seen: bool) -> None:
