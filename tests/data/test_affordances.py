@@ -15,7 +15,7 @@ from foredrive.data import LogPath, find_logs
 from foredrive.data.log_writer import LogWriter
 from foredrive.data.logs import Log
 from foredrive.data.maps import write_map
-from foredrive.data.truth.affordances import read_affordances
+from foredrive.data.truth.affordances import read_affordances, read_stop_lines
 from foredrive.data.truth.store import TaskTruthConfig, TaskTruthStore
 from foredrive.geometry.path_frame import along_path, path_headings
 from foredrive.scene import Boxes, Category, VoxelSpec
@@ -87,6 +87,15 @@ def written(root: Path, route: np.ndarray | None) -> LogPath:
 @pytest.fixture(scope="module")
 def log(tmp_path_factory: pytest.TempPathFactory) -> Log:
     return Log(written(tmp_path_factory.mktemp("lights"), ROUTE))
+
+
+def test_stop_lines_lie_across_their_lanes(log: Log) -> None:
+    (state, ends), (other, _) = sorted(read_stop_lines(log, FRAME // 5))
+    assert (state, other) == (LightState.RED, LightState.GREEN)
+    left = np.array([LINE_X, 1.5]) + world.WORLD_OFFSET[:2]
+    assert ends == pytest.approx(np.stack([left, left - [0.0, 3.0]]))
+    later = [state for state, _ in read_stop_lines(log, 8)]
+    assert later == [LightState.GREEN, LightState.GREEN]
 
 
 def front_x(log: Log) -> float:

@@ -1,5 +1,6 @@
 """An animated picture of a closed-loop drive: the front cameras, and the scene from above."""
 
+from collections.abc import Sequence
 from functools import lru_cache
 from pathlib import Path
 
@@ -11,10 +12,12 @@ from foredrive.data.boxes import read_boxes
 from foredrive.data.cameras import find_camera, pinhole_cameras, read_camera
 from foredrive.data.log_paths import LogPath
 from foredrive.data.logs import Log
+from foredrive.data.truth.affordances import read_stop_lines
 from foredrive.driving.drive_record import DriveRecord
 from foredrive.driving.observation import FRAME_DT_S
 from foredrive.geometry.boxes import box_corners
 from foredrive.scene import Boxes
+from foredrive.scene.traffic_light import LightState
 from foredrive.towns.map.town_map import load_town_map
 from foredrive.view import palette
 from foredrive.view.bev import EGO_OUTLINE_XY
@@ -35,6 +38,7 @@ MIN_RADIUS_PX = 3.5
 SCENARIO_CAPTION_S = 6.0
 """Time for which a caption shows a scenario after its start, s."""
 ROAD, EDGE, ROUTE = "#2a323e", "#3b4656", "#2b6b47"
+LIGHT_COLOURS = {LightState.RED: "#ff3b3b", LightState.YELLOW: "#ffc53d", LightState.GREEN: "#3ddc6b"}
 
 
 def write_drive_video(path: Path, log: LogPath, drive: DriveRecord) -> None:
@@ -51,7 +55,11 @@ def write_drive_video(path: Path, log: LogPath, drive: DriveRecord) -> None:
 
 def _frame(log: Log, index: int, drive: DriveRecord) -> Image.Image:
     above = draw_from_above(
-        drive.town, np.array(drive.route_xy), log.T_world_ego[index], read_boxes(log, index)
+        drive.town,
+        np.array(drive.route_xy),
+        log.T_world_ego[index],
+        read_boxes(log, index),
+        read_stop_lines(log, index),
     )
     _caption(ImageDraw.Draw(above), log, index, drive)
     cameras = pinhole_cameras(log)
@@ -75,12 +83,14 @@ def draw_from_above(
     route_xy: Float[np.ndarray, "N 2"],
     T_world_ego: Float[np.ndarray, "4 4"],
     boxes: Boxes | None,
+    lights: Sequence[tuple[LightState, Float[np.ndarray, "2 2"]]] = (),
 ) -> Image.Image:
     """Draw the scene around the ego vehicle from above; the ego faces right.
 
     Args:
         town: town whose lanes are drawn; None: there is no map.
         boxes: boxes of the other actors, in the ego frame.
+        lights: states of lights, and the ends of their stop lines in the world.
     """
     twice = 2  # Drawn at twice the size and shrunk, because PIL does not smooth the edges of polygons
     image = Image.new("RGB", (twice * ABOVE_WH[0], twice * ABOVE_WH[1]), palette.GROUND)
@@ -100,6 +110,8 @@ def draw_from_above(
         if np.abs(outline - T_world_ego[:2, 3]).max(axis=1).min() < ABOVE_WH[0] / PX_PER_M:
             pen.polygon(pixels(from_world(outline)), fill=ROAD, outline=EDGE, width=twice)
     pen.line(pixels(from_world(route_xy)), fill=ROUTE, width=twice * 4, joint="curve")
+    for state, ends in lights:
+        pen.line(pixels(from_world(ends)), fill=LIGHT_COLOURS[state], width=twice * 3)
     if boxes is not None:
         boxes = boxes[boxes.valid]
         corners = box_corners(boxes.centre, boxes.size_lwh, boxes.yaw)[:, :4, :2]

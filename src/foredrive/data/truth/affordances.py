@@ -46,6 +46,8 @@ ALIGNED_COS = 0.5
 LEVEL_M = 2.5
 """A stop line is on the path if its lane begins at most this far beside it, at most 60° turned, at its
 height."""
+STOP_LINE_M = 3.0
+"""Length of a stop line across its lane."""
 FOLLOWS_M, FOLLOWS_SLOPE = 2.0, 0.15
 """A road user behind the rear axle follows the ego vehicle if it is at most this far beside its axis: more
 the further behind it is."""
@@ -183,6 +185,24 @@ def _light(log: Log, frame: int, path: PathAhead) -> tuple[LightState, float, bo
         if state is not None:
             return state, float(distance_m[row]), True, lane
     return LightState.NONE, 0.0, True, None
+
+
+def read_stop_lines(log: Log, frame: int) -> list[tuple[LightState, Float64[np.ndarray, "2 2"]]]:
+    """Read the state of each known light at a frame, and the ends of its lane's stop line, world xy in m.
+
+    Raises:
+        InputError: the map or the lights cannot be read.
+    """
+    shown, lines = read_traffic_lights(log, frame), _stop_lines(log)
+    if shown is None or lines is None:
+        return []
+    # Across the lane, to its left
+    left = np.stack([-lines.ahead[:, 1], lines.ahead[:, 0]], axis=1) * STOP_LINE_M / 2
+    return [
+        (state, np.stack([xyz[:2] + half, xyz[:2] - half]))
+        for lane, xyz, half in zip(lines.lane.tolist(), lines.xyz, left, strict=True)
+        if (state := STATE_OF_STATUS.get(shown.get(lane, TrafficLightStatus.UNKNOWN))) is not None
+    ]
 
 
 def _lamps(log: Log, frame: int, lane: int | None) -> tuple[Float[Tensor, "L 3"], bool]:
