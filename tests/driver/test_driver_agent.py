@@ -160,11 +160,25 @@ def test_a_green_light_that_was_crossed_does_not_turn_red() -> None:
 def test_doubt_that_there_is_a_light_does_not_turn_it_green() -> None:
     memory = LightMemory()
     unsure = PathEstimate(
-        torch.tensor([[0.35, 0.26, 0.15, 0.24]]), torch.tensor([8.0]), torch.zeros(1, TIMES, CELLS)
+        torch.tensor([[0.45, 0.40, 0.05, 0.10]]), torch.tensor([8.0]), torch.zeros(1, TIMES, CELLS)
     )
     for _ in range(20):
         view = memory.update(unsure, 0.0)
-    assert state(view) is LightState.RED  # .41 to .24
+    assert state(view) is LightState.RED  # .45 to .10
+
+
+def test_readings_without_a_clear_state_keep_no_light_alive() -> None:
+    memory = LightMemory()
+    memory.update(estimate(LightState.RED, 9.0), 0.0, line_seen=True)
+    unclear = PathEstimate(
+        torch.tensor([[0.05, 0.36, 0.31, 0.28]]), torch.tensor([30.0]), torch.zeros(1, TIMES, CELLS)
+    )
+    for moved_m in (4.0, *[0.0] * 10):  # at 5 m the line would be in view
+        view = memory.update(unclear, moved_m)
+    assert state(view) is LightState.NONE
+    for _ in range(5):
+        view = memory.update(unclear, 0.0)
+    assert state(view) is LightState.NONE
 
 
 def test_one_wrong_frame_does_not_turn_a_light() -> None:

@@ -22,8 +22,8 @@ from foredrive.scene.affordances import PathEstimate
 from foredrive.scene.clip import ROUTE_M
 from foredrive.scene.traffic_light import LightState
 
-SEEN = 0.5
-"""Probability of a lamp from which the light of a frame counts."""
+SEEN, CLEAR = 0.5, 1.1
+"""Probability of a lamp, and odds (logit, 3 to 1) of stop or go, from which the light of a frame counts."""
 FADES, LONGEST, DOUBT = 0.5, 5.0, 0.2
 """Share of the evidence for a stop that is kept from plan to plan, its bound (logit), and the evidence below
 which a light that is not seen is forgotten."""
@@ -102,9 +102,10 @@ class LightMemory:
         # A new line is seen from afar: one that is read at the bumper has just been crossed
         self._has_moved = self._has_moved or moved_m > STILL_M
         is_behind = self._line_m is None and line_m < AHEAD_M and self._has_moved
-        if 1 - p[LightState.NONE] > SEEN and not (is_through or is_behind):
-            # Odds given that there is a light: the probability of NONE is no evidence for green
-            odds = float(np.log((stops + 0.02) / (p[LightState.GREEN] + 0.02)))
+        # Odds given that there is a light: the probability of NONE is no evidence for green
+        odds = float(np.log((stops + 0.02) / (p[LightState.GREEN] + 0.02)))
+        is_clear = 1 - p[LightState.NONE] > SEEN and abs(odds) > CLEAR
+        if is_clear and not (is_through or is_behind):
             self._evidence = float(np.clip(FADES * self._evidence + odds, -LONGEST, LONGEST))
             self._unseen, self._yellow = 0, p[LightState.YELLOW] > p[LightState.RED]
             self._move_line(line_m, line_seen)

@@ -18,6 +18,7 @@ from foredrive.engine.summary import Summary, read_summary
 from foredrive.errors import InputError
 from foredrive.methods.nemo.recipes import nemo_tiny
 from foredrive.methods.recipe import Recipe, rescheduled
+from foredrive.runs.drive.agent_inputs import rig_of
 from foredrive.runs.drive.agents import CORRIDOR, EXPERT, REPLAY
 from foredrive.runs.drive.in_reconstruction import ReconstructedRoutes
 from foredrive.runs.drive.in_towns import TownRoutes
@@ -40,10 +41,12 @@ from foredrive.sensors.rigs import SURROUND
 from foredrive.towns.campaign import DrivePlan
 
 SHIPPED = "embedded:nemo_town"
-"""The model that sees and drives."""
+"""The world model that sees."""
+DRIVER = "embedded"
+"""The driver by sight."""
 ROUTES = "town05-short"
-MODEL = "model"
-"""Key of the shipped model's drive, beside that of the expert."""
+SEEING = "driver"
+"""Key of the shipped driver's drive, beside that of the expert."""
 MET_BY = (REPLAY, CORRIDOR)
 """Agents that meet the car in their way: one replays the recorded drive, the other one uses the lidar."""
 TEXTS = ("a pedestrian close by", "a street at night")
@@ -181,7 +184,7 @@ def record_logs(demo: Demo) -> list[LogPath]:
 
 def judge_shipped(demo: Demo) -> Judged:
     """Evaluate the shipped model on the held-out drive."""
-    return _judged(open_run(_shipped(demo)), demo, demo.out / "seen")
+    return _judged(open_run(run_folder(Path(SHIPPED), demo.out)), demo, demo.out / "seen")
 
 
 def train_tiny(demo: Demo) -> Judged:
@@ -191,10 +194,11 @@ def train_tiny(demo: Demo) -> Judged:
 
 
 def drive_route(demo: Demo) -> dict[str, Driven]:
-    """Drive a route of the held-out town: the shipped model, and the expert without sensors."""
-    source = TownRoutes(ROUTES, only=(demo.size.route,))
+    """Drive a route of the held-out town: the shipped driver, and the expert without sensors."""
+    driver = str(run_folder(Path(DRIVER), demo.out).absolute())
+    source = TownRoutes(ROUTES, only=(demo.size.route,), rig=rig_of(driver))
     return {
-        MODEL: _driven(DriveSuite(str(_shipped(demo).absolute()), source), demo.out / "driven"),
+        SEEING: _driven(DriveSuite(driver, source, lidar=False), demo.out / "driven"),
         EXPERT: _driven(DriveSuite(EXPERT, source, sensors=False), demo.out / "driven_expert"),
     }
 
@@ -235,10 +239,6 @@ def _indexed(demo: Demo) -> Path:
 
 def _found(index: FrameIndex, query: Query) -> Found:
     return Found(query, ask(index, query).hits)
-
-
-def _shipped(demo: Demo) -> Path:
-    return run_folder(Path(SHIPPED), demo.out)
 
 
 def _logs(demo: Demo, plans: Sequence[DrivePlan]) -> list[LogPath]:

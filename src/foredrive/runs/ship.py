@@ -138,7 +138,7 @@ def ship_driver(
     clips.pack()
     both = []
     for one, folder in ((run, work / "drives"), (small, work / "drives_in_8_bits")):
-        driven = drive_suite(DriveSuite(str(one.folder.absolute()), routes, sensors=False), folder)
+        driven = drive_suite(DriveSuite(str(one.folder.absolute()), routes, lidar=False), folder)
         if driven.broken:
             raise InputError(f"{folder}: {len(driven.broken)} drives failed")
         values = [values_of(drive) for drive in driven.drives.values()]

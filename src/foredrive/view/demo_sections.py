@@ -10,7 +10,7 @@ from PIL import Image, ImageOps
 
 from foredrive.engine.metrics_log import read_metrics
 from foredrive.runs.demo import (
-    MODEL,
+    SEEING,
     TEXTS,
     Demo,
     Driven,
@@ -49,6 +49,7 @@ RECONSTRUCTION_WIDTH_PX = 512
 SHOWN_VIEWS = 2
 IOU = "occupancy.above_ground.iou_now"
 L2 = "uniad.l2_avg_m"
+FILM = "The drive at twice real time: its cameras, and the scene from above, with each light at its stop line"
 MET_BY = {REPLAY: "drives on as recorded", CORRIDOR: "stops for what the rendered lidar sees"}
 
 
@@ -137,16 +138,18 @@ def show_training(demo: Demo) -> Section:
 def show_drive(demo: Demo) -> Section:
     """Drive a route; show the film, the path, and the scores beside the expert's."""
     driven = drive_route(demo)
-    model = driven[MODEL]
-    write_drive_report(model.folder)
-    score = model.record.score
+    seeing = driven[SEEING]
+    write_drive_report(seeing.folder)
+    score = seeing.record.score
     return Section(
-        f"driving score {model.record.driving_score_1_0:.0f}, {100 * score.completion:.0f} % of the route",
-        _cover(_middle_frame(_film_path(model))),
+        f"driving score {seeing.record.driving_score_1_0:.0f}, {100 * score.completion:.0f} % of the route",
+        _cover(_middle_frame(_film_path(seeing))),
         [
-            Block(figures=[stored_film(_film_path(model), "The model's drive, at twice real time")]),
-            Block(table=_scores({f"the model on {model.name}": model, "the expert": driven[EXPERT]})),
-            Block(drawings=[inline_svg(draw(model.record)) for draw in (draw_drive_path, draw_timeline)]),
+            Block(figures=[stored_film(_film_path(seeing), FILM)]),
+            Block(
+                table=_scores({f"the driver by sight on {seeing.name}": seeing, "the expert": driven[EXPERT]})
+            ),
+            Block(drawings=[inline_svg(draw(seeing.record)) for draw in (draw_drive_path, draw_timeline)]),
         ],
     )
 

@@ -49,11 +49,12 @@ STEPS = (
     Step(
         "Drive",
         "driving a route of Town05 in closed loop",
-        "The vehicle drives the shipped model's plans, and what the model sees next depends on them. The "
-        "scores are those of CARLA's leaderboard 1.0. The model learned to imitate plans, not to recover "
-        "from its own mistakes; the expert beside it knows the state of the town.",
+        "The driver that comes with the package has two front cameras, its route and its speed. It reads "
+        "the next light, its stop line, and who will be on the route, and chooses a speed. It learned in "
+        "other towns. What it sees next depends on what it does. The scores are those of CARLA's "
+        "leaderboard 1.0; the expert beside it knows the state of the town.",
         (
-            "foredrive drive --agent embedded:nemo_town --routes town05-short --only 28 --out runs/drive",
+            "foredrive drive --agent embedded --routes town05-short --only 5 --out runs/drive",
             "foredrive compare runs/drive runs/expert",
         ),
         show_drive,
