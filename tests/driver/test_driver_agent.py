@@ -11,12 +11,15 @@ from foredrive.driver.agent import (
     BEFORE_LINE_M,
     CREEPS,
     IMPATIENT,
+    NEAR_CELLS,
+    STAYS,
     WAITS,
     Driver,
     LightMemory,
     PartlyTrue,
     Perception,
     given_path,
+    staying,
 )
 from foredrive.driver.eyes import CameraEyes, CameraEyesConfig
 from foredrive.driver.sight import Sight
@@ -189,6 +192,16 @@ def test_one_wrong_frame_does_not_turn_a_light() -> None:
     for _ in range(4):
         view = memory.update(estimate(LightState.GREEN, 12.0), 0.0)
     assert state(view) is LightState.GREEN
+
+
+def test_who_is_close_ahead_is_taken_to_stay_for_a_while() -> None:
+    occupied = torch.zeros(2, TIMES, CELLS)
+    occupied[1, 0, 1], occupied[1, 1:, 1] = 0.9, 0.2  # expected to leave at once
+    occupied[1, 0, NEAR_CELLS] = 0.9  # farther away
+    occupied[1, 2, 0] = 0.7  # somebody comes
+    expected = occupied.clone()
+    expected[1, 1 : 1 + STAYS, 1] = 0.9
+    torch.testing.assert_close(staying(occupied), expected)
 
 
 class Fixed(Driver):

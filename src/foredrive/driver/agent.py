@@ -51,6 +51,9 @@ STANDS_MPS = 0.2
 WAITS, CREEPS, IMPATIENT = 10, 8, 70
 """Plans that the vehicle stands without a red light before it creeps, for which it creeps, and after which it
 creeps in spite of a light: it is seen wrongly, or no light at all."""
+NEAR_CELLS, STAYS = 3, 3
+"""Cells of the route next to the vehicle; who is in them now is taken to stay for so many steps of half a
+second. Who stands close ahead is often expected to leave."""
 SURE = 0.93
 """While it creeps, only road users that are as probable as this stop it."""
 
@@ -185,6 +188,7 @@ class Perception:
         moved_m = 0.0 if self._before is None else float((here - self._before).norm())
         self._before = here
         view = self._lights.update(view, moved_m, line_seen=line_seen)
+        view = PathEstimate(view.light, view.light_m, staying(view.occupied))
         return self._patient(view, float(ego_speeds(observation)[0, observation.now]))
 
     def _patient(self, view: PathEstimate, speed_mps: float) -> PathEstimate:
@@ -200,6 +204,14 @@ class Perception:
         # Impatient: the light is ignored. In any case only very probable road users stop the vehicle
         light = torch.eye(4)[[LightState.NONE]].to(view.light) if self._impatient else view.light
         return PathEstimate(light, view.light_m, (view.occupied > SURE).to(view.occupied))
+
+
+def staying(occupied: Float[Tensor, "b T S"]) -> Float[Tensor, "b T S"]:
+    """Return the occupancy of the path if those who are close ahead now stay for a while."""
+    later = occupied.clone()
+    now = occupied[:, :1, :NEAR_CELLS]
+    later[:, 1 : 1 + STAYS, :NEAR_CELLS] = torch.maximum(later[:, 1 : 1 + STAYS, :NEAR_CELLS], now)
+    return later
 
 
 class SightDriver:
