@@ -8,9 +8,11 @@ starts from the world model that comes with the package. `rules_by_sight` has th
 planner of `small`, `true*` is told road users, lights or both as they are. `regressing` is NeMo's own
 planner, which learns from an expert's demonstrations.
 
-All drive the same routes in the same traffic by day, and an interrupted benchmark goes on with the next
-drive; ARM@long drives the long routes. Seeds are those of training. All is kept in runs/drive_nemo, and
-`foredrive compare` reads the folders of drives.
+`shipped` is the driver that comes with the package, `shipped_*` has parts of it.
+
+All drive the same routes in the same traffic by day: the short ones three times, and ARM@long the long ones
+once. An interrupted benchmark goes on with the next drive. Seeds are those of training. All is kept in
+runs/drive_nemo, and `foredrive compare` reads the folders of drives.
 """
 
 import dataclasses
@@ -50,23 +52,24 @@ from foredrive.runs.train.run import train_run
 from foredrive.sensors.rigs import FRONT_TELE, SURROUND
 from foredrive.tasks.bootstrap import bootstrap_mean
 
-EGO_SEEDS, NEMO_EGO_SEEDS = 10, 3
+EGO_SEEDS, NEMO_EGO_SEEDS = 8, 3
 """Seeds of the towns from which the small driver learns, and from which those with NeMo's volume do."""
 ROUNDS = 2
-ROUND_ROUTES, ROUND_LR = "training-short", 1e-3
-"""Routes of a round, and the learning rate of the one epoch in which a driver goes on."""
-NEMO_EPOCHS = 2
+ROUND_ROUTES, ROUND_LR, ROUND_EPOCHS = "training-short", 1e-3, 2
+"""Routes of a round, and the learning rate and the epochs in which a driver goes on."""
+SHIPPED, PARTS = "embedded:driver", ("true", "true-lights", "true-users", "idm")
+"""The driver that comes with the package, and agents of which it is a part."""
 REGRESSING, REGRESSING_STEPS = "nemo_drive", 600
 DEMONSTRATED, ROUTES_A_TOWN = ("Town01", "Town02", "Town03", "Town04", "Town06"), 4
 """Towns of the demonstrations, and the routes in each."""
 JUDGED = {"short": "town05-short", "long": "town05-long"}
-REPETITIONS = 3
+REPETITIONS = {"short": 3, "long": 1}
 CORES = len(os.sched_getaffinity(0))
 CONFIG = {
     "recipes": {name: dataclasses.asdict(recipe) for name, recipe in DRIVER_RECIPES.items()}
     | {REGRESSING: dataclasses.asdict(find_recipe(REGRESSING))},
-    "egos": [EGOS, EGO_SEEDS, NEMO_EGO_SEEDS, NEMO_EPOCHS],
-    "rounds": [ROUNDS, ROUND_ROUTES, ROUND_LR],
+    "egos": [EGOS, EGO_SEEDS, NEMO_EGO_SEEDS],
+    "rounds": [ROUNDS, ROUND_ROUTES, ROUND_LR, ROUND_EPOCHS],
     "demonstrations": [*DEMONSTRATED, ROUTES_A_TOWN, REGRESSING_STEPS],
     "routes": JUDGED,
     "repetitions": REPETITIONS,
@@ -105,7 +108,7 @@ def small(rounds: int, seed: int) -> DriverRun:
 
 
 def _once(recipe: DriverRecipe) -> DriverRecipe:
-    see = dataclasses.replace(recipe.see, epochs=1, lr=ROUND_LR)
+    see = dataclasses.replace(recipe.see, epochs=ROUND_EPOCHS, lr=ROUND_LR)
     return dataclasses.replace(recipe, see=see)
 
 
@@ -135,7 +138,6 @@ def blind(seed: int) -> DriverRun:
 def nemo(name: str, seed: int, pretrained: bool = True) -> DriverRun:
     """Return a driver with NeMo's volume."""
     recipe = recipe_of("driver_nemo", seed)
-    recipe = dataclasses.replace(recipe, see=rescheduled(recipe.see, epochs=NEMO_EPOCHS))
     logs = [*_egos(NEMO_EGO_SEEDS), *rounds_until(ROUNDS)]
     start = run_folder(Path(PRETRAINED)) if pretrained else None
     return trained(recipe, logs, WORK / "runs" / f"{name}_seed{seed}", WORK / "cache", start)
@@ -170,7 +172,7 @@ def scores(agent: str, name: str, routes: str) -> dict[str, float]:
 
 
 def _judged(agent: str, name: str, routes: str) -> SuiteResult:
-    source = TownRoutes(JUDGED[routes], repetitions=REPETITIONS, rig=rig_of(agent))
+    source = TownRoutes(JUDGED[routes], repetitions=REPETITIONS[routes], rig=rig_of(agent))
     return _driven(DriveSuite(agent, source, sensors=False), _folder(name, routes))
 
 
@@ -238,6 +240,8 @@ def _best(seed: int) -> DriverRun:
 
 
 ARMS: Mapping[str, Arm] = {
+    "shipped": told(SHIPPED, "shipped"),
+    **{f"shipped_{part.replace('-', '_')}": told(f"{part}:{SHIPPED}", f"shipped_{part}") for part in PARTS},
     "expert": told(EXPERT, "expert"),
     "idm": told(IDM, "idm"),
     "stop": told(STOP, "stop"),

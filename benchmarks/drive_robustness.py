@@ -19,7 +19,7 @@ from foredrive.runs.drive.agent_inputs import rig_of
 from foredrive.runs.drive.compare import values_of
 from foredrive.runs.drive.in_towns import TownRoutes
 from foredrive.runs.drive.suite import DriveSuite, drive_suite
-from foredrive.sensors.rigs import TELE
+from foredrive.sensors.rigs import TELE, RigPlan
 
 WORK = work_folder(Path("runs/drive_robustness"))
 AGENT = os.environ.get("FOREDRIVE_AGENT", "embedded")
@@ -27,23 +27,29 @@ ROUTES = "town05-short"
 FRONT = "PCAM_F0"
 FROM_S = 3.0
 """Time at which cameras fail: the drive has begun."""
-RAISED_M = 0.5
+RAISED_M, TURNED_DEG = 0.5, 2.0
 
 
-def scores(seed: int, name: str, raised_m: float = 0.0, **changes: Any) -> Mapping[str, float]:
+def scores(
+    seed: int,
+    name: str,
+    rig_of_it: Callable[[RigPlan], RigPlan] | None = None,
+    conditions: str | None = None,
+    **changes: Any,
+) -> Mapping[str, float]:
     """Return the figures of one repetition with a fault.
 
     Args:
         seed: seed of the traffic.
         name: name of the arm.
-        raised_m: the cameras are mounted higher by this.
+        rig_of_it: returns another rig of cameras, which the agent was not trained with.
+        conditions: time and weather; by day without.
         changes: fields of the suite.
     """
     agent = str(Path(AGENT).absolute()) if Path(AGENT).is_dir() else AGENT
     rig = rig_of(agent)
-    source = TownRoutes(
-        ROUTES, seed=seed, rig=rig.raised(raised_m) if raised_m else rig, other_rig=raised_m != 0
-    )
+    other = rig if rig_of_it is None else rig_of_it(rig)
+    source = TownRoutes(ROUTES, seed=seed, rig=other, other_rig=rig_of_it is not None, conditions=conditions)
     suite = dataclasses.replace(DriveSuite(agent, source, sensors=False), **changes)
     for fault in suite.faults.cameras:
         if fault.camera not in rig.cameras:
@@ -80,13 +86,24 @@ CHANGES: Mapping[str, Mapping[str, Any]] = {
     "speed_noise": {"faults": Faults(speed_noise_mps=0.5)},
     "position_noise": {"faults": Faults(position_noise_m=1.0)},
     **{f"latency_{ms}ms": {"latency_s": ms / 1000} for ms in (300, 500)},
-    "raised_cameras": {"raised_m": RAISED_M},
+    "halved_frames": {
+        "faults": Faults(cameras=tuple(CameraFault("halved", place) for place in (FRONT, TELE)))
+    },
+    "raised_cameras": {"rig_of_it": lambda rig: rig.raised(RAISED_M)},
+    "turned_cameras": {"rig_of_it": lambda rig: rig.turned(TURNED_DEG)},
+    **{name: {"conditions": name} for name in ("night", "rain", "fog")},
 }
 """The untouched drives have the usual latency of 0.1 s."""
 
 BENCHMARK = Benchmark(
     question="How much of its score does a driver lose when an input fails?",
     arms={name: arm(name, **changes) for name, changes in CHANGES.items()},
-    config={"agent": AGENT, "routes": ROUTES, "from_s": FROM_S, "raised_m": RAISED_M},
+    config={
+        "agent": AGENT,
+        "routes": ROUTES,
+        "from_s": FROM_S,
+        "raised_m": RAISED_M,
+        "turned_deg": TURNED_DEG,
+    },
     decided_by=("foredrive.driving", "foredrive.towns", "foredrive.methods"),
 )

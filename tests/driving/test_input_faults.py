@@ -58,6 +58,21 @@ def test_a_frozen_camera_repeats_the_image_before() -> None:
     torch.testing.assert_close(seen[3].images[0, 2, 0], clips[3].images[0, 0, 0])
 
 
+def test_a_halved_camera_shows_every_second_image_twice() -> None:
+    keeper, generator = Keeper(), torch.Generator().manual_seed(0)
+    agent = FaultyAgent(keeper, Faults(cameras=(CameraFault("halved", "left", 1.0),)), 0.5, "drive")
+    clip = one_example(0).clip.observed()
+    truth = torch.randint(0, 256, (8, *clip.images.shape[2:]), generator=generator, dtype=torch.uint8)
+    for k in range(6):  # key frames k - 2 to k of the drive
+        agent.act(dataclasses.replace(clip, images=truth[k : k + 3][None]))
+    for k, seen in enumerate(keeper.seen):
+        for frame, number in enumerate(range(k - 2, k + 1)):
+            repeated = number >= 3 and number % 2 == 1
+            torch.testing.assert_close(seen.images[0, frame, 0], truth[number + 2 - repeated, 0])
+        torch.testing.assert_close(seen.images[0, :, 1], truth[k : k + 3, 1])
+        assert bool(seen.image_valid.all())
+
+
 def test_noise_has_its_size_and_a_key_frame_keeps_it() -> None:
     seen, clips = shown(Faults(speed_noise_mps=0.5, position_noise_m=2.0), plans=60)
     error = torch.stack([s.ego_speed_mps - c.ego_speed_mps for s, c in zip(seen, clips, strict=True)])[:, 0]

@@ -54,7 +54,8 @@ class InputFaults:
 
     Args:
         camera_fault: Cameras that fail, KIND:CAMERA or KIND:CAMERA@SECONDS. lost: no image, and the agent is
-            told; black: a black image; frozen: the last image before is repeated.
+            told; black: a black image; frozen: the last image before is repeated;
+            halved: every second key frame has the image before it.
         speed_noise: Standard deviation of the speed that the agent is told, m/s.
         position_noise: Standard deviation of the position from which the target point of the route is
             computed, m.

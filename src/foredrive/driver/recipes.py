@@ -63,7 +63,7 @@ def driver_small() -> DriverRecipe:
         see=Schedule(
             batch_size=16,
             lr=3e-3,
-            epochs=3,
+            epochs=8,
             weight_decay=1e-2,
             clip_grad_norm=5.0,
             checkpoint_every=200,
@@ -84,7 +84,7 @@ def driver_nemo() -> DriverRecipe:
         name="driver_nemo",
         about="driver_small with NeMo's backbone and volume as its eyes",
         eyes=VolumeEyesConfig(world=town.model, voxels=town.clips.voxels, frames=small.eyes.frames),
-        see=replace(small.see, lr=1e-3),
+        see=replace(small.see, lr=1e-3, epochs=2),
     )
 
 

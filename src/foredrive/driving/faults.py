@@ -7,8 +7,8 @@ from typing import Literal
 
 from foredrive.errors import InputError
 
-FaultKind = Literal["lost", "black", "frozen"]
-KINDS: tuple[FaultKind, ...] = ("lost", "black", "frozen")
+FaultKind = Literal["lost", "black", "frozen", "halved"]
+KINDS: tuple[FaultKind, ...] = ("lost", "black", "frozen", "halved")
 
 
 @dataclass(frozen=True)
@@ -17,7 +17,8 @@ class CameraFault:
 
     kind: FaultKind
     """lost: no image, and the agent knows it (`Clip.image_valid`). black: a black image that counts as one.
-    frozen: the last image before the fault is repeated."""
+    frozen: the last image before the fault is repeated. halved: every second key frame repeats the image
+    before it."""
     camera: str
     """123D's name, such as PCAM_F0."""
     from_s: float = 0.0

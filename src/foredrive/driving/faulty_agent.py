@@ -29,6 +29,8 @@ class FaultyAgent:
         self._plans = 0
         self._speeds: dict[float, float] = {}
         self._kept: dict[str, Tensor] = {}
+        self._shown: dict[tuple[str, int], Tensor] = {}
+        """Images by camera and key frame of the drive, of the clip before, as they were shown."""
 
     def act(self, observation: Clip) -> Trajectory:
         """Return the agent's plan for the observation with its faults."""
@@ -54,6 +56,16 @@ class FaultyAgent:
                 self._kept[fault.camera] = images[:, before[-1], camera].clone()
             kept = self._kept.setdefault(fault.camera, images[:, 0, camera].clone())
             images[:, frames, camera] = kept[:, None]
+        elif fault.kind == "halved":
+            numbers = ((clip.t_s[0] + now_s) / self._period_s).round().int().tolist()
+            for frame in frames.tolist():
+                # The image before a key frame with an odd number was shown in this clip or in the one before
+                before_it = self._shown.get((fault.camera, numbers[frame] - 1))
+                if numbers[frame] % 2 and before_it is not None:
+                    images[:, frame, camera] = before_it
+                self._shown[fault.camera, numbers[frame]] = images[:, frame, camera].clone()
+            for camera_and_number in [key for key in self._shown if key[1] < numbers[0] - 1]:
+                del self._shown[camera_and_number]
         else:
             images[:, frames, camera] = 0
             if fault.kind == "lost":

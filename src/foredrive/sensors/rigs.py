@@ -73,6 +73,13 @@ class RigPlan:
         }
         return RigPlan(self.image_hw, moved)
 
+    def turned(self, yaw_deg: float) -> "RigPlan":
+        """Return the same cameras in the same places, all of them turned to the left."""
+        moved = {
+            name: replace(mount, yaw_deg=mount.yaw_deg + yaw_deg) for name, mount in self.cameras.items()
+        }
+        return RigPlan(self.image_hw, moved)
+
 
 SURROUND = RigPlan(
     image_hw=(144, 256),
