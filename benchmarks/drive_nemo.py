@@ -8,7 +8,8 @@ starts from the world model that comes with the package. `rules_by_sight` has th
 planner of `small`, `true*` is told road users, lights or both as they are. `regressing` is NeMo's own
 planner, which learns from an expert's demonstrations.
 
-`shipped` is the driver that comes with the package, `shipped_*` has parts of it.
+`shipped` is the driver that comes with the package, `shipped_*` has parts of it, or drives through the
+interface of CARLA's leaderboards.
 
 All drive the same routes in the same traffic by day: the short ones three times, and ARM@long the long ones
 once. An interrupted benchmark goes on with the next drive. Seeds are those of training. All is kept in
@@ -33,6 +34,7 @@ from benchmarks.common.driver_study import (
     test_egos,
     trained,
 )
+from benchmarks.common.leaderboard_door import LeaderboardDoor
 from benchmarks.common.study import seeded
 from foredrive.data import LogPath, find_all_logs
 from foredrive.driver.recipes import DRIVER_RECIPES, DriverRecipe
@@ -239,8 +241,18 @@ def _best(seed: int) -> DriverRun:
     return small(ROUNDS, seed)
 
 
+def by_leaderboard(seed: int, routes: str) -> Mapping[str, float]:
+    """Return the figures of the shipped driver through the interface of CARLA's leaderboards."""
+    source = LeaderboardDoor(JUDGED[routes], rig=rig_of(SHIPPED))
+    drives = _driven(
+        DriveSuite(SHIPPED, source, sensors=False), _folder("shipped_by_leaderboard", routes)
+    ).drives
+    return {f"{key}_{routes}": value for key, value in _figures(list(drives.values())).items()}
+
+
 ARMS: Mapping[str, Arm] = {
     "shipped": told(SHIPPED, "shipped"),
+    "shipped_by_leaderboard": by_leaderboard,
     **{f"shipped_{part.replace('-', '_')}": told(f"{part}:{SHIPPED}", f"shipped_{part}") for part in PARTS},
     "expert": told(EXPERT, "expert"),
     "idm": told(IDM, "idm"),

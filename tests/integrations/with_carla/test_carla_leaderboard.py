@@ -68,6 +68,20 @@ def test_commands_come_from_the_route(done_m: float, command: Command) -> None:
     assert GlobalPlan(PLAN).command(RouteProgress(done_m=done_m)) is command
 
 
+def test_the_line_of_a_route_is_smooth_and_straight_before_a_turn() -> None:
+    turn = GlobalPlan(PLAN)._xy
+    assert np.abs(turn[turn[:, 0] < 49.5][:, 1]).max() < 1e-9
+    after = turn[(turn[:, 1] > 10.5) & (turn[:, 1] < 59.5)]
+    assert np.abs(after[:, 0] - 60.0).max() < 1e-9
+    corner = turn[(turn[:, 0] > 50.0) & (turn[:, 1] < 10.0)]
+    assert np.abs(np.hypot(corner[:, 0] - 50.0, corner[:, 1] - 10.0) - 10.0).max() < 0.3  # an arc
+    angle = np.radians(np.arange(0.0, 181.0, 30.0))  # points 26 m apart on a bend
+    bend = [point(50 * math.sin(a), 50 - 50 * math.cos(a), RoadOption.LANEFOLLOW) for a in angle]
+    away_m = np.hypot(*(GlobalPlan(bend)._xy - [0.0, 50.0]).T) - 50.0
+    inner = away_m[30:-30]  # a chord would be 1.7 m off
+    assert np.abs(inner).max() < 0.15
+
+
 class Straight:
     """Plans to go straight ahead at a speed; remembers what it saw."""
 

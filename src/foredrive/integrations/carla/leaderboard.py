@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float32, Float64, UInt8
+from jaxtyping import Float32, Float64, Int64, UInt8
 from torch import Tensor
 
 from foredrive.data.batches import stack_records
@@ -150,7 +150,7 @@ COMMAND_OF_OPTION = {
 
 
 class GlobalPlan(RouteLine):
-    """A route of N points with straight lines between them.
+    """A route of N points, up to 50 or 200 m apart, with a smooth line through them.
 
     Args:
         plan: a `carla.Transform` and a `RoadOption` for each point, as `set_global_plan` keeps them. An
@@ -164,11 +164,12 @@ class GlobalPlan(RouteLine):
         self.xy: Float64[np.ndarray, "N 2"] = np.array(
             [xyz_of(transform.location)[:2] for transform, _ in plan], dtype=float
         ).reshape(-1, 2)
-        self._point_arc_m = arc_lengths(self.xy)
-        if len(plan) < 2 or not self._point_arc_m[-1] > 0:
+        if len(plan) < 2 or not arc_lengths(self.xy)[-1] > 0:
             raise InputError(f"a route needs at least two different points, got {len(plan)} points")
         self._commands = [COMMAND_OF_OPTION.get(option.name, Command.STRAIGHT) for _, option in plan]
-        super().__init__(np.column_stack([self.xy, np.zeros(len(plan))]))
+        line, knots = _smooth_line(self.xy, [command is not Command.STRAIGHT for command in self._commands])
+        self._point_arc_m = arc_lengths(line)[knots]
+        super().__init__(np.column_stack([line, np.zeros(len(line))]))
 
     def command(self, progress: RouteProgress) -> Command:
         """Return the first turn or lane change that is under way or begins within `LOOKAHEAD_M`.
@@ -180,6 +181,46 @@ class GlobalPlan(RouteLine):
         last = int(np.searchsorted(self._point_arc_m, progress.done_m + LOOKAHEAD_M))
         soon = self._commands[max(first, 0) : max(last, 1)]
         return next((command for command in soon if command is not Command.STRAIGHT), Command.STRAIGHT)
+
+
+def _smooth_line(
+    xy: Float64[np.ndarray, "N 2"], turns: Sequence[bool]
+) -> tuple[Float64[np.ndarray, "M 2"], Int64[np.ndarray, "N"]]:
+    """Return a smooth line through points, and the indices of the points in it.
+
+    Straight lines would leave the lane in bends, and cut the corners of turns.
+
+    Args:
+        turns: whether the route turns or changes lanes from each point to the next.
+    """
+    steps = np.diff(xy, axis=0)
+    length_m = np.hypot(*steps.T)
+    towards = steps / np.maximum(length_m, 1e-9)[:, None]
+    # The heading at a point is that of the segments beside it, more of the shorter one. Where one of them is
+    # a turn, it is that of the other one: a turn begins straight and ends straight.
+    heading = np.empty_like(xy)
+    for k in range(1, len(xy) - 1):
+        before, after = length_m[k], length_m[k - 1]
+        if turns[k - 1] != turns[k]:
+            before, after = (0.0, 1.0) if turns[k - 1] else (1.0, 0.0)
+        mean = before * towards[k - 1] + after * towards[k]
+        heading[k] = mean / max(np.hypot(*mean), 1e-9)
+    # The first and the last segment are arcs, or straight if there is no other
+    for end, inner, step in ((0, 1, towards[0]), (-1, -2, towards[-1])):
+        heading[end] = step if len(xy) == 2 else 2.0 * (step @ heading[inner]) * step - heading[inner]
+    # A cubic of each segment, at points about a metre apart; tangents of this length make it almost an arc
+    parts, knots = [xy[:1]], [0]
+    cos_half = np.sqrt(np.clip(0.5 + 0.5 * (heading[:-1] * heading[1:]).sum(axis=1), 0.0, 1.0))
+    for k, metres in enumerate(length_m.tolist()):
+        tangent_m = metres / (0.5 + 0.5 * cos_half[k])
+        t = np.linspace(0.0, 1.0, max(int(np.ceil(metres)), 1) + 1)[1:, None]
+        parts.append(
+            (1 + 2 * t) * (1 - t) ** 2 * xy[k]
+            + t**2 * (3 - 2 * t) * xy[k + 1]
+            + tangent_m * (t * (1 - t) ** 2 * heading[k] - t**2 * (1 - t) * heading[k + 1])
+        )
+        knots.append(knots[-1] + len(t))
+    return np.concatenate(parts), np.array(knots)
 
 
 GPS, IMU, SPEED, LIDAR = "GPS", "IMU", "SPEED", "LIDAR"
