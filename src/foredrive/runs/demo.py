@@ -136,7 +136,7 @@ def full_demo() -> DemoSize:
         reconstruction=dataclasses.replace(
             rescheduled_recipe(gaussians_tiny(), steps=300), image_hw=SURROUND.image_hw
         ),
-        route="28",
+        route="12",
         examples=4,
         # Estimates from speeds in benchmarks/results (towns, real-to-sim) and the training time in README
         minutes={"Record": 2, "See": 1, "Learn": 10, "Drive": 2, "Reconstruct": 3, "Search": 1},

@@ -55,7 +55,7 @@ SIGHT_FIGURES = {
 }
 DRIVE_FIGURES = {
     "driving score of leaderboard 1.0": ("driving_score_1_0", 1),
-    "completion of routes, %": ("completion", 100),
+    "completion of routes, %": ("completion", 1),
     "red lights in 100 routes": ("red_lights", 100),
     "collisions in 100 routes": ("collisions", 100),
 }

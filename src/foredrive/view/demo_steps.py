@@ -54,7 +54,7 @@ STEPS = (
         "other towns. What it sees next depends on what it does. The scores are those of CARLA's "
         "leaderboard 1.0; the expert beside it knows the state of the town.",
         (
-            "foredrive drive --agent embedded --routes town05-short --only 5 --out runs/drive",
+            "foredrive drive --agent embedded --routes town05-short --only 12 --out runs/drive",
             "foredrive compare runs/drive runs/expert",
         ),
         show_drive,
