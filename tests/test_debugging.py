@@ -99,10 +99,7 @@ def test_command_that_ends_before_its_recording_says_so(
     take_debugging(["train", f"--profile={tmp_path / 'trace.json.gz'}:60"])
     with debugging.debugging():
         pass
-    assert (
-        "was not written: no step of training, driving, evaluating or recording began after 60 s"
-        in caplog.text
-    )
+    assert "was not written: this process began no step of training" in caplog.text
     assert not list(tmp_path.iterdir())
 
 

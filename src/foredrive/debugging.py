@@ -162,7 +162,8 @@ class _Recording:
         file = self._plan.file
         if self._ends_s is None:
             _log.warning(
-                "%s was not written: no step of training, driving, evaluating or recording began after %g s",
+                "%s was not written: this process began no step of training, driving, evaluating or recording "
+                "after %g s; its workers write traces of their own",
                 file,
                 self._plan.start_s,
             )
