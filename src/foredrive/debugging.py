@@ -162,7 +162,7 @@ class _Recording:
         file = self._plan.file
         if self._ends_s is None:
             _log.warning(
-                "%s was not written: this process began no step of training, driving, evaluating or recording "
+                "%s was not written: this process began no step of training, driving, evaluating, recording "
                 "after %g s; its workers write traces of their own",
                 file,
                 self._plan.start_s,
