@@ -124,12 +124,15 @@ def sparse_plans(route: DriveRoute) -> tuple[list[tuple[dict[str, float], Any]],
             kept.append(k)
             since_m = 0.0
     by_satellite, in_world = [], []
+    steps = np.diff(route.xyz[:, :2], axis=0, append=2 * route.xyz[-1:, :2] - route.xyz[-2:-1, :2])
+    yaw_deg = np.degrees(np.arctan2(steps[:, 1], steps[:, 0]))
     for k in kept:
         x, y, z = (float(value) for value in route.xyz[k])
         road_option = SimpleNamespace(name=OPTION_NAMES[RouteOption(route.option[k])])
         lat, lon = lat_lon_of(x, y).tolist()
         by_satellite.append(({"lat": lat, "lon": lon, "z": z}, road_option))
-        in_world.append((SimpleNamespace(location=SimpleNamespace(x=x, y=-y, z=z)), road_option))
+        location, rotation = SimpleNamespace(x=x, y=-y, z=z), SimpleNamespace(yaw=-float(yaw_deg[k]))
+        in_world.append((SimpleNamespace(location=location, rotation=rotation), road_option))
     return by_satellite, in_world
 
 

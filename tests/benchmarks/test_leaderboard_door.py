@@ -32,9 +32,9 @@ def test_pedals_give_the_acceleration_that_they_stand_for(speed_mps: float) -> N
         assert got.steering_rad == pytest.approx(0.1)
 
 
-@pytest.mark.parametrize(("number", "away_m"), [(0, 0.6), (9, 0.8), (24, 1.3)])
+@pytest.mark.parametrize(("number", "away_m"), [(2, 1.0), (3, 1.0), (28, 0.7)])
 def test_the_sparse_route_stays_in_its_lanes(number: int, away_m: float) -> None:
-    """Straight lines between its points would leave them by 2.9 to 6.2 m."""
+    """Straight lines between its points would leave them by 5.9 to 6.6 m."""
     route = snap_route(load_route_set("town05-short")[number])
     by_satellite, in_world = sparse_plans(route)
     plan = GlobalPlan(in_world)

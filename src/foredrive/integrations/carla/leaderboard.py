@@ -150,7 +150,7 @@ COMMAND_OF_OPTION = {
 
 
 class GlobalPlan(RouteLine):
-    """A route of N points, up to 50 or 200 m apart, with a smooth line through them.
+    """A route of N points, up to 50 or 200 m apart, with a smooth line through them along their lanes.
 
     Args:
         plan: a `carla.Transform` and a `RoadOption` for each point, as `set_global_plan` keeps them. An
@@ -167,7 +167,8 @@ class GlobalPlan(RouteLine):
         if len(plan) < 2 or not arc_lengths(self.xy)[-1] > 0:
             raise InputError(f"a route needs at least two different points, got {len(plan)} points")
         self._commands = [COMMAND_OF_OPTION.get(option.name, Command.STRAIGHT) for _, option in plan]
-        line, knots = _smooth_line(self.xy, [command is not Command.STRAIGHT for command in self._commands])
+        yaw_rad = -np.radians([transform.rotation.yaw for transform, _ in plan])  # CARLA is left-handed
+        line, knots = _smooth_line(self.xy, yaw_rad)
         self._point_arc_m = arc_lengths(line)[knots]
         super().__init__(np.column_stack([line, np.zeros(len(line))]))
 
@@ -184,33 +185,17 @@ class GlobalPlan(RouteLine):
 
 
 def _smooth_line(
-    xy: Float64[np.ndarray, "N 2"], turns: Sequence[bool]
+    xy: Float64[np.ndarray, "N 2"], yaw_rad: Float64[np.ndarray, "N"]
 ) -> tuple[Float64[np.ndarray, "M 2"], Int64[np.ndarray, "N"]]:
-    """Return a smooth line through points, and the indices of the points in it.
+    """Return a smooth line through points in the directions of their lanes, and the points' indices in it.
 
-    Straight lines would leave the lane in bends, and cut the corners of turns.
-
-    Args:
-        turns: whether the route turns or changes lanes from each point to the next.
+    Straight lines between the points would leave the lane in bends and cut the corners of turns.
     """
-    steps = np.diff(xy, axis=0)
-    length_m = np.hypot(*steps.T)
-    towards = steps / np.maximum(length_m, 1e-9)[:, None]
-    # The heading at a point is that of the segments beside it, more of the shorter one. Where one of them is
-    # a turn, it is that of the other one: a turn begins straight and ends straight.
-    heading = np.empty_like(xy)
-    for k in range(1, len(xy) - 1):
-        before, after = length_m[k], length_m[k - 1]
-        if turns[k - 1] != turns[k]:
-            before, after = (0.0, 1.0) if turns[k - 1] else (1.0, 0.0)
-        mean = before * towards[k - 1] + after * towards[k]
-        heading[k] = mean / max(np.hypot(*mean), 1e-9)
-    # The first and the last segment are arcs, or straight if there is no other
-    for end, inner, step in ((0, 1, towards[0]), (-1, -2, towards[-1])):
-        heading[end] = step if len(xy) == 2 else 2.0 * (step @ heading[inner]) * step - heading[inner]
+    length_m = np.hypot(*np.diff(xy, axis=0).T)
+    heading = np.stack([np.cos(yaw_rad), np.sin(yaw_rad)], axis=1)
     # A cubic of each segment, at points about a metre apart; tangents of this length make it almost an arc
-    parts, knots = [xy[:1]], [0]
     cos_half = np.sqrt(np.clip(0.5 + 0.5 * (heading[:-1] * heading[1:]).sum(axis=1), 0.0, 1.0))
+    parts, knots = [xy[:1]], [0]
     for k, metres in enumerate(length_m.tolist()):
         tangent_m = metres / (0.5 + 0.5 * cos_half[k])
         t = np.linspace(0.0, 1.0, max(int(np.ceil(metres)), 1) + 1)[1:, None]
