@@ -1,6 +1,7 @@
 """The rule-based agent: what it reads of estimates and boxes, and a drive through a town."""
 
 import numpy as np
+import pytest
 import torch
 
 from foredrive.data.truth.affordances import PathAhead, path_ahead
