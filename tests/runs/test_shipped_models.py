@@ -104,6 +104,11 @@ def test_all_weights_of_the_package_are_listed(capsys: pytest.CaptureFixture[str
     assert all(each.card is not None and each.data and each.commit for each in models)
     for each in (*models, towers):
         assert 5e5 < each.size < 1.2e7
+    shares = [
+        figures for each in models for title, figures in each.card.figures.items() if title.endswith("%")
+    ]
+    assert len(shares) >= 2
+    assert all(0 < share < 100 for pair in shares for share in pair)
     assert main(["models"]) == 0
     printed = capsys.readouterr().out
     assert all(each.name in printed for each in (*models, towers))
