@@ -33,7 +33,7 @@ RAISED_M, TURNED_DEG = 0.5, 2.0
 def scores(
     seed: int,
     name: str,
-    rig_of_it: Callable[[RigPlan], RigPlan] | None = None,
+    changed_rig: Callable[[RigPlan], RigPlan] | None = None,
     conditions: str | None = None,
     **changes: Any,
 ) -> Mapping[str, float]:
@@ -42,14 +42,16 @@ def scores(
     Args:
         seed: seed of the traffic.
         name: name of the arm.
-        rig_of_it: returns another rig of cameras, which the agent was not trained with.
+        changed_rig: returns another rig of cameras, which the agent was not trained with.
         conditions: time and weather; by day without.
         changes: fields of the suite.
     """
     agent = str(Path(AGENT).absolute()) if Path(AGENT).is_dir() else AGENT
     rig = rig_of(agent)
-    other = rig if rig_of_it is None else rig_of_it(rig)
-    source = TownRoutes(ROUTES, seed=seed, rig=other, other_rig=rig_of_it is not None, conditions=conditions)
+    other = rig if changed_rig is None else changed_rig(rig)
+    source = TownRoutes(
+        ROUTES, seed=seed, rig=other, other_rig=changed_rig is not None, conditions=conditions
+    )
     suite = dataclasses.replace(DriveSuite(agent, source, sensors=False), **changes)
     for fault in suite.faults.cameras:
         if fault.camera not in rig.cameras:
@@ -89,8 +91,8 @@ CHANGES: Mapping[str, Mapping[str, Any]] = {
     "halved_frames": {
         "faults": Faults(cameras=tuple(CameraFault("halved", place) for place in (FRONT, TELE)))
     },
-    "raised_cameras": {"rig_of_it": lambda rig: rig.raised(RAISED_M)},
-    "turned_cameras": {"rig_of_it": lambda rig: rig.turned(TURNED_DEG)},
+    "raised_cameras": {"changed_rig": lambda rig: rig.raised(RAISED_M)},
+    "turned_cameras": {"changed_rig": lambda rig: rig.turned(TURNED_DEG)},
     **{name: {"conditions": name} for name in ("night", "rain", "fog")},
 }
 """The untouched drives have the usual latency of 0.1 s."""

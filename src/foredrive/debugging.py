@@ -31,7 +31,8 @@ class ProfilePlan:
     Args:
         file: where the trace goes, gzipped JSON that Perfetto opens. Workers add their process number.
         start_s: time from the start of a process to that of its recording.
-        length_s: length of the recording. A second takes 1 MB to 1.5 GB of memory; operators are recorded.
+        length_s: length of the recording. By the number of operators, a second takes 1 MB to 1.5 GB of
+            memory.
     """
 
     file: Path
@@ -112,6 +113,8 @@ def debugging(worker: bool = False) -> Iterator[None]:
         yield
     finally:
         recording.end()
+        if not worker:  # a worker records in its first job alone, a process that runs commands in each
+            _Recording.current = None
 
 
 def profile_step() -> None:
@@ -162,8 +165,7 @@ class _Recording:
         file = self._plan.file
         if self._ends_s is None:
             _log.warning(
-                "%s was not written: this process began no step of training, driving, evaluating, recording "
-                "after %g s; its workers write traces of their own",
+                "%s was not written: no step of this process began after %g s; its workers write their own",
                 file,
                 self._plan.start_s,
             )

@@ -45,8 +45,6 @@ SHIPPED = "embedded:nemo_town"
 DRIVER = "embedded"
 """The driver by sight."""
 ROUTES = "town05-short"
-SEEING = "driver"
-"""Key of the shipped driver's drive, beside that of the expert."""
 MET_BY = (REPLAY, CORRIDOR)
 """Agents that meet the car in their way: one replays the recorded drive, the other one uses the lidar."""
 TEXTS = ("a pedestrian close by", "a street at night")
@@ -195,10 +193,10 @@ def train_tiny(demo: Demo) -> Judged:
 
 def drive_route(demo: Demo) -> dict[str, Driven]:
     """Drive a route of the held-out town: the shipped driver, and the expert without sensors."""
-    driver = str(run_folder(Path(DRIVER), demo.out).absolute())
-    source = TownRoutes(ROUTES, only=(demo.size.route,), rig=rig_of(driver))
+    folder = str(run_folder(Path(DRIVER), demo.out).absolute())
+    source = TownRoutes(ROUTES, only=(demo.size.route,), rig=rig_of(folder))
     return {
-        SEEING: _driven(DriveSuite(driver, source, lidar=False), demo.out / "driven"),
+        DRIVER: _driven(DriveSuite(folder, source, lidar=False), demo.out / "driven"),
         EXPERT: _driven(DriveSuite(EXPERT, source, sensors=False), demo.out / "driven_expert"),
     }
 

@@ -10,7 +10,7 @@ from PIL import Image, ImageOps
 
 from foredrive.engine.metrics_log import read_metrics
 from foredrive.runs.demo import (
-    SEEING,
+    DRIVER,
     TEXTS,
     Demo,
     Driven,
@@ -138,7 +138,7 @@ def show_training(demo: Demo) -> Section:
 def show_drive(demo: Demo) -> Section:
     """Drive a route; show the film, the path, and the scores beside the expert's."""
     driven = drive_route(demo)
-    seeing = driven[SEEING]
+    seeing = driven[DRIVER]
     write_drive_report(seeing.folder)
     score = seeing.record.score
     return Section(

@@ -32,7 +32,7 @@ class RoadOption(enum.Enum):
 
 
 def point(x: float, y: float, option: RoadOption, yaw_deg: float = 0.0) -> tuple[Any, RoadOption]:
-    """Of our world, as the leaderboard has it: y and yaw mirrored."""
+    """Return a point of our world as the leaderboard has it: y and yaw are mirrored."""
     location, rotation = SimpleNamespace(x=x, y=-y, z=0.0), SimpleNamespace(yaw=-yaw_deg)
     return SimpleNamespace(location=location, rotation=rotation), option
 
