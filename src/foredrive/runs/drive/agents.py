@@ -376,5 +376,5 @@ def agent_folder(agent: str, argument: str) -> Path:
     folder = run_folder(Path(argument))
     if not folder.is_dir():
         names = ", ".join(f"{kind.name}{kind.argument}" for kind in AGENTS)
-        raise InputError(f"unknown agent {agent!r}; the agents are {names}")
+        raise InputError(f"unknown agent {agent!r}; the agents are {names}, embedded")
     return folder
