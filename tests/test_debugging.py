@@ -2,6 +2,7 @@
 
 import gzip
 import json
+import logging
 import os
 import subprocess
 import sys
@@ -138,3 +139,4 @@ def test_verbose_shows_where_an_error_comes_from(capsys: pytest.CaptureFixture[s
     said = capsys.readouterr().err
     assert "Traceback" in said
     assert said.rstrip().splitlines()[-1].startswith("foredrive: ")
+    assert logging.getLogger("foredrive").level == logging.NOTSET  # later commands of this process are quiet

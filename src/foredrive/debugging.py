@@ -96,9 +96,20 @@ def debugging(worker: bool = False) -> Iterator[None]:
     Args:
         worker: whether this is a worker process of a command. Its trace has its own file name.
     """
+    logger = logging.getLogger("foredrive")
+    level = logger.level
     if is_verbose():
         logging.basicConfig(format="%(relativeCreated)7d ms %(process)d %(name)s: %(message)s")
-        logging.getLogger("foredrive").setLevel(logging.DEBUG)
+        logger.setLevel(logging.DEBUG)
+    try:
+        with _profiling(worker):
+            yield
+    finally:
+        logger.setLevel(level)
+
+
+@contextlib.contextmanager
+def _profiling(worker: bool) -> Iterator[None]:
     if PROFILE not in os.environ or _Recording.current is not None:  # A worker records in its first job
         yield
         return
