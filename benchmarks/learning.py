@@ -21,7 +21,7 @@ import torch
 from torch.utils.data import DataLoader
 
 from benchmarks.common.study import seeded
-from benchmarks.learning_towns import TEST_TOWNS, learning_digest, plan_learning, record_missing
+from benchmarks.learning_towns import DIGEST, TEST_TOWNS, plan_learning, record_missing
 from foredrive.data import ClipDataset, LogPath, collate
 from foredrive.engine.bench import Benchmark, study_identity
 from foredrive.engine.metrics_log import read_metrics
@@ -176,7 +176,7 @@ def speed(seed: int) -> dict[str, float]:
 CONFIG = {
     "recipes": {name: dataclasses.asdict(recipe) for name, recipe in RECIPES.items()},
     "budgets": {name: dataclasses.asdict(budget) for name, budget in BUDGETS.items()},
-    "drives": learning_digest(),
+    "drives": DIGEST,
     "judged_every_s": JUDGED_EVERY_S,
 }
 IDENTITY = study_identity(CONFIG, DECIDED_BY)

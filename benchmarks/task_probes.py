@@ -20,7 +20,7 @@ from torch.utils.data import DataLoader
 
 from benchmarks.common.study import seeded
 from benchmarks.learning import logs_of
-from benchmarks.learning_towns import learning_digest
+from benchmarks.learning_towns import DIGEST
 from foredrive.data import ClipDataset, collate
 from foredrive.engine.bench import Benchmark, study_identity
 from foredrive.engine.summary import Summary, numbers
@@ -153,7 +153,7 @@ CONFIG = {
     "heads": dataclasses.asdict(heads_recipe()),
     "recipes": {name: dataclasses.asdict(find_recipe(name)) for name in (NEMO, DRIVEWORLD)},
     "training_drives": DRIVES,
-    "drives": learning_digest(),
+    "drives": DIGEST,
     "judged_every_s": JUDGED_EVERY_S,
 }
 IDENTITY = study_identity(CONFIG, DECIDED_BY)

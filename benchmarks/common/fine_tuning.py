@@ -11,7 +11,7 @@ from typing import Any
 
 from benchmarks import learning
 from benchmarks.common.study import StudyLogs, run_arm, seeded, share_of
-from benchmarks.learning_towns import learning_digest
+from benchmarks.learning_towns import DIGEST
 from foredrive.engine.bench import study_identity
 from foredrive.engine.folder import WEIGHTS
 from foredrive.methods.planner.path_fit import PathFit
@@ -32,7 +32,7 @@ CONFIG = {
     "pretraining_seed": PRETRAINING_SEED,
     "steps": STEPS,
     "path_stride_s": PATH_STRIDE_S,
-    "drives": learning_digest(),
+    "drives": DIGEST,
 }
 DECIDED_BY = (
     "foredrive.tasks.planning.scores",
