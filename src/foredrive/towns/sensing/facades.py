@@ -6,11 +6,10 @@ The functions are compiled by numba and called once for each hit.
 import math
 from typing import no_type_check
 
-import numba
 import numpy as np
 
 from foredrive.towns.place.materials import GroundFloor, WallKind, WindowKind
-from foredrive.towns.sensing.patterns import TEXTURED, band, bands, lattice, noise
+from foredrive.towns.sensing.patterns import TEXTURED, band, bands, kernel_part, lattice, noise
 
 GLASS_RGB = (0.045, 0.06, 0.075)
 ACCENT_RGB = np.array(
@@ -38,10 +37,8 @@ _CURTAIN, _SHUTTERED = int(WindowKind.CURTAIN), int(WindowKind.SHUTTERED)
 _GRID, _SLIT = int(WindowKind.GRID), int(WindowKind.SLIT)
 _SHOPS, _GATES = int(GroundFloor.SHOPS), int(GroundFloor.GATES)
 
-_kernel = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=True, forceinline=True)
 
-
-@_kernel
+@kernel_part
 @no_type_check
 def _ground_floor(p, material, x_in, y, bay, column, span, du, dv, out):
     """Compute the openings below the first storey. `_openings` describes what is written to `out`."""
@@ -86,7 +83,7 @@ def _ground_floor(p, material, x_in, y, bay, column, span, du, dv, out):
     out[0], out[1] = glass, pane - glass
 
 
-@_kernel
+@kernel_part
 @no_type_check
 def _shutters(x, y, left, wide, low, high, du, dv):
     """Return the share of the footprint that shutters on both sides of a window fill."""
@@ -95,7 +92,7 @@ def _shutters(x, y, left, wide, low, high, du, dv):
     return share * band(y, low, low + high, dv) * (1.0 - 0.3 * bands(y, 0.12, 0.04, dv))
 
 
-@_kernel
+@kernel_part
 @no_type_check
 def _rail(x, y, left, wide, du, dv, out):
     """Add a rail in front of a window that reaches down to the floor."""
@@ -105,7 +102,7 @@ def _rail(x, y, left, wide, du, dv, out):
     out[0], out[1], out[2] = out[0] * (1.0 - rail), out[1] * (1.0 - rail), rail
 
 
-@_kernel
+@kernel_part
 @no_type_check
 def _openings(p, material, u, v, w, du, dv, out):
     """Compute the parts of a façade's footprint that are not wall.
@@ -176,7 +173,7 @@ def _openings(p, material, u, v, w, du, dv, out):
     return int(row * 131.0 + column)
 
 
-@_kernel
+@kernel_part
 @no_type_check
 def _wall(p, material, u, v, du, dv):
     """Return the brightness of a façade's material: joints, single bricks and slabs, ribs."""
@@ -201,7 +198,7 @@ def _wall(p, material, u, v, du, dv):
     return 1.0
 
 
-@_kernel
+@kernel_part
 @no_type_check
 def facade(p, material, x, y, uvw, extent, i, out):
     """Compute walls with windows, doors, shop fronts, a plinth and a ledge above the ground floor."""

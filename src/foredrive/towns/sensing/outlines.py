@@ -77,7 +77,8 @@ def same_as_centre(pixels, samples, surfaces, actor, lit, buffer, centre):
         if same and surfaces.material[i] != MISS:
             same = lit[i] == centre.lit[pixel] and not _bends(surfaces.normal, i, centre.normal, pixel)
         if same:
-            out[i] = centre.radiance[pixel]
+            for c in range(3):  # an assignment of rows takes seconds to compile
+                out[i, c] = centre.radiance[pixel, c]
     return out
 
 

@@ -19,10 +19,18 @@ _TABLE_MASK = (1 << _TABLE_BITS) - 1
 _NOISE = np.random.default_rng(20).random(1 << _TABLE_BITS).astype(np.float32)
 """Random numbers to which lattice points are hashed."""
 
-_kernel = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=True, forceinline=True)
+_OPTIONS = {"error_model": "numpy", "fastmath": True, "forceinline": True}
+kernel_part = numba.njit(no_cpython_wrapper=True, no_cfunc_wrapper=True, **_OPTIONS)
+"""Decorator of functions that only kernels call, inlined. They compile faster; Python cannot call them."""
+_kernel = numba.njit(cache=True, nogil=True, **_OPTIONS)
+# With signatures: otherwise numba compiles a version for each constant that is passed as seed
+_kernel_of_points = numba.njit("float32(int64, int64, int64)", cache=True, nogil=True, **_OPTIONS)
+_kernel_of_footprints = numba.njit(
+    [f"float64({x}, {x}, {x}, int64)" for x in ("float64", "float32")], cache=True, nogil=True, **_OPTIONS
+)
 
 
-@_kernel
+@_kernel_of_points
 @no_type_check
 def lattice(ix: int, iy: int, seed: int) -> float:
     """Return a random number in 0..1 for a lattice point."""
@@ -33,7 +41,7 @@ def lattice(ix: int, iy: int, seed: int) -> float:
     return _NOISE[(h >> 13) & _TABLE_MASK]
 
 
-@_kernel
+@_kernel_of_footprints
 @no_type_check
 def noise(x: float, y: float, footprint: float, seed: int) -> float:
     """Return value noise of wavelength 1 in -1..1, or 0 where the footprint (in the unit of x) blurs it

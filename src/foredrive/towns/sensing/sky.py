@@ -3,17 +3,13 @@
 import math
 from typing import no_type_check
 
-import numba
-
-from foredrive.towns.sensing.patterns import noise
+from foredrive.towns.sensing.patterns import kernel_part, noise
 
 FOG_TOP_M = 100.0
 """Upper limit of fog, rain and haze, m."""
 
-_kernel = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=True, forceinline=True)
 
-
-@_kernel
+@kernel_part
 @no_type_check
 def sky(light, dx, dy, dz, out):
     """Fill out [3] with the sky: a gradient, a glow around the sun, clouds, and haze in front of all of
@@ -30,14 +26,14 @@ def sky(light, dx, dy, dz, out):
     _air_and_sun(light, dx, dy, dz, cloud, out)
 
 
-@_kernel
+@kernel_part
 @no_type_check
 def blurred_sky(light, dx, dy, dz, out):
     """Fill out [3] with the sky as a rough mirror shows it: its clouds are blurred into one layer."""
     _air_and_sun(light, dx, dy, dz, light.clouds * min(1.0, 6.0 * dz), out)
 
 
-@_kernel
+@kernel_part
 @no_type_check
 def _air_and_sun(light, dx, dy, dz, cloud, out):
     up = max(dz, 0.0)

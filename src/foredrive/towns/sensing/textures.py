@@ -6,11 +6,9 @@ The functions are compiled by numba and called once for each hit.
 import math
 from typing import no_type_check
 
-import numba
-
 from foredrive.towns.place.materials import GRASS_RGB, LinePattern, Texture, srgb_to_linear
 from foredrive.towns.sensing.facades import facade
-from foredrive.towns.sensing.patterns import band, bands, lattice, noise
+from foredrive.towns.sensing.patterns import band, bands, kernel_part, lattice, noise
 
 DASH_PERIOD_M, DASH_M = 9.0, 3.0
 DOUBLE_LINE_GAP_M = 0.12
@@ -29,10 +27,8 @@ _STRIPES, _GLASS, _FIELD = int(Texture.STRIPES), int(Texture.GLASS), int(Texture
 _LINE_NONE, _LINE_BROKEN = int(LinePattern.NONE), int(LinePattern.BROKEN)
 _LINE_DOUBLE, _LINE_DOUBLE_BROKEN = int(LinePattern.DOUBLE_SOLID), int(LinePattern.DOUBLE_BROKEN)
 
-_kernel = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=True, forceinline=True)
 
-
-@_kernel
+@kernel_part
 @no_type_check
 def _line(distance: float, along: float, du: float, dw: float, pattern: int, width: float) -> float:
     """Return the painted share of the footprint at a distance from the border that the line follows."""
@@ -49,7 +45,7 @@ def _line(distance: float, along: float, du: float, dw: float, pattern: int, wid
     return share
 
 
-@_kernel
+@kernel_part
 @no_type_check
 def _road(p, material, x, y, uvw, extent, i, out):
     """Compute asphalt: grain, wear along the wheel tracks, patches, lines."""
@@ -83,7 +79,7 @@ def _road(p, material, x, y, uvw, extent, i, out):
     out[4] = paint
 
 
-@_kernel
+@kernel_part
 @no_type_check
 def _grass(x, y, size):
     """Return factors on red, green and blue of the land."""
@@ -94,7 +90,7 @@ def _grass(x, y, size):
     return shade * (0.8 + 0.5 * dry), shade * (0.95 + 0.12 * dry), shade * (0.8 + 0.3 * dry)
 
 
-@_kernel
+@kernel_part
 @no_type_check
 def _field(p, material, x, y, uvw, extent, i, out):
     """Compute rows of crops with the ruts of tractors, and grass beyond the border."""
@@ -118,7 +114,7 @@ def _field(p, material, x, y, uvw, extent, i, out):
         out[c] = tilled * inside + _GRASS_RGB[c] * grass[c] * (1.0 - inside)
 
 
-@_kernel
+@kernel_part
 @no_type_check
 def _tint(kind, p, material, xyz, uvw, extent, i):
     """Return factors on red, green and blue of the simpler textures."""
@@ -157,7 +153,7 @@ def _tint(kind, p, material, xyz, uvw, extent, i):
     return 1.0, 1.0, 1.0
 
 
-@_kernel
+@kernel_part
 @no_type_check
 def texture(materials, material, xyz, uvw, extent, i, out):
     """Evaluate a material at the i-th of many hits.
