@@ -18,7 +18,7 @@ from beartype import beartype
 from jaxtyping import AbstractArray, jaxtyped
 
 PACKAGE = "foredrive"
-CALLS = 100
+CALLS = 10
 """Shapes are checked in so many calls of a function in a test: loops of simulators call some 10,000 times."""
 
 _calls = Counter[FunctionType]()

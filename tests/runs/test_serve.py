@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 import urllib.request
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ from foredrive.cli.main import main
 from foredrive.driving.ncap.outcome import Outcome
 from foredrive.engine.summary import read_summary
 from foredrive.errors import InputError
+from foredrive.integrations.remote import planner_client
 from foredrive.integrations.remote.json_http import ask
 from foredrive.json_server import Address, JsonServer
 from foredrive.runs.drive.in_ncap import SafetyTests
@@ -87,7 +89,7 @@ def test_who_is_not_there_is_told_before_driving(
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("foredrive.integrations.remote.planner_client.check_planner.__defaults__", (0.1,))
+    monkeypatch.setattr(planner_client, "check_planner", partial(planner_client.check_planner, within_s=0.1))
     server = JsonServer({})
     server.close()
     command = [
