@@ -8,6 +8,7 @@ import math
 import os
 import signal
 import threading
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -72,6 +73,15 @@ def real_data() -> Path:
     if not folder.is_dir():
         pytest.skip("no real logs here: set FOREDRIVE_REAL_DATA")
     return folder
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Shuffle the files where several workers share them, the same way in each worker.
+
+    Files of one folder use the same kernels. Side by side, two workers would compile each of them twice.
+    """
+    if hasattr(config, "workerinput"):
+        items.sort(key=lambda item: zlib.crc32(item.location[0].encode()))
 
 
 def pytest_runtest_setup() -> None:

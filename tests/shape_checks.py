@@ -9,7 +9,6 @@ import importlib.abc
 import importlib.machinery
 import inspect
 import sys
-from collections import Counter
 from collections.abc import Sequence
 from types import FunctionType, ModuleType
 from typing import Any, get_args
@@ -21,7 +20,8 @@ PACKAGE = "foredrive"
 CALLS = 10
 """Shapes are checked in so many calls of a function in a test: loops of simulators call some 10,000 times."""
 
-_calls = Counter[FunctionType]()
+_left: list[list[int]] = []
+"""How many calls of each function are still to be checked in this test."""
 
 
 def install() -> None:
@@ -32,7 +32,8 @@ def install() -> None:
 
 def begin_test() -> None:
     """Count calls anew."""
-    _calls.clear()
+    for left in _left:
+        left[0] = CALLS
 
 
 def check_all(home: ModuleType | type, module: str) -> None:
@@ -60,13 +61,14 @@ def _checked(function: FunctionType) -> Any:
 
 
 def _with_shapes(function: FunctionType) -> Any:
-    checked = jaxtyped(function, typechecker=beartype)
+    checked, left = jaxtyped(function, typechecker=beartype), [CALLS]
+    _left.append(left)
 
     @functools.wraps(function)
     def counted(*args: Any, **kwargs: Any) -> Any:
-        if _calls[function] >= CALLS:
+        if not left[0]:
             return function(*args, **kwargs)
-        _calls[function] += 1
+        left[0] -= 1
         return checked(*args, **kwargs)
 
     return counted

@@ -27,7 +27,7 @@ def test_a_wrong_shape_is_caught_in_a_record() -> None:
         )
 
 
-def test_the_hundredth_call_is_still_checked() -> None:
+def test_the_last_counted_call_is_still_checked() -> None:
     for _ in range(CALLS - 1):
         transform_points(torch.eye(4), torch.zeros(5, 3))
     with pytest.raises(TypeCheckError):
