@@ -50,7 +50,7 @@ format: install
 
 # Files of tests side by side on up to four cores, each in a process with one thread.
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder
-# Folders of tests without processes, logs, towns and training; 80 s on two cores.
+# Folders of tests without processes, logs, towns and training; 40 s on two cores.
 QUICK := $(addprefix tests/, geometry scene sensors sets tasks search test_architecture.py)
 
 test: install lint
