@@ -1,0 +1,426 @@
+"""How far rendered images and sweeps may be trusted, from what the sensors of the log have seen.
+
+A reconstruction shows surfaces well that its training views saw from about the same direction and no farther
+away, and guesses the others. Each block of a rendered image is looked up in the training views: was its
+surface seen, by how many of them, from which angle and distance? A gamma regression with logarithmic link
+turns this into an expected squared error, beams likewise by a logistic regression. Their weights were fitted
+to reconstructed towns, where the true frame is known for every pose (`benchmarks/trust.py`).
+"""
+
+import dataclasses
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from jaxtyping import Bool, Float, Int
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from foredrive.errors import InputError
+from foredrive.geometry.projection import pixel_centres, pixels_to_rays, project
+from foredrive.geometry.se3 import inverse_se3, transform_points
+from foredrive.methods.reconstruction.novel_views import novel_camera_view, novel_sweep_view
+from foredrive.methods.reconstruction.reconstructed import ReconstructedScene
+from foredrive.methods.reconstruction.rendered import RenderedImage, RenderedSweep
+from foredrive.methods.reconstruction.scene_graph import STATIC, SceneGraph
+from foredrive.methods.reconstruction.seed_points import actor_rows
+from foredrive.methods.reconstruction.tracks import ActorTracks, states_at
+from foredrive.methods.reconstruction.vehicle import LoggedVehicle
+from foredrive.methods.reconstruction.views import CameraView, SweepView
+from foredrive.scene.record import Record
+
+BLOCKS = 32
+"""Blocks from left to right in an image."""
+SKY_M = 1000.0
+"""Distance at which directions without a surface are compared."""
+SAME_M, SAME_SHARE = 0.3, 0.1
+"""A view saw a surface if its depth there differs by at most this distance plus this share of the depth."""
+NEAR_RAD = 0.1
+"""Angle within which a view looks from about the same direction."""
+_ANGLE_COST_RAD, _RATIO_COST = 0.1, 0.3
+"""Change of angle, and of the logarithm of the distance, by which a view is one unit worse as evidence."""
+_NEAREST_VIEWS = 48
+"""Number of training views of each image that are searched: those whose cameras look most alike."""
+_METRES_A_RAD = 15.0
+"""Distance between cameras that counts as much as a turn by one radian."""
+_APART_M = 3000.0
+"""Distance by which the points of each actor are kept apart from all others."""
+POINTS = 300_000
+"""Maximum number of lidar points that are kept."""
+
+IMAGE_WEIGHTS = {
+    "one": 0.0,
+    "unseen": 0.0,
+    "unseen_sky": 0.0,
+    "unseen_low": 0.0,
+    "angle": 0.0,
+    "small_angle": 0.0,
+    "nearer_than_seen": 0.0,
+    "farther_than_seen": 0.0,
+    "views": 0.0,
+    "near_views": 0.0,
+    "open": 0.0,
+    "sky": 0.0,
+    "actor": 0.0,
+    "range": 0.0,
+    "texture": 0.0,
+    "edge": 0.0,
+}
+"""Weights of `image_features` for the logarithm of the squared error of a block, by `bench trust`."""
+SWEEP_WEIGHTS = {
+    "one": 0.0,
+    "lost": 0.0,
+    "unsure": 0.0,
+    "away": 0.0,
+    "range": 0.0,
+    "long_range": 0.0,
+    "spread": 0.0,
+    "open": 0.0,
+    "actor": 0.0,
+}
+"""Weights of `sweep_features` for the log odds of a right beam, by `bench trust`."""
+
+
+@dataclass(frozen=True)
+class ObservedViews(Record):
+    """The V training images of a log as the reconstruction shows them, in blocks."""
+
+    K: Float[Tensor, "V 3 3"]
+    """Intrinsics for images of one pixel a block."""
+    dist: Float[Tensor, "V 5"]
+    T_scene_cam: Float[Tensor, "V 4 4"]
+    depth_m: Float[Tensor, "V h w"]
+    alpha: Float[Tensor, "V h w"]
+    T_scene_actor: Float[Tensor, "V A 4 4"]
+    """Poses of the actors when each image was exposed."""
+    present: Bool[Tensor, "V A"]
+
+
+@torch.no_grad()
+def observe_views(
+    scene: ReconstructedScene, vehicle: LoggedVehicle, t_s: Sequence[float]
+) -> ObservedViews | None:
+    """Render the images of all cameras at the training times, in blocks; None without cameras or times."""
+    rig, graph = vehicle.rig, scene.graph
+    if not rig.names or not t_s:
+        return None
+    assert rig.exposed_dt_s is not None
+    views = [
+        in_blocks(novel_camera_view(rig, camera, vehicle.at(time_s + float(rig.exposed_dt_s[camera]))))
+        for time_s in t_s
+        for camera in range(len(rig.names))
+    ]
+    images = [scene.camera(graph, view.to(scene.device)) for view in views]
+    states = [states_at(graph.tracks, view.t_s) for view in views]
+    return ObservedViews(
+        K=torch.stack([view.K for view in views]),
+        dist=torch.stack([view.dist for view in views]),
+        T_scene_cam=torch.stack([view.T_scene_cam for view in views]),
+        depth_m=torch.stack([image.range_m.cpu() for image in images]),
+        alpha=torch.stack([image.alpha.cpu() for image in images]),
+        T_scene_actor=torch.stack([state.T_scene_actor.cpu() for state in states]),
+        present=torch.stack([state.present.cpu() for state in states]),
+    )
+
+
+def in_blocks(view: CameraView) -> CameraView:
+    """Return a view with one pixel a block."""
+    return view.shrunk(max(1, round(view.size_hw[1] / BLOCKS)))
+
+
+@torch.no_grad()
+def image_features(
+    observed: ObservedViews,
+    track_id: Int[Tensor, "A"],
+    tracks: ActorTracks,
+    view: CameraView,
+    image: RenderedImage,
+) -> dict[str, Float[Tensor, "N"]]:
+    """Return what is known about each block of a rendered image, row by row.
+
+    Args:
+        observed: the training views.
+        track_id: ids of the actors in `observed`.
+        tracks: the actors of the rendered scene, edits included. Those with other ids were never seen.
+        view: the camera, with one pixel a block.
+        image: the rendered image, on the CPU.
+    """
+    height, width = view.size_hw
+    rays = pixels_to_rays(pixel_centres((height, width)).view(-1, 2), view.K, view.dist)
+    alpha, depth_m = image.alpha.flatten(), image.range_m.flatten()
+    sky = alpha < 0.5
+    points_cam = rays / rays[:, 2:] * torch.where(sky, SKY_M, depth_m)[:, None]
+    range_m = points_cam.norm(dim=-1)
+    points = transform_points(view.T_scene_cam, points_cam)
+    states = states_at(tracks, view.t_s)
+    owner = actor_rows(points, torch.zeros(len(points)), states, tracks)
+    owner[sky] = STATIC
+
+    chosen = _most_alike(observed, view)
+    observed = observed[chosen]
+    # Surfaces of actors, and the camera beside them, to where the actor was when each view was exposed
+    rows = _rows_of(track_id, tracks, owner)
+    T_then_now, present = _moved_along(observed, states.T_scene_actor, owner, rows)
+    points_then = _transformed(T_then_now, points.expand(len(chosen), -1, -1))
+    eye_then = _transformed(T_then_now, view.T_scene_cam[:3, 3].expand(len(chosen), len(points), 3))
+    uv, depth_then_m, inside = project(
+        transform_points(inverse_se3(observed.T_scene_cam), points_then),
+        observed.K,
+        observed.dist,
+        (height, width),
+    )
+    u, v = uv[..., 0].long().clamp(0, width - 1), uv[..., 1].long().clamp(0, height - 1)
+    every = torch.arange(len(chosen))[:, None]
+    shown_m, shown_alpha = observed.depth_m[every, v, u], observed.alpha[every, v, u]
+    same_surface = (shown_alpha >= 0.5) & ((depth_then_m - shown_m).abs() < SAME_SHARE * shown_m + SAME_M)
+    saw = inside & present & torch.where(sky, shown_alpha < 0.5, same_surface)
+
+    # Evidence is best from the same direction and from no farther away
+    before = points_then - observed.T_scene_cam[:, None, :3, 3]
+    angle_rad = torch.acos(F.cosine_similarity(before, points_then - eye_then, dim=-1).clamp(-1, 1))
+    farther = torch.where(sky, 0.0, (before.norm(dim=-1) / range_m).log())
+    cost = angle_rad / _ANGLE_COST_RAD + farther.clamp_min(0) / _RATIO_COST
+    best = torch.where(saw, cost, torch.inf).argmin(0)
+    seen, column = saw.any(0), torch.arange(len(points))
+    best_angle_rad = torch.where(seen, angle_rad[best, column], 0.0)
+    best_farther = torch.where(seen, farther[best, column].clamp(-1, 2), 0.0)
+    log_depth = image.range_m.clamp_min(0.1).log()
+    unseen, solid = (~seen).float(), (~sky).float()
+    return {
+        "one": torch.ones_like(alpha),
+        "unseen": unseen,
+        "unseen_sky": unseen * sky,
+        "unseen_low": unseen * torch.linspace(0, 1, height).repeat_interleave(width),
+        "angle": best_angle_rad,
+        "small_angle": best_angle_rad.clamp_max(NEAR_RAD),
+        "nearer_than_seen": best_farther.clamp_min(0),
+        "farther_than_seen": best_farther.clamp_max(0),
+        "views": saw.float().sum(0).log1p(),
+        "near_views": (saw & (angle_rad < NEAR_RAD)).float().sum(0).log1p(),
+        "open": (1 - alpha) * solid,
+        "sky": sky.float(),
+        "actor": (owner != STATIC).float(),
+        "range": range_m.log1p() * solid,
+        "texture": (_steps(image.rgb.mean(0)) + 0.005).log(),
+        "edge": _steps(log_depth).clamp_max(2.0),
+    }
+
+
+def _steps(values: Float[Tensor, "h w"]) -> Float[Tensor, "N"]:
+    """Return the change of each block to the next block to the right and below."""
+    right = F.pad((values[:, 1:] - values[:, :-1]).abs(), (0, 1))
+    below = F.pad((values[1:] - values[:-1]).abs(), (0, 0, 0, 1))
+    return (right + below).flatten()
+
+
+def _most_alike(observed: ObservedViews, view: CameraView) -> Int[Tensor, "n"]:
+    """Return the training views whose place and axis are nearest to those of a view."""
+    away_m = (observed.T_scene_cam[:, :3, 3] - view.T_scene_cam[:3, 3]).norm(dim=-1)
+    turned = 1 - observed.T_scene_cam[:, :3, 2] @ view.T_scene_cam[:3, 2]
+    return (away_m / _METRES_A_RAD + turned).argsort(stable=True)[:_NEAREST_VIEWS]
+
+
+def _rows_of(track_id: Int[Tensor, "A"], tracks: ActorTracks, owner: Int[Tensor, "N"]) -> Int[Tensor, "N"]:
+    """Return the row in `track_id` of the actor of each point; A for the static part, A + 1 for others."""
+    count = len(track_id)
+    same = tracks.track_id[:, None].cpu() == track_id
+    row = torch.where(same.any(-1), same.float().argmax(-1) if count else 0, count + 1)
+    # The row behind the last actor is the static part's, which STATIC = -1 indexes
+    return torch.cat([row, torch.tensor([count])])[owner]
+
+
+def _moved_along(
+    observed: ObservedViews,
+    T_scene_actor: Float[Tensor, "B 4 4"],
+    owner: Int[Tensor, "N"],
+    rows: Int[Tensor, "N"],
+) -> tuple[Float[Tensor, "V N 4 4"], Bool[Tensor, "V N"]]:
+    """Return the motion of each point's actor from now to each view's time, and whether it was present."""
+    views = len(observed.T_scene_cam)
+    still = torch.eye(4).expand(views, 2, 4, 4)
+    T_then = torch.cat([observed.T_scene_actor, still], 1)[:, rows]
+    present = torch.cat([observed.present, torch.tensor([[True, False]]).expand(views, 2)], 1)
+    T_now = torch.cat([T_scene_actor, torch.eye(4)[None]])[owner]
+    # An actor that was never seen has no pose then: its points stay where they are, and count as unseen
+    moves = (rows < observed.present.shape[1])[:, None, None]
+    return torch.where(moves, T_then @ inverse_se3(T_now), torch.eye(4)), present[:, rows]
+
+
+def _transformed(T: Float[Tensor, "V N 4 4"], points: Float[Tensor, "V N 3"]) -> Float[Tensor, "V N 3"]:
+    """Transform each point by its own pose."""
+    return (T[..., :3, :3] @ points[..., None])[..., 0] + T[..., :3, 3]
+
+
+@dataclass(frozen=True)
+class ObservedPoints:
+    """Surfaces that the log's lidar saw, as the reconstruction shows them.
+
+    Points of actors are in the actors' frames, and moved up by a distance of their own, so that one tree
+    holds all of them.
+    """
+
+    points: Float[Tensor, "P 3"]
+
+    @cached_property
+    def tree(self) -> cKDTree:
+        """Return the tree of all points."""
+        return cKDTree(self.points.numpy())
+
+
+@torch.no_grad()
+def observe_points(
+    scene: ReconstructedScene, vehicle: LoggedVehicle, t_s: Sequence[float]
+) -> ObservedPoints | None:
+    """Render the sweeps of the log's lidar at the training times; None without a lidar or times."""
+    lidar, graph = vehicle.lidar, scene.graph
+    if lidar is None or not t_s:
+        return None
+    every = math.ceil(len(t_s) * len(lidar.channel) / POINTS)
+    clouds = []
+    for time_s in t_s:
+        view = novel_sweep_view(lidar, vehicle.at(time_s))
+        view = dataclasses.replace(view, beams=view.beams[::every])
+        sweep = scene.sweep(graph, scene.prepare_sweep(view), view.t_s)
+        hit = sweep.returned.cpu()
+        clouds.append(_apart(scene.tracks.track_id, graph.tracks, view, sweep, hit)[0])
+    return ObservedPoints(torch.cat(clouds))
+
+
+def _apart(
+    track_id: Int[Tensor, "A"],
+    tracks: ActorTracks,
+    view: SweepView,
+    sweep: RenderedSweep,
+    hit: Bool[Tensor, "P"],
+) -> tuple[Float[Tensor, "H 3"], Int[Tensor, "H"]]:
+    """Return the end points of the beams that hit something as in `ObservedPoints`, and whose they are."""
+    beams, states = view.beams[hit], states_at(tracks, view.t_s)
+    ends = beams.origin_ego + beams.dir_ego * sweep.hit_range_m.cpu()[hit, None]
+    points = transform_points(view.T_scene_ego, ends)
+    owner = actor_rows(points, beams.dt_s, states, tracks)
+    rows = _rows_of(track_id.cpu(), tracks, owner)
+    on_actor = owner != STATIC
+    mine = owner[on_actor]
+    # To the time of the sweep, then into the frame of the box
+    at_sweep = points[on_actor] - states.velocity_mps[mine] * beams.dt_s[on_actor, None]
+    local = _transformed(inverse_se3(states.T_scene_actor[mine])[None], at_sweep[None])[0]
+    points[on_actor] = local + _APART_M * (rows[on_actor, None] + 1) * torch.tensor([0.0, 0.0, 1.0])
+    return points, owner
+
+
+@torch.no_grad()
+def sweep_features(
+    observed: ObservedPoints,
+    track_id: Int[Tensor, "A"],
+    tracks: ActorTracks,
+    view: SweepView,
+    sweep: RenderedSweep,
+) -> dict[str, Float[Tensor, "P"]]:
+    """Return what is known about each beam of a rendered sweep.
+
+    Args:
+        observed: surfaces that the lidar saw.
+        track_id: ids of the actors in `observed`.
+        tracks: the actors of the rendered scene, edits included.
+        view: the beams.
+        sweep: the rendered sweep.
+    """
+    hit = sweep.returned.cpu()
+    points, owner = _apart(track_id, tracks, view, sweep, hit)
+    away_m, range_m, actor = (torch.zeros(len(hit)) for _ in range(3))
+    away_m[hit] = torch.from_numpy(np.asarray(observed.tree.query(points.numpy())[0], np.float32))
+    range_m[hit] = sweep.hit_range_m.cpu()[hit]
+    actor[hit] = (owner != STATIC).float()
+    returned = hit.float()
+    spread_m = (sweep.range_m - sweep.hit_range_m).abs().cpu() * returned
+    return {
+        "one": torch.ones_like(returned),
+        "lost": 1 - returned,
+        "unsure": torch.exp(-sweep.drop_logit.abs().cpu()),
+        "away": (away_m + 0.02).log() * returned,
+        "range": range_m.log1p(),
+        "long_range": (range_m / 20).log().clamp_min(0) * returned,
+        "spread": (spread_m + 0.01).log() * returned,
+        "open": (1 - sweep.alpha.cpu()) * returned,
+        "actor": actor,
+    }
+
+
+def beam_is_right(
+    range_m: Float[Tensor, "P"],
+    returned: Bool[Tensor, "P"],
+    real_range_m: Float[Tensor, "P"],
+    really_returned: Bool[Tensor, "P"],
+) -> Bool[Tensor, "P"]:
+    """Return which beams are rightly lost, or return with a range within 0.1 m and 2 % of the true one."""
+    close = (range_m - real_range_m).abs() < 0.1 + 0.02 * real_range_m
+    return (returned == really_returned) & (close | ~really_returned)
+
+
+@dataclass(frozen=True, eq=False)
+class Trust:
+    """What a reconstruction expects of its own images and sweeps."""
+
+    scene: ReconstructedScene
+    views: ObservedViews | None
+    """None without cameras."""
+    points: ObservedPoints | None
+    """None without a lidar."""
+    offset: float = 0.0
+    """Added to the logarithm of expected squared errors: how this log differs from those of the fit."""
+
+    @torch.no_grad()
+    def image_error(self, graph: SceneGraph, view: CameraView) -> Float[Tensor, "h w"]:
+        """Return the expected squared error of each block of an image, with colours from 0 to 1.
+
+        Args:
+            graph: the scene, or an edited version of it.
+            view: the camera, at any size.
+
+        Raises:
+            InputError: the log has no cameras.
+        """
+        if self.views is None:
+            raise InputError("a log without cameras says nothing about images")
+        view = in_blocks(view)
+        image = self.scene.camera(graph, view.to(self.scene.device))
+        features = image_features(self.views, self._track_id, graph.tracks, view, image)
+        log_error = self.offset + weighted_sum(features, IMAGE_WEIGHTS)
+        return log_error.clamp_max(0.0).exp().view(view.size_hw)
+
+    @torch.no_grad()
+    def sweep_is_right(self, graph: SceneGraph, view: SweepView) -> Float[Tensor, "P"]:
+        """Return the probability that each beam is right, see `beam_is_right`.
+
+        Args:
+            graph: the scene, or an edited version of it.
+            view: the beams; some of a sweep are enough.
+
+        Raises:
+            InputError: the log has no lidar.
+        """
+        if self.points is None:
+            raise InputError("a log without lidar says nothing about sweeps")
+        sweep = self.scene.sweep(graph, self.scene.prepare_sweep(view), view.t_s)
+        features = sweep_features(self.points, self._track_id, graph.tracks, view, sweep)
+        return weighted_sum(features, SWEEP_WEIGHTS).sigmoid()
+
+    @property
+    def _track_id(self) -> Int[Tensor, "A"]:
+        return self.scene.track_id
+
+
+def weighted_sum(
+    features: Mapping[str, Float[Tensor, "N"]], weights: Mapping[str, float]
+) -> Float[Tensor, "N"]:
+    """Return the linear predictor of a regression."""
+    return sum((weight * features[name] for name, weight in weights.items()), torch.zeros(()))
+
+
+def psnr_of(squared_error: Float[Tensor, "h w"]) -> float:
+    """Return the PSNR of an image, dB, from the squared errors of its blocks."""
+    return float(-10 * squared_error.mean().clamp_min(1e-9).log10())
