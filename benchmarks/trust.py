@@ -25,13 +25,16 @@ from foredrive.files import atomic_path
 from foredrive.methods.reconstruction.edits import ShiftEgo
 from foredrive.methods.reconstruction.reconstructed import ReconstructedScene
 from foredrive.methods.reconstruction.trust import (
+    BEAMS_APART,
     IMAGE_WEIGHTS,
     SWEEP_WEIGHTS,
+    TRUSTED_LOSS_DB,
+    TRUSTED_LOSS_SHARE,
     ObservedPoints,
     ObservedViews,
     beam_is_right,
+    block_hw,
     image_features,
-    in_blocks,
     observe_points,
     observe_views,
     psnr_of,
@@ -57,11 +60,6 @@ FRAMES_APART = 8
 """Every eighth frame from the second on is judged; all of them are held out."""
 POSES, ASIDE_M, TURNED_DEG = 24, 6.0, 25.0
 """Number of random poses at each moment beside the logged one, and their bounds."""
-BEAMS_APART = 7
-GOOD_DB = 3.0
-"""An image is good if its PSNR is at most so much below that of the held-out images of its log."""
-GOOD_SHARE = 0.05
-"""A sweep is good if its share of right beams is at most so much below that of the held-out sweeps."""
 RECIPE = gaussians_tiny()
 CONFIG = {
     "drives": [dataclasses.asdict(drive) for drive in DRIVES.values()],
@@ -121,11 +119,11 @@ def _blocks(
     scene: ReconstructedScene, views: ObservedViews, view: CameraView
 ) -> tuple[Float[Tensor, "N D"], Float[Tensor, "N"]]:
     """Return the features of the blocks of an image, and their squared errors."""
-    graph, small = scene.graph, in_blocks(view)
-    features = image_features(views, scene.track_id, graph.tracks, small, scene.camera(graph, small))
+    graph, image = scene.graph, scene.camera(scene.graph, view)
+    features = image_features(views, scene.track_id, graph.tracks, view, image)
     assert view.image is not None
-    squared = (scene.camera(graph, view).rgb.clamp(0, 1) - view.image / 255).square().mean(0)
-    errors = torch.nn.functional.interpolate(squared[None, None], small.size_hw, mode="area")
+    squared = (image.rgb.clamp(0, 1) - view.image / 255).square().mean(0)
+    errors = torch.nn.functional.interpolate(squared[None, None], block_hw(view.size_hw), mode="area")
     return torch.stack([features[name] for name in IMAGE_WEIGHTS], -1), errors.flatten()
 
 
@@ -217,7 +215,7 @@ def of_town(town: str, _: int) -> dict[str, float]:
     frames = predicted(own, fit_images(others), fit_sweeps(others))
     beside = ~frames["held"]
     figures = {"frames": float(beside.sum())}
-    for kind, unit, margin in (("db", "db", GOOD_DB), ("share", "share", GOOD_SHARE)):
+    for kind, unit, margin in (("db", "db", TRUSTED_LOSS_DB), ("share", "share", TRUSTED_LOSS_SHARE)):
         true, expected = frames[f"true_{kind}"], frames[f"expected_{kind}"]
         least = true[~beside].mean() - margin
         true, expected = true[beside], expected[beside]

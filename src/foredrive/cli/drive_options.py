@@ -183,12 +183,14 @@ class InReconstruction:
         start: Times of the log at which drives begin, s; by default as early as possible.
         threat: Put a car in the way: it stands, comes head-on or crosses.
         edits: File of edits to the reconstructed scene.
+        stay_trusted: End a drive where the reconstruction no longer expects good sensors.
     """
 
     reconstructed: Annotated[OptionalPath, tyro.conf.arg(name="in", metavar="RUN")] = None
     start: Annotated[tuple[float, ...], tyro.conf.arg(metavar="S [S ...]")] = ()
     threat: tuple[Literal["stationary", "frontal", "side"], ...] = ()
     edits: OptionalPath = None
+    stay_trusted: bool = False
 
     def check(self) -> None:
         """Raise `InputError` if a file does not exist or a time is impossible."""
@@ -205,8 +207,10 @@ class InReconstruction:
             InputError: options for reconstructed logs are given without --in.
         """
         if self.reconstructed is None:
-            if self.start or self.threat or self.edits is not None:
-                raise InputError("--start, --threat and --edits need a reconstructed log (--in RUN)")
+            if self.start or self.threat or self.edits is not None or self.stay_trusted:
+                raise InputError(
+                    "--start, --threat, --edits and --stay-trusted need a reconstructed log (--in RUN)"
+                )
             return None
         from foredrive.driving.replay.threats import Threat
         from foredrive.runs.drive.in_reconstruction import ReconstructedRoutes
@@ -216,4 +220,5 @@ class InReconstruction:
             starts_s=self.start,
             threats=tuple(map(Threat, self.threat)),
             edits=None if self.edits is None else str(self.edits.absolute()),
+            stay_trusted=self.stay_trusted,
         )

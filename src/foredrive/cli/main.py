@@ -41,6 +41,7 @@ from foredrive.cli.search_evaluate import search_evaluate
 from foredrive.cli.search_index import search_index, search_train
 from foredrive.cli.serve import serve
 from foredrive.cli.train import train
+from foredrive.cli.trust import trust
 from foredrive.cli.view import view
 from foredrive.debugging import debugging, is_verbose, take_debugging
 from foredrive.errors import InputError
@@ -93,6 +94,7 @@ VERBS: dict[str, Callable[..., Any]] = {
     "search evaluate": search_evaluate,
     "reconstruct": reconstruct,
     "render": render,
+    "trust": trust,
     "imagine": imagine,
     "export": export,
     "export mcap": export_mcap,

@@ -26,6 +26,7 @@ def ncap(
     films: int = 6,
     propose: bool = False,
     sees: Literal["camera", "lidar", "both"] | None = None,
+    stay_trusted: bool = False,
     workers: int = 1,
     ray: bool = False,
 ) -> None:
@@ -49,6 +50,7 @@ def ncap(
             it, instead of testing an agent.
         sees: Show the agent only its cameras, only its lidar, or both; by default all that it takes, and a
             planner at http://HOST:PORT its cameras.
+        stay_trusted: End a run, without a score, where the reconstruction no longer expects good sensors.
         workers: Number of runs at a time. Each worker process opens the reconstructions.
         ray: Drive on Ray: on the cluster at RAY_ADDRESS, or on a cluster that is started here.
     """
@@ -79,7 +81,13 @@ def ncap(
 
     name = str(Path(agent).absolute()) if Path(agent).is_dir() else agent
     source = SafetyTests(
-        folders, str(scenarios.absolute()), rules, runs, spread=ray or workers > 1, sees=sees
+        folders,
+        str(scenarios.absolute()),
+        rules,
+        runs,
+        spread=ray or workers > 1,
+        sees=sees,
+        stay_trusted=stay_trusted,
     )
     suite = DriveSuite(name, source, sensors, latency_s=RULES[rules].latency_s)
 

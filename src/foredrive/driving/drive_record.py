@@ -56,6 +56,8 @@ class DriveRecord:
     threat: SafetyResult | None = None
     lanes_known: bool = True
     """False if departures from the lanes cannot be detected."""
+    trusted_share: float | None = None
+    """Share of the key frames that the reconstruction trusts; None where it was not asked, and in towns."""
 
     @property
     def scenario_events(self) -> tuple[Event, ...]:
@@ -73,6 +75,7 @@ def record_of(
     wall_s: float,
     threat: SafetyResult | None = None,
     lanes_known: bool = True,
+    trusted_share: float | None = None,
 ) -> DriveRecord:
     """Build the record of a drive. The arguments are fields of `DriveRecord`."""
     states = drive.states[::TRACK_EVERY]
@@ -98,4 +101,5 @@ def record_of(
         log=log,
         threat=threat,
         lanes_known=lanes_known,
+        trusted_share=trusted_share,
     )

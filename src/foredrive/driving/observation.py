@@ -30,6 +30,8 @@ class KeyFrame:
     """Without cameras (C = 0) if sensors are off."""
     sweep: LidarSweep | None
     boxes: Boxes
+    trusted: bool | None = None
+    """As `Rendered.trusted`."""
 
 
 def make_clip(

@@ -260,6 +260,8 @@ class Rendered(Record):
     """RGB, in the camera order of the renderer's rig."""
     sweep: LidarSweep | None
     """One revolution in the ego frame, with the beams that do not return. None if there is no lidar."""
+    trusted: bool | None = None
+    """Whether the frame should be almost as good as those of the log; None: the renderer does not say."""
 
 
 @runtime_checkable

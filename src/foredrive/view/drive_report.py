@@ -88,6 +88,8 @@ def score_table(summary: Summary) -> Table:
         Row(["Failed drives", summary["failed"]]),
         Row(["Planning time, median, ms", number(summary["plan_ms"], 0)]),
     ]
+    if "trusted_share" in summary:
+        rest.append(Row(["Key frames with trusted sensors, %", _percent(summary["trusted_share"])]))
     title = f"{_number_of(summary['routes'], 'route')}, {_number_of(summary['repetitions'], 'repetition')}"
     return Table([Column(align="left"), Column()], [Section(scores), Section(wrong), Section(rest)], title)
 
@@ -144,6 +146,9 @@ def _tiles(summary: Summary) -> list[MetricTile]:
         )
     failed, near = number(summary["failed"]), _percent(summary["near_collision_share"])
     comfortable = _percent(summary["comfortable_share"])
+    if "trusted_share" in summary:
+        trusted = _percent(summary["trusted_share"])
+        tiles.append(MetricTile("Trusted key frames, %", trusted, note="where good sensors are expected"))
     return [
         *tiles,
         MetricTile("Failed drives", failed, note=f"of {number(summary['drives'])}"),

@@ -19,6 +19,8 @@ COLUMNS = (
     Column("HD-Score", digits=2),
     Column("stopped short"),
     Column("left way"),
+    Column("trusted, %", digits=0),
+    Column("untrusted"),
 )
 
 
@@ -33,6 +35,8 @@ def safety_table(runs: Sequence[TestedRun], left_out: Mapping[str, str]) -> Tabl
         "score: 0 to 5; in brackets 95 % intervals over runs; score by progress: mean of their product",
         "impact speed: share of the reference speed, of runs with a collision; TTC: median of the smallest "
         "time to collision of each run",
+        "trusted: share of the key frames in which the reconstruction expects good sensors; untrusted: runs "
+        "that ended where it does not (--stay-trusted)",
         *(f"left out, {label}: {why}" for label, why in left_out.items()),
     ]
     sections = [
@@ -59,6 +63,8 @@ def _row(name: str, of: SafetyFigures, is_strong: bool = False) -> Row:
         of.hd_score,
         of.stopped_short,
         of.left_way,
+        None if of.trusted_share is None else 100 * of.trusted_share,
+        of.untrusted,
     ]
     return Row(cells, is_strong)
 

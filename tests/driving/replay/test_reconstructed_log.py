@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from foredrive.driving.drive import Drive, drive_route
 from foredrive.driving.dynamics import EGO
 from foredrive.driving.ncap.outcome import Outcome, judge, threat_score
+from foredrive.driving.observation import no_images
 from foredrive.driving.replay.logged_drive import LoggedDrive
 from foredrive.driving.replay.logged_lanes import LoggedLanes
 from foredrive.driving.replay.reconstructed import STRUCK, ReconstructedScenario, ReconstructedSimulator
@@ -18,7 +19,7 @@ from foredrive.driving.replay.threats import AFTER_S, Threat, reference_mps, sen
 from foredrive.driving.scores import Ending
 from foredrive.driving.simple_agents import ReplayAgent, StraightAgent
 from foredrive.errors import InputError
-from foredrive.geometry.se3 import matrix_from_yaw
+from foredrive.geometry.se3 import inverse_se3, matrix_from_yaw
 from foredrive.methods.reconstruction.edits import Edit, ShiftEgo, apply_edits
 from foredrive.methods.reconstruction.renderer import ReconstructedRenderer
 from foredrive.methods.reconstruction.scene_graph import SceneGraph
@@ -27,7 +28,7 @@ from foredrive.methods.reconstruction.vehicle import LoggedVehicle
 from foredrive.methods.splatad import Gaussians
 from foredrive.methods.splatad.content import GaussianContent
 from foredrive.methods.splatad.scene import GaussianScene
-from foredrive.scene import Agent, BicycleState, CameraRig, Category
+from foredrive.scene import Agent, BicycleState, CameraRig, Category, Rendered
 
 SPEED_MPS, PERIOD_S, END_S = 8.0, 0.1, 10.0
 WORLD_YAW = 0.7
@@ -277,3 +278,39 @@ def test_a_shifted_ego_vehicle_drives_beside_the_log() -> None:
     beside = np.linalg.inv(LoggedDrive(vehicle(), torch.eye(4)).pose_at(1.0)) @ simulator.drive.pose_at(1.0)
     assert np.allclose(beside[:3, 3], [0, 2, 0], atol=1e-5)
     assert driven(simulator, replay(simulator)).score.ending is Ending.COMPLETED
+
+
+class OnceTrusted:
+    """A renderer without sensors that trusts the first metres of the log alone."""
+
+    def __init__(self, until_m: float) -> None:
+        self.rig, self._until_m = vehicle().rig, until_m
+
+    def render(self, T_world_ego: torch.Tensor, twist_ego: torch.Tensor, t_s: float) -> Rendered:
+        along = inverse_se3(vehicle().T_world_scene) @ T_world_ego
+        return Rendered(no_images(), None, float(along[0, 3]) < self._until_m)
+
+
+@pytest.mark.parametrize("stays", [False, True])
+def test_a_drive_knows_how_much_of_it_was_trusted_and_may_end_there(stays: bool) -> None:
+    graph, log = scene_with(actor(500.0, 0.0)), LoggedDrive(vehicle(), torch.eye(4))
+    simulator = ReconstructedSimulator(OnceTrusted(30.0), graph.tracks, log)
+    scenario = ReconstructedScenario(1.0, length_s=6.0, stays_trusted=stays)
+    drive = drive_route(simulator, scenario, StraightAgent(SPEED_MPS), route="r")
+    # From 8 m on at 8 m/s: key frames at 8, 12, … m; 28 m is the last one before 30 m
+    trusted = [True] * 6 + [False] * (1 if stays else 7)
+    assert list(simulator.state.trusted) == trusted
+    assert simulator.trusted_share == pytest.approx(6 / len(trusted))
+    result = judge(Threat.STATIONARY, drive, 8.0)
+    if stays:
+        assert drive.score.ending is Ending.UNTRUSTED
+        assert (result.outcome, result.score) == (Outcome.UNTRUSTED, None)
+        assert drive.states[-1].x_m != drive.states[-2].x_m
+    else:
+        assert drive.score.ending is Ending.COMPLETED
+        assert (result.outcome, result.score) == (Outcome.PASSED, 5.0)
+
+
+def test_a_renderer_that_says_nothing_leaves_the_share_open() -> None:
+    simulator = begun(scene_with(actor(500.0, 0.0)))
+    assert simulator.trusted_share is None

@@ -29,6 +29,8 @@ class TestedRun:
     """Smallest time to collision at the key frames, s. None if all move apart."""
     comfortable_share: float | None
     """Share of the time within nuPlan's bounds. None if the run is too short to tell."""
+    trusted_share: float | None = None
+    """Share of the key frames that the reconstruction trusts; None if nothing was rendered."""
 
 
 @dataclass(frozen=True)
@@ -61,6 +63,10 @@ class SafetyFigures:
     comfortable_share: float | None
     hd_score: float | None = None
     """Mean of HUGSIM's HD-Score; None without a map."""
+    untrusted: int = 0
+    """Number of runs that ended where the sensors were no longer trusted. They have no score."""
+    trusted_share: float | None = None
+    """Mean share of the key frames that the reconstruction trusts."""
 
 
 def aggregate(
@@ -115,6 +121,8 @@ def _figures(groups: Groups, rng: np.random.Generator) -> SafetyFigures:
             groups, lambda run: None if run.result.score is None else run.comfortable_share
         ),
         hd_score=_mean(groups, lambda run: run.result.hd_score),
+        untrusted=outcomes.count(Outcome.UNTRUSTED),
+        trusted_share=_mean(groups, lambda run: run.trusted_share),
     )
 
 

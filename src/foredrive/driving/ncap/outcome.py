@@ -32,6 +32,9 @@ class Outcome(enum.StrEnum):
     LEFT_WAY = "left_way"
     """The vehicle left the way without a collision before, so that nothing could be shown any more."""
     COLLIDED = "collided"
+    UNTRUSTED = "untrusted"
+    """The vehicle left the region in which the sensors are trusted, without a collision before. It has no
+    score."""
     FAILED = "failed"
     """The agent raised an error or returned no plan, without a collision before. It has no score."""
 
@@ -41,6 +44,7 @@ OUTCOME_OF = {
     Ending.TIMEOUT: Outcome.STOPPED_SHORT,
     Ending.BLOCKED: Outcome.STOPPED_SHORT,
     Ending.DEVIATION: Outcome.LEFT_WAY,
+    Ending.UNTRUSTED: Outcome.UNTRUSTED,
     Ending.CRASHED: Outcome.FAILED,
 }
 """Outcome of a drive without a collision, by its ending."""
@@ -59,7 +63,7 @@ class SafetyResult:
     reference_mps: float
     """Impact speed of a vehicle that takes no action, m/s."""
     score: float | None
-    """0 to 5. None for a failed drive: a failure is counted and never scored."""
+    """0 to 5. None for a drive that failed or was not trusted to its end: it is counted and never scored."""
     progress: float
     """Share of the way that was driven, 0 to 1."""
     hd_score: float | None = None
@@ -101,7 +105,7 @@ def judge(
     # A collision decides, whatever the drive's own ending
     impact_mps = None if hit is None else hit.severity
     outcome = OUTCOME_OF[drive.score.ending] if hit is None else Outcome.COLLIDED
-    scores = {Outcome.FAILED: None, Outcome.LEFT_WAY: left_way_score}
+    scores = {Outcome.FAILED: None, Outcome.UNTRUSTED: None, Outcome.LEFT_WAY: left_way_score}
     return SafetyResult(
         kind=kind,
         outcome=outcome,

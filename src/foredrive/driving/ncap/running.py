@@ -55,7 +55,14 @@ class SafetyRun:
 
 
 def set_up_run(
-    place: Place, scenario: SafetyScenario, number: int, rules: Rules, *, sensors: bool, past_frames: int
+    place: Place,
+    scenario: SafetyScenario,
+    number: int,
+    rules: Rules,
+    *,
+    sensors: bool,
+    past_frames: int,
+    stay_trusted: bool = False,
 ) -> SafetyRun:
     """Set up run `number` of a scenario. The ego vehicle drives itself from the end of the priming on.
 
@@ -83,7 +90,13 @@ def set_up_run(
     graph = place_actors(place.graph, drawn, T_world_scene, place.track_ids, moving_stay=rules.moving_stay)
     simulator = ReconstructedSimulator(place.renderer(graph), graph.all_tracks, drive, place.lanes)
     start = ReconstructedScenario(
-        start_s, sensors, past_frames, ends_on_collision=True, length_s=length_s, contact=rules.contact
+        start_s,
+        sensors,
+        past_frames,
+        ends_on_collision=True,
+        length_s=length_s,
+        contact=rules.contact,
+        stays_trusted=stay_trusted,
     )
     return SafetyRun(simulator, start, drawn, pilot_of(rules, simulator))
 

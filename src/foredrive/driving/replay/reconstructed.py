@@ -27,6 +27,8 @@ MIN_WAY_M = 1.0
 """Shortest way of which a share can be driven, m."""
 COLLISION = "collision"
 """Kind of the event in which the first collision ends a drive."""
+UNTRUSTED = "untrusted"
+"""Kind of the event in which a drive ends because its sensors are no longer trusted."""
 STRUCK = "struck"
 """Kind of the event in which a replayed actor hits the ego vehicle from behind. The actor replays
 its track and cannot brake, so this is no collision of the ego vehicle."""
@@ -49,6 +51,8 @@ class ReconstructedScenario:
     drive may last to the log's end."""
     contact: EgoContact = field(default_factory=EgoContact)
     """What counts as a collision."""
+    stays_trusted: bool = False
+    """Whether the drive ends at the first key frame after its start that is not trusted."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,6 +67,8 @@ class ReconstructedState:
     driven_m: float = 0.0
     outside_m: float = 0.0
     """Part of `driven_m` outside of all lanes, m."""
+    trusted: tuple[bool, ...] = ()
+    """Of each key frame since the start, whether the renderer trusts it. Empty if it does not say."""
     ended: str | None = None
     """Reason why the drive is over. None while it goes on."""
 
@@ -115,7 +121,7 @@ class ReconstructedSimulator:
             t_s = number * FRAME_DT_S
             at_s = scenario.start_s + t_s
             frames = self._with_frame(frames, self.drive.state_at(at_s), self.drive.pose_at(at_s), t_s)
-        self.state = ReconstructedState(0, self.drive.state_at(scenario.start_s), frames)
+        self.state = _judged(ReconstructedState(0, self.drive.state_at(scenario.start_s), frames))
         self._clip = self._make_clip()
         return self._clip
 
@@ -140,9 +146,12 @@ class ReconstructedSimulator:
         self.state = state
         if state.step_index % FRAME_STEPS == 0:
             T = self.drive.on_ground(state.ego)
-            self.state = dataclasses.replace(
-                state, frames=self._with_frame(state.frames, state.ego, T, state.t_s)
-            )
+            frames = self._with_frame(state.frames, state.ego, T, state.t_s)
+            state = _judged(dataclasses.replace(state, frames=frames))
+            if self._scenario.stays_trusted and state.ended is None and state.trusted[-1:] == (False,):
+                state = dataclasses.replace(state, ended=UNTRUSTED)
+                events.append(self._route.end_event(UNTRUSTED, state.progress, state.ego, state.t_s))
+            self.state = state
             self._clip = self._make_clip()
         return Step(self._clip, events, state.ended is not None)
 
@@ -250,16 +259,28 @@ class ReconstructedSimulator:
     ) -> tuple[KeyFrame, ...]:
         """Append a new key frame and return the latest frames, as many as an observation has."""
         at_s = self._scenario.start_s + t_s
-        images, sweep = no_images(), None
+        images, sweep, trusted = no_images(), None, None
         T_world_ego = torch.from_numpy(T)
         if self._scenario.sensors:
             twist = torch.tensor([ego.speed_mps, 0.0, 0.0, 0.0, 0.0, yaw_rate_radps(ego)])
             seen = self.renderer.render(T_world_ego, twist, at_s)
-            images, sweep = seen.images, seen.sweep
+            images, sweep, trusted = seen.images, seen.sweep, seen.trusted
         boxes = boxes_at(self._tracks, inverse_se3(self._T_world_scene) @ T_world_ego, at_s, BOX_RANGE_M)
-        frame = KeyFrame(t_s, T, ego.speed_mps, images, sweep, boxes)
+        frame = KeyFrame(t_s, T, ego.speed_mps, images, sweep, boxes, trusted)
         return (*frames, frame)[-1 - self._scenario.past_frames :]
+
+    @property
+    def trusted_share(self) -> float | None:
+        """Return the share of the drive's key frames that are trusted. None if the renderer does not say."""
+        trusted = self.state.trusted
+        return sum(trusted) / len(trusted) if trusted else None
 
     def _make_clip(self) -> Clip:
         rig = self.renderer.rig if self._scenario.sensors else None
         return self._route.observe(self.state.frames, self.state.progress, rig)
+
+
+def _judged(state: ReconstructedState) -> ReconstructedState:
+    """Note whether the latest key frame is trusted."""
+    latest = state.frames[-1].trusted
+    return state if latest is None else dataclasses.replace(state, trusted=(*state.trusted, latest))

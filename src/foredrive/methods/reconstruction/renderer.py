@@ -11,6 +11,7 @@ from foredrive.geometry.se3 import inverse_se3
 from foredrive.methods.reconstruction.novel_views import novel_camera_view, novel_sweep_view, rendered_sweep
 from foredrive.methods.reconstruction.reconstructed import ReconstructedScene
 from foredrive.methods.reconstruction.scene_graph import SceneGraph
+from foredrive.methods.reconstruction.trust import Trust
 from foredrive.methods.reconstruction.vehicle import EgoState, LoggedVehicle
 from foredrive.scene import CameraRig, LidarSweep, Rendered
 from foredrive.sensors import SpinningLidar
@@ -24,6 +25,8 @@ class ReconstructedRenderer:
     graph: SceneGraph
     """The scene's own graph, or an edited version of it."""
     vehicle: LoggedVehicle
+    trust: Trust | None = None
+    """Judges the rendered frames; None: nothing is said about them."""
 
     @property
     def rig(self) -> CameraRig:
@@ -39,13 +42,20 @@ class ReconstructedRenderer:
         # The scene's frame is near the drive, so 32 bits are enough for its coordinates
         T_scene_ego = (inverse_se3(self.vehicle.T_world_scene) @ T_world_ego).float()
         ego = EgoState(T_scene_ego, twist_ego, t_s)
-        device, rig = self.scene.device, self.rig
+        rig, lidar = self.rig, self.vehicle.lidar
+        views = [novel_camera_view(rig, camera, ego) for camera in range(len(rig.names))]
+        shown = [(view, self.scene.camera(self.graph, view.to(self.scene.device))) for view in views]
         images = torch.zeros(len(rig.names), 3, *rig.size_hw, dtype=torch.uint8)
-        for camera in range(len(rig.names)):
-            view = novel_camera_view(rig, camera, ego).to(device)
-            images[camera] = self.scene.camera(self.graph, view).rgb_8bit
-        lidar = self.vehicle.lidar
-        return Rendered(images, None if lidar is None else render_sweep(self.scene, self.graph, lidar, ego))
+        for camera, (_, image) in enumerate(shown):
+            images[camera] = image.rgb_8bit
+        swept = None
+        if lidar is not None:
+            view = novel_sweep_view(lidar, ego)
+            swept = view, self.scene.sweep(self.graph, self.scene.prepare_sweep(view), ego.t_s)
+        trusted = None
+        if self.trust is not None:
+            trusted = self.trust.trusts(self.trust.expected(self.graph, shown, swept))
+        return Rendered(images, None if swept is None else rendered_sweep(*swept), trusted)
 
 
 @torch.no_grad()

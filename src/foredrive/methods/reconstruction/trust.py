@@ -12,6 +12,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -33,8 +34,8 @@ from foredrive.methods.reconstruction.vehicle import LoggedVehicle
 from foredrive.methods.reconstruction.views import CameraView, SweepView
 from foredrive.scene.record import Record
 
-BLOCKS = 32
-"""Blocks from left to right in an image."""
+BLOCKS, OBSERVED_BLOCKS = 32, 128
+"""Blocks from left to right in an image, and in those of the training views, which are compared with it."""
 SKY_M = 1000.0
 """Distance at which directions without a surface are compared."""
 SAME_M, SAME_SHARE = 0.3, 0.1
@@ -51,6 +52,10 @@ _APART_M = 3000.0
 """Distance by which the points of each actor are kept apart from all others."""
 POINTS = 300_000
 """Maximum number of lidar points that are kept."""
+BEAMS_APART = 7
+"""Every seventh beam of a sweep is looked up."""
+TRUSTED_LOSS_DB, TRUSTED_LOSS_SHARE = 3.0, 0.05
+"""Largest loss of expected PSNR and of the share of right beams with which a frame is still trusted."""
 
 IMAGE_WEIGHTS = {
     "one": 0.0,
@@ -110,26 +115,50 @@ def observe_views(
         return None
     assert rig.exposed_dt_s is not None
     views = [
-        in_blocks(novel_camera_view(rig, camera, vehicle.at(time_s + float(rig.exposed_dt_s[camera]))))
+        novel_camera_view(rig, camera, vehicle.at(time_s + float(rig.exposed_dt_s[camera])))
         for time_s in t_s
         for camera in range(len(rig.names))
     ]
-    images = [scene.camera(graph, view.to(scene.device)) for view in views]
+    size_hw = block_hw(rig.size_hw, OBSERVED_BLOCKS)
+    depth_m, alpha = zip(
+        *(_centres(scene.camera(graph, view.to(scene.device)), size_hw) for view in views), strict=True
+    )
     states = [states_at(graph.tracks, view.t_s) for view in views]
     return ObservedViews(
-        K=torch.stack([view.K for view in views]),
+        K=_scaled(torch.stack([view.K for view in views]), rig.size_hw, size_hw),
         dist=torch.stack([view.dist for view in views]),
         T_scene_cam=torch.stack([view.T_scene_cam for view in views]),
-        depth_m=torch.stack([image.range_m.cpu() for image in images]),
-        alpha=torch.stack([image.alpha.cpu() for image in images]),
+        depth_m=torch.stack(depth_m),
+        alpha=torch.stack(alpha),
         T_scene_actor=torch.stack([state.T_scene_actor.cpu() for state in states]),
         present=torch.stack([state.present.cpu() for state in states]),
     )
 
 
-def in_blocks(view: CameraView) -> CameraView:
-    """Return a view with one pixel a block."""
-    return view.shrunk(max(1, round(view.size_hw[1] / BLOCKS)))
+def block_hw(size_hw: tuple[int, int], across: int = BLOCKS) -> tuple[int, int]:
+    """Return the numbers of blocks from top to bottom and from left to right in an image of some size."""
+    height, width = size_hw
+    across = min(across, width)
+    return max(1, round(height * across / width)), across
+
+
+def _scaled(
+    K: Float[Tensor, "*b 3 3"], size_hw: tuple[int, int], blocks_hw: tuple[int, int]
+) -> Float[Tensor, "*b 3 3"]:
+    """Return intrinsics for images of one pixel a block."""
+    return K * K.new_tensor([blocks_hw[1] / size_hw[1], blocks_hw[0] / size_hw[0], 1.0])[:, None]
+
+
+def _centres(
+    image: RenderedImage, blocks_hw: tuple[int, int]
+) -> tuple[Float[Tensor, "h w"], Float[Tensor, "h w"]]:
+    """Return depth and alpha in the middle of each block. Means would lie between the surfaces of a block."""
+    height, width = image.alpha.shape
+    v, u = (
+        ((torch.arange(count) + 0.5) * size / count).long()
+        for count, size in zip(blocks_hw, (height, width), strict=True)
+    )
+    return image.range_m[v[:, None], u].cpu(), image.alpha[v[:, None], u].cpu()
 
 
 @torch.no_grad()
@@ -146,12 +175,14 @@ def image_features(
         observed: the training views.
         track_id: ids of the actors in `observed`.
         tracks: the actors of the rendered scene, edits included. Those with other ids were never seen.
-        view: the camera, with one pixel a block.
-        image: the rendered image, on the CPU.
+        view: the camera.
+        image: the rendered image.
     """
-    height, width = view.size_hw
-    rays = pixels_to_rays(pixel_centres((height, width)).view(-1, 2), view.K, view.dist)
-    alpha, depth_m = image.alpha.flatten(), image.range_m.flatten()
+    height, width = size_hw = block_hw(view.size_hw)
+    depth_hw_m, alpha_hw = _centres(image, size_hw)
+    alpha, depth_m = alpha_hw.flatten(), depth_hw_m.flatten()
+    K = _scaled(view.K, view.size_hw, size_hw)
+    rays = pixels_to_rays(pixel_centres(size_hw).view(-1, 2), K, view.dist)
     sky = alpha < 0.5
     points_cam = rays / rays[:, 2:] * torch.where(sky, SKY_M, depth_m)[:, None]
     range_m = points_cam.norm(dim=-1)
@@ -167,13 +198,14 @@ def image_features(
     T_then_now, present = _moved_along(observed, states.T_scene_actor, owner, rows)
     points_then = _transformed(T_then_now, points.expand(len(chosen), -1, -1))
     eye_then = _transformed(T_then_now, view.T_scene_cam[:3, 3].expand(len(chosen), len(points), 3))
+    rows_columns = observed.depth_m.shape[1:]
     uv, depth_then_m, inside = project(
         transform_points(inverse_se3(observed.T_scene_cam), points_then),
         observed.K,
         observed.dist,
-        (height, width),
+        (rows_columns[0], rows_columns[1]),
     )
-    u, v = uv[..., 0].long().clamp(0, width - 1), uv[..., 1].long().clamp(0, height - 1)
+    u, v = (uv[..., axis].long().clamp(0, rows_columns[1 - axis] - 1) for axis in (0, 1))
     every = torch.arange(len(chosen))[:, None]
     shown_m, shown_alpha = observed.depth_m[every, v, u], observed.alpha[every, v, u]
     same_surface = (shown_alpha >= 0.5) & ((depth_then_m - shown_m).abs() < SAME_SHARE * shown_m + SAME_M)
@@ -188,7 +220,7 @@ def image_features(
     seen, column = saw.any(0), torch.arange(len(points))
     best_angle_rad = torch.where(seen, angle_rad[best, column], 0.0)
     best_farther = torch.where(seen, farther[best, column].clamp(-1, 2), 0.0)
-    log_depth = image.range_m.clamp_min(0.1).log()
+    grey = F.interpolate(image.rgb.cpu().mean(0)[None, None], size_hw, mode="area")[0, 0]
     unseen, solid = (~seen).float(), (~sky).float()
     return {
         "one": torch.ones_like(alpha),
@@ -205,8 +237,8 @@ def image_features(
         "sky": sky.float(),
         "actor": (owner != STATIC).float(),
         "range": range_m.log1p() * solid,
-        "texture": (_steps(image.rgb.mean(0)) + 0.005).log(),
-        "edge": _steps(log_depth).clamp_max(2.0),
+        "texture": (_steps(grey) + 0.005).log(),
+        "edge": _steps(depth_hw_m.clamp_min(0.1).log()).clamp_max(2.0),
     }
 
 
@@ -241,13 +273,14 @@ def _moved_along(
 ) -> tuple[Float[Tensor, "V N 4 4"], Bool[Tensor, "V N"]]:
     """Return the motion of each point's actor from now to each view's time, and whether it was present."""
     views = len(observed.T_scene_cam)
-    still = torch.eye(4).expand(views, 2, 4, 4)
-    T_then = torch.cat([observed.T_scene_actor, still], 1)[:, rows]
+    T_then_now = torch.eye(4).repeat(views, len(rows), 1, 1)
+    for row in rows[rows < observed.present.shape[1]].unique().tolist():
+        mine = rows == row
+        now = inverse_se3(T_scene_actor[owner[mine][0]])
+        T_then_now[:, mine] = (observed.T_scene_actor[:, row] @ now)[:, None]
+    # The static part is always present; an actor that was never seen is not, and its points stay in place
     present = torch.cat([observed.present, torch.tensor([[True, False]]).expand(views, 2)], 1)
-    T_now = torch.cat([T_scene_actor, torch.eye(4)[None]])[owner]
-    # An actor that was never seen has no pose then: its points stay where they are, and count as unseen
-    moves = (rows < observed.present.shape[1])[:, None, None]
-    return torch.where(moves, T_then @ inverse_se3(T_now), torch.eye(4)), present[:, rows]
+    return T_then_now, present[:, rows]
 
 
 def _transformed(T: Float[Tensor, "V N 4 4"], points: Float[Tensor, "V N 3"]) -> Float[Tensor, "V N 3"]:
@@ -361,6 +394,15 @@ def beam_is_right(
     return (returned == really_returned) & (close | ~really_returned)
 
 
+class Expected(NamedTuple):
+    """Expected quality of the frame of a vehicle at one time."""
+
+    psnr_db: float | None
+    """PSNR of all images together, dB; None without cameras."""
+    right_share: float | None
+    """Share of the beams that are right, see `beam_is_right`; None without a lidar."""
+
+
 @dataclass(frozen=True, eq=False)
 class Trust:
     """What a reconstruction expects of its own images and sweeps."""
@@ -370,48 +412,68 @@ class Trust:
     """None without cameras."""
     points: ObservedPoints | None
     """None without a lidar."""
-    offset: float = 0.0
+    offset: float
     """Added to the logarithm of expected squared errors: how this log differs from those of the fit."""
+    reference: Expected
+    """Expected quality along the logged way. Frames are trusted if theirs is almost as good."""
 
     @torch.no_grad()
-    def image_error(self, graph: SceneGraph, view: CameraView) -> Float[Tensor, "h w"]:
-        """Return the expected squared error of each block of an image, with colours from 0 to 1.
+    def block_errors(self, graph: SceneGraph, view: CameraView, image: RenderedImage) -> Float[Tensor, "h w"]:
+        """Return the expected squared error of each block of a rendered image, with colours from 0 to 1.
 
         Args:
-            graph: the scene, or an edited version of it.
-            view: the camera, at any size.
+            graph: the scene, or an edited version of it, that was rendered.
+            view: the camera.
+            image: the rendered image.
 
         Raises:
-            InputError: the log has no cameras.
+            InputError: the reconstruction has no cameras.
         """
         if self.views is None:
-            raise InputError("a log without cameras says nothing about images")
-        view = in_blocks(view)
-        image = self.scene.camera(graph, view.to(self.scene.device))
-        features = image_features(self.views, self._track_id, graph.tracks, view, image)
+            raise InputError("a reconstruction without cameras expects nothing of images")
+        features = image_features(self.views, self.scene.track_id, graph.tracks, view, image)
         log_error = self.offset + weighted_sum(features, IMAGE_WEIGHTS)
-        return log_error.clamp_max(0.0).exp().view(view.size_hw)
+        return log_error.clamp_max(0.0).exp().view(block_hw(view.size_hw))
 
     @torch.no_grad()
-    def sweep_is_right(self, graph: SceneGraph, view: SweepView) -> Float[Tensor, "P"]:
-        """Return the probability that each beam is right, see `beam_is_right`.
-
-        Args:
-            graph: the scene, or an edited version of it.
-            view: the beams; some of a sweep are enough.
+    def right_beams(self, graph: SceneGraph, view: SweepView, sweep: RenderedSweep) -> Float[Tensor, "n"]:
+        """Return the probability to be right of every `BEAMS_APART`-th beam of a rendered sweep.
 
         Raises:
-            InputError: the log has no lidar.
+            InputError: the reconstruction has no lidar.
         """
         if self.points is None:
-            raise InputError("a log without lidar says nothing about sweeps")
-        sweep = self.scene.sweep(graph, self.scene.prepare_sweep(view), view.t_s)
-        features = sweep_features(self.points, self._track_id, graph.tracks, view, sweep)
+            raise InputError("a reconstruction without lidar expects nothing of sweeps")
+        some = slice(None, None, BEAMS_APART)
+        view, sweep = dataclasses.replace(view, beams=view.beams[some]), _some_beams(sweep, some)
+        features = sweep_features(self.points, self.scene.track_id, graph.tracks, view, sweep)
         return weighted_sum(features, SWEEP_WEIGHTS).sigmoid()
 
-    @property
-    def _track_id(self) -> Int[Tensor, "A"]:
-        return self.scene.track_id
+    def expected(
+        self,
+        graph: SceneGraph,
+        images: Sequence[tuple[CameraView, RenderedImage]],
+        sweep: tuple[SweepView, RenderedSweep] | None,
+    ) -> Expected:
+        """Return the expected quality of a rendered frame: of its images, with their views, and its sweep."""
+        errors = [self.block_errors(graph, view, image).flatten() for view, image in images]
+        right = None if sweep is None else float(self.right_beams(graph, *sweep).mean())
+        return Expected(psnr_of(torch.cat(errors)) if errors else None, right)
+
+    def trusts(self, expected: Expected) -> bool:
+        """Return whether a frame is expected to be almost as good as those along the logged way."""
+        margins = (TRUSTED_LOSS_DB, TRUSTED_LOSS_SHARE)
+        return all(
+            value is None or usual is None or value >= usual - margin
+            for value, usual, margin in zip(expected, self.reference, margins, strict=True)
+        )
+
+
+def _some_beams(sweep: RenderedSweep, some: slice) -> RenderedSweep:
+    chosen: dict[str, Any] = {
+        name: None if value is None else value[some] for name, value in vars(sweep).items()
+    }
+    return RenderedSweep(**chosen)
 
 
 def weighted_sum(
@@ -421,6 +483,6 @@ def weighted_sum(
     return sum((weight * features[name] for name, weight in weights.items()), torch.zeros(()))
 
 
-def psnr_of(squared_error: Float[Tensor, "h w"]) -> float:
+def psnr_of(squared_error: Float[Tensor, "*shape"]) -> float:
     """Return the PSNR of an image, dB, from the squared errors of its blocks."""
     return float(-10 * squared_error.mean().clamp_min(1e-9).log10())

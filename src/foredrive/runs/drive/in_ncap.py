@@ -28,6 +28,7 @@ from foredrive.runs.drive.in_reconstruction import (
     check_lidar_of,
     lanes_of,
     opened_reconstruction,
+    opened_trust,
     past_frames_of,
     renders_for,
 )
@@ -51,6 +52,8 @@ class SafetyTests:
     """Whether several processes drive. Each of them opens the scenes."""
     sees: Sees | None = None
     """What the agent is shown of what it takes; None: all."""
+    stay_trusted: bool = False
+    """Whether a run ends, without a score, where the sensors are no longer trusted."""
 
     grows = ("count",)
 
@@ -62,7 +65,9 @@ class SafetyTests:
     def noted(self) -> Mapping[str, object]:
         """Return the fields, a hash of the scenarios, and their path as the routes."""
         scenarios = repr(load_scenarios(Path(self.scenarios)))
-        shown = {} if self.sees is None else {"sees": self.sees}
+        shown: dict[str, object] = {} if self.sees is None else {"sees": self.sees}
+        if self.stay_trusted:
+            shown["stay_trusted"] = True
         return {
             **shown,
             "scenarios_sha256": hashlib.sha256(scenarios.encode()).hexdigest(),
@@ -96,8 +101,8 @@ class SafetyTests:
         rules = _rules(self.rules)
         scenario = next(entry for entry in load_scenarios(Path(self.scenarios)) if entry.label == job.route)
         folder = _folders(self.runs)[scenario.scene]
-        sensors = renders_for(suite)
-        place = place_in(folder)
+        sensors = renders_for(suite) or self.stay_trusted
+        place = place_in(folder, trusted=sensors)
         check_lidar_of(suite.agent, self.sees, place.vehicle, folder)
         run = set_up_run(
             place,
@@ -106,6 +111,7 @@ class SafetyTests:
             rules,
             sensors=sensors,
             past_frames=_past_frames(suite.agent, scenario),
+            stay_trusted=self.stay_trusted,
         )
         simulator, start = run.simulator, run.scenario
         rig = simulator.renderer.rig if sensors else None
@@ -121,6 +127,7 @@ class SafetyTests:
                 log,
                 lambda: log_frame(simulator.state.frames[-1], simulator.state.ego, rig),
                 lanes_known=lanes_of(Path(folder)) is not None,
+                trusted_share=lambda: simulator.trusted_share,
                 judge=lambda driven: _judged(driven, scenario, reference, rules, run, place),
                 pilot=run.pilot,
             )
@@ -222,10 +229,11 @@ def _tested(source: SafetyTests) -> SelfTest:
     return dataclasses.replace(tested, left_out={**tested.left_out, **outside})
 
 
-@functools.lru_cache(maxsize=1)  # consecutive runs share one scene
-def place_in(folder: str) -> Place:
-    """Return a reconstruction as a place of tests."""
+@functools.lru_cache(maxsize=2)  # consecutive runs share one scene
+def place_in(folder: str, trusted: bool = False) -> Place:
+    """Return a reconstruction as a place of tests, whose renderers say which frames they trust if asked."""
     opened = opened_reconstruction(folder)
+    trust = opened_trust(folder) if trusted else None
     ids = {str(track_id): track_id for track_id in opened.scene.graph.all_tracks.track_id.tolist()}
     with contextlib.suppress(InputError):  # without its log, actors are known by their numbers alone
         of_log = read_track_ids(Log(open_run_log(Path(folder))[1]))
@@ -233,7 +241,7 @@ def place_in(folder: str) -> Place:
     return Place(
         opened.scene.graph,
         opened.vehicle,
-        lambda graph: ReconstructedRenderer(opened.scene, graph, opened.vehicle),
+        lambda graph: ReconstructedRenderer(opened.scene, graph, opened.vehicle, trust),
         ids,
         lanes_of(Path(folder)),
     )

@@ -24,6 +24,7 @@ from foredrive.driving.simple_agents import ReplayAgent
 from foredrive.errors import InputError
 from foredrive.methods.reconstruction.edits import Edit, load_edits
 from foredrive.methods.reconstruction.renderer import ReconstructedRenderer
+from foredrive.methods.reconstruction.trust import Trust
 from foredrive.methods.reconstruction.vehicle import LoggedVehicle
 from foredrive.runs.drive.agent_inputs import inputs_of
 from foredrive.runs.drive.agents import CORRIDOR, EXPERT, REPLAY, Sees, is_remote, make_agent
@@ -35,6 +36,7 @@ from foredrive.runs.reconstruction.reconstruction_run import (
     open_reconstruction,
     open_run_log,
 )
+from foredrive.runs.reconstruction.trust import trust_of
 from foredrive.scene import Agent, Clip, Trajectory
 from foredrive.towns.driving.drive_log import drive_log, log_frame
 
@@ -51,13 +53,18 @@ class ReconstructedRoutes:
     """Threats, each in its own drive from every start; empty: one drive without a threat."""
     edits: str | None = None
     """File of edits to the scene; None: no edits."""
+    stay_trusted: bool = False
+    """Whether a drive ends where the sensors are no longer trusted."""
 
     in_turn = True
     grows = ("starts_s", "threats")
 
     def noted(self) -> Mapping[str, object]:
-        """Return the fields, and the run as the routes."""
-        return {**dataclasses.asdict(self), "routes": self.run}
+        """Return the fields, and the run as the routes. `stay_trusted` is left out if it is not set."""
+        fields = dataclasses.asdict(self)
+        if not self.stay_trusted:
+            del fields["stay_trusted"]
+        return {**fields, "routes": self.run}
 
     def jobs(self, agent: str) -> Sequence[DriveJob]:
         """Return one drive for each start and threat."""
@@ -87,23 +94,31 @@ class ReconstructedRoutes:
         if threat is not None:
             sent = send_threat(threat, graph, drive, start_s)
             graph = edited_scene(opened.scene, [*edits, sent]).graph
-        renderer = ReconstructedRenderer(opened.scene, graph, opened.vehicle)
+        sensors = renders_for(suite) or self.stay_trusted
+        trust = opened_trust(self.run) if sensors else None
+        renderer = ReconstructedRenderer(opened.scene, graph, opened.vehicle, trust)
         lanes = lanes_of(opened.folder)
         simulator = ReconstructedSimulator(renderer, graph.all_tracks, drive, lanes)
-        sensors = renders_for(suite)
         agent = agent_in(suite.agent, simulator)
         route_xyz = drive.route_from(start_s)
         rig = renderer.rig if sensors else None
         with drive_log(out, job.name, route_xyz, rig) as log:
             yield DriveSetup(
                 simulator,
-                ReconstructedScenario(start_s, sensors, past_frames, ends_on_collision=threat is not None),
+                ReconstructedScenario(
+                    start_s,
+                    sensors,
+                    past_frames,
+                    ends_on_collision=threat is not None,
+                    stays_trusted=self.stay_trusted,
+                ),
                 agent,
                 route_xyz,
                 RouteLine(route_xyz).length_m,
                 log,
                 lambda: log_frame(simulator.state.frames[-1], simulator.state.ego, rig),
                 lanes_known=lanes is not None,
+                trusted_share=lambda: simulator.trusted_share,
                 judge=lambda driven: (
                     None if threat is None else judge(threat, driven, reference_mps(threat, drive, start_s))
                 ),
@@ -114,6 +129,12 @@ class ReconstructedRoutes:
 def opened_reconstruction(run: str) -> OpenedReconstruction:
     """Open a reconstruction. Drives one after another in one log share it."""
     return open_reconstruction(Path(run))
+
+
+@functools.lru_cache(maxsize=1)
+def opened_trust(run: str) -> Trust:
+    """Return what a reconstruction expects of its frames. Drives one after another in one log share it."""
+    return trust_of(opened_reconstruction(run))
 
 
 def renders_for(suite: DriveSuite) -> bool:

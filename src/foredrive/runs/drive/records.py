@@ -26,8 +26,9 @@ Figures = dict[str, float | int | str | None]
 def write_drive(path: Path, record: DriveRecord) -> None:
     """Write the record of a drive as JSON."""
     content = _RECORD.dump_python(record, mode="json")
-    if record.threat is None:
-        del content["threat"]
+    for name in ("threat", "trusted_share"):
+        if content[name] is None:
+            del content[name]
     write_json(path, content)
 
 
@@ -99,6 +100,9 @@ def summarise(drives: Sequence[DriveRecord]) -> Figures:
     plan_ms = [1000 * seconds for drive in drives for seconds in drive.act_s]
     out["comfortable_share"] = statistics.fmean(comfortable) if comfortable else None
     out["near_collision_share"] = statistics.fmean(near) if near else None
+    trusted = [drive.trusted_share for drive in drives if drive.trusted_share is not None]
+    if trusted:
+        out["trusted_share"] = statistics.fmean(trusted)
     out["plan_ms"] = statistics.median(plan_ms) if plan_ms else None
     out["driven_s"] = sum(drive.score.duration_s for drive in drives)
     out["wall_s"] = sum(drive.wall_s for drive in drives)
@@ -113,6 +117,7 @@ def tested_runs(drives: Sequence[DriveRecord]) -> list[TestedRun]:
             drive.threat,
             min((seconds for seconds in drive.nearest_s if seconds is not None), default=None),
             drive.comfort.comfortable_share if drive.comfort else None,
+            drive.trusted_share,
         )
         for drive in drives
         if drive.threat is not None

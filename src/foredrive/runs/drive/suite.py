@@ -65,6 +65,8 @@ class DriveSetup:
     lanes_known: bool = True
     judge: Callable[[Drive], SafetyResult | None] = lambda drive: None
     """Scores the drive against a threat; None: there is no threat."""
+    trusted_share: Callable[[], float | None] = lambda: None
+    """Returns the share of the drive's key frames whose sensors are trusted."""
     pilot: Pilot | None = None
     """Moves the vehicle along the plans; None: as `drive_route` does by itself."""
 
@@ -239,6 +241,7 @@ def drive_one(job: DriveJob, suite: DriveSuite, out: Path, threads: int | None =
         wall_s=time.perf_counter() - began,
         threat=setup.judge(drive),
         lanes_known=setup.lanes_known,
+        trusted_share=setup.trusted_share(),
     )
     write_drive(_file(out, job), record)
     return read_drive(_file(out, job))

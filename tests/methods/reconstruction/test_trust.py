@@ -1,0 +1,211 @@
+"""What a reconstruction knows of rendered frames, on scenes that are computed by hand."""
+
+import dataclasses
+import math
+
+import pytest
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from foredrive.geometry.se3 import matrix_from_yaw
+from foredrive.methods.reconstruction.rendered import RenderedImage, RenderedSweep
+from foredrive.methods.reconstruction.tracks import ActorTracks
+from foredrive.methods.reconstruction.trust import (
+    IMAGE_WEIGHTS,
+    SWEEP_WEIGHTS,
+    ObservedPoints,
+    ObservedViews,
+    beam_is_right,
+    image_features,
+    psnr_of,
+    sweep_features,
+)
+from foredrive.methods.reconstruction.views import CameraView, SweepView
+from foredrive.scene import Category, LidarSweep
+
+SIZE_HW = (16, 32)
+WALL_M = 10.0
+LOOKS_FORWARD = torch.tensor([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+"""Axes of a camera (x right, y down, z forward) that looks along x."""
+K = torch.tensor([[16.0, 0.0, 16.0], [0.0, 16.0, 8.0], [0.0, 0.0, 1.0]])
+
+
+def pose(x_m: float = 0.0, y_m: float = 0.0, yaw_deg: float = 0.0) -> Float[Tensor, "4 4"]:
+    """Pose of a camera that looks along the yaw."""
+    T = matrix_from_yaw(torch.tensor(math.radians(yaw_deg)), torch.tensor([x_m, y_m, 0.0]))
+    T[:3, :3] = T[:3, :3] @ LOOKS_FORWARD
+    return T
+
+
+def view(x_m: float = 0.0, y_m: float = 0.0, yaw_deg: float = 0.0, t_s: float = 1.0) -> CameraView:
+    return CameraView(
+        K=K,
+        dist=torch.zeros(5),
+        T_scene_cam=pose(x_m, y_m, yaw_deg),
+        twist_cam=torch.zeros(6),
+        t_s=t_s,
+        readout_s=0.0,
+        size_hw=SIZE_HW,
+        sensor=0,
+    )
+
+
+def image(depth_m: float, alpha: float = 1.0) -> RenderedImage:
+    return RenderedImage(
+        torch.full((3, *SIZE_HW), 0.5), torch.full(SIZE_HW, depth_m), torch.full(SIZE_HW, alpha)
+    )
+
+
+def tracks(x_m: tuple[float, float], track_id: int = 7) -> ActorTracks:
+    """A wide box that drives along x: its places at 0 and at 1 s."""
+    xyz = torch.tensor([[x_m[0], 0.0, 0.0], [x_m[1], 0.0, 0.0]])
+    return ActorTracks(
+        track_id=torch.tensor([track_id]),
+        category=torch.tensor([int(Category.TRUCK)]),
+        size_lwh=torch.tensor([[2.0, 60.0, 60.0]]),
+        t_s=torch.tensor([0.0, 1.0]),
+        T_scene_actor=matrix_from_yaw(torch.zeros(2), xyz)[None],
+        present=torch.ones(1, 2, dtype=torch.bool),
+    )
+
+
+NOBODY = tracks((1e4, 1e4))
+
+
+def observed(
+    depths_m: tuple[float, ...] = (WALL_M,), x_m: tuple[float, ...] = (0.0,), actor_m: float = 1e4
+) -> ObservedViews:
+    """Training views from places on the x axis that see walls at some depths, exposed at 0 s."""
+    count = len(depths_m)
+    return ObservedViews(
+        K=K.expand(count, 3, 3),
+        dist=torch.zeros(count, 5),
+        T_scene_cam=torch.stack([pose(x) for x in x_m]),
+        depth_m=torch.tensor(depths_m)[:, None, None].expand(count, *SIZE_HW),
+        alpha=torch.ones(count, *SIZE_HW),
+        T_scene_actor=matrix_from_yaw(
+            torch.zeros(count, 1), torch.tensor([actor_m, 0.0, 0.0]).expand(count, 1, 3)
+        ),
+        present=torch.ones(count, 1, dtype=torch.bool),
+    )
+
+
+def middle(values: Float[Tensor, "N"]) -> float:
+    return float(values.view(SIZE_HW)[8, 16])
+
+
+def features(
+    views: ObservedViews, new: CameraView, shown: RenderedImage, actors: ActorTracks = NOBODY
+) -> dict[str, Float[Tensor, "N"]]:
+    return image_features(views, torch.tensor([7]), actors, new, shown)
+
+
+def test_what_a_view_saw_is_seen_again_from_its_place() -> None:
+    known = features(observed(), view(), image(WALL_M))
+    assert set(known) == set(IMAGE_WEIGHTS)
+    assert float(known["unseen"].sum()) == 0
+    assert float(known["angle"].max()) < 1e-3
+    assert float(known["nearer_than_seen"].max()) < 1e-3
+    assert known["views"].tolist() == pytest.approx([math.log(2)] * 512)
+
+
+def test_who_comes_nearer_or_aside_knows_less_of_the_same_wall() -> None:
+    nearer = features(observed(), view(x_m=5.0), image(WALL_M - 5.0))
+    assert middle(nearer["nearer_than_seen"]) == pytest.approx(math.log(2), abs=0.01)
+    aside = features(observed(), view(y_m=3.0), image(WALL_M))
+    # The point straight ahead lies 3 m to the left of the first camera's axis
+    assert middle(aside["angle"]) == pytest.approx(math.atan(3.0 / WALL_M), abs=0.03)
+    assert float(aside["near_views"].view(SIZE_HW)[8, 16]) == 0.0
+    farther = features(observed(), view(x_m=-10.0), image(WALL_M + 10.0))
+    assert middle(farther["farther_than_seen"]) == pytest.approx(-math.log(2), abs=0.01)
+
+
+def test_behind_something_and_outside_of_the_image_nothing_was_seen() -> None:
+    assert features(observed((4.0,)), view(), image(WALL_M))["unseen"].tolist() == [1.0] * 512
+    assert features(observed(), view(yaw_deg=180.0), image(WALL_M))["unseen"].tolist() == [1.0] * 512
+    # Of two views, the one that is not hidden counts
+    both = features(observed((4.0, WALL_M - 2.0), (0.0, 2.0)), view(), image(WALL_M))
+    assert middle(both["unseen"]) == 0.0
+
+
+def test_sky_is_where_the_training_views_saw_sky() -> None:
+    open_sky = dataclasses.replace(observed(), alpha=torch.zeros(1, *SIZE_HW))
+    assert features(open_sky, view(x_m=6.0), image(3.0, alpha=0.0))["unseen"].sum() == 0
+    walled = features(observed(), view(x_m=6.0), image(3.0, alpha=0.0))
+    assert walled["unseen_sky"].tolist() == [1.0] * 512
+
+
+def test_an_actor_is_looked_up_where_it_was() -> None:
+    """It was 10 m ahead at 0 s and is 20 m ahead at 1 s: its rear was seen from half the distance."""
+    driven = tracks((11.0, 21.0))
+    known = features(observed((WALL_M,), actor_m=11.0), view(), image(2 * WALL_M), driven)
+    assert middle(known["actor"]) == 1.0
+    assert middle(known["unseen"]) == 0.0
+    assert middle(known["farther_than_seen"]) == pytest.approx(-math.log(2), abs=0.01)
+    # A wall at that depth was never seen, nor was an actor of another number
+    still = features(observed((WALL_M,), actor_m=11.0), view(), image(2 * WALL_M))
+    assert middle(still["unseen"]) == 1.0
+    stranger = features(observed((WALL_M,), actor_m=11.0), view(), image(2 * WALL_M), tracks((11.0, 21.0), 8))
+    assert (middle(stranger["actor"]), middle(stranger["unseen"])) == (1.0, 1.0)
+
+
+def sweep_of(
+    ends_ego: Float[Tensor, "P 3"], T_scene_ego: Float[Tensor, "4 4"]
+) -> tuple[SweepView, RenderedSweep]:
+    """Beams from the origin of the ego frame to some points; the last one is lost."""
+    range_m = ends_ego.norm(dim=-1)
+    returned = torch.ones(len(range_m), dtype=torch.bool)
+    returned[-1] = False
+    zero = torch.zeros_like(range_m)
+    beams = LidarSweep(
+        origin_ego=torch.zeros_like(ends_ego),
+        dir_ego=ends_ego / range_m[:, None],
+        range_m=zero,
+        returned=torch.zeros_like(returned),
+        intensity=zero,
+        dt_s=zero,
+        beam=torch.zeros_like(range_m, dtype=torch.int64),
+        valid=torch.ones_like(returned),
+    )
+    drop_logit = torch.where(returned, -3.0, 3.0)
+    shown = RenderedSweep(range_m, range_m, zero, drop_logit, torch.ones_like(range_m), None)
+    return SweepView(beams, True, T_scene_ego, torch.zeros(6), 1.0), shown
+
+
+def test_beams_know_how_far_away_the_nearest_observed_point_is() -> None:
+    seen = ObservedPoints(torch.tensor([[12.0, 5.0, 0.0], [0.0, -5.0, 0.0]]))
+    # The vehicle stands at (2, 5) and looks to the left: 10 m to its right is the first point
+    T_scene_ego = matrix_from_yaw(torch.tensor(math.pi / 2), torch.tensor([2.0, 5.0, 0.0]))
+    ends = torch.tensor([[0.0, -10.0, 0.0], [0.0, -10.0, 0.3], [0.0, 0.0, 9.0]])
+    known = sweep_features(seen, torch.tensor([7]), NOBODY, *sweep_of(ends, T_scene_ego))
+    assert set(known) == set(SWEEP_WEIGHTS)
+    assert known["away"].exp().sub(0.02)[:2].tolist() == pytest.approx([0.0, 0.3], abs=1e-4)
+    assert known["lost"].tolist() == [0.0, 0.0, 1.0]
+    assert known["range"][:2].exp().sub(1).tolist() == pytest.approx([10.0, 10.0], abs=0.01)
+
+
+def test_points_of_an_actor_stay_with_it() -> None:
+    """A point on an actor is compared in the actor's frame, whatever stands at its place by now."""
+    moved = tracks((11.0, 21.0))
+    ends = torch.tensor([[20.5, 1.0, 2.0], [0.0, 0.0, 9.0]])
+    view_now, shown = sweep_of(ends, torch.eye(4))
+    # Half a metre behind the middle of the box, one to the left, two up
+    local = torch.tensor([[-0.5, 1.0, 2.0 + 3000.0], [20.5, 1.0, 2.4]])
+    known = sweep_features(ObservedPoints(local), torch.tensor([7]), moved, view_now, shown)
+    assert float(known["away"][0].exp() - 0.02) == pytest.approx(0.0, abs=1e-3)
+    assert known["actor"].tolist() == [1.0, 0.0]
+    stranger = sweep_features(ObservedPoints(local), torch.tensor([9]), moved, view_now, shown)
+    assert float(stranger["away"][0].exp()) > 1000.0
+
+
+def test_a_beam_is_right_if_it_is_lost_or_ends_as_it_should() -> None:
+    true_m = torch.tensor([10.0, 10.0, 50.0, 50.0, 0.0, 0.0, 20.0])
+    is_true = torch.tensor([True, True, True, True, False, False, True])
+    said_m = torch.tensor([10.25, 10.35, 51.0, 51.2, 0.0, 30.0, 0.0])
+    said = torch.tensor([True, True, True, True, False, True, False])
+    assert beam_is_right(said_m, said, true_m, is_true).tolist() == [1, 0, 1, 0, 1, 0, 0]
+
+
+def test_psnr_is_that_of_the_mean_error() -> None:
+    assert psnr_of(torch.tensor([[0.001, 0.003]])) == pytest.approx(-10 * math.log10(0.002))
