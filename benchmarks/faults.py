@@ -34,6 +34,7 @@ from foredrive.data.log_paths import LogPath, find_logs
 from foredrive.data.logs import Log
 from foredrive.engine.bench import Benchmark
 from foredrive.engine.config import save_recipe
+from foredrive.errors import InputError
 from foredrive.geometry.polylines import points_at
 from foredrive.runs.recipes.known import find_recipe
 from foredrive.scene import VoxelSpec
@@ -197,12 +198,14 @@ def _server() -> ProgramServer:
 def bad_inputs(seed: int) -> dict[str, float]:
     """Return the number of tests of damaged files and of bad input, and how many of them fail."""
     done = subprocess.run(
-        [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", *BAD_INPUTS],
+        [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", *BAD_INPUTS],
         stdout=subprocess.PIPE,
         text=True,
         check=False,
     )
     told = {what: int(number) for number, what in re.findall(r"(\d+) (passed|failed|error)", done.stdout)}
+    if not told:
+        raise InputError(f"pytest does not say how many tests passed (exit code {done.returncode})")
     failed = told.get("failed", 0) + told.get("error", 0)
     return {"bad_inputs": float(told.get("passed", 0)), "bad_inputs_failed": float(failed)}
 

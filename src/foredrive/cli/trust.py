@@ -14,11 +14,11 @@ def trust(
     out: OptionalPath = None,
     every: Annotated[float, tyro.conf.arg(metavar="SECONDS")] = 1.0,
 ) -> None:
-    """Predict where the sensors of a reconstruction are good, beside the logged way.
+    """Predict where the images of a reconstruction are good, beside the logged way.
 
-    Places up to 6 m to either side and headings up to 20 degrees are judged by what the log's cameras and
-    lidar saw from there. A place is trusted if the expected loss is at most 3 dB of PSNR, and 5 % of the
-    beams. docs/safety-tests.md says how often this is right.
+    Places up to 6 m to either side and headings up to 20 degrees are judged by what the log's cameras saw of
+    what is visible there. A place is trusted if the expected loss of PSNR is at most 3 dB.
+    docs/reconstruction.md says how often this is right.
 
     Args:
         run: Folder of a reconstruction.
@@ -50,7 +50,7 @@ def trust(
             tick()
     make_folder(folder)
     with together(folder):
-        write_trust_json(folder / "trust.json", expects.reference, places)
-        write_trust_map(folder / "trust.png", opened, expects.reference, places)
-    print_table(trust_table(expects.reference, places), Console())
+        write_trust_json(folder / "trust.json", expects.reference_db, places)
+        write_trust_map(folder / "trust.png", opened, expects.reference_db, places)
+    print_table(trust_table(expects.reference_db, places), Console())
     print(f"wrote {folder / 'trust.png'}, {folder / 'trust.json'}")

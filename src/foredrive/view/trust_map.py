@@ -1,4 +1,4 @@
-"""Where the sensors of a reconstruction are trusted: a table, a map from above, and JSON."""
+"""Where the images of a reconstruction are trusted: a table, a map from above, and JSON."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from foredrive.engine.provenance import collect_provenance
 from foredrive.engine.summary import write_json
 from foredrive.files import atomic_path
-from foredrive.methods.reconstruction.trust import TRUSTED_LOSS_DB, TRUSTED_LOSS_SHARE, Expected
+from foredrive.methods.reconstruction.trust import TRUSTED_LOSS_DB
 from foredrive.runs.reconstruction.reconstruction_run import OpenedReconstruction
 from foredrive.runs.reconstruction.trust import TrustedPlace
 from foredrive.view.table import Column, Row, Section, Table
@@ -22,7 +22,7 @@ WORST_LOSS_DB = 8.0
 """Loss at the end of the colour scale."""
 
 
-def trust_table(reference: Expected, places: Sequence[TrustedPlace]) -> Table:
+def trust_table(reference_db: float, places: Sequence[TrustedPlace]) -> Table:
     """Return the share of trusted moments by offset and heading, in percent."""
     offsets_m, headings_deg = (
         sorted({getattr(place, name) for place in places}, reverse=True) for name in ("left_m", "left_deg")
@@ -43,7 +43,10 @@ def trust_table(reference: Expected, places: Sequence[TrustedPlace]) -> Table:
         Column("moments trusted, %", align="left"),
         *(Column(_turned(x), digits=0) for x in headings_deg),
     ]
-    notes = [f"along the logged way: {_quality(reference)}", _rule()]
+    notes = [
+        f"along the logged way, images have {reference_db:.1f} dB; a moment is trusted if at most "
+        f"{TRUSTED_LOSS_DB:g} dB less are expected"
+    ]
     return Table(columns, [Section(rows)], notes=notes)
 
 
@@ -55,29 +58,13 @@ def _turned(left_deg: float) -> str:
     return f"{abs(left_deg):g}° {'left' if left_deg > 0 else 'right'}" if left_deg else "straight"
 
 
-def _quality(expected: Expected) -> str:
-    parts = []
-    if expected.psnr_db is not None:
-        parts.append(f"images of {expected.psnr_db:.1f} dB")
-    if expected.right_share is not None:
-        parts.append(f"{100 * expected.right_share:.0f} % of the beams right")
-    return ", ".join(parts)
-
-
-def _rule() -> str:
-    return (
-        f"trusted: at most {TRUSTED_LOSS_DB:g} dB and {100 * TRUSTED_LOSS_SHARE:g} % of the beams below "
-        "that; a beam is right within 0.1 m and 2 % of the range"
-    )
-
-
-def write_trust_json(path: Path, reference: Expected, places: Sequence[TrustedPlace]) -> None:
+def write_trust_json(path: Path, reference_db: float, places: Sequence[TrustedPlace]) -> None:
     """Write all places with their expected quality."""
     write_json(
         path,
         {
-            "reference": reference._asdict(),
-            "trusted_loss": {"psnr_db": TRUSTED_LOSS_DB, "right_share": TRUSTED_LOSS_SHARE},
+            "reference_db": reference_db,
+            "trusted_loss_db": TRUSTED_LOSS_DB,
             "trusted_share": fmean(place.trusted for place in places),
             "places": [dataclasses.asdict(place) for place in places],
             **collect_provenance(),
@@ -86,7 +73,7 @@ def write_trust_json(path: Path, reference: Expected, places: Sequence[TrustedPl
 
 
 def write_trust_map(
-    path: Path, opened: OpenedReconstruction, reference: Expected, places: Sequence[TrustedPlace]
+    path: Path, opened: OpenedReconstruction, reference_db: float, places: Sequence[TrustedPlace]
 ) -> None:
     """Draw the places from above: an arrow for each heading, in the colour of the expected loss."""
     way = opened.vehicle.T_scene_ego[:, :2, 3].numpy()
@@ -97,12 +84,12 @@ def write_trust_map(
     axes.plot(*way.T, color="0.6", linewidth=1, zorder=0)
     headings_rad = np.array([_heading_rad(opened, place) for place in places])
     xy = np.array([place.xy for place in places])
-    loss = np.array([_loss(reference, place) for place in places])
+    loss_db = np.array([reference_db - place.psnr_db for place in places])
     arrows = axes.quiver(
         *xy.T,
         ARROW_M * np.cos(headings_rad),
         ARROW_M * np.sin(headings_rad),
-        loss,
+        loss_db,
         cmap="RdYlGn_r",
         angles="xy",
         scale_units="xy",
@@ -117,10 +104,11 @@ def write_trust_map(
     axes.set_aspect("equal")
     axes.set_xlabel("m, along the first heading of the log")
     axes.set_ylabel("m")
-    axes.set_title(f"{opened.folder.name}: expected loss against the logged way ({_quality(reference)})")
+    axes.set_title(
+        f"{opened.folder.name}: expected loss of PSNR against the logged way ({reference_db:.1f} dB)"
+    )
     axes.legend(loc="upper left", frameon=False)
-    label = "dB of PSNR" if reference.psnr_db is not None else "% of the beams"
-    figure.colorbar(arrows, ax=axes, label=f"loss, {label}", shrink=0.8)
+    figure.colorbar(arrows, ax=axes, label="loss, dB", shrink=0.8)
     with atomic_path(path) as temporary:
         figure.savefig(temporary, dpi=110, bbox_inches="tight", format="png")
 
@@ -128,12 +116,3 @@ def write_trust_map(
 def _heading_rad(opened: OpenedReconstruction, place: TrustedPlace) -> float:
     forward = opened.vehicle.at(place.t_s).T_scene_ego[:2, 0].numpy()
     return float(np.arctan2(forward[1], forward[0]) + np.radians(place.left_deg))
-
-
-def _loss(reference: Expected, place: TrustedPlace) -> float:
-    """Return the loss of PSNR, dB, or without cameras that of right beams, %."""
-    if reference.psnr_db is not None and place.psnr_db is not None:
-        return reference.psnr_db - place.psnr_db
-    assert reference.right_share is not None
-    assert place.right_share is not None
-    return 100 * (reference.right_share - place.right_share)

@@ -1,4 +1,4 @@
-"""What a reconstruction knows of rendered frames, on scenes that are computed by hand."""
+"""What a reconstruction knows of rendered images, on scenes that are computed by hand."""
 
 import dataclasses
 import math
@@ -9,20 +9,16 @@ from jaxtyping import Float
 from torch import Tensor
 
 from foredrive.geometry.se3 import matrix_from_yaw
-from foredrive.methods.reconstruction.rendered import RenderedImage, RenderedSweep
+from foredrive.methods.reconstruction.rendered import RenderedImage
 from foredrive.methods.reconstruction.tracks import ActorTracks
 from foredrive.methods.reconstruction.trust import (
     IMAGE_WEIGHTS,
-    SWEEP_WEIGHTS,
-    ObservedPoints,
     ObservedViews,
-    beam_is_right,
     image_features,
     psnr_of,
-    sweep_features,
 )
-from foredrive.methods.reconstruction.views import CameraView, SweepView
-from foredrive.scene import Category, LidarSweep
+from foredrive.methods.reconstruction.views import CameraView
+from foredrive.scene import Category
 
 SIZE_HW = (16, 32)
 WALL_M = 10.0
@@ -148,63 +144,6 @@ def test_an_actor_is_looked_up_where_it_was() -> None:
     assert middle(still["unseen"]) == 1.0
     stranger = features(observed((WALL_M,), actor_m=11.0), view(), image(2 * WALL_M), tracks((11.0, 21.0), 8))
     assert (middle(stranger["actor"]), middle(stranger["unseen"])) == (1.0, 1.0)
-
-
-def sweep_of(
-    ends_ego: Float[Tensor, "P 3"], T_scene_ego: Float[Tensor, "4 4"]
-) -> tuple[SweepView, RenderedSweep]:
-    """Beams from the origin of the ego frame to some points; the last one is lost."""
-    range_m = ends_ego.norm(dim=-1)
-    returned = torch.ones(len(range_m), dtype=torch.bool)
-    returned[-1] = False
-    zero = torch.zeros_like(range_m)
-    beams = LidarSweep(
-        origin_ego=torch.zeros_like(ends_ego),
-        dir_ego=ends_ego / range_m[:, None],
-        range_m=zero,
-        returned=torch.zeros_like(returned),
-        intensity=zero,
-        dt_s=zero,
-        beam=torch.zeros_like(range_m, dtype=torch.int64),
-        valid=torch.ones_like(returned),
-    )
-    drop_logit = torch.where(returned, -3.0, 3.0)
-    shown = RenderedSweep(range_m, range_m, zero, drop_logit, torch.ones_like(range_m), None)
-    return SweepView(beams, True, T_scene_ego, torch.zeros(6), 1.0), shown
-
-
-def test_beams_know_how_far_away_the_nearest_observed_point_is() -> None:
-    seen = ObservedPoints(torch.tensor([[12.0, 5.0, 0.0], [0.0, -5.0, 0.0]]))
-    # The vehicle stands at (2, 5) and looks to the left: 10 m to its right is the first point
-    T_scene_ego = matrix_from_yaw(torch.tensor(math.pi / 2), torch.tensor([2.0, 5.0, 0.0]))
-    ends = torch.tensor([[0.0, -10.0, 0.0], [0.0, -10.0, 0.3], [0.0, 0.0, 9.0]])
-    known = sweep_features(seen, torch.tensor([7]), NOBODY, *sweep_of(ends, T_scene_ego))
-    assert set(known) == set(SWEEP_WEIGHTS)
-    assert known["away"].exp().sub(0.02)[:2].tolist() == pytest.approx([0.0, 0.3], abs=1e-4)
-    assert known["lost"].tolist() == [0.0, 0.0, 1.0]
-    assert known["range"][:2].exp().sub(1).tolist() == pytest.approx([10.0, 10.0], abs=0.01)
-
-
-def test_points_of_an_actor_stay_with_it() -> None:
-    """A point on an actor is compared in the actor's frame, whatever stands at its place by now."""
-    moved = tracks((11.0, 21.0))
-    ends = torch.tensor([[20.5, 1.0, 2.0], [0.0, 0.0, 9.0]])
-    view_now, shown = sweep_of(ends, torch.eye(4))
-    # Half a metre behind the middle of the box, one to the left, two up
-    local = torch.tensor([[-0.5, 1.0, 2.0 + 3000.0], [20.5, 1.0, 2.4]])
-    known = sweep_features(ObservedPoints(local), torch.tensor([7]), moved, view_now, shown)
-    assert float(known["away"][0].exp() - 0.02) == pytest.approx(0.0, abs=1e-3)
-    assert known["actor"].tolist() == [1.0, 0.0]
-    stranger = sweep_features(ObservedPoints(local), torch.tensor([9]), moved, view_now, shown)
-    assert float(stranger["away"][0].exp()) > 1000.0
-
-
-def test_a_beam_is_right_if_it_is_lost_or_ends_as_it_should() -> None:
-    true_m = torch.tensor([10.0, 10.0, 50.0, 50.0, 0.0, 0.0, 20.0])
-    is_true = torch.tensor([True, True, True, True, False, False, True])
-    said_m = torch.tensor([10.25, 10.35, 51.0, 51.2, 0.0, 30.0, 0.0])
-    said = torch.tensor([True, True, True, True, False, True, False])
-    assert beam_is_right(said_m, said, true_m, is_true).tolist() == [1, 0, 1, 0, 1, 0, 0]
 
 
 def test_psnr_is_that_of_the_mean_error() -> None:

@@ -48,14 +48,11 @@ class ReconstructedRenderer:
         images = torch.zeros(len(rig.names), 3, *rig.size_hw, dtype=torch.uint8)
         for camera, (_, image) in enumerate(shown):
             images[camera] = image.rgb_8bit
-        swept = None
-        if lidar is not None:
-            view = novel_sweep_view(lidar, ego)
-            swept = view, self.scene.sweep(self.graph, self.scene.prepare_sweep(view), ego.t_s)
+        sweep = None if lidar is None else render_sweep(self.scene, self.graph, lidar, ego)
         trusted = None
         if self.trust is not None:
-            trusted = self.trust.trusts(self.trust.expected(self.graph, shown, swept))
-        return Rendered(images, None if swept is None else rendered_sweep(*swept), trusted)
+            trusted = self.trust.trusts(self.trust.psnr_db(self.graph, shown))
+        return Rendered(images, sweep, trusted)
 
 
 @torch.no_grad()

@@ -1,37 +1,31 @@
-"""How far rendered images and sweeps may be trusted, from what the sensors of the log have seen.
+"""How far rendered images may be trusted, from what the cameras of the log have seen.
 
 A reconstruction shows surfaces well that its training views saw from about the same direction and no farther
 away, and guesses the others. Each block of a rendered image is looked up in the training views: was its
 surface seen, by how many of them, from which angle and distance? A gamma regression with logarithmic link
-turns this into an expected squared error, beams likewise by a logistic regression. Their weights were fitted
-to reconstructed towns, where the true frame is known for every pose (`benchmarks/trust.py`).
+turns this into an expected squared error. Its weights were fitted to reconstructed towns, where the true
+image is known for every pose (`benchmarks/trust.py`). Sweeps hardly get worse within 6 m of the logged way.
 """
 
-import dataclasses
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
-from typing import Any, NamedTuple
 
-import numpy as np
 import torch
 import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
-from scipy.spatial import cKDTree
 from torch import Tensor
 
 from foredrive.errors import InputError
 from foredrive.geometry.projection import pixel_centres, pixels_to_rays, project
 from foredrive.geometry.se3 import inverse_se3, transform_points
-from foredrive.methods.reconstruction.novel_views import novel_camera_view, novel_sweep_view
+from foredrive.methods.reconstruction.novel_views import novel_camera_view
 from foredrive.methods.reconstruction.reconstructed import ReconstructedScene
-from foredrive.methods.reconstruction.rendered import RenderedImage, RenderedSweep
+from foredrive.methods.reconstruction.rendered import RenderedImage
 from foredrive.methods.reconstruction.scene_graph import STATIC, SceneGraph
 from foredrive.methods.reconstruction.seed_points import actor_rows
 from foredrive.methods.reconstruction.tracks import ActorTracks, states_at
 from foredrive.methods.reconstruction.vehicle import LoggedVehicle
-from foredrive.methods.reconstruction.views import CameraView, SweepView
+from foredrive.methods.reconstruction.views import CameraView
 from foredrive.scene.record import Record
 
 BLOCKS, OBSERVED_BLOCKS = 32, 128
@@ -40,30 +34,25 @@ SKY_M = 1000.0
 """Distance at which directions without a surface are compared."""
 SAME_M, SAME_SHARE = 0.3, 0.1
 """A view saw a surface if its depth there differs by at most this distance plus this share of the depth."""
-NEAR_RAD = 0.1
-"""Angle within which a view looks from about the same direction."""
+NEAR_RAD, TINY_RAD = 0.1, 0.01
+"""Angle within which a view looks from about the same direction, and up to which errors grow fast."""
 _ANGLE_COST_RAD, _RATIO_COST = 0.1, 0.3
 """Change of angle, and of the logarithm of the distance, by which a view is one unit worse as evidence."""
 _NEAREST_VIEWS = 48
 """Number of training views of each image that are searched: those whose cameras look most alike."""
 _METRES_A_RAD = 15.0
 """Distance between cameras that counts as much as a turn by one radian."""
-_APART_M = 3000.0
-"""Distance by which the points of each actor are kept apart from all others."""
-POINTS = 300_000
-"""Maximum number of lidar points that are kept."""
-BEAMS_APART = 7
-"""Every seventh beam of a sweep is looked up."""
-TRUSTED_LOSS_DB, TRUSTED_LOSS_SHARE = 3.0, 0.05
-"""Largest loss of expected PSNR and of the share of right beams with which a frame is still trusted."""
+TRUSTED_LOSS_DB = 3.0
+"""Largest loss of expected PSNR with which a frame is still trusted."""
 
 IMAGE_WEIGHTS = {
     "one": 0.0,
     "unseen": 0.0,
+    "unseen_area": 0.0,
     "unseen_sky": 0.0,
     "unseen_low": 0.0,
     "angle": 0.0,
-    "small_angle": 0.0,
+    "tiny_angle": 0.0,
     "nearer_than_seen": 0.0,
     "farther_than_seen": 0.0,
     "views": 0.0,
@@ -76,18 +65,6 @@ IMAGE_WEIGHTS = {
     "edge": 0.0,
 }
 """Weights of `image_features` for the logarithm of the squared error of a block, by `bench trust`."""
-SWEEP_WEIGHTS = {
-    "one": 0.0,
-    "lost": 0.0,
-    "unsure": 0.0,
-    "away": 0.0,
-    "range": 0.0,
-    "long_range": 0.0,
-    "spread": 0.0,
-    "open": 0.0,
-    "actor": 0.0,
-}
-"""Weights of `sweep_features` for the log odds of a right beam, by `bench trust`."""
 
 
 @dataclass(frozen=True)
@@ -106,13 +83,15 @@ class ObservedViews(Record):
 
 
 @torch.no_grad()
-def observe_views(
-    scene: ReconstructedScene, vehicle: LoggedVehicle, t_s: Sequence[float]
-) -> ObservedViews | None:
-    """Render the images of all cameras at the training times, in blocks; None without cameras or times."""
+def observe_views(scene: ReconstructedScene, vehicle: LoggedVehicle, t_s: Sequence[float]) -> ObservedViews:
+    """Render the images of all cameras at the training times, in blocks.
+
+    Raises:
+        InputError: the log has no cameras.
+    """
     rig, graph = vehicle.rig, scene.graph
-    if not rig.names or not t_s:
-        return None
+    if not rig.names:
+        raise InputError("without cameras, nothing is known about images beside the logged way")
     assert rig.exposed_dt_s is not None
     views = [
         novel_camera_view(rig, camera, vehicle.at(time_s + float(rig.exposed_dt_s[camera])))
@@ -225,10 +204,11 @@ def image_features(
     return {
         "one": torch.ones_like(alpha),
         "unseen": unseen,
+        "unseen_area": unseen * _around(unseen.view(size_hw)),
         "unseen_sky": unseen * sky,
         "unseen_low": unseen * torch.linspace(0, 1, height).repeat_interleave(width),
         "angle": best_angle_rad,
-        "small_angle": best_angle_rad.clamp_max(NEAR_RAD),
+        "tiny_angle": best_angle_rad.clamp_max(TINY_RAD),
         "nearer_than_seen": best_farther.clamp_min(0),
         "farther_than_seen": best_farther.clamp_max(0),
         "views": saw.float().sum(0).log1p(),
@@ -240,6 +220,11 @@ def image_features(
         "texture": (_steps(grey) + 0.005).log(),
         "edge": _steps(depth_hw_m.clamp_min(0.1).log()).clamp_max(2.0),
     }
+
+
+def _around(values: Float[Tensor, "h w"]) -> Float[Tensor, "N"]:
+    """Return the mean over each block and its neighbours."""
+    return F.avg_pool2d(values[None, None], 3, stride=1, padding=1, count_include_pad=False).flatten()
 
 
 def _steps(values: Float[Tensor, "h w"]) -> Float[Tensor, "N"]:
@@ -288,134 +273,16 @@ def _transformed(T: Float[Tensor, "V N 4 4"], points: Float[Tensor, "V N 3"]) ->
     return (T[..., :3, :3] @ points[..., None])[..., 0] + T[..., :3, 3]
 
 
-@dataclass(frozen=True)
-class ObservedPoints:
-    """Surfaces that the log's lidar saw, as the reconstruction shows them.
-
-    Points of actors are in the actors' frames, and moved up by a distance of their own, so that one tree
-    holds all of them.
-    """
-
-    points: Float[Tensor, "P 3"]
-
-    @cached_property
-    def tree(self) -> cKDTree:
-        """Return the tree of all points."""
-        return cKDTree(self.points.numpy())
-
-
-@torch.no_grad()
-def observe_points(
-    scene: ReconstructedScene, vehicle: LoggedVehicle, t_s: Sequence[float]
-) -> ObservedPoints | None:
-    """Render the sweeps of the log's lidar at the training times; None without a lidar or times."""
-    lidar, graph = vehicle.lidar, scene.graph
-    if lidar is None or not t_s:
-        return None
-    every = math.ceil(len(t_s) * len(lidar.channel) / POINTS)
-    clouds = []
-    for time_s in t_s:
-        view = novel_sweep_view(lidar, vehicle.at(time_s))
-        view = dataclasses.replace(view, beams=view.beams[::every])
-        sweep = scene.sweep(graph, scene.prepare_sweep(view), view.t_s)
-        hit = sweep.returned.cpu()
-        clouds.append(_apart(scene.tracks.track_id, graph.tracks, view, sweep, hit)[0])
-    return ObservedPoints(torch.cat(clouds))
-
-
-def _apart(
-    track_id: Int[Tensor, "A"],
-    tracks: ActorTracks,
-    view: SweepView,
-    sweep: RenderedSweep,
-    hit: Bool[Tensor, "P"],
-) -> tuple[Float[Tensor, "H 3"], Int[Tensor, "H"]]:
-    """Return the end points of the beams that hit something as in `ObservedPoints`, and whose they are."""
-    beams, states = view.beams[hit], states_at(tracks, view.t_s)
-    ends = beams.origin_ego + beams.dir_ego * sweep.hit_range_m.cpu()[hit, None]
-    points = transform_points(view.T_scene_ego, ends)
-    owner = actor_rows(points, beams.dt_s, states, tracks)
-    rows = _rows_of(track_id.cpu(), tracks, owner)
-    on_actor = owner != STATIC
-    mine = owner[on_actor]
-    # To the time of the sweep, then into the frame of the box
-    at_sweep = points[on_actor] - states.velocity_mps[mine] * beams.dt_s[on_actor, None]
-    local = _transformed(inverse_se3(states.T_scene_actor[mine])[None], at_sweep[None])[0]
-    points[on_actor] = local + _APART_M * (rows[on_actor, None] + 1) * torch.tensor([0.0, 0.0, 1.0])
-    return points, owner
-
-
-@torch.no_grad()
-def sweep_features(
-    observed: ObservedPoints,
-    track_id: Int[Tensor, "A"],
-    tracks: ActorTracks,
-    view: SweepView,
-    sweep: RenderedSweep,
-) -> dict[str, Float[Tensor, "P"]]:
-    """Return what is known about each beam of a rendered sweep.
-
-    Args:
-        observed: surfaces that the lidar saw.
-        track_id: ids of the actors in `observed`.
-        tracks: the actors of the rendered scene, edits included.
-        view: the beams.
-        sweep: the rendered sweep.
-    """
-    hit = sweep.returned.cpu()
-    points, owner = _apart(track_id, tracks, view, sweep, hit)
-    away_m, range_m, actor = (torch.zeros(len(hit)) for _ in range(3))
-    away_m[hit] = torch.from_numpy(np.asarray(observed.tree.query(points.numpy())[0], np.float32))
-    range_m[hit] = sweep.hit_range_m.cpu()[hit]
-    actor[hit] = (owner != STATIC).float()
-    returned = hit.float()
-    spread_m = (sweep.range_m - sweep.hit_range_m).abs().cpu() * returned
-    return {
-        "one": torch.ones_like(returned),
-        "lost": 1 - returned,
-        "unsure": torch.exp(-sweep.drop_logit.abs().cpu()),
-        "away": (away_m + 0.02).log() * returned,
-        "range": range_m.log1p(),
-        "long_range": (range_m / 20).log().clamp_min(0) * returned,
-        "spread": (spread_m + 0.01).log() * returned,
-        "open": (1 - sweep.alpha.cpu()) * returned,
-        "actor": actor,
-    }
-
-
-def beam_is_right(
-    range_m: Float[Tensor, "P"],
-    returned: Bool[Tensor, "P"],
-    real_range_m: Float[Tensor, "P"],
-    really_returned: Bool[Tensor, "P"],
-) -> Bool[Tensor, "P"]:
-    """Return which beams are rightly lost, or return with a range within 0.1 m and 2 % of the true one."""
-    close = (range_m - real_range_m).abs() < 0.1 + 0.02 * real_range_m
-    return (returned == really_returned) & (close | ~really_returned)
-
-
-class Expected(NamedTuple):
-    """Expected quality of the frame of a vehicle at one time."""
-
-    psnr_db: float | None
-    """PSNR of all images together, dB; None without cameras."""
-    right_share: float | None
-    """Share of the beams that are right, see `beam_is_right`; None without a lidar."""
-
-
 @dataclass(frozen=True, eq=False)
 class Trust:
-    """What a reconstruction expects of its own images and sweeps."""
+    """What a reconstruction expects of its own images."""
 
     scene: ReconstructedScene
-    views: ObservedViews | None
-    """None without cameras."""
-    points: ObservedPoints | None
-    """None without a lidar."""
+    views: ObservedViews
     offset: float
     """Added to the logarithm of expected squared errors: how this log differs from those of the fit."""
-    reference: Expected
-    """Expected quality along the logged way. Frames are trusted if theirs is almost as good."""
+    reference_db: float
+    """Expected PSNR along the logged way."""
 
     @torch.no_grad()
     def block_errors(self, graph: SceneGraph, view: CameraView, image: RenderedImage) -> Float[Tensor, "h w"]:
@@ -425,55 +292,18 @@ class Trust:
             graph: the scene, or an edited version of it, that was rendered.
             view: the camera.
             image: the rendered image.
-
-        Raises:
-            InputError: the reconstruction has no cameras.
         """
-        if self.views is None:
-            raise InputError("a reconstruction without cameras expects nothing of images")
         features = image_features(self.views, self.scene.track_id, graph.tracks, view, image)
         log_error = self.offset + weighted_sum(features, IMAGE_WEIGHTS)
         return log_error.clamp_max(0.0).exp().view(block_hw(view.size_hw))
 
-    @torch.no_grad()
-    def right_beams(self, graph: SceneGraph, view: SweepView, sweep: RenderedSweep) -> Float[Tensor, "n"]:
-        """Return the probability to be right of every `BEAMS_APART`-th beam of a rendered sweep.
+    def psnr_db(self, graph: SceneGraph, images: Sequence[tuple[CameraView, RenderedImage]]) -> float:
+        """Return the expected PSNR of the images of all cameras at one time together, dB."""
+        return psnr_of(torch.cat([self.block_errors(graph, view, image).flatten() for view, image in images]))
 
-        Raises:
-            InputError: the reconstruction has no lidar.
-        """
-        if self.points is None:
-            raise InputError("a reconstruction without lidar expects nothing of sweeps")
-        some = slice(None, None, BEAMS_APART)
-        view, sweep = dataclasses.replace(view, beams=view.beams[some]), _some_beams(sweep, some)
-        features = sweep_features(self.points, self.scene.track_id, graph.tracks, view, sweep)
-        return weighted_sum(features, SWEEP_WEIGHTS).sigmoid()
-
-    def expected(
-        self,
-        graph: SceneGraph,
-        images: Sequence[tuple[CameraView, RenderedImage]],
-        sweep: tuple[SweepView, RenderedSweep] | None,
-    ) -> Expected:
-        """Return the expected quality of a rendered frame: of its images, with their views, and its sweep."""
-        errors = [self.block_errors(graph, view, image).flatten() for view, image in images]
-        right = None if sweep is None else float(self.right_beams(graph, *sweep).mean())
-        return Expected(psnr_of(torch.cat(errors)) if errors else None, right)
-
-    def trusts(self, expected: Expected) -> bool:
-        """Return whether a frame is expected to be almost as good as those along the logged way."""
-        margins = (TRUSTED_LOSS_DB, TRUSTED_LOSS_SHARE)
-        return all(
-            value is None or usual is None or value >= usual - margin
-            for value, usual, margin in zip(expected, self.reference, margins, strict=True)
-        )
-
-
-def _some_beams(sweep: RenderedSweep, some: slice) -> RenderedSweep:
-    chosen: dict[str, Any] = {
-        name: None if value is None else value[some] for name, value in vars(sweep).items()
-    }
-    return RenderedSweep(**chosen)
+    def trusts(self, psnr_db: float) -> bool:
+        """Return whether images are expected to be almost as good as those along the logged way."""
+        return psnr_db >= self.reference_db - TRUSTED_LOSS_DB
 
 
 def weighted_sum(

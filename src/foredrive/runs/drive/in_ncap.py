@@ -102,7 +102,7 @@ class SafetyTests:
         scenario = next(entry for entry in load_scenarios(Path(self.scenarios)) if entry.label == job.route)
         folder = _folders(self.runs)[scenario.scene]
         sensors = renders_for(suite) or self.stay_trusted
-        place = place_in(folder, trusted=sensors)
+        place = place_in(folder, trusted=sensors, required=self.stay_trusted)
         check_lidar_of(suite.agent, self.sees, place.vehicle, folder)
         run = set_up_run(
             place,
@@ -230,10 +230,15 @@ def _tested(source: SafetyTests) -> SelfTest:
 
 
 @functools.lru_cache(maxsize=2)  # consecutive runs share one scene
-def place_in(folder: str, trusted: bool = False) -> Place:
-    """Return a reconstruction as a place of tests, whose renderers say which frames they trust if asked."""
+def place_in(folder: str, trusted: bool = False, required: bool = False) -> Place:
+    """Return a reconstruction as a place of tests.
+
+    Args:
+        trusted: whether its renderers say which frames they trust; without cameras they do not.
+        required: raise an error where they cannot say it.
+    """
     opened = opened_reconstruction(folder)
-    trust = opened_trust(folder) if trusted else None
+    trust = opened_trust(folder, required) if trusted else None
     ids = {str(track_id): track_id for track_id in opened.scene.graph.all_tracks.track_id.tolist()}
     with contextlib.suppress(InputError):  # without its log, actors are known by their numbers alone
         of_log = read_track_ids(Log(open_run_log(Path(folder))[1]))

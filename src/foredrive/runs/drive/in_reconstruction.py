@@ -95,7 +95,7 @@ class ReconstructedRoutes:
             sent = send_threat(threat, graph, drive, start_s)
             graph = edited_scene(opened.scene, [*edits, sent]).graph
         sensors = renders_for(suite) or self.stay_trusted
-        trust = opened_trust(self.run) if sensors else None
+        trust = opened_trust(self.run, self.stay_trusted) if sensors else None
         renderer = ReconstructedRenderer(opened.scene, graph, opened.vehicle, trust)
         lanes = lanes_of(opened.folder)
         simulator = ReconstructedSimulator(renderer, graph.all_tracks, drive, lanes)
@@ -132,9 +132,17 @@ def opened_reconstruction(run: str) -> OpenedReconstruction:
 
 
 @functools.lru_cache(maxsize=1)
-def opened_trust(run: str) -> Trust:
-    """Return what a reconstruction expects of its frames. Drives one after another in one log share it."""
-    return trust_of(opened_reconstruction(run))
+def opened_trust(run: str, required: bool = False) -> Trust | None:
+    """Return what a reconstruction expects of its images. Drives one after another in one log share it.
+
+    Args:
+        required: raise an error in place of returning None where there are no cameras.
+
+    Raises:
+        InputError: the reconstruction is not finished, or has no cameras if that is required.
+    """
+    opened = opened_reconstruction(run)
+    return trust_of(opened) if opened.vehicle.rig.names or required else None
 
 
 def renders_for(suite: DriveSuite) -> bool:

@@ -1,8 +1,8 @@
-"""Where the sensors of a reconstruction may be trusted: places and headings beside the logged way."""
+"""Where the images of a reconstruction may be trusted: places and headings beside the logged way."""
 
+import dataclasses
 import itertools
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from statistics import fmean
 
@@ -12,10 +12,8 @@ from foredrive.engine.folder import CONFIG, SUMMARY
 from foredrive.engine.summary import read_summary
 from foredrive.errors import InputError
 from foredrive.geometry.se3 import matrix_from_yaw
-from foredrive.methods.reconstruction.novel_views import novel_camera_view, novel_sweep_view
-from foredrive.methods.reconstruction.reconstructed import ReconstructedScene
-from foredrive.methods.reconstruction.scene_graph import SceneGraph
-from foredrive.methods.reconstruction.trust import Expected, Trust, observe_points, observe_views
+from foredrive.methods.reconstruction.novel_views import novel_camera_view
+from foredrive.methods.reconstruction.trust import Trust, observe_views
 from foredrive.methods.reconstruction.vehicle import EgoState, LoggedVehicle
 from foredrive.runs.recipes.reconstruction import load_reconstruction_recipe
 from foredrive.runs.reconstruction.reconstruction_run import OpenedReconstruction
@@ -29,7 +27,7 @@ REFERENCE_FRAMES = 12
 
 @dataclass(frozen=True)
 class TrustedPlace:
-    """The expected quality of the sensors at one place, heading and time."""
+    """The expected quality of the images at one place, heading and time."""
 
     t_s: float
     left_m: float
@@ -38,18 +36,17 @@ class TrustedPlace:
     """Turn to the left of the logged heading."""
     xy: tuple[float, float]
     """Place in the frame of the scene, m."""
-    psnr_db: float | None
-    right_share: float | None
+    psnr_db: float
     trusted: bool
 
 
 def trust_of(opened: OpenedReconstruction) -> Trust:
-    """Return what a finished reconstruction expects of its frames. It takes some seconds for each camera.
+    """Return what a finished reconstruction expects of its images. It takes some seconds for each camera.
 
     The expectations are shifted so that they agree with the held-out images of the log on average.
 
     Raises:
-        InputError: the reconstruction is not finished.
+        InputError: the reconstruction is not finished, or has no cameras.
     """
     scene, vehicle = opened.scene, opened.vehicle
     if not (opened.folder / SUMMARY).is_file():
@@ -58,34 +55,23 @@ def trust_of(opened: OpenedReconstruction) -> Trust:
     held = [bool(every) and frame % every == every - 1 for frame in range(len(vehicle.t_s))]
     trained_s = [t_s for t_s, out in zip(vehicle.t_s.tolist(), held, strict=True) if not out]
     held_s = [t_s for t_s, out in zip(vehicle.t_s.tolist(), held, strict=True) if out]
-    views, points = observe_views(scene, vehicle, trained_s), observe_points(scene, vehicle, trained_s)
-    plain = Trust(scene, views, points, 0.0, Expected(None, None))
+    plain = Trust(scene, observe_views(scene, vehicle, trained_s), 0.0, 0.0)
     # Without held-out frames, the training frames are the reference, and their PSNR is not known
-    compared = (held_s or trained_s)[:: max(1, len(held_s or trained_s) // REFERENCE_FRAMES)]
-    frames = [expected_frame(plain, scene.graph, vehicle, vehicle.at(t_s)) for t_s in compared]
-    expected_db = _mean([frame.psnr_db for frame in frames])
+    compared_s = (held_s or trained_s)[:: max(1, len(held_s or trained_s) // REFERENCE_FRAMES)]
+    expected_db = fmean(expected_psnr_db(plain, vehicle, vehicle.at(t_s)) for t_s in compared_s)
     actual_db = read_summary(opened.folder / SUMMARY).get("psnr_db")
-    offset = 0.0
-    if expected_db is not None and isinstance(actual_db, float | int) and math.isfinite(actual_db):
-        offset = (expected_db - actual_db) * math.log(10) / 10
-        expected_db = float(actual_db)
-    return Trust(scene, views, points, offset, Expected(expected_db, _mean([f.right_share for f in frames])))
-
-
-def _mean(values: Sequence[float | None]) -> float | None:
-    return None if None in values or not values else fmean(value for value in values if value is not None)
+    if not (isinstance(actual_db, float) and math.isfinite(actual_db)):
+        return dataclasses.replace(plain, reference_db=expected_db)
+    offset = (expected_db - actual_db) * math.log(10) / 10
+    return dataclasses.replace(plain, offset=offset, reference_db=actual_db)
 
 
 @torch.no_grad()
-def expected_frame(trust: Trust, graph: SceneGraph, vehicle: LoggedVehicle, ego: EgoState) -> Expected:
-    """Return the expected quality of all sensors of the log at a pose of the vehicle."""
-    scene: ReconstructedScene = trust.scene
+def expected_psnr_db(trust: Trust, vehicle: LoggedVehicle, ego: EgoState) -> float:
+    """Return the expected PSNR of all cameras of the log together at a pose of the vehicle, without edits."""
+    scene, graph = trust.scene, trust.scene.graph
     views = [novel_camera_view(vehicle.rig, camera, ego) for camera in range(len(vehicle.rig.names))]
-    images = [(view, scene.camera(graph, view.to(scene.device))) for view in views]
-    if vehicle.lidar is None:
-        return trust.expected(graph, images, None)
-    view = novel_sweep_view(vehicle.lidar, ego)
-    return trust.expected(graph, images, (view, scene.sweep(graph, scene.prepare_sweep(view), ego.t_s)))
+    return trust.psnr_db(graph, [(view, scene.camera(graph, view.to(scene.device))) for view in views])
 
 
 def place_grid(vehicle: LoggedVehicle, step_s: float) -> list[tuple[float, float, float]]:
@@ -101,6 +87,6 @@ def trusted_place(
     """Judge one place, heading and time of a reconstruction without edits."""
     moved = matrix_from_yaw(torch.tensor(math.radians(left_deg)), torch.tensor([0.0, left_m, 0.0]))
     ego = vehicle.at(t_s).shifted(moved)
-    expected = expected_frame(trust, trust.scene.graph, vehicle, ego)
+    psnr_db = expected_psnr_db(trust, vehicle, ego)
     x_m, y_m = ego.T_scene_ego[:2, 3].tolist()
-    return TrustedPlace(t_s, left_m, left_deg, (x_m, y_m), *expected, trust.trusts(expected))
+    return TrustedPlace(t_s, left_m, left_deg, (x_m, y_m), psnr_db, trust.trusts(psnr_db))
