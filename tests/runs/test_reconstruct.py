@@ -141,7 +141,7 @@ def test_weights_that_are_none_are_told(run: Path, log: LogPath, tmp_path: Path)
     folder = tmp_path / "damaged"
     shutil.copytree(run, folder, ignore=shutil.ignore_patterns("cache"))
     (folder / "model.safetensors").write_bytes(b"nothing of the kind")
-    with pytest.raises(InputError, match="weights of a scene cannot be read"):
+    with pytest.raises(InputError, match="not the weights of a scene"):
         reconstruct(recipe(), log, folder)
 
 

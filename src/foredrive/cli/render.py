@@ -1,5 +1,6 @@
 """`foredrive render`."""
 
+import dataclasses
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -25,6 +26,7 @@ def render(
     start: Annotated[float, tyro.conf.arg(metavar="SECONDS")] = 0.0,
     seconds: float | None = None,
     rate_hz: float | None = None,
+    dim_unseen: bool = False,
 ) -> None:
     """Write a video of a reconstructed log: its cameras, and its lidar from above.
 
@@ -47,6 +49,7 @@ def render(
         start: Start of the video, s since the start of the log.
         seconds: Length of the video, s; by default until the end of the log.
         rate_hz: Frames per second, shown in real time; by default the rate of the log.
+        dim_unseen: Darken what no image that the reconstruction was made from shows.
     """
     from foredrive.view.video import check_video
 
@@ -63,10 +66,13 @@ def render(
         from foredrive.methods.reconstruction.edits import save_edits as write_edits
         from foredrive.runs.reconstruction.reconstruction_run import open_reconstruction
         from foredrive.runs.reconstruction.render import edits_from_arguments, plan_frames
+        from foredrive.runs.reconstruction.trust import trained_views
         from foredrive.view.reconstruction_video import write_reconstruction_video
 
     opened = open_reconstruction(run)
     plan = plan_frames(opened.vehicle, cameras, lidar, start_s=start, seconds=seconds, rate_hz=rate_hz)
+    if dim_unseen:
+        plan = dataclasses.replace(plan, observed=trained_views(opened))
     edit_list = [] if edits is None else load_edits(edits)
     tracks = opened.scene.graph.all_tracks
     changes = [*edit_list, *edits_from_arguments(tracks, edit_list, shift_left, remove, insert)]

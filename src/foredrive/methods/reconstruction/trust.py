@@ -7,6 +7,7 @@ turns this into an expected squared error. Its weights were fitted to reconstruc
 image is known for every pose (`benchmarks/trust.py`). Sweeps hardly get worse within 6 m of the logged way.
 """
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -42,6 +43,8 @@ _NEAREST_VIEWS = 48
 """Number of training views of each image that are searched: those whose cameras look most alike."""
 _METRES_A_RAD = 15.0
 """Distance between cameras that counts as much as a turn by one radian."""
+DARK = 0.75
+"""Share of the light that `darkened` takes away."""
 TRUSTED_LOSS_DB = 3.0
 """Largest loss of expected PSNR with which a frame is still trusted."""
 
@@ -157,6 +160,7 @@ def image_features(
         view: the camera.
         image: the rendered image.
     """
+    tracks, track_id = tracks.to("cpu"), track_id.cpu()
     height, width = size_hw = block_hw(view.size_hw)
     depth_hw_m, alpha_hw = _centres(image, size_hw)
     alpha, depth_m = alpha_hw.flatten(), depth_hw_m.flatten()
@@ -220,6 +224,29 @@ def image_features(
         "texture": (_steps(grey) + 0.005).log(),
         "edge": _steps(depth_hw_m.clamp_min(0.1).log()).clamp_max(2.0),
     }
+
+
+@torch.no_grad()
+def darkened(
+    observed: ObservedViews,
+    scene: ReconstructedScene,
+    graph: SceneGraph,
+    view: CameraView,
+    image: RenderedImage,
+) -> RenderedImage:
+    """Return an image in which what no training view saw is dark.
+
+    Args:
+        observed: the training views.
+        scene: the scene.
+        graph: the scene, or an edited version of it, that was rendered.
+        view: the camera.
+        image: the rendered image.
+    """
+    unseen = image_features(observed, scene.track_id, graph.tracks, view, image)["unseen"]
+    light = 1 - DARK * unseen.view(block_hw(view.size_hw)).to(image.rgb)
+    light = F.interpolate(light[None, None], view.size_hw, mode="bilinear", align_corners=False)[0]
+    return dataclasses.replace(image, rgb=image.rgb * light)
 
 
 def _around(values: Float[Tensor, "h w"]) -> Float[Tensor, "N"]:

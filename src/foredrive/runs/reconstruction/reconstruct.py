@@ -118,10 +118,12 @@ def _reconstruct(
     """Do the steps of a reconstruction that are not done yet."""
     save_vehicle(data.vehicle, folder / VEHICLE)
     representation: Representation = recipe.representation
-    scene = initial_model(recipe, data)
-    scene.to("cuda" if torch.cuda.is_available() else "cpu")
-    weights = folder / WEIGHTS
-    if not weights.is_file():
+    weights, device = folder / WEIGHTS, "cuda" if torch.cuda.is_available() else "cpu"
+    if weights.is_file():
+        # A trained scene needs no seeding, which takes longer than everything else here
+        scene = open_scene(recipe, weights, data.vehicle).to(device)
+    else:
+        scene = initial_model(recipe, data).to(device)
         train, names = data.train, data.vehicle.rig.names
         tracks = joined_tracks(data.tracks, data.obstacles)
         for finding in calibration_findings(names, train.cameras, train.sweeps, tracks):
@@ -131,8 +133,6 @@ def _reconstruct(
         representation.complete(scene, data.vehicle.T_scene_ego, data.train)
         with atomic_path(weights) as temporary:
             save_weights(scene, temporary)
-    scene.resize(weights)
-    load_weights(scene, weights)
     with together(folder):
         if not (folder / SUMMARY).is_file():
             write_summary(folder / SUMMARY, _summary(recipe, path, folder, scene, data))
@@ -189,6 +189,20 @@ def initial_model(recipe: ReconstructionRecipe[Any], data: ReconstructionData) -
         data.train, data.tracks, len(vehicle.rig.names), vehicle.reach_m
     )
     scene.keep_obstacles(data.obstacles)
+    return scene
+
+
+def open_scene(
+    recipe: ReconstructionRecipe[Any], weights: Path, vehicle: LoggedVehicle
+) -> ReconstructedScene:
+    """Return a trained scene.
+
+    Raises:
+        InputError: the file cannot be read or holds no weights of such a scene.
+    """
+    scene: ReconstructedScene = recipe.representation.open(weights, vehicle.reach_m)
+    scene.restore_obstacles(weights)
+    load_weights(scene, weights)
     return scene
 
 

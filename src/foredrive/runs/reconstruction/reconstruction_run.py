@@ -7,14 +7,13 @@ from pathlib import Path
 from typing import Any
 
 from foredrive.data import LogPath
-from foredrive.engine.checkpoints import load_weights
 from foredrive.engine.folder import CONFIG, LOG, WEIGHTS
 from foredrive.errors import InputError
 from foredrive.methods.reconstruction.edits import Edit, EditedScene, apply_edits
 from foredrive.methods.reconstruction.reconstructed import ReconstructedScene
 from foredrive.methods.reconstruction.vehicle import LoggedVehicle, load_vehicle
 from foredrive.runs.recipes.reconstruction import ReconstructionRecipe, load_reconstruction_recipe
-from foredrive.runs.reconstruction.reconstruct import VEHICLE
+from foredrive.runs.reconstruction.reconstruct import VEHICLE, open_scene
 
 
 @dataclass(frozen=True)
@@ -40,10 +39,7 @@ def open_reconstruction(folder: Path) -> OpenedReconstruction:
     if not (folder / VEHICLE).is_file():
         raise InputError(f"{folder}: made by an earlier version (no {VEHICLE}); reconstruct the log again")
     vehicle = load_vehicle(folder / VEHICLE)
-    scene = recipe.representation.open(folder / WEIGHTS, vehicle.reach_m)
-    scene.restore_obstacles(folder / WEIGHTS)
-    load_weights(scene, folder / WEIGHTS)
-    return OpenedReconstruction(folder, scene, vehicle)
+    return OpenedReconstruction(folder, open_scene(recipe, folder / WEIGHTS, vehicle), vehicle)
 
 
 def edited_scene(scene: ReconstructedScene, edits: list[Edit]) -> EditedScene:

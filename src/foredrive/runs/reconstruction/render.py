@@ -21,6 +21,7 @@ from foredrive.methods.reconstruction.novel_views import novel_camera_view
 from foredrive.methods.reconstruction.reconstructed import ReconstructedScene
 from foredrive.methods.reconstruction.renderer import render_sweep
 from foredrive.methods.reconstruction.tracks import ActorTracks, boxes_at
+from foredrive.methods.reconstruction.trust import ObservedViews, darkened
 from foredrive.methods.reconstruction.vehicle import LoggedVehicle
 from foredrive.scene import Boxes, LidarSweep
 from foredrive.sensors import SpinningLidar, hdl32e, pandar64, vlp16
@@ -43,6 +44,8 @@ class RenderPlan:
     cameras: tuple[int, ...]
     """Indices of the cameras in the vehicle's rig."""
     lidar: SpinningLidar | None
+    observed: ObservedViews | None = None
+    """Training views: what none of them saw is darkened. None: nothing is."""
 
 
 @dataclass(frozen=True)
@@ -124,8 +127,11 @@ def render_frame(
     assert rig.exposed_dt_s is not None
     for place, camera in enumerate(plan.cameras):
         ego = vehicle.at(t_s + float(rig.exposed_dt_s[camera])).shifted(edited.T_ego_shifted.cpu())
-        view = novel_camera_view(rig, camera, ego).to(scene.device)
-        images[place] = scene.camera(edited.graph, view).rgb_8bit
+        view = novel_camera_view(rig, camera, ego)
+        image = scene.camera(edited.graph, view.to(scene.device))
+        if plan.observed is not None:
+            image = darkened(plan.observed, scene, edited.graph, view, image)
+        images[place] = image.rgb_8bit
     ego, sweep = vehicle.at(t_s).shifted(edited.T_ego_shifted.cpu()), None
     if plan.lidar is not None:
         sweep = render_sweep(scene, edited.graph, plan.lidar, ego)

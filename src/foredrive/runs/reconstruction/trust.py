@@ -13,7 +13,7 @@ from foredrive.engine.summary import read_summary
 from foredrive.errors import InputError
 from foredrive.geometry.se3 import matrix_from_yaw
 from foredrive.methods.reconstruction.novel_views import novel_camera_view
-from foredrive.methods.reconstruction.trust import Trust, observe_views
+from foredrive.methods.reconstruction.trust import ObservedViews, Trust, observe_views
 from foredrive.methods.reconstruction.vehicle import EgoState, LoggedVehicle
 from foredrive.runs.recipes.reconstruction import load_reconstruction_recipe
 from foredrive.runs.reconstruction.reconstruction_run import OpenedReconstruction
@@ -51,19 +51,34 @@ def trust_of(opened: OpenedReconstruction) -> Trust:
     scene, vehicle = opened.scene, opened.vehicle
     if not (opened.folder / SUMMARY).is_file():
         raise InputError(f"{opened.folder}: not finished; continue it with `foredrive reconstruct`")
-    every = load_reconstruction_recipe(opened.folder / CONFIG).hold_out_every
-    held = [bool(every) and frame % every == every - 1 for frame in range(len(vehicle.t_s))]
-    trained_s = [t_s for t_s, out in zip(vehicle.t_s.tolist(), held, strict=True) if not out]
-    held_s = [t_s for t_s, out in zip(vehicle.t_s.tolist(), held, strict=True) if out]
+    trained_s, held_s = _frame_times(opened)
     plain = Trust(scene, observe_views(scene, vehicle, trained_s), 0.0, 0.0)
     # Without held-out frames, the training frames are the reference, and their PSNR is not known
-    compared_s = (held_s or trained_s)[:: max(1, len(held_s or trained_s) // REFERENCE_FRAMES)]
+    compared_s = held_s or trained_s
+    compared_s = compared_s[:: max(1, len(compared_s) // REFERENCE_FRAMES)]
     expected_db = fmean(expected_psnr_db(plain, vehicle, vehicle.at(t_s)) for t_s in compared_s)
     actual_db = read_summary(opened.folder / SUMMARY).get("psnr_db")
     if not (isinstance(actual_db, float) and math.isfinite(actual_db)):
         return dataclasses.replace(plain, reference_db=expected_db)
     offset = (expected_db - actual_db) * math.log(10) / 10
     return dataclasses.replace(plain, offset=offset, reference_db=actual_db)
+
+
+def trained_views(opened: OpenedReconstruction) -> ObservedViews:
+    """Return the training views of a reconstruction.
+
+    Raises:
+        InputError: the reconstruction has no cameras.
+    """
+    return observe_views(opened.scene, opened.vehicle, _frame_times(opened)[0])
+
+
+def _frame_times(opened: OpenedReconstruction) -> tuple[list[float], list[float]]:
+    """Return the times of the training frames and of the held-out frames, s."""
+    every = load_reconstruction_recipe(opened.folder / CONFIG).hold_out_every
+    t_s = opened.vehicle.t_s.tolist()
+    held_s = t_s[every - 1 :: every] if every else []
+    return [time_s for time_s in t_s if time_s not in held_s], held_s
 
 
 @torch.no_grad()
