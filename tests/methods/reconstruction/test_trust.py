@@ -13,7 +13,10 @@ from foredrive.methods.reconstruction.rendered import RenderedImage
 from foredrive.methods.reconstruction.tracks import ActorTracks
 from foredrive.methods.reconstruction.trust import (
     IMAGE_WEIGHTS,
+    TINY_RAD,
     ObservedViews,
+    expected_errors,
+    fitted_offset,
     image_features,
     psnr_of,
 )
@@ -148,3 +151,43 @@ def test_an_actor_is_looked_up_where_it_was() -> None:
 
 def test_psnr_is_that_of_the_mean_error() -> None:
     assert psnr_of(torch.tensor([[0.001, 0.003]])) == pytest.approx(-10 * math.log10(0.002))
+
+
+def test_what_nobody_saw_is_dark_and_the_rest_is_untouched() -> None:
+    """The training view looked at the left half of what is rendered; the right half is behind its wall."""
+    depths = torch.full((1, *SIZE_HW), WALL_M)
+    depths[..., 16:] = 4.0
+    views = dataclasses.replace(observed(), depth_m=depths)
+    known = features(views, view(), image(WALL_M))
+    unseen = known["unseen"].view(SIZE_HW)
+    assert unseen[:, :15].sum() == 0
+    assert unseen[:, 17:].min() == 1
+    area = known["unseen_area"].view(SIZE_HW)
+    assert area[8, 24] == 1.0
+    assert area[8, 16] == pytest.approx(2 / 3)
+
+
+def blocks(unseen: list[float], angle_rad: list[float]) -> dict[str, Float[Tensor, "N"]]:
+    """Blocks of which nothing else is known."""
+    known = {name: torch.zeros(len(unseen)) for name in IMAGE_WEIGHTS}
+    known |= {"one": torch.ones(len(unseen)), "unseen": torch.tensor(unseen)}
+    return known | {"tiny_angle": torch.tensor(angle_rad).clamp_max(TINY_RAD)}
+
+
+def test_the_level_of_a_log_counts_for_what_was_seen() -> None:
+    weights = {"one": math.log(0.001), "unseen": math.log(20.0)}
+    known = blocks([0.0, 0.0, 1.0], [0.0, 0.3, 0.0])
+    plain, worse = (expected_errors(known, offset, weights) for offset in (0.0, math.log(4.0)))
+    assert plain.tolist() == pytest.approx([0.001, 0.001, 0.02])
+    assert worse.tolist() == pytest.approx([0.004, 0.002, 0.02])
+    assert float(expected_errors(known, 100.0, weights).max()) == 1.0  # no error is larger
+
+
+@pytest.mark.parametrize("psnr_db", [20.0, 27.0, 33.0])
+def test_held_out_images_set_the_level(psnr_db: float) -> None:
+    weights = {"one": math.log(0.002), "tiny_angle": 50.0}
+    frames = [blocks([0.0, 0.0], [0.0, 0.005]), blocks([0.0, 0.0], [0.002, 0.001])]
+    offset = fitted_offset(frames, psnr_db, weights)
+    reached_db = [psnr_of(expected_errors(frame, offset, weights)) for frame in frames]
+    assert sum(reached_db) / 2 == pytest.approx(psnr_db, abs=1e-3)
+    assert (offset > 0) == (psnr_db < 26.0)

@@ -45,8 +45,11 @@ def place_gaussians(
     shown = torch.cat([states.present, states.present.new_ones(1)])[content.actor]  # STATIC, -1: last entry
     # Gaussians of present actors; the static ones always count
     moving = (shown & (content.actor >= 0)).nonzero()[:, 0]
-    still = (content.actor < 0).nonzero()[:, 0]
-    standing = content.gaussians[still]
+    if torch.is_grad_enabled():
+        still = (content.actor < 0).nonzero()[:, 0]
+        standing = content.gaussians[still]
+    else:
+        still, standing = content.static_part
     if len(moving) == 0:
         return PlacedGaussians(standing, torch.zeros_like(standing.mean_m), still)
     owner = content.actor[moving]

@@ -1,19 +1,28 @@
 """Where the images of a reconstruction may be trusted: places and headings beside the logged way."""
 
-import dataclasses
 import itertools
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from statistics import fmean
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from foredrive.engine.folder import CONFIG, SUMMARY
 from foredrive.engine.summary import read_summary
 from foredrive.errors import InputError
 from foredrive.geometry.se3 import matrix_from_yaw
 from foredrive.methods.reconstruction.novel_views import novel_camera_view
-from foredrive.methods.reconstruction.trust import ObservedViews, Trust, observe_views
+from foredrive.methods.reconstruction.trust import (
+    ObservedViews,
+    Trust,
+    expected_errors,
+    fitted_offset,
+    image_features,
+    observe_views,
+    psnr_of,
+)
 from foredrive.methods.reconstruction.vehicle import EgoState, LoggedVehicle
 from foredrive.runs.recipes.reconstruction import load_reconstruction_recipe
 from foredrive.runs.reconstruction.reconstruction_run import OpenedReconstruction
@@ -56,12 +65,11 @@ def trust_of(opened: OpenedReconstruction) -> Trust:
     # Without held-out frames, the training frames are the reference, and their PSNR is not known
     compared_s = held_s or trained_s
     compared_s = compared_s[:: max(1, len(compared_s) // REFERENCE_FRAMES)]
-    expected_db = fmean(expected_psnr_db(plain, vehicle, vehicle.at(t_s)) for t_s in compared_s)
+    frames = [_features(plain, vehicle, vehicle.at(t_s)) for t_s in compared_s]
     actual_db = read_summary(opened.folder / SUMMARY).get("psnr_db")
     if not (isinstance(actual_db, float) and math.isfinite(actual_db)):
-        return dataclasses.replace(plain, reference_db=expected_db)
-    offset = (expected_db - actual_db) * math.log(10) / 10
-    return dataclasses.replace(plain, offset=offset, reference_db=actual_db)
+        return replace(plain, reference_db=fmean(psnr_of(expected_errors(frame, 0.0)) for frame in frames))
+    return replace(plain, offset=fitted_offset(frames, actual_db), reference_db=actual_db)
 
 
 def trained_views(opened: OpenedReconstruction) -> ObservedViews:
@@ -82,11 +90,20 @@ def _frame_times(opened: OpenedReconstruction) -> tuple[list[float], list[float]
 
 
 @torch.no_grad()
+def _features(trust: Trust, vehicle: LoggedVehicle, ego: EgoState) -> dict[str, Float[Tensor, "N"]]:
+    """Return the features of the blocks of all cameras at a pose of the vehicle, without edits."""
+    scene, graph = trust.scene, trust.scene.graph
+    of_cameras = []
+    for camera in range(len(vehicle.rig.names)):
+        view = novel_camera_view(vehicle.rig, camera, ego)
+        image = scene.camera(graph, view.to(scene.device))
+        of_cameras.append(image_features(trust.views, scene.track_id, graph.tracks, view, image))
+    return {name: torch.cat([features[name] for features in of_cameras]) for name in of_cameras[0]}
+
+
 def expected_psnr_db(trust: Trust, vehicle: LoggedVehicle, ego: EgoState) -> float:
     """Return the expected PSNR of all cameras of the log together at a pose of the vehicle, without edits."""
-    scene, graph = trust.scene, trust.scene.graph
-    views = [novel_camera_view(vehicle.rig, camera, ego) for camera in range(len(vehicle.rig.names))]
-    return trust.psnr_db(graph, [(view, scene.camera(graph, view.to(scene.device))) for view in views])
+    return psnr_of(expected_errors(_features(trust, vehicle, ego), trust.offset))
 
 
 def place_grid(vehicle: LoggedVehicle, step_s: float) -> list[tuple[float, float, float]]:
