@@ -16,8 +16,8 @@ from foredrive.runs.reconstruction.reconstruction_run import OpenedReconstructio
 from foredrive.runs.reconstruction.trust import TrustedPlace
 from foredrive.view.table import Column, Row, Section, Table
 
-ARROW_M = 0.9
-"""Length of the arrow of a place, m: half of the distance between places."""
+ARROW_IN = 0.4
+"""Length of the arrow of a place, inches."""
 WORST_LOSS_DB = 8.0
 """Loss at the end of the colour scale."""
 
@@ -75,44 +75,38 @@ def write_trust_json(path: Path, reference_db: float, places: Sequence[TrustedPl
 def write_trust_map(
     path: Path, opened: OpenedReconstruction, reference_db: float, places: Sequence[TrustedPlace]
 ) -> None:
-    """Draw the places from above: an arrow for each heading, in the colour of the expected loss."""
-    way = opened.vehicle.T_scene_ego[:, :2, 3].numpy()
-    span = np.ptp(np.concatenate([way, np.array([place.xy for place in places])]), axis=0)
-    width = 12.0
-    figure = Figure(figsize=(width, float(np.clip(width * span[1] / max(span[0], 1.0), 3.0, 12.0)) + 1.0))
+    """Draw the places from above, beside the logged way as a straight line: an arrow for each heading."""
+    t_s, left_m, left_deg, psnr_db = (
+        np.array([getattr(place, name) for place in places])
+        for name in ("t_s", "left_m", "left_deg", "psnr_db")
+    )
+    moments = len(set(t_s.tolist()))
+    figure = Figure(figsize=(min(max(6.0, 2.0 + 1.1 * moments), 20.0), 6.5), layout="constrained")
     axes = figure.subplots()
-    axes.plot(*way.T, color="0.6", linewidth=1, zorder=0)
-    headings_rad = np.array([_heading_rad(opened, place) for place in places])
-    xy = np.array([place.xy for place in places])
-    loss_db = np.array([reference_db - place.psnr_db for place in places])
+    axes.set_facecolor("0.15")  # The middle of the colour scale is pale
+    axes.axhline(0.0, color="0.5", linewidth=1, zorder=0)
     arrows = axes.quiver(
-        *xy.T,
-        ARROW_M * np.cos(headings_rad),
-        ARROW_M * np.sin(headings_rad),
-        loss_db,
+        *(t_s, left_m, np.cos(np.radians(left_deg)), np.sin(np.radians(left_deg))),
+        reference_db - psnr_db,
         cmap="RdYlGn_r",
-        angles="xy",
-        scale_units="xy",
-        scale=1.0,
-        width=0.0014,
-        headwidth=4,
+        scale_units="inches",
+        scale=1 / ARROW_IN,
+        width=0.02,
+        units="inches",
+        headwidth=3,
     )
     arrows.set_clim(0.0, WORST_LOSS_DB)
     trusted = np.array([place.trusted for place in places])
-    x, y = xy[trusted].T
-    axes.scatter(x, y, s=6, color="0.1", zorder=3, label="trusted for some heading")
-    axes.set_aspect("equal")
-    axes.set_xlabel("m, along the first heading of the log")
-    axes.set_ylabel("m")
-    axes.set_title(
-        f"{opened.folder.name}: expected loss of PSNR against the logged way ({reference_db:.1f} dB)"
+    axes.scatter(
+        t_s[trusted], left_m[trusted], s=10, color="white", zorder=3, label="trusted for some heading"
     )
-    axes.legend(loc="upper left", frameon=False)
-    figure.colorbar(arrows, ax=axes, label="loss, dB", shrink=0.8)
+    step_s = (t_s.max() - t_s.min()) / max(moments - 1, 1) or 1.0
+    axes.set_xlim(t_s.min() - 0.3 * step_s, t_s.max() + step_s)
+    axes.set_ylim(left_m.min() - 1.0, left_m.max() + 1.0)
+    axes.set_xlabel("time of the log, s")
+    axes.set_ylabel("to the left of the logged way, m")
+    axes.set_title(f"{opened.folder.name}: expected loss against the logged way ({reference_db:.1f} dB)")
+    figure.legend(loc="outside lower left", frameon=True, facecolor="0.3", labelcolor="white")
+    figure.colorbar(arrows, ax=axes, label="loss of PSNR, dB", shrink=0.8)
     with atomic_path(path) as temporary:
-        figure.savefig(temporary, dpi=110, bbox_inches="tight", format="png")
-
-
-def _heading_rad(opened: OpenedReconstruction, place: TrustedPlace) -> float:
-    forward = opened.vehicle.at(place.t_s).T_scene_ego[:2, 0].numpy()
-    return float(np.arctan2(forward[1], forward[0]) + np.radians(place.left_deg))
+        figure.savefig(temporary, dpi=110, format="png")
