@@ -16,6 +16,7 @@ NAMES = {
     "ec": "extended comfort",
     "epdms": "EPDMS of the stage",
 }
+TRUSTED = "second.trusted_share"
 
 
 def pseudo_table(summary: Mapping[str, object]) -> Table:
@@ -27,6 +28,8 @@ def pseudo_table(summary: Mapping[str, object]) -> Table:
     ]
     both = Row(["both stages", _value(summary, "epdms"), ""], is_strong=True)
     notes = [f"{summary['starts']} starts, {summary['failed']} failed; red lights are not known"]
+    if isinstance(share := summary.get(TRUSTED), float):
+        notes.append(f"{100 * share:.0f} % of the states of the second stage have trusted images")
     return Table(columns, [Section(rows), Section([both])], notes=notes)
 
 

@@ -18,11 +18,13 @@ from foredrive.driving.epdms.pseudo_simulation import (
 )
 from foredrive.driving.epdms.world import Roads
 from foredrive.driving.ncap.running import Place
+from foredrive.driving.observation import no_images
 from foredrive.driving.replay.logged_drive import LoggedDrive
 from foredrive.driving.replay.reconstructed import ReconstructedSimulator
 from foredrive.driving.replay.replay_expert import ReplayExpert
 from foredrive.driving.simple_agents import StraightAgent, plan_of
 from foredrive.errors import InputError
+from foredrive.geometry.se3 import inverse_se3
 from foredrive.methods.reconstruction.renderer import ReconstructedRenderer
 from foredrive.methods.reconstruction.scene_graph import SceneGraph
 from foredrive.methods.reconstruction.tracks import ActorTracks
@@ -30,7 +32,7 @@ from foredrive.methods.reconstruction.vehicle import LoggedVehicle
 from foredrive.methods.splatad import Gaussians
 from foredrive.methods.splatad.content import GaussianContent
 from foredrive.methods.splatad.scene import GaussianScene
-from foredrive.scene import Category, Clip, Trajectory
+from foredrive.scene import Category, Clip, Rendered, Trajectory
 from foredrive.scene.road_map import RoadMap
 
 SPEED = 8.0
@@ -170,3 +172,28 @@ def test_failed_starts_are_counted_and_have_no_share() -> None:
     assert (figures["starts"], figures["failed"]) == (3, 2)
     assert figures["epdms"] == found.score
     assert figures_of([], failed=1)["epdms"] is None
+
+
+class TrustsThePath:
+    """A renderer without sensors that trusts places on the logged path alone."""
+
+    def __init__(self, vehicle: LoggedVehicle) -> None:
+        self.rig, self._T_world_scene = vehicle.rig, vehicle.T_world_scene
+
+    def render(self, T_world_ego: torch.Tensor, twist_ego: torch.Tensor, t_s: float) -> Rendered:
+        along = inverse_se3(self._T_world_scene) @ T_world_ego
+        return Rendered(no_images(), None, abs(float(along[1, 3])) < 0.5)
+
+
+def test_the_share_of_trusted_follow_ups_stands_beside_the_score() -> None:
+    """Of three follow-up states two lie 0.8 m beside the path."""
+    where = place()
+    where = dataclasses.replace(where, renderer=lambda graph: TrustsThePath(where.vehicle))
+    agent = StraightAgent(SPEED)
+    simulation = PseudoSimulation(where, roads(), lambda simulator: agent, 1, follow_ups=FOLLOW_UPS[3:6])
+    scored = simulation.score(2.0)
+    assert scored.trusted_share == pytest.approx(1 / 3)
+    figures = figures_of([scored, dataclasses.replace(scored, trusted_share=1.0)], 0)
+    assert figures["second.trusted_share"] == pytest.approx(2 / 3)
+    unsaid = run(lambda simulator: agent, follow_ups=FOLLOW_UPS[3:4]).score(2.0)
+    assert figures_of([unsaid], 0)["second.trusted_share"] is None

@@ -79,6 +79,8 @@ class PseudoScore:
     """Sub-scores of the first stage at the start."""
     second: tuple[DriverScores, ...]
     """Sub-scores of the follow-up states."""
+    trusted_share: float | None = None
+    """Share of the follow-up states whose images are trusted; None if the renderer does not say."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,6 +91,7 @@ class _Planned:
     scores: DriverScores
     start_m: Float64[np.ndarray, "2"]
     end_m: Float64[np.ndarray, "2"]
+    trusted_share: float | None
 
 
 class PseudoSimulation:
@@ -153,7 +156,9 @@ class PseudoSimulation:
                 )
             )
             second += [follow_up.scores for follow_up in follow_ups]
-        return PseudoScore(start_s, float(np.mean(groups)), first[1].scores, tuple(second))
+        shares = [plan.trusted_share for pair in pairs for plan in pair if plan.trusted_share is not None]
+        trusted_share = float(np.mean(shares)) if shares else None
+        return PseudoScore(start_s, float(np.mean(groups)), first[1].scores, tuple(second), trusted_share)
 
     def _planned(self, start_s: float, offset: Offset, human: bool = False) -> _Planned:
         """Return the simulated and scored plan from one state.
@@ -185,7 +190,7 @@ class PseudoSimulation:
         cos, sin = np.cos(state.yaw_rad), np.sin(state.yaw_rad)
         start_m = np.array([state.x_m, state.y_m])
         end_m = start_m + np.array([cos * xy[0] - sin * xy[1], sin * xy[0] + cos * xy[1]])
-        return _Planned(ego, scores, start_m, end_m)
+        return _Planned(ego, scores, start_m, end_m, simulator.trusted_share)
 
     def _scored(
         self,
@@ -259,6 +264,8 @@ def figures_of(scores: list[PseudoScore], failed: int) -> Mapping[str, float | i
     """Return the means over all starts. Failed starts are counted and have no share in them."""
     figures: dict[str, float | int | None] = {"starts": len(scores) + failed, "failed": failed}
     figures["epdms"] = float(np.mean([score.score for score in scores])) if scores else None
+    shares = [score.trusted_share for score in scores if score.trusted_share is not None]
+    figures["second.trusted_share"] = float(np.mean(shares)) if shares else None
     for stage, of in (
         ("first", [score.first for score in scores]),
         ("second", [entry for score in scores for entry in score.second]),

@@ -49,7 +49,8 @@ def pseudo_simulate(
     check_ready(agent)
     scores, failed = list[PseudoScore](), 0
     for run in runs:
-        place = place_in(run)
+        sensors = inputs.cameras or inputs.lidar
+        place = place_in(run, trusted=sensors)
         check_lidar_of(agent, None, place.vehicle, run)
         drive = LoggedDrive(place.vehicle, torch.eye(4))
         # an agent that cannot be made here is an error of the caller, and no failed start
@@ -62,7 +63,7 @@ def pseudo_simulate(
             roads_of(run),
             functools.partial(agent_in, agent),
             inputs.past_frames,
-            sensors=inputs.cameras or inputs.lidar,
+            sensors=sensors,
         )
         starts = simulation.starts_s(every_s)
         if not starts:
