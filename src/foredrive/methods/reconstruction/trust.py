@@ -40,6 +40,8 @@ NEAR_RAD, TINY_RAD = 0.1, 0.01
 """Angle within which a view looks from about the same direction, and up to which errors grow fast."""
 _ANGLE_COST_RAD, _RATIO_COST = 0.1, 0.3
 """Change of angle, and of the logarithm of the distance, by which a view is one unit worse as evidence."""
+MOST_VIEWS = 300
+"""Maximum number of training views that are kept: of long logs every second or third moment."""
 _NEAREST_VIEWS = 48
 """Number of training views of each image that are searched: those whose cameras look most alike."""
 _METRES_A_RAD = 15.0
@@ -99,9 +101,10 @@ def observe_views(scene: ReconstructedScene, vehicle: LoggedVehicle, t_s: Sequen
     if not rig.names:
         raise InputError("without cameras, nothing is known about images beside the logged way")
     assert rig.exposed_dt_s is not None
+    every = -(-len(t_s) * len(rig.names) // MOST_VIEWS)
     views = [
         novel_camera_view(rig, camera, vehicle.at(time_s + float(rig.exposed_dt_s[camera])))
-        for time_s in t_s
+        for time_s in t_s[::every]
         for camera in range(len(rig.names))
     ]
     size_hw = block_hw(rig.size_hw, OBSERVED_BLOCKS)
