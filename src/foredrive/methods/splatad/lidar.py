@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from foredrive.geometry.se3 import hat
 from foredrive.methods.reconstruction.gaussians import Gaussians
 from foredrive.methods.splatad.beams import sector_of
 from foredrive.methods.splatad.footprint import InSensor, footprint, in_sensor, positions_in_sensor, through
@@ -124,8 +125,8 @@ def _scanned(
     # The line through (time_s, here) at time 0
     centre = _Centre(here[0] - (time_s * velocity[:2]).T, here[1] - time_s * velocity[2], velocity)
     # Until then the axes turn by time · ω, and J (1 - time [ω]×) takes vectors in the axes at time 0.
-    turned = torch.linalg.cross(here[2], twist_lidar[None, 3:, None].expand_as(here[2]), dim=1)
-    return centre, here[2] - time_s * turned
+    turned = hat(twist_lidar[3:]) @ here[2]
+    return centre, here[2] + time_s * turned
 
 
 def _moved(
@@ -138,9 +139,8 @@ def _moved(
 
     With p' = v in a frame that moves by u and turns by ω, p'' = -ω × (2 v + u + ω × p).
     """
-    linear, turn = twist_lidar[:3, None], twist_lidar[3:, None].expand_as(position_m)
-    inner = 2 * velocity_mps + linear + torch.linalg.cross(turn, position_m, dim=0)
-    change = -torch.linalg.cross(turn, inner, dim=0)
+    turn = hat(twist_lidar[3:])
+    change = -turn @ (2 * velocity_mps + twist_lidar[:3, None] + turn @ position_m)
     # Taylor expansion to second order: p + t v + t²/2 p''
     return position_m + time_s * (velocity_mps + 0.5 * time_s * change)
 
