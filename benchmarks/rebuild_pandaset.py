@@ -12,7 +12,12 @@ from typing import Any
 
 from benchmarks.common.study import pandaset_log, work_folder
 from foredrive.engine.bench import Benchmark
-from foredrive.runs.recipes.reconstruction import ReconstructionRecipe, gaussians_tiny, rescheduled_recipe
+from foredrive.runs.recipes.reconstruction import (
+    ReconstructionRecipe,
+    gaussians_small,
+    gaussians_tiny,
+    rescheduled_recipe,
+)
 from foredrive.runs.reconstruction.reconstruct import reconstruct
 
 WORK = work_folder(Path("runs/rebuild"))
@@ -23,6 +28,7 @@ SHORTER = rescheduled_recipe(
 """Less than a third of the steps, with as much growth: the recipe that arms change in one thing each."""
 ARMS: dict[str, ReconstructionRecipe[Any]] = {
     "gaussians_tiny": RECIPE,
+    "gaussians_small": dataclasses.replace(gaussians_small(), cameras=RECIPE.cameras),
     "shorter": SHORTER,
     "static_only": dataclasses.replace(SHORTER, actors=False),
     "no_rolling_shutter": dataclasses.replace(

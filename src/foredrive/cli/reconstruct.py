@@ -58,9 +58,9 @@ def reconstruct(
         out: Folder of the run; of several logs, each has its run in SPLIT/NAME there. If it holds a run
             already, the run continues from the last checkpoint, and a finished run is kept.
         method: Representation of the scene; by default the recipe's.
-        recipe: Name of the recipe: gaussians_tiny (minutes on two cores), field_tiny (half an hour on two
-            cores), gaussians_base, gaussians_published or field_base (a GPU), or a YAML file; by default
-            METHOD_tiny.
+        recipe: Name of the recipe: gaussians_tiny (minutes on two cores), gaussians_small (a quarter of an
+            hour, better), field_tiny (half an hour), gaussians_base, gaussians_published or field_base (a
+            GPU), or a YAML file; by default METHOD_tiny.
         cameras: Use only these cameras, by their own names or 123D's, such as pcam_f0; by default the
             recipe's.
         image_size: Images are shrunk to this size (height, width), px; by default the recipe's, 270 480 or

@@ -1,6 +1,6 @@
 """Scenes of Gaussians as a representation that recipes can name."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
@@ -93,6 +93,13 @@ def tiny_gaussians() -> GaussianRecipe:
         ),
         scene=GaussianSceneConfig(CameraDecoderConfig(width=12)),
     )
+
+
+def small_gaussians() -> GaussianRecipe:
+    """Return Gaussians for a quarter of an hour on one core, with images of 480×270."""
+    tiny = tiny_gaussians()
+    schedule = replace(tiny.schedule, steps=2_000, max_gaussians=400_000, grow_from=100, grow_until=1_600)
+    return replace(tiny, schedule=schedule)
 
 
 def base_gaussians() -> GaussianRecipe:
