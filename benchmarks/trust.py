@@ -1,4 +1,4 @@
-"""How well a reconstruction knows from where its images are good: `foredrive bench trust`.
+"""Measure whether a reconstruction knows from where its images are good: `foredrive bench trust`.
 
 Drives of six towns are reconstructed from a front camera and a lidar. Held-out moments are rendered from
 random places and headings beside the logged way, and compared with the town's own sensors there. An arm

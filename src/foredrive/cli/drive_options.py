@@ -183,7 +183,7 @@ class InReconstruction:
         start: Times of the log at which drives begin, s; by default as early as possible.
         threat: Put a car in the way: it stands, comes head-on or crosses.
         edits: File of edits to the reconstructed scene.
-        stay_trusted: End a drive where the reconstruction no longer expects good sensors.
+        stay_trusted: End a drive where the reconstruction no longer expects good images.
     """
 
     reconstructed: Annotated[OptionalPath, tyro.conf.arg(name="in", metavar="RUN")] = None

@@ -50,7 +50,7 @@ def ncap(
             it, instead of testing an agent.
         sees: Show the agent only its cameras, only its lidar, or both; by default all that it takes, and a
             planner at http://HOST:PORT its cameras.
-        stay_trusted: End a run, without a score, where the reconstruction no longer expects good sensors.
+        stay_trusted: End a run, without a score, where the reconstruction no longer expects good images.
         workers: Number of runs at a time. Each worker process opens the reconstructions.
         ray: Drive on Ray: on the cluster at RAY_ADDRESS, or on a cluster that is started here.
     """

@@ -43,7 +43,7 @@ class Ending(enum.StrEnum):
     COLLISION = "collision"
     """The first collision, in safety tests alone."""
     UNTRUSTED = "untrusted"
-    """The sensors of a reconstruction were no longer trusted, in drives that are to stay where they are."""
+    """The images of a reconstruction were no longer trusted, in drives that are to stay where they are."""
     CRASHED = "crashed"
     """The agent raised an error or returned no plan. The drive is scored up to that point and counts as
     failed."""

@@ -89,7 +89,7 @@ def score_table(summary: Summary) -> Table:
         Row(["Planning time, median, ms", number(summary["plan_ms"], 0)]),
     ]
     if "trusted_share" in summary:
-        rest.append(Row(["Key frames with trusted sensors, %", _percent(summary["trusted_share"])]))
+        rest.append(Row(["Key frames with trusted images, %", _percent(summary["trusted_share"])]))
     title = f"{_number_of(summary['routes'], 'route')}, {_number_of(summary['repetitions'], 'repetition')}"
     return Table([Column(align="left"), Column()], [Section(scores), Section(wrong), Section(rest)], title)
 
@@ -148,7 +148,7 @@ def _tiles(summary: Summary) -> list[MetricTile]:
     comfortable = _percent(summary["comfortable_share"])
     if "trusted_share" in summary:
         trusted = _percent(summary["trusted_share"])
-        tiles.append(MetricTile("Trusted key frames, %", trusted, note="where good sensors are expected"))
+        tiles.append(MetricTile("Trusted key frames, %", trusted, note="where good images are expected"))
     return [
         *tiles,
         MetricTile("Failed drives", failed, note=f"of {number(summary['drives'])}"),

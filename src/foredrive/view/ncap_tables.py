@@ -35,7 +35,7 @@ def safety_table(runs: Sequence[TestedRun], left_out: Mapping[str, str]) -> Tabl
         "score: 0 to 5; in brackets 95 % intervals over runs; score by progress: mean of their product",
         "impact speed: share of the reference speed, of runs with a collision; TTC: median of the smallest "
         "time to collision of each run",
-        "trusted: share of the key frames in which the reconstruction expects good sensors; untrusted: runs "
+        "trusted: share of the key frames in which the reconstruction expects good images; untrusted: runs "
         "that ended where it does not (--stay-trusted)",
         *(f"left out, {label}: {why}" for label, why in left_out.items()),
     ]

@@ -64,7 +64,7 @@ class SafetyFigures:
     hd_score: float | None = None
     """Mean of HUGSIM's HD-Score; None without a map."""
     untrusted: int = 0
-    """Number of runs that ended where the sensors were no longer trusted. They have no score."""
+    """Number of runs that ended where the images were no longer trusted. They have no score."""
     trusted_share: float | None = None
     """Mean share of the key frames that the reconstruction trusts."""
 

@@ -33,7 +33,7 @@ class Outcome(enum.StrEnum):
     """The vehicle left the way without a collision before, so that nothing could be shown any more."""
     COLLIDED = "collided"
     UNTRUSTED = "untrusted"
-    """The vehicle left the region in which the sensors are trusted, without a collision before. It has no
+    """The vehicle left the region in which the images are trusted, without a collision before. It has no
     score."""
     FAILED = "failed"
     """The agent raised an error or returned no plan, without a collision before. It has no score."""

@@ -28,7 +28,7 @@ MIN_WAY_M = 1.0
 COLLISION = "collision"
 """Kind of the event in which the first collision ends a drive."""
 UNTRUSTED = "untrusted"
-"""Kind of the event in which a drive ends because its sensors are no longer trusted."""
+"""Kind of the event in which a drive ends because its images are no longer trusted."""
 STRUCK = "struck"
 """Kind of the event in which a replayed actor hits the ego vehicle from behind. The actor replays
 its track and cannot brake, so this is no collision of the ego vehicle."""
@@ -52,7 +52,7 @@ class ReconstructedScenario:
     contact: EgoContact = field(default_factory=EgoContact)
     """What counts as a collision."""
     stays_trusted: bool = False
-    """Whether the drive ends at the first key frame after its start that is not trusted."""
+    """If True, the drive ends at the first key frame after its start that is not trusted."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +68,7 @@ class ReconstructedState:
     outside_m: float = 0.0
     """Part of `driven_m` outside of all lanes, m."""
     trusted: tuple[bool, ...] = ()
-    """Of each key frame since the start, whether the renderer trusts it. Empty if it does not say."""
+    """True for each key frame since the start that the renderer trusts. Empty if it does not say."""
     ended: str | None = None
     """Reason why the drive is over. None while it goes on."""
 

@@ -1,16 +1,17 @@
-"""How far rendered images may be trusted, from what the cameras of the log have seen.
+"""Predict how far rendered images may be trusted, from what the cameras of the log have seen.
 
 A reconstruction shows surfaces well that its training views saw from about the same direction and no farther
 away, and guesses the others. Each block of a rendered image is looked up in the training views: was its
 surface seen, by how many of them, from which angle and distance? A gamma regression with logarithmic link
 turns this into an expected squared error. Its weights were fitted to reconstructed towns, where the true
-image is known for every pose (`benchmarks/trust.py`). Sweeps hardly get worse within 6 m of the logged way.
+image is known for every pose (`benchmarks/trust.py`). Sweeps are not predicted.
 """
 
 import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from statistics import fmean
+from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -166,47 +167,15 @@ def image_features(
         view: the camera.
         image: the rendered image.
     """
-    tracks, track_id = tracks.to("cpu"), track_id.cpu()
     height, width = size_hw = block_hw(view.size_hw)
-    depth_hw_m, alpha_hw = _centres(image, size_hw)
-    alpha, depth_m = alpha_hw.flatten(), depth_hw_m.flatten()
-    K = _scaled(view.K, view.size_hw, size_hw)
-    rays = pixels_to_rays(pixel_centres(size_hw).view(-1, 2), K, view.dist)
-    sky = alpha < 0.5
-    points_cam = rays / rays[:, 2:] * torch.where(sky, SKY_M, depth_m)[:, None]
-    range_m = points_cam.norm(dim=-1)
-    points = transform_points(view.T_scene_cam, points_cam)
-    states = states_at(tracks, view.t_s)
-    owner = actor_rows(points, torch.zeros(len(points)), states, tracks)
-    owner[sky] = STATIC
-
-    chosen = _most_alike(observed, view)
-    observed = observed[chosen]
-    # Surfaces of actors, and the camera beside them, to where the actor was when each view was exposed
-    rows = _rows_of(track_id, tracks, owner)
-    T_then_now, present = _moved_along(observed, states.T_scene_actor, owner, rows)
-    points_then = _transformed(T_then_now, points.expand(len(chosen), -1, -1))
-    eye_then = _transformed(T_then_now, view.T_scene_cam[:3, 3].expand(len(chosen), len(points), 3))
-    rows_columns = observed.depth_m.shape[1:]
-    uv, depth_then_m, inside = project(
-        transform_points(inverse_se3(observed.T_scene_cam), points_then),
-        observed.K,
-        observed.dist,
-        (rows_columns[0], rows_columns[1]),
-    )
-    u, v = (uv[..., axis].long().clamp(0, rows_columns[1 - axis] - 1) for axis in (0, 1))
-    every = torch.arange(len(chosen))[:, None]
-    shown_m, shown_alpha = observed.depth_m[every, v, u], observed.alpha[every, v, u]
-    same_surface = (shown_alpha >= 0.5) & ((depth_then_m - shown_m).abs() < SAME_SHARE * shown_m + SAME_M)
-    saw = inside & present & torch.where(sky, shown_alpha < 0.5, same_surface)
-
+    depth_m, alpha_hw = _centres(image, size_hw)
+    surfaces = _surfaces(tracks.to("cpu"), view, depth_m, alpha_hw)
+    alpha, sky, range_m = alpha_hw.flatten(), surfaces.sky, surfaces.range_m
+    saw, angle_rad, farther = _sightings(observed, track_id.cpu(), tracks.to("cpu"), view, surfaces)
     # Evidence is best from the same direction and from no farther away
-    before = points_then - observed.T_scene_cam[:, None, :3, 3]
-    angle_rad = torch.acos(F.cosine_similarity(before, points_then - eye_then, dim=-1).clamp(-1, 1))
-    farther = torch.where(sky, 0.0, (before.norm(dim=-1) / range_m).log())
     cost = angle_rad / _ANGLE_COST_RAD + farther.clamp_min(0) / _RATIO_COST
     best = torch.where(saw, cost, torch.inf).argmin(0)
-    seen, column = saw.any(0), torch.arange(len(points))
+    seen, column = saw.any(0), torch.arange(len(alpha))
     best_angle_rad = torch.where(seen, angle_rad[best, column], 0.0)
     best_farther = torch.where(seen, farther[best, column].clamp(-1, 2), 0.0)
     grey = F.interpolate(image.rgb.cpu().mean(0)[None, None], size_hw, mode="area")[0, 0]
@@ -225,11 +194,80 @@ def image_features(
         "near_views": (saw & (angle_rad < NEAR_RAD)).float().sum(0).log1p(),
         "open": (1 - alpha) * solid,
         "sky": sky.float(),
-        "actor": (owner != STATIC).float(),
+        "actor": (surfaces.owner != STATIC).float(),
         "range": range_m.log1p() * solid,
         "texture": (_steps(grey) + 0.005).log(),
-        "edge": _steps(depth_hw_m.clamp_min(0.1).log()).clamp_max(2.0),
+        "edge": _steps(depth_m.clamp_min(0.1).log()).clamp_max(2.0),
     }
+
+
+class _Surfaces(NamedTuple):
+    """What the N blocks of an image show."""
+
+    points: Float[Tensor, "N 3"]
+    """Places in the scene; sky is far away."""
+    range_m: Float[Tensor, "N"]
+    sky: Bool[Tensor, "N"]
+    owner: Int[Tensor, "N"]
+    """Row of the actor that a point lies on, or `STATIC`."""
+
+
+def _surfaces(
+    tracks: ActorTracks, view: CameraView, depth_m: Float[Tensor, "h w"], alpha: Float[Tensor, "h w"]
+) -> _Surfaces:
+    """Return what each block of an image shows, by its rendered depth."""
+    size_hw = (depth_m.shape[0], depth_m.shape[1])
+    K = _scaled(view.K, view.size_hw, size_hw)
+    rays = pixels_to_rays(pixel_centres(size_hw).view(-1, 2), K, view.dist)
+    sky = alpha.flatten() < 0.5
+    points_cam = rays / rays[:, 2:] * torch.where(sky, SKY_M, depth_m.flatten())[:, None]
+    points = transform_points(view.T_scene_cam, points_cam)
+    owner = actor_rows(points, torch.zeros(len(points)), states_at(tracks, view.t_s), tracks)
+    owner[sky] = STATIC
+    return _Surfaces(points, points_cam.norm(dim=-1), sky, owner)
+
+
+class _Sightings(NamedTuple):
+    """How V training views saw N surfaces."""
+
+    saw: Bool[Tensor, "V N"]
+    """True where the surface was in the image and not hidden."""
+    angle_rad: Float[Tensor, "V N"]
+    """Angle between the directions from which the view and the new camera see the surface."""
+    farther: Float[Tensor, "V N"]
+    """Logarithm of the view's distance in distances of the new camera; 0 for sky."""
+
+
+def _sightings(
+    observed: ObservedViews,
+    track_id: Int[Tensor, "A"],
+    tracks: ActorTracks,
+    view: CameraView,
+    surfaces: _Surfaces,
+) -> _Sightings:
+    """Look surfaces up in the training views whose cameras are most alike."""
+    observed = observed[_most_alike(observed, view)]
+    views, points, sky = len(observed.T_scene_cam), surfaces.points, surfaces.sky
+    # Surfaces of actors, and the camera beside them, to where the actor was when each view was exposed
+    T_scene_actor = states_at(tracks, view.t_s).T_scene_actor
+    rows = _rows_of(track_id, tracks, surfaces.owner)
+    T_then_now, present = _moved_along(observed, T_scene_actor, surfaces.owner, rows)
+    points_then = _transformed(T_then_now, points.expand(views, -1, -1))
+    eye_then = _transformed(T_then_now, view.T_scene_cam[:3, 3].expand(views, len(points), 3))
+    # The depth that each view has where the surface would be in its image
+    height, width = observed.depth_m.shape[1:]
+    points_cam = transform_points(inverse_se3(observed.T_scene_cam), points_then)
+    uv, depth_then_m, inside = project(points_cam, observed.K, observed.dist, (height, width))
+    u, v = uv[..., 0].long().clamp(0, width - 1), uv[..., 1].long().clamp(0, height - 1)
+    every = torch.arange(views)[:, None]
+    shown_m, shown_alpha = observed.depth_m[every, v, u], observed.alpha[every, v, u]
+    # Another depth means that something else was in front, or that this surface is not where it seems
+    same_surface = (shown_alpha >= 0.5) & ((depth_then_m - shown_m).abs() < SAME_SHARE * shown_m + SAME_M)
+    saw = inside & present & torch.where(sky, shown_alpha < 0.5, same_surface)
+    before = points_then - observed.T_scene_cam[:, None, :3, 3]
+    angle_rad = torch.acos(F.cosine_similarity(before, points_then - eye_then, dim=-1).clamp(-1, 1))
+    farther = torch.where(sky, 0.0, (before.norm(dim=-1) / surfaces.range_m).log())
+    return _Sightings(saw, angle_rad, farther)
 
 
 @torch.no_grad()
@@ -309,12 +347,12 @@ def _transformed(T: Float[Tensor, "V N 4 4"], points: Float[Tensor, "V N 3"]) ->
 
 @dataclass(frozen=True, eq=False)
 class Trust:
-    """What a reconstruction expects of its own images."""
+    """A reconstruction's expectations of its own images."""
 
     scene: ReconstructedScene
     views: ObservedViews
     offset: float
-    """How this log differs from those of the fit, see `expected_errors`."""
+    """Offset of `expected_errors`: this log differs from those of the fit."""
     reference_db: float
     """Expected PSNR along the logged way."""
 

@@ -53,7 +53,7 @@ class SafetyTests:
     sees: Sees | None = None
     """What the agent is shown of what it takes; None: all."""
     stay_trusted: bool = False
-    """Whether a run ends, without a score, where the sensors are no longer trusted."""
+    """If True, a run ends, without a score, where the images are no longer trusted."""
 
     grows = ("count",)
 

@@ -54,7 +54,7 @@ class ReconstructedRoutes:
     edits: str | None = None
     """File of edits to the scene; None: no edits."""
     stay_trusted: bool = False
-    """Whether a drive ends where the sensors are no longer trusted."""
+    """If True, a drive ends where the images are no longer trusted."""
 
     in_turn = True
     grows = ("starts_s", "threats")

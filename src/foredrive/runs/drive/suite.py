@@ -66,7 +66,7 @@ class DriveSetup:
     judge: Callable[[Drive], SafetyResult | None] = lambda drive: None
     """Scores the drive against a threat; None: there is no threat."""
     trusted_share: Callable[[], float | None] = lambda: None
-    """Returns the share of the drive's key frames whose sensors are trusted."""
+    """Returns the share of the drive's key frames whose images are trusted."""
     pilot: Pilot | None = None
     """Moves the vehicle along the plans; None: as `drive_route` does by itself."""
 
