@@ -17,6 +17,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from jaxtyping import Float
+from safetensors.torch import load_file, save_file
 from scipy import stats
 from torch import Tensor
 
@@ -33,13 +34,13 @@ from foredrive.methods.reconstruction.trust import (
     expected_errors,
     fitted_offset,
     image_features,
-    observe_views,
     psnr_of,
 )
 from foredrive.methods.reconstruction.views import CameraView, SweepView
 from foredrive.runs.recipes.reconstruction import gaussians_tiny
 from foredrive.runs.reconstruction.reconstruct import reconstruct
 from foredrive.runs.reconstruction.reconstruction_run import open_reconstruction
+from foredrive.runs.reconstruction.trust import trained_views
 
 DRIVES = {
     town: TownDrive(town, seed)
@@ -82,22 +83,21 @@ class Judged(NamedTuple):
 @functools.cache
 def judged(town: str) -> Judged:
     """Return the frames of a town; record, reconstruct and render what is missing."""
-    file, drive = WORK / f"{town}.pt", DRIVES[town]
+    file, drive = WORK / f"{town}.safetensors", DRIVES[town]
     if not file.is_file():
         folder = WORK / "rebuilt" / town
         recipe = dataclasses.replace(RECIPE, cameras=drive.cameras)
         reconstruct(recipe, drive.recorded(WORK / "towns"), folder, WORK / "cache")
         frames = _judge(drive, folder)
         with atomic_path(file) as temporary:
-            torch.save(frames._asdict(), temporary)
-    return Judged(**torch.load(file, weights_only=True))
+            save_file(frames._asdict(), temporary)
+    return Judged(**load_file(file))
 
 
 def _judge(drive: TownDrive, folder: Path) -> Judged:
     truth, run = TownTruth(drive), open_reconstruction(folder)
-    scene, vehicle, rng = run.scene, run.vehicle, np.random.default_rng(0)
-    trained_s = vehicle.t_s[::2].tolist()
-    views = observe_views(scene, vehicle, trained_s)
+    scene, rng = run.scene, np.random.default_rng(0)
+    views = trained_views(run)
     rows = []
     for frame in range(1, drive.frames, FRAMES_APART):
         aside_m, turned_deg = rng.uniform(-1, 1, (2, POSES)) * np.array([[ASIDE_M], [TURNED_DEG]])

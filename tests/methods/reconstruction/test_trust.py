@@ -153,7 +153,7 @@ def test_psnr_is_that_of_the_mean_error() -> None:
     assert psnr_of(torch.tensor([[0.001, 0.003]])) == pytest.approx(-10 * math.log10(0.002))
 
 
-def test_what_nobody_saw_is_dark_and_the_rest_is_untouched() -> None:
+def test_a_block_beside_seen_ones_is_half_of_an_unseen_area() -> None:
     """The training view looked at the left half of what is rendered; the right half is behind its wall."""
     depths = torch.full((1, *SIZE_HW), WALL_M)
     depths[..., 16:] = 4.0

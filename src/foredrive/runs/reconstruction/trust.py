@@ -1,7 +1,9 @@
 """Where the images of a reconstruction may be trusted: places and headings beside the logged way."""
 
 import itertools
+import logging
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from statistics import fmean
 
@@ -30,6 +32,7 @@ from foredrive.runs.reconstruction.reconstruction_run import OpenedReconstructio
 OFFSETS_M = (0.0, 1.0, -1.0, 2.0, -2.0, 3.0, -3.0, 4.5, -4.5, 6.0, -6.0)
 HEADINGS_DEG = (0.0, 10.0, -10.0, 20.0, -20.0)
 """Places to the left and headings to the left that are judged, beside each moment of the log."""
+_log = logging.getLogger(__name__)
 REFERENCE_FRAMES = 12
 """Number of held-out frames, spread over the log, that the expectations are compared with."""
 
@@ -67,9 +70,14 @@ def trust_of(opened: OpenedReconstruction) -> Trust:
     compared_s = compared_s[:: max(1, len(compared_s) // REFERENCE_FRAMES)]
     frames = [_features(plain, vehicle, vehicle.at(t_s)) for t_s in compared_s]
     actual_db = read_summary(opened.folder / SUMMARY).get("psnr_db")
-    if not (isinstance(actual_db, float) and math.isfinite(actual_db)):
-        return replace(plain, reference_db=fmean(psnr_of(expected_errors(frame, 0.0)) for frame in frames))
-    return replace(plain, offset=fitted_offset(frames, actual_db), reference_db=actual_db)
+    if isinstance(actual_db, float) and math.isfinite(actual_db):
+        # The summary has the mean over single images, of each camera
+        offset = fitted_offset([image for frame in frames for image in frame], actual_db)
+    else:
+        _log.warning("%s: no held-out images: what is expected is that of other logs", opened.folder)
+        offset = 0.0
+    trust = replace(plain, offset=offset)
+    return replace(trust, reference_db=fmean(_psnr_db(trust, frame) for frame in frames))
 
 
 def trained_views(opened: OpenedReconstruction) -> ObservedViews:
@@ -90,20 +98,25 @@ def _frame_times(opened: OpenedReconstruction) -> tuple[list[float], list[float]
 
 
 @torch.no_grad()
-def _features(trust: Trust, vehicle: LoggedVehicle, ego: EgoState) -> dict[str, Float[Tensor, "N"]]:
-    """Return the features of the blocks of all cameras at a pose of the vehicle, without edits."""
+def _features(trust: Trust, vehicle: LoggedVehicle, ego: EgoState) -> list[dict[str, Float[Tensor, "N"]]]:
+    """Return the features of the blocks of each camera's image at a pose of the vehicle, without edits."""
     scene, graph = trust.scene, trust.scene.graph
     of_cameras = []
     for camera in range(len(vehicle.rig.names)):
         view = novel_camera_view(vehicle.rig, camera, ego)
         image = scene.camera(graph, view.to(scene.device))
         of_cameras.append(image_features(trust.views, scene.track_id, graph.tracks, view, image))
-    return {name: torch.cat([features[name] for features in of_cameras]) for name in of_cameras[0]}
+    return of_cameras
+
+
+def _psnr_db(trust: Trust, images: Sequence[Mapping[str, Float[Tensor, "N"]]]) -> float:
+    """Return the expected PSNR of the images of all cameras at one time together, dB."""
+    return psnr_of(torch.cat([expected_errors(features, trust.offset) for features in images]))
 
 
 def expected_psnr_db(trust: Trust, vehicle: LoggedVehicle, ego: EgoState) -> float:
     """Return the expected PSNR of all cameras of the log together at a pose of the vehicle, without edits."""
-    return psnr_of(expected_errors(_features(trust, vehicle, ego), trust.offset))
+    return _psnr_db(trust, _features(trust, vehicle, ego))
 
 
 def place_grid(vehicle: LoggedVehicle, step_s: float) -> list[tuple[float, float, float]]:
