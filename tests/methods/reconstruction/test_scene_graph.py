@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from foredrive.errors import InputError
 from foredrive.geometry.se3 import exp_se3, matrix_from_yaw
+from foredrive.methods.reconstruction.edits import Remove, apply_edits
 from foredrive.methods.reconstruction.scene_graph import STATIC, SceneGraph
 from foredrive.methods.reconstruction.tracks import (
     ActorTracks,
@@ -210,3 +211,16 @@ def test_what_was_met_once_stands() -> None:
     tracks = walkers()
     once = dataclasses.replace(tracks, present=torch.tensor([[False, False, True, False]]).expand(4, 4))
     assert not bool(move_at_least(once, 0.01).any())
+
+
+def test_what_is_kept_for_drawing_places_the_same_as_what_is_trained() -> None:
+    """The static part is copied once; the actors move all the same, and an edited graph has its own copy."""
+    graph = graph_of([[1.0, 0, 0], [5.0, 5, 5], [0.0, 0, 0]], [0, STATIC, 1], two_actors())
+    shorter = apply_edits(graph, [Remove(7)]).graph
+    with torch.no_grad():
+        kept = [place_gaussians(seen, t_s) for seen in (graph, shorter) for t_s in (0.0, 0.5, 1.0)]
+    fresh = [place_gaussians(seen, t_s) for seen in (graph, shorter) for t_s in (0.0, 0.5, 1.0)]
+    assert not torch.equal(kept[0].gaussians.mean_m, kept[1].gaussians.mean_m)
+    for one, other in zip(kept, fresh, strict=True):
+        assert torch.equal(one.gaussians.mean_m, other.gaussians.mean_m)
+        assert torch.equal(one.source, other.source)
