@@ -1,6 +1,7 @@
 """The verb for safety tests, in a small log that was reconstructed: scenarios, runs that are kept, report."""
 
 import dataclasses
+import json
 import shutil
 from pathlib import Path
 
@@ -173,3 +174,19 @@ def test_a_camera_that_the_reconstruction_does_not_have_cannot_fail(
     suite = DriveSuite("stop", ReconstructedRoutes(str(reconstructed)), sensors=False, faults=faults)
     with pytest.raises(InputError, match="no camera ahed; there are ahead, left"):
         drive_suite(suite, tmp_path)
+
+
+def test_a_safety_test_says_how_much_of_it_is_trusted(
+    reconstructed: Path, scenarios: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = ["ncap", str(reconstructed), "--scenarios", str(scenarios), "--agent", "stop", "--runs", "1"]
+    assert main([*command, "--films", "0", "--stay-trusted", "--out", str(tmp_path)]) == 0
+    summary = read_summary(tmp_path / "summary.json")
+    share, untrusted = summary["threats.all.trusted_share"], summary["threats.all.untrusted"]
+    assert isinstance(share, float)
+    assert 0.0 <= share <= 1.0
+    assert (summary["threats.all.score"] is None) == (untrusted == 1)
+    assert (share < 1.0) == (untrusted == 1)
+    drive = json.loads((tmp_path / "drives" / "stationary-on_rep0.json").read_text())
+    assert drive["trusted_share"] == pytest.approx(share)
+    assert "trusted, %" in capsys.readouterr().out
