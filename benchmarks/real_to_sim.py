@@ -26,7 +26,7 @@ WORK = work_folder(Path("runs/real_to_sim"))
 MODEL = "embedded:nemo_town"
 TOWN_HW, REAL_HW = (96, 160), (108, 192)
 """Size of the images: of the model, and at least that in the camera's own proportions."""
-DRIVE = TownDrive("Town05", seed=101, seconds=10.0, cameras=tuple(SURROUND.cameras), image_hw=TOWN_HW)
+DRIVE = TownDrive("Town05", seed=101, seconds=10.0, rig=SURROUND.of_size(TOWN_HW))
 RECIPE = dataclasses.replace(gaussians_tiny(), cameras=None)
 
 

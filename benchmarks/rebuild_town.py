@@ -44,7 +44,7 @@ FEWEST = 20
 """Minimum number of changed pixels or beams of a view that counts."""
 OF_IMAGES = ("psnr_db", "ssim", "nearest.psnr_db", "nearest.ssim")
 OF_SWEEPS = ("depth_median_sq_m2", "intensity_rmse", "drop_accuracy", "chamfer_m2")
-RECIPE = dataclasses.replace(gaussians_tiny(), cameras=DRIVE.cameras, moves_m=0.0)
+RECIPE = dataclasses.replace(gaussians_tiny(), cameras=tuple(DRIVE.rig.cameras), moves_m=0.0)
 """All tracks are actors, because the edited car may stand."""
 ARMS: dict[str, ReconstructionRecipe[Any]] = {
     "gaussians": RECIPE,

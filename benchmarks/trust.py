@@ -86,7 +86,7 @@ def judged(town: str) -> Judged:
     file, drive = WORK / f"{town}.safetensors", DRIVES[town]
     if not file.is_file():
         folder = WORK / "rebuilt" / town
-        recipe = dataclasses.replace(RECIPE, cameras=drive.cameras)
+        recipe = dataclasses.replace(RECIPE, cameras=tuple(drive.rig.cameras))
         reconstruct(recipe, drive.recorded(WORK / "towns"), folder, WORK / "cache")
         frames = _judge(drive, folder)
         with atomic_path(file) as temporary:

@@ -20,7 +20,7 @@ from foredrive.methods.reconstruction.vehicle import EgoState
 from foredrive.methods.reconstruction.views import CameraView, SweepView
 from foredrive.scene.actors import ActorState
 from foredrive.scene.conditions import BackgroundTraffic
-from foredrive.sensors.rigs import camera_rig
+from foredrive.sensors.rigs import SURROUND, RigPlan, camera_rig
 from foredrive.sensors.vehicle import find_lidar
 from foredrive.towns.map.town_map import load_town_map
 from foredrive.towns.recorder import LabelOptions, record, split_of
@@ -28,6 +28,8 @@ from foredrive.towns.sensing.capture import SensorSuite
 from foredrive.towns.traffic.expert import DriveSnapshot, ExpertDrive
 from foredrive.towns.traffic.traffic import Traffic
 from foredrive.towns.world import World
+
+FRONT = RigPlan((270, 480), {"PCAM_F0": SURROUND.cameras["PCAM_F0"]})
 
 
 @dataclass(frozen=True)
@@ -41,17 +43,14 @@ class TownDrive:
     background_traffic: BackgroundTraffic = dataclasses.field(
         default_factory=lambda: BackgroundTraffic(vehicles=60, pedestrians=20)
     )
-    cameras: tuple[str, ...] = ("PCAM_F0",)
-    image_hw: tuple[int, int] = (270, 480)
+    rig: RigPlan = FRONT
     readout_s: float = 0.03
     lidar: str = "pandar64"
 
     @cached_property
     def sensors(self) -> SensorSuite:
         """Return the sensors of the vehicle."""
-        rig = camera_rig(self.image_hw, self.readout_s)
-        rows = [rig.names.index(name) for name in self.cameras]
-        return SensorSuite(dataclasses.replace(rig[rows], names=self.cameras), find_lidar(self.lidar))
+        return SensorSuite(camera_rig(None, self.readout_s, self.rig), find_lidar(self.lidar))
 
     @property
     def frames(self) -> int:

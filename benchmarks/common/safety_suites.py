@@ -14,16 +14,17 @@ from foredrive.driving.ncap.scenario import SafetyScenario
 from foredrive.driving.ncap.scenario_file import load_scenarios, save_scenarios
 from foredrive.driving.replay.threats import Threat
 from foredrive.engine.bench import study_identity
-from foredrive.engine.folder import SUMMARY
 from foredrive.errors import InputError
 from foredrive.runs.drive.in_ncap import SafetyTests, propose_scenarios
 from foredrive.runs.drive.records import tested_runs
 from foredrive.runs.drive.suite import DriveSuite, drive_suite
-from foredrive.runs.recipes.reconstruction import gaussians_tiny
+from foredrive.runs.recipes.reconstruction import gaussians_small
 from foredrive.runs.reconstruction.reconstruct import reconstruct
 from foredrive.scene.conditions import BackgroundTraffic
+from foredrive.sensors.rigs import FRONT_TELE, SURROUND, TELE, RigPlan
 
-CAMERAS = ("PCAM_F0", "PCAM_L0", "PCAM_R0", "PCAM_L1", "PCAM_R1", "PCAM_B0")
+RIG = RigPlan(SURROUND.image_hw, {**SURROUND.cameras, TELE: FRONT_TELE.cameras[TELE]})
+"""NeMo's six cameras, and the narrow one of the driver."""
 
 
 @dataclass(frozen=True)
@@ -37,18 +38,17 @@ class SuiteSize:
 
 
 def safety_drive(town: str, seed: int, seconds: float = 20.0) -> TownDrive:
-    """Return a drive to reconstruct: six cameras of 160 by 96 px and a lidar of 32 channels, at 10 Hz."""
+    """Return a drive to reconstruct: seven cameras of 256 by 144 px and a lidar of 32 channels, at 10 Hz."""
     traffic = BackgroundTraffic(vehicles=40, pedestrians=20)
-    return TownDrive(
-        town, seed, seconds, background_traffic=traffic, cameras=CAMERAS, image_hw=(96, 160), lidar="hdl32e"
-    )
+    return TownDrive(town, seed, seconds, background_traffic=traffic, rig=RIG, lidar="hdl32e")
 
 
 DRIVES = tuple(safety_drive(town, seed) for town, seed in (("Town10HD", 3), ("Town03", 4), ("Town05", 5)))
 """The drives that benchmarks of safety tests reconstruct."""
+RECIPE = dataclasses.replace(gaussians_small(), cameras=tuple(RIG.cameras), image_hw=RIG.image_hw)
 RECONSTRUCTION = {
     "drives": [dataclasses.asdict(drive) for drive in DRIVES],
-    "recipe": dataclasses.asdict(gaussians_tiny()),
+    "recipe": dataclasses.asdict(RECIPE),
 }
 WORK = Path("runs/safety_rebuilds") / study_identity(
     RECONSTRUCTION,
@@ -63,10 +63,7 @@ WORK = Path("runs/safety_rebuilds") / study_identity(
 def reconstructed_town(drive: TownDrive) -> Path:
     """Return the folder of the reconstruction of a drive; record and reconstruct what is missing."""
     folder = WORK / "rebuilt" / drive.town
-    if (folder / SUMMARY).is_file():
-        return folder  # the first step of `reconstruct` takes a minute, even if nothing is left to do
-    recipe = dataclasses.replace(gaussians_tiny(), cameras=drive.cameras, image_hw=drive.image_hw)
-    reconstruct(recipe, drive.recorded(WORK / "towns"), folder, WORK / "cache")
+    reconstruct(RECIPE, drive.recorded(WORK / "towns"), folder, WORK / "cache")
     return folder
 
 

@@ -18,9 +18,15 @@ from foredrive.methods.reconstruction.views import CameraView, SweepView
 from foredrive.runs.reconstruction.calibration_check import calibration_findings
 from foredrive.scene import Category
 from foredrive.scene.actors import ActorState
+from foredrive.sensors.rigs import SURROUND, RigPlan
 
+CAMERAS = ("PCAM_F0", "PCAM_R0")
 DRIVE = TownDrive(
-    "Town02", seed=3, seconds=6.0, rate_hz=2.0, cameras=("PCAM_F0", "PCAM_R0"), image_hw=(120, 240)
+    "Town02",
+    seed=3,
+    seconds=6.0,
+    rate_hz=2.0,
+    rig=RigPlan((120, 240), {name: SURROUND.cameras[name] for name in CAMERAS}),
 )
 AHEAD = 1_000
 """A car that is put ahead: whom traffic puts there depends on the last digits of the machine's arithmetic."""
@@ -100,7 +106,7 @@ def test_who_is_removed_or_moved_is_not_where_it_was() -> None:
 
 
 def findings(cameras: list[CameraView], sweeps: list[SweepView]) -> list[str]:
-    return [finding.text for finding in calibration_findings(DRIVE.cameras, cameras, sweeps, NOBODY)]
+    return [finding.text for finding in calibration_findings(CAMERAS, cameras, sweeps, NOBODY)]
 
 
 def test_a_right_calibration_gives_no_finding(driven: list[TrueViews]) -> None:
@@ -128,7 +134,7 @@ def test_a_camera_that_is_turned_is_told(
 ) -> None:
     cameras = moved(driven, sensor, [0.0, 0.0, 0.0, 0.0, math.radians(degrees), 0.0])
     (said,) = findings(cameras, [seen.sweep for seen in driven])
-    assert said.startswith(f"camera {DRIVE.cameras[sensor]} fits the lidar better if it is turned")
+    assert said.startswith(f"camera {CAMERAS[sensor]} fits the lidar better if it is turned")
     around = [abs(degrees) + step for step in (-0.25, 0.0, 0.25)]
     assert any(f"{degrees:.2f}° to the {side}" in said for degrees in around)
 
@@ -154,7 +160,7 @@ def test_a_camera_whose_clock_is_wrong_is_told(sensor: int, driven: list[TrueVie
         for camera in seen.cameras
     ]
     (said,) = findings(cameras, [seen.sweep for seen in driven])
-    assert said.startswith(f"camera {DRIVE.cameras[sensor]} fits the lidar better if its images are from")
+    assert said.startswith(f"camera {CAMERAS[sensor]} fits the lidar better if its images are from")
     assert any(f"{delay_s:.2f} s earlier" in said for delay_s in (0.04, 0.05, 0.06))
 
 

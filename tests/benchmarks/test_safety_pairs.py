@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks.common.reconstructed_towns import TownDrive, TownTruth
+from benchmarks.common.reconstructed_towns import FRONT, TownDrive, TownTruth
 from benchmarks.common.safety_pairs import Driven, Pair, agreement, outline, read_pair
 from benchmarks.common.safety_suites import spread
 from foredrive.driving.ncap.scenario import Polyline, SafetyScenario, ScenarioActor
@@ -61,7 +61,7 @@ def test_chosen_scenarios_are_spread_over_the_log() -> None:
 
 @pytest.fixture(scope="module")
 def truth() -> TownTruth:
-    drive = TownDrive("Town02", 3, 2.0, rate_hz=2.0, cameras=("PCAM_F0",), image_hw=(48, 80), lidar="vlp16")
+    drive = TownDrive("Town02", 3, 2.0, rate_hz=2.0, rig=FRONT.of_size((48, 80)), lidar="vlp16")
     return TownTruth(drive)
 
 
