@@ -1,13 +1,13 @@
 """Test whether a reconstructed world predicts the real one: `foredrive bench ncap-transfer`, hours.
 
 The same safety tests are driven in a town and in the reconstruction of a recorded drive there. Actors and
-traffic replay in both, so that they differ in what the sensors show alone. Each agent that looks at its
-sensors drives each test once in each world. `collision_agreement` is the share of the pairs in which both
-or neither end in a collision, and `score_correlation` is that of the scores (Pearson). Arms are
-AGENT_KIND@TOWN; without a kind or a town they are over all, and `all` is both agents. They tell where it
-breaks.
+traffic replay in both, so that they differ in what the sensors show alone. Each agent drives each test once
+in each world, and sees its own cameras or the lidar. The noise of an agent's sensors is the same in both.
+A test is a kind, a place, and the time and speed at which the actor comes; `APPROACHES` are from hardly to
+easily avoidable, so that outcomes are mixed.
 
-Pairs are kept in runs/ncap_transfer, so that an interrupted arm goes on with the next pair.
+Arms are of single towns (their drives are made there), of all towns, of single kinds and of single agents.
+Drives are kept in runs/ncap_transfer, so that an interrupted arm goes on with the next drive.
 """
 
 import dataclasses
@@ -15,25 +15,43 @@ import functools
 from pathlib import Path
 
 from benchmarks.common.reconstructed_towns import TownDrive
-from benchmarks.common.safety_pairs import Pair, PairedTests, agreement
-from benchmarks.common.safety_suites import (
-    DRIVES,
-    RECONSTRUCTION,
-    SuiteSize,
-    chosen_scenarios,
-    reconstructed_town,
-)
-from foredrive.driving.ncap.scenario_file import load_scenarios
+from benchmarks.common.safety_agreement import agreement
+from benchmarks.common.safety_pairs import Pair, PairedAgent, PairedTests, SensorNoise
+from benchmarks.common.safety_suites import DRIVES, RECONSTRUCTION, reconstructed_town, spread
+from foredrive.driving.ncap.proposing import Approach, propose
+from foredrive.driving.ncap.rules import OURS
+from foredrive.driving.ncap.scenario import SafetyScenario
+from foredrive.driving.ncap.scenario_file import load_scenarios, save_scenarios
+from foredrive.driving.ncap.self_test import self_test
 from foredrive.driving.replay.threats import Threat
 from foredrive.engine.bench import Benchmark, study_identity
+from foredrive.runs.drive.in_ncap import place_in
+from foredrive.sensors.rigs import FRONT_TELE, SURROUND, RigPlan
 
-SIZE = SuiteSize(runs=3)
-"""3 towns x 3 kinds x 4 starts x 3 runs: 108 pairs of each agent, if all kinds are feasible four times."""
-AGENTS = {"nemo_cameras": "embedded:nemo_town", "corridor_lidar": "lidar-corridor"}
+APPROACHES = {
+    Threat.STATIONARY: (Approach(2.0), Approach(3.0), Approach(4.0)),
+    Threat.FRONTAL: (Approach(2.0, 2.0), Approach(3.0, 3.0), Approach(4.0, 4.0)),
+    Threat.SIDE: (Approach(2.0, 3.0), Approach(3.0, 5.0), Approach(4.0, 7.0)),
+}
+PLACES = 3
+"""Largest number of places for each kind and approach in a town."""
+ONE = RigPlan(SURROUND.image_hw, {"PCAM_F0": SURROUND.cameras["PCAM_F0"]})
+NOISY_IMAGES, NOISY_SWEEPS = SensorNoise(pixel_std=40.0), SensorNoise(lost_beams=0.95)
+AGENTS = {
+    "nemo": PairedAgent("embedded:nemo_town", SURROUND),
+    "nemo_noisy": PairedAgent("embedded:nemo_town", SURROUND, noise=NOISY_IMAGES),
+    "driver": PairedAgent("embedded", FRONT_TELE),
+    "driver_noisy": PairedAgent("embedded", FRONT_TELE, noise=NOISY_IMAGES),
+    "idm": PairedAgent("idm:embedded", FRONT_TELE),
+    "idm_noisy": PairedAgent("idm:embedded", FRONT_TELE, noise=NOISY_IMAGES),
+    "corridor": PairedAgent("lidar-corridor", ONE, lidar=True),
+    "corridor_noisy": PairedAgent("lidar-corridor", ONE, lidar=True, noise=NOISY_SWEEPS),
+}
 CONFIG = {
     "rebuilding": RECONSTRUCTION,
-    "size": dataclasses.asdict(SIZE),
-    "agents": AGENTS,
+    "approaches": {kind.value: [dataclasses.asdict(a) for a in of] for kind, of in APPROACHES.items()},
+    "places": PLACES,
+    "agents": {name: dataclasses.asdict(agent) for name, agent in AGENTS.items()},
 }
 DECIDED_BY = (
     "benchmarks.common.safety_pairs",
@@ -56,34 +74,58 @@ def tests_in(drive: TownDrive) -> PairedTests:
     return PairedTests(drive, reconstructed_town(drive))
 
 
-def pairs_of(agent: str, drive: TownDrive) -> list[Pair]:
-    """Return the pairs of an agent in a town; drive those that are missing."""
-    return [
-        tests_in(drive).pair(
-            AGENTS[agent], scenario, number, WORK / agent / drive.town / f"{scenario.label}_rep{number}.json"
-        )
-        for scenario in load_scenarios(chosen_scenarios(reconstructed_town(drive), SIZE, WORK))
-        for number in range(SIZE.runs)
-    ]
+def scenarios_of(drive: TownDrive) -> list[SafetyScenario]:
+    """Return the tests in a town, those that pass the self-test; find them if their file is missing."""
+    file = WORK / "scenarios" / f"{drive.town}.yaml"
+    if not file.is_file():
+        place, chosen = place_in(str(reconstructed_town(drive))), list[SafetyScenario]()
+        for kind, approaches in APPROACHES.items():
+            for approach in approaches:
+                proposals = [one for one in propose(place, drive.town, approach) if one.kind is kind]
+                passed = self_test(proposals, lambda _: place, 1, OURS).passed
+                suffix = f"_{approach.impact_s:g}s_{approach.actor_mps:g}mps"
+                chosen += [dataclasses.replace(one, name=one.name + suffix) for one in spread(passed, PLACES)]
+        file.parent.mkdir(parents=True, exist_ok=True)
+        save_scenarios(chosen, file)
+    return list(load_scenarios(file))
+
+
+def pairs_in(drive: TownDrive) -> list[Pair]:
+    """Return the pairs of all agents in a town; drive those that are missing."""
+    pairs, scenarios = [], scenarios_of(drive)
+    for number, scenario in enumerate(scenarios):
+        for name, agent in AGENTS.items():
+            file = Path(name) / drive.town / f"{scenario.label}.json"
+            if not all((WORK / world / file).is_file() for world in ("town", "gaussians")):
+                print(f"{drive.town}: test {number + 1} of {len(scenarios)}, {name}", flush=True)
+            town = tests_in(drive).in_town(agent, scenario, WORK / "town" / file)
+            reconstructed = tests_in(drive).reconstructed(agent, scenario, WORK / "gaussians" / file)
+            test = f"{drive.town}/{scenario.label}"
+            pairs.append(Pair(scenario.kind.value, name, test, town, reconstructed))
+    return pairs
 
 
 def transfer(
-    agents: tuple[str, ...], drives: tuple[TownDrive, ...], kind: Threat | None, _: int
+    drives: tuple[TownDrive, ...], kind: Threat | None, agent: str | None, _: int
 ) -> dict[str, float]:
-    """Return the agreement of the pairs of some agents in some towns, of one kind or of all."""
-    pairs = [pair for drive in drives for agent in agents for pair in pairs_of(agent, drive)]
-    return agreement([pair for pair in pairs if kind is None or pair.kind == kind.value])
+    """Return the agreement of the pairs in some towns, of one kind and one agent or of all."""
+    pairs = [pair for drive in drives for pair in pairs_in(drive)]
+    return agreement(
+        [
+            pair
+            for pair in pairs
+            if (kind is None or pair.kind == kind.value) and (agent is None or pair.agent == agent)
+        ]
+    )
 
 
-EVERYONE = {"all": tuple(AGENTS), **{agent: (agent,) for agent in AGENTS}}
-EVERYWHERE = {"": DRIVES, **{f"@{drive.town}": (drive,) for drive in DRIVES}}
 BENCHMARK = Benchmark(
     question="Does a safety test in a reconstructed world predict the same test in the real one?",
     arms={
-        f"{who}{of_kind}{where}": functools.partial(transfer, agents, drives, kind)
-        for where, drives in EVERYWHERE.items()
-        for who, agents in EVERYONE.items()
-        for of_kind, kind in {"": None, **{f"_{kind}": kind for kind in Threat}}.items()
+        **{drive.town: functools.partial(transfer, (drive,), None, None) for drive in DRIVES},
+        "all": functools.partial(transfer, DRIVES, None, None),
+        **{kind.value: functools.partial(transfer, DRIVES, kind, None) for kind in Threat},
+        **{agent: functools.partial(transfer, DRIVES, None, agent) for agent in AGENTS},
     },
     seeds=(0,),
     config=CONFIG,

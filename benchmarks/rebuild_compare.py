@@ -118,7 +118,9 @@ def in_town(arm: str) -> Callable[[int], dict[str, float]]:
 
     def measure(seed: int) -> dict[str, float]:
         recipe = rescheduled_recipe(RECIPES[arm], seed=seed)
-        recipe = dataclasses.replace(recipe, cameras=DRIVE.cameras, moves_m=0.0)  # the edited car may stand
+        recipe = dataclasses.replace(
+            recipe, cameras=tuple(DRIVE.rig.cameras), moves_m=0.0
+        )  # the edited car may stand
         log, folder = DRIVE.recorded(ROOT / "town"), WORK / f"{arm}_town_seed{seed}"
         return judged_town(reconstruct(recipe, log, folder, ROOT / "cache"))
 

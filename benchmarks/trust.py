@@ -116,7 +116,7 @@ def _blocks(
 ) -> tuple[Float[Tensor, "N D"], Float[Tensor, "N"]]:
     """Return the features of the blocks of an image, and their squared errors."""
     graph, image = scene.graph, scene.camera(scene.graph, view)
-    features = image_features(views, scene.track_id, graph.tracks, view, image)
+    features = image_features(views, scene.track_id, graph, view, image)
     assert view.image is not None
     squared = (image.rgb.clamp(0, 1) - view.image / 255).square().mean(0)
     errors = torch.nn.functional.interpolate(squared[None, None], block_hw(view.size_hw), mode="area")

@@ -3,15 +3,15 @@
 import dataclasses
 import json
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from statistics import fmean
 
 import numpy as np
 import shapely
+import torch
 from jaxtyping import Float64
-from scipy import stats
 
 from benchmarks.common.reconstructed_towns import TownDrive, TownTruth
 from foredrive.driving.drive import Drive, drive_route
@@ -19,18 +19,47 @@ from foredrive.driving.dynamics import EGO, STEP_S
 from foredrive.driving.ncap.drawing import DrawnRun, draw_run
 from foredrive.driving.ncap.outcome import judge
 from foredrive.driving.ncap.rules import OURS
-from foredrive.driving.ncap.running import Place, set_up_run
+from foredrive.driving.ncap.running import Place, SafetyRun, set_up_run
 from foredrive.driving.ncap.scenario import SafetyScenario
 from foredrive.driving.ncap.self_test import run_reference
 from foredrive.driving.replay.replayed import users_at
 from foredrive.engine.summary import write_json
+from foredrive.methods.reconstruction.reconstructed import RenderedImage
+from foredrive.methods.reconstruction.renderer import ReconstructedRenderer
 from foredrive.methods.reconstruction.scene_graph import SceneGraph
 from foredrive.methods.reconstruction.tracks import ActorTracks
+from foredrive.methods.reconstruction.trust import Trust
+from foredrive.methods.reconstruction.views import CameraView
 from foredrive.runs.drive.agent_inputs import inputs_of
 from foredrive.runs.drive.in_ncap import place_in
 from foredrive.runs.drive.in_reconstruction import agent_in
-from foredrive.scene import Renderer
+from foredrive.runs.reconstruction.reconstruction_run import OpenedReconstruction, open_reconstruction
+from foredrive.runs.reconstruction.trust import trust_of
+from foredrive.scene import Agent, Clip, Renderer, Trajectory
+from foredrive.sensors.rigs import RigPlan, camera_rig
 from foredrive.towns.driving.town_replay import TownReplayRenderer
+from foredrive.towns.sensing.capture import SensorSuite
+
+
+@dataclass(frozen=True)
+class SensorNoise:
+    """Noise of an agent's sensors, the same in both worlds."""
+
+    pixel_std: float = 0.0
+    """Standard deviation of the noise of each pixel, of 255."""
+    lost_beams: float = 0.0
+    """Share of the beams of each sweep that are lost."""
+
+
+@dataclass(frozen=True)
+class PairedAgent:
+    """An agent, and the sensors that it is shown."""
+
+    agent: str
+    rig: RigPlan
+    """Its own cameras. An agent without cameras has some all the same: trust is about images."""
+    lidar: bool = False
+    noise: SensorNoise = field(default_factory=SensorNoise)
 
 
 @dataclass(frozen=True)
@@ -42,19 +71,75 @@ class Driven:
     progress: float
     min_distance_m: float
     """Smallest distance between the boxes of the ego vehicle and of the scenario's actors."""
+    trusted_share: float | None = None
+    """Share of the key frames whose images are trusted; None in the town."""
+    lost_db: float | None = None
+    """Mean over the key frames of the PSNR that is expected to be lost against the logged way."""
+    last_expected_db: float | None = None
+    last_true_db: float | None = None
+    """Expected and true PSNR of the last key frame."""
 
 
 @dataclass(frozen=True)
 class Pair:
-    """One test in the town and in its reconstruction."""
+    """One test of an agent in the town and in its reconstruction."""
 
     kind: str
+    agent: str
+    test: str
+    """Name of the test, the same for all agents."""
     town: Driven
     reconstructed: Driven
 
 
+@dataclass(frozen=True, eq=False)
+class NotedTrust(Trust):
+    """What a reconstruction expects of its images, kept image by image."""
+
+    noted_db: list[float] = field(default_factory=list)
+
+    def psnr_db(self, graph: SceneGraph, images: Sequence[tuple[CameraView, RenderedImage]]) -> float:
+        """Return the expected PSNR of the images of all cameras at one time together, dB; keep it."""
+        self.noted_db.append(super().psnr_db(graph, images))
+        return self.noted_db[-1]
+
+
+@dataclass(eq=False)
+class NoisyAgent:
+    """An agent whose newest key frame has noise. The key frames before it keep theirs.
+
+    Args:
+        agent: gets the noisy observations.
+        noise: the noise.
+        seed: seed of all draws.
+    """
+
+    agent: Agent
+    noise: SensorNoise
+    seed: int
+    _plans: int = field(default=0, init=False)
+
+    def act(self, observation: Clip) -> Trajectory:
+        """Return the agent's plan for the observation with noise."""
+        images, valid = observation.images.clone(), observation.sweeps.valid.clone()
+        newest = self._plans
+        self._plans += 1
+        for past in range(observation.now + 1):
+            # A key frame is drawn anew for each observation, from the same numbers
+            rng = torch.Generator().manual_seed(1_000 * self.seed + newest - past + 100)
+            frame = observation.now - past
+            if self.noise.pixel_std and images.numel():
+                drawn = torch.randn(images[:, frame].shape, generator=rng) * self.noise.pixel_std
+                images[:, frame] = (images[:, frame] + drawn).clamp(0, 255).to(images.dtype)
+            if self.noise.lost_beams and valid.numel():
+                kept = torch.rand(valid[:, frame].shape, generator=rng) >= self.noise.lost_beams
+                valid[:, frame] &= kept
+        sweeps = dataclasses.replace(observation.sweeps, valid=valid)
+        return self.agent.act(dataclasses.replace(observation, images=images, sweeps=sweeps))
+
+
 class PairedTests:
-    """Tests in one town. Agents, actors, and traffic are the same in both drives of a pair.
+    """Tests in one town and its reconstruction. Agents, actors, and traffic are the same in both.
 
     Args:
         drive: the recorded drive.
@@ -63,24 +148,54 @@ class PairedTests:
 
     def __init__(self, drive: TownDrive, reconstructed: Path) -> None:
         self._truth, self._place = TownTruth(drive), place_in(str(reconstructed))
+        self._opened: OpenedReconstruction = open_reconstruction(reconstructed)
+        self._trust = trust_of(self._opened)
 
-    def pair(self, agent: str, scenario: SafetyScenario, number: int, file: Path) -> Pair:
-        """Return a pair; drive it unless its file is there."""
+    def in_town(self, agent: PairedAgent, scenario: SafetyScenario, file: Path) -> Driven:
+        """Return the drive with the town's own sensors; drive it unless its file is there."""
         if file.is_file():
-            return read_pair(json.loads(file.read_text()))
-        reference_mps = run_reference(self._place, scenario, number, OURS)
-        drawn = draw_run(scenario, number)
-        in_town = dataclasses.replace(self._place, renderer=lambda graph: self._seen_by_town(graph, drawn))
-        pair = Pair(
-            scenario.kind.value,
-            self._driven(in_town, agent, scenario, number, reference_mps),
-            self._driven(self._place, agent, scenario, number, reference_mps),
+            return Driven(**json.loads(file.read_text()))
+        drawn = draw_run(scenario, 0)
+        place = dataclasses.replace(
+            self._place, renderer=lambda graph: self._seen_by_town(graph, drawn, agent)
         )
-        file.parent.mkdir(parents=True, exist_ok=True)
-        write_json(file, dataclasses.asdict(pair))
-        return pair
+        return _kept(self._driven(place, agent, scenario)[1], file)
 
-    def _seen_by_town(self, graph: SceneGraph, drawn: DrawnRun) -> Renderer:
+    def reconstructed(self, agent: PairedAgent, scenario: SafetyScenario, file: Path) -> Driven:
+        """Return the drive with rendered sensors; drive it unless its file is there."""
+        if file.is_file():
+            return Driven(**json.loads(file.read_text()))
+        rig = dataclasses.replace(camera_rig(None, 0.0, agent.rig), exposed_dt_s=None)
+        lidar = self._place.vehicle.lidar if agent.lidar else None
+        vehicle = dataclasses.replace(self._place.vehicle, rig=rig, other_names=(), lidar=lidar)
+        trust = NotedTrust(self._trust.scene, self._trust.views, self._trust.offset, self._trust.reference_db)
+        shown: list[SceneGraph] = []
+
+        def render(graph: SceneGraph) -> Renderer:
+            shown.append(graph)
+            return ReconstructedRenderer(self._opened.scene, graph, vehicle, trust)
+
+        run, driven = self._driven(dataclasses.replace(self._place, renderer=render), agent, scenario)
+        # The town as it looks from where the drive ended
+        simulator = run.simulator
+        frame = simulator.state.frames[-1]
+        town = self._seen_by_town(shown[-1], draw_run(scenario, 0), agent)
+        seen = town.render(
+            torch.from_numpy(frame.T_world_ego), torch.zeros(6), run.scenario.start_s + frame.t_s
+        )
+        error = (seen.images.double() - frame.images.double()).square().mean() / 255**2
+        past = run.scenario.past_frames
+        noted_db = trust.noted_db[past:]
+        driven = dataclasses.replace(
+            driven,
+            trusted_share=simulator.trusted_share,
+            lost_db=trust.reference_db - fmean(noted_db),
+            last_expected_db=noted_db[-1],
+            last_true_db=float(-10 * error.log10()),
+        )
+        return _kept(driven, file)
+
+    def _seen_by_town(self, graph: SceneGraph, drawn: DrawnRun, agent: PairedAgent) -> Renderer:
         """Return the town's sensors in the recorded drive with the actors of a run."""
         logged = set(self._place.graph.tracks.track_id.tolist())
         added = [number for number in graph.tracks.track_id.tolist() if number not in logged]
@@ -88,39 +203,45 @@ class PairedTests:
         truth = self._truth
         return TownReplayRenderer(
             truth.world,
-            truth.drive.sensors,
+            SensorSuite(camera_rig(None, 0.0, agent.rig), truth.drive.sensors.lidar if agent.lidar else None),
             truth.snapshots,
             graph.tracks,
             self._place.vehicle.T_world_scene,
             dict(zip(added, models, strict=True)),
         )
 
-    def _driven(
-        self, place: Place, agent: str, scenario: SafetyScenario, number: int, reference_mps: float
-    ) -> Driven:
-        past = inputs_of(agent).past_frames
-        run = set_up_run(place, scenario, number, OURS, sensors=True, past_frames=past)
-        planner = agent_in(agent, run.simulator)
+    def _driven(self, place: Place, agent: PairedAgent, scenario: SafetyScenario) -> tuple[SafetyRun, Driven]:
+        """Drive a test in one of both worlds."""
+        reference_mps = run_reference(self._place, scenario, 0, OURS)
+        past = inputs_of(agent.agent).past_frames
+        run = set_up_run(place, scenario, 0, OURS, sensors=True, past_frames=past)
+        planner = NoisyAgent(agent_in(agent.agent, run.simulator), agent.noise, scenario.start_frame)
         drive = drive_route(run.simulator, run.scenario, planner, route=scenario.label, pilot=run.pilot)
         result = judge(scenario.kind, drive, reference_mps, OURS.left_way_score)
-        graph = run.simulator.tracks
-        count = len(graph) - len(self._place.graph.tracks)
-        near_m = min_distance_m(drive, graph, count, place, run.scenario.start_s)
-        return Driven(result.outcome.value, result.score, result.progress, near_m)
+        logged = self._place.graph.all_tracks.track_id.cpu()
+        added = run.simulator.tracks.only(~torch.isin(run.simulator.tracks.track_id, logged))
+        near_m = min_distance_m(drive, added, place, run.scenario.start_s)
+        return run, Driven(result.outcome.value, result.score, result.progress, near_m)
 
 
-def min_distance_m(drive: Drive, tracks: ActorTracks, count: int, place: Place, start_s: float) -> float:
-    """Return the smallest distance of the ego vehicle from the last `count` actors in a drive, m."""
+def _kept(driven: Driven, file: Path) -> Driven:
+    """Write a drive to its file; return it."""
+    file.parent.mkdir(parents=True, exist_ok=True)
+    write_json(file, dataclasses.asdict(driven))
+    return driven
+
+
+def min_distance_m(drive: Drive, tracks: ActorTracks, place: Place, start_s: float) -> float:
+    """Return the smallest distance of the ego vehicle from some actors in a drive, m."""
     nearest = math.inf
     for index, state in enumerate(drive.states):
         users = users_at(tracks, place.vehicle.T_world_scene, start_s + index * STEP_S)
         forward = np.array([math.cos(state.yaw_rad), math.sin(state.yaw_rad)])
         centre = np.array([state.x_m, state.y_m]) + EGO.axle_to_centre_m * forward
         ego = outline(centre, state.yaw_rad, 0.5 * np.array([EGO.length_m, EGO.width_m]))
-        for row in range(len(users.track_id) - count, len(users.track_id)):
-            if users.track_id[row] >= 0:
-                other = outline(users.foot_m[row, :2], float(users.yaw[row]), users.half_lw[row])
-                nearest = min(nearest, float(ego.distance(other)))
+        for row in np.flatnonzero(users.track_id >= 0):
+            other = outline(users.foot_m[row, :2], float(users.yaw[row]), users.half_lw[row])
+            nearest = min(nearest, float(ego.distance(other)))
     return nearest
 
 
@@ -131,38 +252,3 @@ def outline(
     corners = half_lw * np.array([[1, 1], [1, -1], [-1, -1], [-1, 1]])
     cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
     return shapely.Polygon(corners @ np.array([[cos, sin], [-sin, cos]]) + centre)
-
-
-def read_pair(written: Mapping[str, Any]) -> Pair:
-    """Return a pair as `PairedTests.pair` wrote it."""
-    town, reconstructed = (Driven(**written[name]) for name in ("town", "reconstructed"))
-    return Pair(written["kind"], town, reconstructed)
-
-
-def agreement(pairs: Sequence[Pair]) -> dict[str, float]:
-    """Return how well tests in a reconstruction predict those in the town.
-
-    Pairs with a failed drive are counted and left out. Correlations are Pearson's; one without spread on one
-    side is left out, since it has no value.
-    """
-    whole = [pair for pair in pairs if pair.town.score is not None and pair.reconstructed.score is not None]
-    figures = {"pairs": float(len(whole)), "failed": float(len(pairs) - len(whole))}
-    if not whole:
-        return figures
-    collided = [[drive.outcome == "collided" for drive in (pair.town, pair.reconstructed)] for pair in whole]
-    scores = np.array([[pair.town.score, pair.reconstructed.score] for pair in whole], dtype=float)
-    away_m = np.array([[pair.town.min_distance_m, pair.reconstructed.min_distance_m] for pair in whole])
-    figures |= {
-        "collision_agreement": float(np.mean([town == reconstructed for town, reconstructed in collided])),
-        "outcome_agreement": float(np.mean([p.town.outcome == p.reconstructed.outcome for p in whole])),
-        "collisions_in_town": float(np.mean([town for town, _ in collided])),
-        "collisions_in_rebuild": float(np.mean([reconstructed for _, reconstructed in collided])),
-        "score_in_town": float(scores[:, 0].mean()),
-        "score_in_rebuild": float(scores[:, 1].mean()),
-        "score_difference": float(np.abs(scores[:, 0] - scores[:, 1]).mean()),
-        "min_distance_difference_m": float(np.median(np.abs(away_m[:, 0] - away_m[:, 1]))),
-    }
-    for name, values in (("score", scores), ("min_distance", away_m)):
-        if (np.ptp(values, axis=0) > 0).all() and np.isfinite(values).all():
-            figures[f"{name}_correlation"] = float(stats.pearsonr(*values.T).statistic)
-    return figures

@@ -122,9 +122,11 @@ def test_a_run_is_continued_and_drives(logs: list[LogPath], dataset: ClipDataset
     assert bool(plan.xy.isfinite().all())
     town = TownSimulator()
     assert isinstance(make_agent(f"student:{folder}", lambda: 0.0, town), AlternatingStudent)
-    for other in ("ego-mlp:", "idm:"):
-        with pytest.raises(InputError):  # it has no fitted MLP; the rule needs a town
-            make_agent(f"{other}{folder}", lambda: 0.0)
+    with pytest.raises(InputError, match="the run of a driver"):
+        make_agent(f"ego-mlp:{folder}", lambda: 0.0)
+    by_rule = make_agent(f"idm:{folder}", lambda: 0.0)
+    plan = by_rule.act(join([PackedClips(dataset, tmp_path / "cache/packed")[0]]).clip)
+    assert bool(plan.xy.isfinite().all())
     assert isinstance(make_agent(f"true-lights:{folder}", lambda: 0.0, town), SightDriver)
     with pytest.raises(InputError, match="true-lights:RUN"):
         make_agent(f"true-light:{folder}", lambda: 0.0, town)

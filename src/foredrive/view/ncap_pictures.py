@@ -10,7 +10,7 @@ from jaxtyping import Float64
 from foredrive.driving.dynamics import yaw_rate_radps
 from foredrive.driving.ncap.drawing import draw_run
 from foredrive.driving.ncap.placing import place_actors, way_points
-from foredrive.driving.ncap.proposing import IMPACT_S
+from foredrive.driving.ncap.proposing import Approach
 from foredrive.driving.ncap.running import Place
 from foredrive.driving.ncap.scenario import SafetyScenario
 from foredrive.driving.observation import FRAME_DT_S
@@ -23,6 +23,8 @@ from foredrive.view.bev import draw_boxes, draw_ego, start_bev
 from foredrive.view.image_drawing import Camera, draw_boxes_on_image, resize
 from foredrive.view.sheet import Sheet
 
+IMPACT_S = Approach().impact_s
+"""Time from the end of the priming to the impact of a vehicle that takes no action, s."""
 BEFORE_S = 1.5
 """Time from the picture to the impact of a vehicle that takes no action, s."""
 REACH_M = 40.0

@@ -22,7 +22,7 @@ from foredrive.methods.reconstruction.edits import (
     save_edits,
     unused_id,
 )
-from foredrive.methods.reconstruction.scene_graph import STATIC, SceneGraph
+from foredrive.methods.reconstruction.scene_graph import ANOTHER, STATIC, SceneGraph
 from foredrive.methods.splatad.content import gaussians_of
 from foredrive.methods.splatad.placing import place_gaussians
 
@@ -48,6 +48,9 @@ def test_removing_takes_the_gaussians_along() -> None:
 def test_a_copy_is_another_actor() -> None:
     edited = apply_edits(scene(), [Duplicate(7, copy=8, offset_m=(0.0, 3.0, 0.0)), Remove(7)]).graph
     assert edited.tracks.track_id.tolist() == [11, 8]
+    assert edited.looks_like.tolist() == [11, 7]
+    again = apply_edits(edited, [Duplicate(8, copy=9)]).graph
+    assert again.looks_like.tolist() == [11, 7, 7]
     placed = place_gaussians(edited, 0.0).gaussians
     assert torch.allclose(placed.mean_m[-1], torch.tensor([1.0, 3, 1]))
 
@@ -59,6 +62,7 @@ def test_an_inserted_actor_stands_on_the_same_ground() -> None:
     assert torch.allclose(pose[:3, 3], torch.tensor([0.0, 0, 1]))  # both are 2 m high
     assert torch.allclose(pose[:2, :2], -torch.eye(2), atol=1e-6)
     assert edited.tracks.category[2] == scene().tracks.category[1]
+    assert edited.looks_like.tolist() == [7, 11, ANOTHER]
 
 
 def test_a_sent_copy_goes_straight_on_all_the_time() -> None:

@@ -10,7 +10,8 @@ from torch import Tensor
 
 from foredrive.geometry.se3 import matrix_from_yaw
 from foredrive.methods.reconstruction.rendered import RenderedImage
-from foredrive.methods.reconstruction.tracks import ActorTracks
+from foredrive.methods.reconstruction.scene_graph import ANOTHER, SceneGraph
+from foredrive.methods.reconstruction.tracks import ActorTracks, joined_tracks
 from foredrive.methods.reconstruction.trust import (
     IMAGE_WEIGHTS,
     TINY_RAD,
@@ -21,6 +22,8 @@ from foredrive.methods.reconstruction.trust import (
     psnr_of,
 )
 from foredrive.methods.reconstruction.views import CameraView
+from foredrive.methods.splatad import Gaussians
+from foredrive.methods.splatad.content import GaussianContent
 from foredrive.scene import Category
 
 SIZE_HW = (16, 32)
@@ -95,9 +98,18 @@ def middle(values: Float[Tensor, "N"]) -> float:
 
 
 def features(
-    views: ObservedViews, new: CameraView, shown: RenderedImage, actors: ActorTracks = NOBODY
+    views: ObservedViews,
+    new: CameraView,
+    shown: RenderedImage,
+    actors: ActorTracks = NOBODY,
+    looks: tuple[int, ...] | None = None,
 ) -> dict[str, Float[Tensor, "N"]]:
-    return image_features(views, torch.tensor([7]), actors, new, shown)
+    content = GaussianContent(
+        Gaussians(*(torch.zeros(0, size) for size in (3, 4, 3)), torch.zeros(0), torch.zeros(0, 3)),
+        torch.zeros(0, dtype=torch.int64),
+    )
+    graph = SceneGraph(actors, content, looks=None if looks is None else torch.tensor(looks))
+    return image_features(views, torch.tensor([7]), graph, new, shown)
 
 
 def test_what_a_view_saw_is_seen_again_from_its_place() -> None:
@@ -147,6 +159,18 @@ def test_an_actor_is_looked_up_where_it_was() -> None:
     assert middle(still["unseen"]) == 1.0
     stranger = features(observed((WALL_M,), actor_m=11.0), view(), image(2 * WALL_M), tracks((11.0, 21.0), 8))
     assert (middle(stranger["actor"]), middle(stranger["unseen"])) == (1.0, 1.0)
+
+
+def test_copies_were_seen_where_the_actor_was_that_they_look_like() -> None:
+    """Two copies of the actor whose rear was 10 m ahead at 0 s: one is 20 m ahead, one behind the camera."""
+    copies = tracks((21.0, 21.0), 8)
+    behind = tracks((-99.0, -99.0), 9)
+    both = joined_tracks(behind, copies)
+    known = features(observed(actor_m=11.0), view(), image(2 * WALL_M), both, looks=(7, 7))
+    assert (middle(known["actor"]), middle(known["unseen"])) == (1.0, 0.0)
+    assert middle(known["farther_than_seen"]) == pytest.approx(-math.log(2), abs=0.01)
+    of_another_log = features(observed(actor_m=11.0), view(), image(2 * WALL_M), copies, looks=(ANOTHER,))
+    assert middle(of_another_log["unseen"]) == 1.0
 
 
 def test_psnr_is_that_of_the_mean_error() -> None:

@@ -14,7 +14,7 @@ from foredrive.scene.affordances import CELLS, TIMES, PathEstimate
 from foredrive.scene.boxes import unlabelled
 from foredrive.scene.conditions import BackgroundTraffic
 from foredrive.scene.traffic_light import LightState
-from foredrive.towns.driving.idm_agent import IdmAgent, estimated_view, true_view
+from foredrive.towns.driving.idm_agent import IdmAgent, TruePerception, estimated_view, true_view
 from foredrive.towns.driving.town import TownScenario, TownSimulator
 from foredrive.towns.map.town_map import load_town_map
 from foredrive.towns.traffic.traffic import Traffic
@@ -75,7 +75,8 @@ def test_it_waits_at_a_red_light_of_a_town_and_goes_on() -> None:
     scenario = TownScenario(
         "Town02", route, seed, lanes=(lane, onward), background_traffic=BackgroundTraffic(0, 0), limit_s=40.0
     )
-    drive = drive_route(simulator, scenario, IdmAgent(simulator), route="r")
+    truth = TruePerception(simulator)
+    drive = drive_route(simulator, scenario, IdmAgent(truth.path, truth.view), route="r")
     assert (drive.score.ending, drive.score.infractions) == (Ending.COMPLETED, ())
     speed_mps = np.array([state.speed_mps for state in drive.states])
     assert speed_mps.max() > 5.0

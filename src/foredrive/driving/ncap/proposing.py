@@ -1,7 +1,7 @@
 """Scenarios that are feasible in a reconstructed log: where and when each kind of test makes sense.
 
-Neuro-ncap's scenarios were placed by hand. Here they are found. A place is where the ego vehicle would be 4 s
-after it begins to drive itself, at constant speed on the logged path. A scenario is feasible if
+Neuro-ncap's scenarios were placed by hand. Here they are found. A place is where the ego vehicle would be
+some time after it begins to drive itself, at constant speed on the logged path. A scenario is feasible if
 
 - the log moves at the start, and the place lies on its path, so that it was seen from near;
 - the actor's way is free of the log's actors until 1 s after the impact, and the ego vehicle's up to there;
@@ -16,6 +16,7 @@ What is proposed still has to pass the self-test.
 import functools
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import shapely
@@ -37,14 +38,12 @@ from foredrive.scene import Category
 
 PRIMING_FRAMES, EVERY_FRAMES = 2, 2
 """Priming of each test, and distance between two starts that are tried, key frames."""
-IMPACT_S, AFTERWARDS_S, LENGTH_S = 4.0, 1.0, 8.0
-"""Time from the end of the priming to the impact without action, shortest time left in the log afterwards,
-and longest length of a test, s."""
+AFTERWARDS_S, LENGTH_S = 1.0, 8.0
+"""Shortest time left in the log after the impact, and longest length of a test, s."""
 HIDDEN_BEFORE_S, ON_LANE_S = 2.0, 1.5
 """Time before the impact from which the actor must be in sight, and time around it on a lane, s."""
 MIN_MPS, BRAKING_MPS2, REACTION_S = 3.0, 4.0, 1.0
 """Slowest start, m/s, braking that passes a test, m/s², and time before it begins, s."""
-ACTOR_MPS = 5.0
 SEEN_WITHIN_M, BODY_M = 20.0, 2.7
 """A copied car was seen from within this distance, m. Nothing is nearer to its middle than `BODY_M` on a free
 way, half a car's length and some margin."""
@@ -54,11 +53,23 @@ MODELS = 3
 """Number of cars to choose from."""
 
 
-def propose(place: Place, scene: str) -> list[SafetyScenario]:
+@dataclass(frozen=True)
+class Approach:
+    """How the actor of a proposed test comes to the place of the impact."""
+
+    impact_s: float = 4.0
+    """Time from the end of the priming to the impact without action."""
+    actor_mps: float = 5.0
+    """Speed of an actor that comes head-on or crosses."""
+
+
+def propose(place: Place, scene: str, approach: Approach = Approach()) -> list[SafetyScenario]:
     """Return the feasible scenarios of a reconstructed log, in the order of their starts.
 
     Args:
+        place: the log.
         scene: name of the reconstruction in the scenarios.
+        approach: time and speed of the actor.
 
     Raises:
         InputError: no car that is an actor of its own was seen from near.
@@ -71,12 +82,13 @@ def propose(place: Place, scene: str) -> list[SafetyScenario]:
     for frame in range(first, int(drive.end_s / FRAME_DT_S), EVERY_FRAMES):
         begin_s = FRAME_DT_S * (frame + PRIMING_FRAMES)
         length_s = min(LENGTH_S, FRAME_DT_S * math.floor((drive.end_s - FRAME_DT_S * frame) / FRAME_DT_S))
-        if begin_s + IMPACT_S + AFTERWARDS_S > FRAME_DT_S * frame + length_s:
+        if begin_s + approach.impact_s + AFTERWARDS_S > FRAME_DT_S * frame + length_s:
             break
         speed_mps, path = drive.state_at(begin_s).speed_mps, _path_from(drive, begin_s)
         for kind in Threat:
-            actor = _actor(kind, path, speed_mps, begin_s, models)
-            if actor is not None and _feasible(place, drive, others_at, actor, begin_s):
+            actor = _actor(kind, path, speed_mps, begin_s, approach, models)
+            impact_s = begin_s + approach.impact_s
+            if actor is not None and _feasible(place, drive, others_at, actor, begin_s, impact_s):
                 name = f"{scene}_{FRAME_DT_S * frame:g}s"
                 proposals.append(SafetyScenario(name, kind, scene, frame, length_s, (actor,), PRIMING_FRAMES))
     return proposals
@@ -109,20 +121,21 @@ def _actor(
     path: Float64[np.ndarray, "N 3"],
     speed_mps: float,
     begin_s: float,
+    approach: Approach,
     models: Sequence[str],
 ) -> ScenarioActor | None:
     """Return the actor of a test. None if the log is too slow, or its path too short for it."""
     arc_m = arc_lengths(path[:, :2])
     bumper_m = EGO.axle_to_centre_m + 0.5 * EGO.length_m
-    # Where the front bumper would be at constant speed after `IMPACT_S`
-    at_m = speed_mps * IMPACT_S + bumper_m
+    # Where the front bumper would be at constant speed at the time of the impact
+    at_m = speed_mps * approach.impact_s + bumper_m
     if speed_mps < MIN_MPS or at_m + 4.0 > arc_m[-1]:
         return None
     # The spot of the impact and the heading of the path there
     before, spot, after = points_at(path, arc_m, np.array([at_m - 0.5, at_m, at_m + 0.5]))
     yaw = float(math.atan2(after[1] - before[1], after[0] - before[0]))
     x, y, z = spot.tolist()
-    impact_s, names = begin_s + IMPACT_S, tuple(models)
+    impact_s, names = begin_s + approach.impact_s, tuple(models)
     shift = Jitter(yaw, longitudinal_m=2.0, lateral_m=0.5)
     # A standing car with its rear at the spot, about half its length further on
     if kind is Threat.STATIONARY:
@@ -131,9 +144,9 @@ def _actor(
         return ScenarioActor(names, Rectilinear(centre, impact_s, yaw), yaw, jitter=standing)
     # From the right, so that it is at the spot at the time of the impact
     if kind is Threat.SIDE:
-        way = Rectilinear((x, y, z), impact_s, yaw + 0.5 * math.pi, ACTOR_MPS)
+        way = Rectilinear((x, y, z), impact_s, yaw + 0.5 * math.pi, approach.actor_mps)
         return ScenarioActor(names, way, jitter=Jitter(yaw, longitudinal_m=0.5, lateral_m=0.5))
-    return _oncoming(path, arc_m, at_m, impact_s, names, shift)
+    return _oncoming(path, arc_m, at_m, impact_s, approach.actor_mps, names, shift)
 
 
 def _oncoming(
@@ -141,6 +154,7 @@ def _oncoming(
     arc_m: Float64[np.ndarray, "N"],
     at_m: float,
     impact_s: float,
+    actor_mps: float,
     names: tuple[str, ...],
     shift: Jitter,
 ) -> ScenarioActor:
@@ -148,7 +162,7 @@ def _oncoming(
     # Backwards from the spot along the logged path, at constant speed
     ahead_m = np.arange(0.0, min(float(arc_m[-1]) - at_m, 30.0), 2.0)
     points = points_at(path, arc_m, at_m + ahead_m[::-1])
-    times = impact_s - ahead_m[::-1] / ACTOR_MPS
+    times = impact_s - ahead_m[::-1] / actor_mps
     way = Polyline(tuple(times.tolist()), tuple((x, y, z) for x, y, z in points.tolist()))
     return ScenarioActor(names, way, jitter=shift)
 
@@ -159,19 +173,20 @@ def _feasible(
     others_at: Callable[[float], shapely.Geometry],
     actor: ScenarioActor,
     begin_s: float,
+    impact_s: float,
 ) -> bool:
     """Return whether the ways of actor and ego vehicle are free, and the actor is seen in time.
 
     Args:
         others_at: returns the boxes of the log's actors at a time.
-        begin_s: end of the priming, s.
+        begin_s, impact_s: times of the log at which the priming ends and the impact is, s.
     """
     way = actor.way if isinstance(actor.way, Polyline) else actor.way.polyline()
     speed_mps = drive.state_at(begin_s).speed_mps
     # Reaction and comfortable braking must fit into the way to the impact
-    if speed_mps * REACTION_S + speed_mps**2 / (2 * BRAKING_MPS2) > speed_mps * IMPACT_S:
+    if speed_mps * REACTION_S + speed_mps**2 / (2 * BRAKING_MPS2) > speed_mps * (impact_s - begin_s):
         return False
-    end_s = begin_s + IMPACT_S + AFTERWARDS_S
+    end_s = impact_s + AFTERWARDS_S
     for t_s in np.arange(begin_s, end_s + 1e-6, FRAME_DT_S).tolist():
         others = others_at(t_s)
         # The actor's body must be free at all times
@@ -179,14 +194,14 @@ def _feasible(
         if shapely.Point(foot).buffer(BODY_M).intersects(others):
             return False
         # Around the impact the actor must be on a lane
-        near = abs(t_s - begin_s - IMPACT_S) <= ON_LANE_S
+        near = abs(t_s - impact_s) <= ON_LANE_S
         if near and place.lanes is not None and place.lanes.outside(foot):
             return False
         # Until the impact: the ego vehicle's way is free, and shortly before it the actor is in sight
-        if t_s <= begin_s + IMPACT_S:
+        if t_s <= impact_s:
             ego = shapely.Point(drive.pose_at(t_s)[:2, 3]).buffer(0.5 * EGO.width_m)
             sight = shapely.LineString([drive.pose_at(t_s)[:2, 3], foot])
-            late = t_s >= begin_s + IMPACT_S - HIDDEN_BEFORE_S
+            late = t_s >= impact_s - HIDDEN_BEFORE_S
             if ego.intersects(others) or (late and sight.intersects(others)):
                 return False
     return True

@@ -16,7 +16,7 @@ from torch import Tensor
 from foredrive.errors import InputError
 from foredrive.files import atomic_path
 from foredrive.geometry.se3 import inverse_se3, matrix_from_yaw
-from foredrive.methods.reconstruction.scene_graph import SceneGraph
+from foredrive.methods.reconstruction.scene_graph import ANOTHER, SceneGraph
 from foredrive.methods.reconstruction.tracks import ActorTracks
 
 Offset = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
@@ -213,7 +213,12 @@ def _moved(tracks: ActorTracks, row: int, offset_m: Offset, yaw_rad: float) -> A
 
 def _without(graph: SceneGraph, row: int) -> SceneGraph:
     others = torch.arange(len(graph.tracks)) != row
-    return dataclasses.replace(graph, tracks=graph.tracks.only(others), content=graph.content.without(row))
+    return dataclasses.replace(
+        graph,
+        tracks=graph.tracks.only(others),
+        content=graph.content.without(row),
+        looks=graph.looks_like[others],
+    )
 
 
 def _with_copy(
@@ -236,6 +241,9 @@ def _with_copy(
         raise InputError(f"actor {actor} cannot be copied here: {error}") from error
     # Boxes are posed by their centre: half the difference of the heights keeps the copy on the ground
     lift_m = 0.5 * float(source.tracks.size_lwh[row, 2] - tracks.size_lwh[way, 2])
+    looks = graph.looks_like[row : row + 1]
+    if source is not graph:
+        looks = tracks.track_id.new_tensor([ANOTHER])
     forward_m, left_m, up_m = offset_m
     pose = tracks.T_scene_actor[way] @ _offset((forward_m, left_m, up_m + lift_m), yaw_rad).to(
         tracks.size_lwh
@@ -252,6 +260,7 @@ def _with_copy(
             present=torch.cat([tracks.present, tracks.present[way : way + 1]]),
         ),
         content=content,
+        looks=torch.cat([graph.looks_like, looks]),
     )
 
 

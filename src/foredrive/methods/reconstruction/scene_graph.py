@@ -8,6 +8,8 @@ from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 import torch
+from jaxtyping import Int
+from torch import Tensor
 
 from foredrive.errors import InputError
 from foredrive.methods.reconstruction.gaussians import Gaussians
@@ -16,6 +18,8 @@ from foredrive.scene.record import Record
 
 STATIC = -1
 """Row number of the static part, which belongs to no actor."""
+ANOTHER = -1
+"""In place of an id: the actor is of another log."""
 
 
 @runtime_checkable
@@ -60,6 +64,14 @@ class SceneGraph(Record):
     obstacles: ActorTracks | None = None
     """Tracks whose looks belong to the static part, such as those of parked vehicles. They are in the way all
     the same. Key times are those of `tracks`."""
+    looks: Int[Tensor, "A"] | None = None
+    """Ids of the log's actors that the actors look like, `ANOTHER` for one of another log. None: without
+    edits, each looks like itself."""
+
+    @property
+    def looks_like(self) -> Int[Tensor, "A"]:
+        """Return the id of the log's actor that each actor looks like; `ANOTHER` for one of another log."""
+        return self.tracks.track_id if self.looks is None else self.looks
 
     @property
     def all_tracks(self) -> ActorTracks:

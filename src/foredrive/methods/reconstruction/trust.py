@@ -154,7 +154,7 @@ def _centres(
 def image_features(
     observed: ObservedViews,
     track_id: Int[Tensor, "A"],
-    tracks: ActorTracks,
+    graph: SceneGraph,
     view: CameraView,
     image: RenderedImage,
 ) -> dict[str, Float[Tensor, "N"]]:
@@ -163,15 +163,18 @@ def image_features(
     Args:
         observed: the training views.
         track_id: ids of the actors in `observed`.
-        tracks: the actors of the rendered scene, edits included. Those with other ids were never seen.
+        graph: the scene, or an edited version of it, that was rendered. Copies were seen where the actors
+            were that they look like; actors of other logs were never seen.
         view: the camera.
         image: the rendered image.
     """
     height, width = size_hw = block_hw(view.size_hw)
     depth_m, alpha_hw = _centres(image, size_hw)
-    surfaces = _surfaces(tracks.to("cpu"), view, depth_m, alpha_hw)
+    tracks = graph.tracks.to("cpu")
+    surfaces = _surfaces(tracks, view, depth_m, alpha_hw)
+    rows = _rows_of(track_id.cpu(), graph.looks_like.cpu(), surfaces.owner)
     alpha, sky, range_m = alpha_hw.flatten(), surfaces.sky, surfaces.range_m
-    saw, angle_rad, farther = _sightings(observed, track_id.cpu(), tracks.to("cpu"), view, surfaces)
+    saw, angle_rad, farther = _sightings(observed, rows, tracks, view, surfaces)
     # Evidence is best from the same direction and from no farther away
     cost = angle_rad / _ANGLE_COST_RAD + farther.clamp_min(0) / _RATIO_COST
     best = torch.where(saw, cost, torch.inf).argmin(0)
@@ -240,17 +243,24 @@ class _Sightings(NamedTuple):
 
 def _sightings(
     observed: ObservedViews,
-    track_id: Int[Tensor, "A"],
+    rows: Int[Tensor, "N"],
     tracks: ActorTracks,
     view: CameraView,
     surfaces: _Surfaces,
 ) -> _Sightings:
-    """Look surfaces up in the training views whose cameras are most alike."""
+    """Look surfaces up in the training views whose cameras are most alike.
+
+    Args:
+        observed: the training views.
+        rows: of `_rows_of`.
+        tracks: the actors of the rendered scene.
+        view: the camera.
+        surfaces: what the blocks show.
+    """
     observed = observed[_most_alike(observed, view)]
     views, points, sky = len(observed.T_scene_cam), surfaces.points, surfaces.sky
     # Surfaces of actors, and the camera beside them, to where the actor was when each view was exposed
     T_scene_actor = states_at(tracks, view.t_s).T_scene_actor
-    rows = _rows_of(track_id, tracks, surfaces.owner)
     T_then_now, present = _moved_along(observed, T_scene_actor, surfaces.owner, rows)
     points_then = _transformed(T_then_now, points.expand(views, -1, -1))
     eye_then = _transformed(T_then_now, view.T_scene_cam[:3, 3].expand(views, len(points), 3))
@@ -288,7 +298,7 @@ def darkened(
         image: the rendered image.
     """
     # Single blocks at the edges of objects stay bright, since their neighbours were seen
-    unseen = image_features(observed, scene.track_id, graph.tracks, view, image)["unseen_area"]
+    unseen = image_features(observed, scene.track_id, graph, view, image)["unseen_area"]
     light = 1 - DARK * unseen.view(block_hw(view.size_hw)).to(image.rgb)
     light = F.interpolate(light[None, None], view.size_hw, mode="bilinear", align_corners=False)[0]
     return dataclasses.replace(image, rgb=image.rgb * light)
@@ -313,10 +323,15 @@ def _most_alike(observed: ObservedViews, view: CameraView) -> Int[Tensor, "n"]:
     return (away_m / _METRES_A_RAD + turned).argsort(stable=True)[:_NEAREST_VIEWS]
 
 
-def _rows_of(track_id: Int[Tensor, "A"], tracks: ActorTracks, owner: Int[Tensor, "N"]) -> Int[Tensor, "N"]:
-    """Return the row in `track_id` of the actor of each point; A for the static part, A + 1 for others."""
+def _rows_of(
+    track_id: Int[Tensor, "A"], looks: Int[Tensor, "B"], owner: Int[Tensor, "N"]
+) -> Int[Tensor, "N"]:
+    """Return the row in `track_id` of the actor that the owner of each point looks like.
+
+    A stands for the static part, A + 1 for actors of other logs.
+    """
     count = len(track_id)
-    same = tracks.track_id[:, None].cpu() == track_id
+    same = looks[:, None] == track_id
     row = torch.where(same.any(-1), same.float().argmax(-1) if count else 0, count + 1)
     # The row behind the last actor is the static part's, which STATIC = -1 indexes
     return torch.cat([row, torch.tensor([count])])[owner]
@@ -331,9 +346,9 @@ def _moved_along(
     """Return the motion of each point's actor from now to each view's time, and whether it was present."""
     views = len(observed.T_scene_cam)
     T_then_now = torch.eye(4).repeat(views, len(rows), 1, 1)
-    for row in rows[rows < observed.present.shape[1]].unique().tolist():
-        mine = rows == row
-        now = inverse_se3(T_scene_actor[owner[mine][0]])
+    for actor in owner[rows < observed.present.shape[1]].unique().tolist():
+        mine = owner == actor
+        row, now = rows[mine][0], inverse_se3(T_scene_actor[actor])
         T_then_now[:, mine] = (observed.T_scene_actor[:, row] @ now)[:, None]
     # The static part is always present; an actor that was never seen is not, and its points stay in place
     present = torch.cat([observed.present, torch.tensor([[True, False]]).expand(views, 2)], 1)
@@ -365,7 +380,7 @@ class Trust:
             view: the camera.
             image: the rendered image.
         """
-        features = image_features(self.views, self.scene.track_id, graph.tracks, view, image)
+        features = image_features(self.views, self.scene.track_id, graph, view, image)
         return expected_errors(features, self.offset).view(block_hw(view.size_hw))
 
     def psnr_db(self, graph: SceneGraph, images: Sequence[tuple[CameraView, RenderedImage]]) -> float:

@@ -1,5 +1,6 @@
 """The inputs that agents require: sensors, key frames, the cameras of their training."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from foredrive.driving.observation import FRAME_DT_S
@@ -70,6 +71,19 @@ def rig_of(agent: str) -> RigPlan:
     """Return the rig that most of an agent's training logs have; the surround rig if the agent has none."""
     rigs = _rigs_of(agent)
     return SURROUND if rigs is None else rigs.usual
+
+
+def chosen_cameras(agent: str, cameras: Sequence[str]) -> list[str]:
+    """Return the cameras that an agent is shown, in lower case: those that it requires, or else all.
+
+    Of a rig that has more than all cameras of the agent's training, these are chosen.
+    """
+    names = [camera.lower() for camera in cameras]
+    if (required := inputs_of(agent).camera_names) is not None:
+        return [camera.lower() for camera in required]
+    rigs = _rigs_of(agent)
+    usual = set(names) if rigs is None else {camera.lower() for camera in rigs.usual.cameras}
+    return [name for name in names if name in usual] if usual <= set(names) else names
 
 
 def check_rig_of(agent: str, rig: RigPlan) -> None:

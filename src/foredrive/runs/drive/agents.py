@@ -63,9 +63,10 @@ def _build_expert(setup: AgentSetup) -> "Agent":
 
 
 def _build_idm(setup: AgentSetup) -> "Agent":
-    from foredrive.towns.driving.idm_agent import IdmAgent
+    from foredrive.towns.driving.idm_agent import IdmAgent, TruePerception
 
-    return IdmAgent(setup.in_town())
+    truth = TruePerception(setup.in_town())
+    return IdmAgent(truth.path, truth.view)
 
 
 def _straight_on(speed_mps: float) -> Callable[[AgentSetup], "Agent"]:
@@ -120,11 +121,14 @@ def _build_run(setup: AgentSetup) -> "Agent":
 
 
 def _build_rules_by_sight(setup: AgentSetup) -> "Agent":
-    from foredrive.driver.agent import Perception
+    from foredrive.driver.agent import Perception, given_path
     from foredrive.runs.drive.seeing_agents import driver_of
-    from foredrive.towns.driving.idm_agent import IdmAgent
+    from foredrive.towns.driving.idm_agent import IdmAgent, TruePerception, estimated_view
 
-    return IdmAgent(setup.in_town(), Perception(driver_of(setup.folder)))
+    perceive = Perception(driver_of(setup.folder))
+    # Without a town, the route is as far known as the observation tells it
+    path = given_path if setup.town is None else TruePerception(setup.town).path
+    return IdmAgent(path, lambda observation, _: estimated_view(perceive(observation)[0]))
 
 
 def _partly_true(*, lights: bool, users: bool) -> Callable[[AgentSetup], "Agent"]:

@@ -26,7 +26,7 @@ from foredrive.methods.reconstruction.edits import Edit, load_edits
 from foredrive.methods.reconstruction.renderer import ReconstructedRenderer
 from foredrive.methods.reconstruction.trust import Trust
 from foredrive.methods.reconstruction.vehicle import LoggedVehicle
-from foredrive.runs.drive.agent_inputs import inputs_of
+from foredrive.runs.drive.agent_inputs import chosen_cameras, inputs_of
 from foredrive.runs.drive.agents import CORRIDOR, EXPERT, REPLAY, Sees, is_remote, make_agent
 from foredrive.runs.drive.suite import DriveJob, DriveSetup, DriveSuite
 from foredrive.runs.reconstruction.reconstruction_run import (
@@ -234,5 +234,5 @@ def _agent_in(name: str, simulator: ReconstructedSimulator, sees: Sees | None) -
         return CorridorAgent(simulator.drive)
     agent = make_agent(name, lambda: simulator.state.t_s, sees=sees)
     cameras = [camera.lower() for camera in simulator.renderer.rig.names]
-    wanted = [camera.lower() for camera in inputs_of(name).camera_names or cameras]
+    wanted = chosen_cameras(name, cameras)
     return _SelectedCameras(agent, camera_indices(cameras, wanted)) if wanted != cameras else agent

@@ -105,7 +105,7 @@ def _features(trust: Trust, vehicle: LoggedVehicle, ego: EgoState) -> list[dict[
     for camera in range(len(vehicle.rig.names)):
         view = novel_camera_view(vehicle.rig, camera, ego)
         image = scene.camera(graph, view.to(scene.device))
-        of_cameras.append(image_features(trust.views, scene.track_id, graph.tracks, view, image))
+        of_cameras.append(image_features(trust.views, scene.track_id, graph, view, image))
     return of_cameras
 
 

@@ -33,27 +33,20 @@ PROBABLE = 0.5
 class IdmAgent:
     """An `Agent` on the route's line that keeps its distance by the intelligent driver model.
 
-    It knows the route and its place on it. Lights and road users come from the simulator, where the latter
-    go on at constant velocity, or from `perceive`.
-
     Args:
-        simulator: the town that it drives in.
-        perceive: returns what is perceived in an observation of a batch of one; None reads the simulator.
+        path: returns the route ahead in an observation of a batch of one.
+        view: returns what is on that route: the truth, or what is perceived.
     """
 
     def __init__(
-        self, simulator: TownSimulator, perceive: Callable[[Clip], PathEstimate] | None = None
+        self, path: Callable[[Clip], PathAhead], view: Callable[[Clip, PathAhead], PathView]
     ) -> None:
-        self._truth, self._perceive = TruePerception(simulator), perceive
+        self._path, self._view = path, view
 
     def act(self, observation: Clip) -> Trajectory:
         """Return the plan for an observation of a batch of one."""
-        clip = observation[0]
-        path = self._truth.path(clip)
-        if self._perceive is None:
-            view = self._truth.view(clip, path)
-        else:
-            view = estimated_view(self._perceive(observation)[0])
+        clip, path = observation[0], self._path(observation)
+        view = self._view(observation, path)
         along_m = rule_progress(path, float(clip.ego_speed_mps[clip.now]), view)
         return plan_of(torch.from_numpy(waypoints_along(path, along_m)).float()[None, None])
 
@@ -70,22 +63,23 @@ class TruePerception:
 
     def __call__(self, observation: Clip) -> PathEstimate:
         """Return the view of an observation of a batch of one as an estimate that is sure."""
-        clip = observation[0]
-        view = self.view(clip, self.path(clip))
+        view = self.view(observation, self.path(observation))
         return PathEstimate(
             torch.eye(4)[[view.light]],
             torch.tensor([view.light_m]),
             torch.from_numpy(view.occupied).float()[None],
         )
 
-    def path(self, clip: Clip) -> PathAhead:
-        """Return the route ahead of an unbatched observation."""
+    def path(self, observation: Clip) -> PathAhead:
+        """Return the route ahead of an observation of a batch of one."""
+        clip = observation[0]
         xyz = self._simulator.scenario.route_xyz
         T_world_ego = clip.T_world_ego[clip.now].numpy()
         return path_ahead(xyz, arc_lengths(xyz), self._simulator.done_m, T_world_ego, FRONT_M)
 
-    def view(self, clip: Clip, path: PathAhead) -> PathView:
+    def view(self, observation: Clip, path: PathAhead) -> PathView:
         """Return what is on a path: the state of its light, and boxes that go on at constant velocity."""
+        clip = observation[0]
         light, light_m = self._light(path, clip.T_world_ego[clip.now].numpy())
         return true_view(clip.boxes[clip.now], path, light, light_m)
 
