@@ -69,8 +69,9 @@ WORK = Path("runs/ncap_transfer") / study_identity(CONFIG, DECIDED_BY)
 
 
 @functools.lru_cache(maxsize=1)
-def tests_in(drive: TownDrive) -> PairedTests:
+def tests_in(town: str) -> PairedTests:
     """Return the paired tests of one town; the next town replaces it."""
+    drive = next(drive for drive in DRIVES if drive.town == town)
     return PairedTests(drive, reconstructed_town(drive))
 
 
@@ -98,8 +99,8 @@ def pairs_in(drive: TownDrive) -> list[Pair]:
             file = Path(name) / drive.town / f"{scenario.label}.json"
             if not all((WORK / world / file).is_file() for world in ("town", "gaussians")):
                 print(f"{drive.town}: test {number + 1} of {len(scenarios)}, {name}", flush=True)
-            town = tests_in(drive).in_town(agent, scenario, WORK / "town" / file)
-            reconstructed = tests_in(drive).reconstructed(agent, scenario, WORK / "gaussians" / file)
+            town = tests_in(drive.town).in_town(agent, scenario, WORK / "town" / file)
+            reconstructed = tests_in(drive.town).reconstructed(agent, scenario, WORK / "gaussians" / file)
             test = f"{drive.town}/{scenario.label}"
             pairs.append(Pair(scenario.kind.value, name, test, town, reconstructed))
     return pairs
