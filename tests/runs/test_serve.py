@@ -24,9 +24,11 @@ from foredrive.errors import InputError
 from foredrive.integrations.remote import planner_client
 from foredrive.integrations.remote.json_http import ask
 from foredrive.json_server import Address, JsonServer
+from foredrive.methods.reconstruction.trust import TRUSTED_LOSS_DB
 from foredrive.runs.drive.in_ncap import SafetyTests
 from foredrive.runs.drive.in_reconstruction import opened_reconstruction
 from foredrive.runs.drive.suite import DriveSuite, drive_suite
+from foredrive.runs.reconstruction.trust import trust_of
 from foredrive.runs.serve import alpasim_server_of, planner_of, renderer_of
 
 
@@ -140,6 +142,9 @@ def test_the_renderer_serves_images_sweeps_and_actors(reconstructed: Path) -> No
         pose = (T_world_ego @ np.array(sensors["camera2ego"][0])).tolist()
         asked = {"pose": pose, "timestamp": at_us, "camera_name": "ahead"}
         before = tensors(text_of(address, "/render_image", asked))
+        here = ask(address, "/trust", asked)
+        back = (T_world_ego @ np.diag([-1.0, -1.0, 1.0, 1.0]) @ np.array(sensors["camera2ego"][0])).tolist()
+        turned = ask(address, "/trust", {**asked, "pose": back})
         lidar = {"pose": (T_world_ego @ np.array(sensors["lidar2ego"])).tolist(), "timestamp": at_us}
         own = tensors(text_of(address, "/render_sweep", {**lidar, "lidar_name": sensors["lidars"][0]}))
         other = tensors(text_of(address, "/render_sweep", {**lidar, "lidar_name": "vlp16"}))
@@ -175,6 +180,14 @@ def test_the_renderer_serves_images_sweeps_and_actors(reconstructed: Path) -> No
     assert (before.int() - direct.int()).abs().max() <= 1
     assert not torch.equal(before, after)
     np.testing.assert_array_equal(np.asarray(picture), after.numpy())
+    trust = trust_of(opened)
+    view = _view(opened, 1.0)
+    expected_db = trust.psnr_db(opened.scene.graph, [(view, opened.scene.camera(opened.scene.graph, view))])
+    assert here["expected_psnr_db"] == pytest.approx(expected_db, abs=0.01)
+    assert here["logged_psnr_db"] == pytest.approx(trust.reference_db)
+    assert here["trusted"] == (expected_db >= trust.reference_db - TRUSTED_LOSS_DB)
+    # Nobody looked back
+    assert turned["expected_psnr_db"] < here["expected_psnr_db"]
     assert len(moved) == 1
     np.testing.assert_allclose(moved[0]["poses"][5], parked["poses"][5], atol=1e-3)
     assert moved[0]["dims"] == pytest.approx([2.0, 4.0, 2.0], abs=0.1)

@@ -1,6 +1,7 @@
 """Servers of runs for other programs: a reconstruction as a renderer, an agent as a planner."""
 
 import contextlib
+import functools
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ from foredrive.json_server import Answer
 from foredrive.runs.drive.agent_inputs import inputs_of
 from foredrive.runs.drive.agents import make_agent, require_alpasim
 from foredrive.runs.reconstruction.reconstruction_run import open_reconstruction, open_run_log
+from foredrive.runs.reconstruction.trust import trust_of
 
 Answers = Mapping[tuple[str, str], Answer]
 
@@ -38,7 +40,8 @@ def renderer_of(folder: Path) -> Answers:
     with contextlib.suppress(InputError):
         log = Log(open_run_log(folder)[1])
         names, start_us = {number: token for token, number in read_track_ids(log).items()}, int(log.t_us[0])
-    return RenderService(opened.scene, opened.vehicle, names, start_us).answers()
+    trust = functools.partial(trust_of, opened)
+    return RenderService(opened.scene, opened.vehicle, names, start_us, trust).answers()
 
 
 def planner_of(agent: str) -> Answers:

@@ -1,14 +1,15 @@
 """A reconstructed log as neuro-ncap's renderer server, plus sweeps by named lidars.
 
 Source: public repository georghess/neurad-studio, `nerfstudio/scripts/closed_loop`: `/alive`, `/start_time`,
-`/get_actors`, `/update_actors`, `/render_image`. Ours are `/sensors` and `/render_sweep`. A rolling shutter
-is not seen, since a request has no velocities.
+`/get_actors`, `/update_actors`, `/render_image`. Ours are `/sensors`, `/render_sweep` and `/trust`. A rolling
+shutter is not seen, since a request has no velocities.
 """
 
 import dataclasses
+import functools
 import io
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Literal
 
@@ -26,10 +27,13 @@ from foredrive.json_server import Answer, Raw, validated
 from foredrive.methods.reconstruction.edits import Edit, Remove, apply_edits
 from foredrive.methods.reconstruction.novel_views import novel_camera_view
 from foredrive.methods.reconstruction.reconstructed import ReconstructedScene
+from foredrive.methods.reconstruction.rendered import RenderedImage
 from foredrive.methods.reconstruction.renderer import render_sweep
 from foredrive.methods.reconstruction.scene_graph import SceneGraph
 from foredrive.methods.reconstruction.tracks import poses_at
+from foredrive.methods.reconstruction.trust import Trust
 from foredrive.methods.reconstruction.vehicle import EgoState, LoggedVehicle
+from foredrive.methods.reconstruction.views import CameraView
 from foredrive.sensors import SpinningLidar
 from foredrive.sensors.vehicle import LIDARS
 
@@ -86,12 +90,20 @@ class RenderService:
         vehicle: the vehicle that recorded the log.
         names: the name of each actor by its track id.
         start_us: time of the log's start, microseconds.
+        trust: returns what the reconstruction expects of its images. It is called once, when it is first
+            asked for: it takes some seconds for each camera.
     """
 
     def __init__(
-        self, scene: ReconstructedScene, vehicle: LoggedVehicle, names: Mapping[int, str], start_us: int = 0
+        self,
+        scene: ReconstructedScene,
+        vehicle: LoggedVehicle,
+        names: Mapping[int, str],
+        start_us: int,
+        trust: Callable[[], Trust],
     ) -> None:
         self._scene, self._vehicle, self._start_us = scene, vehicle, start_us
+        self._trust = functools.cache(trust)
         self._logged: SceneGraph = scene.graph
         self._graph: SceneGraph = scene.graph
         self._names = {number: names.get(number, str(number)) for number in self._ids()}
@@ -111,6 +123,7 @@ class RenderService:
             ("POST", "/update_actors"): self._update_actors,
             ("POST", "/render_image"): self._render_image,
             ("POST", "/render_sweep"): self._render_sweep,
+            ("POST", "/trust"): self._judge_image,
         }
 
     def _ids(self) -> list[int]:
@@ -192,20 +205,39 @@ class RenderService:
         present = (keys >= t_s[0] - step_s) & (keys <= t_s[-1] + step_s)
         return torch.stack([poses_at(t_s, T, at_s)[0][0] for at_s in keys.tolist()]), present
 
-    @torch.no_grad()
     def _render_image(self, body: object) -> Raw:
         asked: ImageRequest = validated(ImageRequest, body, "/render_image")
+        image = self._rendered(asked)[1].rgb_8bit.permute(1, 2, 0).contiguous()
+        if asked.image_format == "raw":
+            return Raw(encode_tensors(image).encode(), "text/plain")
+        return _picture(image, "png" if asked.image_format == "png" else "jpeg")
+
+    def _judge_image(self, body: object) -> dict[str, object]:
+        """Return how good the image of a request is expected to be, and along the logged way."""
+        asked: ImageRequest = validated(ImageRequest, body, "/trust")
+        rendered, trust = self._rendered(asked), self._trust()
+        psnr_db = trust.psnr_db(self._graph, [rendered])
+        return {
+            "expected_psnr_db": psnr_db,
+            "logged_psnr_db": trust.reference_db,
+            "trusted": trust.trusts(psnr_db),
+        }
+
+    @torch.no_grad()
+    def _rendered(self, asked: ImageRequest) -> tuple[CameraView, RenderedImage]:
+        """Render the image of a request.
+
+        Raises:
+            InputError: there is no such camera, the pose is none, or the log does not last until then.
+        """
         rig = dataclasses.replace(self._vehicle.rig, exposed_dt_s=None)
         if asked.camera_name not in self._cameras:
             raise InputError(f"no camera {asked.camera_name!r}; there are: {', '.join(self._cameras)}")
         camera = self._cameras[asked.camera_name]
         T_world_cam = read_pose(asked.pose, "pose")
         ego = self._ego(T_world_cam @ inverse_se3(rig.T_ego_cam[camera].double()), asked.timestamp)
-        view = novel_camera_view(rig, camera, ego).to(self._scene.device)
-        image = self._scene.camera(self._graph, view).rgb_8bit.permute(1, 2, 0).contiguous()
-        if asked.image_format == "raw":
-            return Raw(encode_tensors(image).encode(), "text/plain")
-        return _picture(image, "png" if asked.image_format == "png" else "jpeg")
+        view = novel_camera_view(rig, camera, ego)
+        return view, self._scene.camera(self._graph, view.to(self._scene.device))
 
     @torch.no_grad()
     def _render_sweep(self, body: object) -> Raw:
