@@ -5,6 +5,7 @@ import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from statistics import fmean
 
@@ -45,6 +46,8 @@ from foredrive.towns.sensing.capture import SensorSuite
 class SensorNoise:
     """Noise of an agent's sensors, the same in both worlds."""
 
+    gain: float = 1.0
+    """Factor of all pixels: below 1, images are too dark."""
     pixel_std: float = 0.0
     """Standard deviation of the noise of each pixel, of 255."""
     lost_beams: float = 0.0
@@ -128,9 +131,10 @@ class NoisyAgent:
             # A key frame is drawn anew for each observation, from the same numbers
             rng = torch.Generator().manual_seed(1_000 * self.seed + newest - past + 100)
             frame = observation.now - past
-            if self.noise.pixel_std and images.numel():
+            if images.numel():
                 drawn = torch.randn(images[:, frame].shape, generator=rng) * self.noise.pixel_std
-                images[:, frame] = (images[:, frame] + drawn).clamp(0, 255).to(images.dtype)
+                noisy = self.noise.gain * images[:, frame] + drawn
+                images[:, frame] = noisy.round().clamp(0, 255).to(images.dtype)
             if self.noise.lost_beams and valid.numel():
                 kept = torch.rand(valid[:, frame].shape, generator=rng) >= self.noise.lost_beams
                 valid[:, frame] &= kept
@@ -147,9 +151,23 @@ class PairedTests:
     """
 
     def __init__(self, drive: TownDrive, reconstructed: Path) -> None:
-        self._truth, self._place = TownTruth(drive), place_in(str(reconstructed))
-        self._opened: OpenedReconstruction = open_reconstruction(reconstructed)
-        self._trust = trust_of(self._opened)
+        self._drive, self._reconstructed = drive, reconstructed
+
+    @cached_property
+    def _truth(self) -> TownTruth:
+        return TownTruth(self._drive)
+
+    @cached_property
+    def _place(self) -> Place:
+        return place_in(str(self._reconstructed))
+
+    @cached_property
+    def _opened(self) -> OpenedReconstruction:
+        return open_reconstruction(self._reconstructed)
+
+    @cached_property
+    def _trust(self) -> Trust:
+        return trust_of(self._opened)
 
     def in_town(self, agent: PairedAgent, scenario: SafetyScenario, file: Path) -> Driven:
         """Return the drive with the town's own sensors; drive it unless its file is there."""

@@ -4,6 +4,7 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -18,7 +19,7 @@ from foredrive.errors import InputError
 from foredrive.runs.drive.in_ncap import SafetyTests, propose_scenarios
 from foredrive.runs.drive.records import tested_runs
 from foredrive.runs.drive.suite import DriveSuite, drive_suite
-from foredrive.runs.recipes.reconstruction import gaussians_small
+from foredrive.runs.recipes.reconstruction import ReconstructionRecipe, field_tiny, gaussians_small
 from foredrive.runs.reconstruction.reconstruct import reconstruct
 from foredrive.scene.conditions import BackgroundTraffic
 from foredrive.sensors.rigs import FRONT_TELE, SURROUND, TELE, RigPlan
@@ -46,24 +47,26 @@ def safety_drive(town: str, seed: int, seconds: float = 20.0) -> TownDrive:
 DRIVES = tuple(safety_drive(town, seed) for town, seed in (("Town10HD", 3), ("Town03", 4), ("Town05", 5)))
 """The drives that benchmarks of safety tests reconstruct."""
 RECIPE = dataclasses.replace(gaussians_small(), cameras=tuple(RIG.cameras), image_hw=RIG.image_hw)
+FIELD = dataclasses.replace(field_tiny(), cameras=RECIPE.cameras, image_hw=RECIPE.image_hw)
 RECONSTRUCTION = {
     "drives": [dataclasses.asdict(drive) for drive in DRIVES],
     "recipe": dataclasses.asdict(RECIPE),
+    "field": dataclasses.asdict(FIELD),
 }
 WORK = Path("runs/safety_rebuilds") / study_identity(
     RECONSTRUCTION,
     (
         "foredrive.methods.reconstruction",
-        "foredrive.methods.splatad.training",
-        "foredrive.methods.reconstruction.training",
+        "foredrive.methods.splatad",
+        "foredrive.methods.neurad",
     ),
 )
 
 
-def reconstructed_town(drive: TownDrive) -> Path:
+def reconstructed_town(drive: TownDrive, recipe: ReconstructionRecipe[Any] = RECIPE) -> Path:
     """Return the folder of the reconstruction of a drive; record and reconstruct what is missing."""
-    folder = WORK / "rebuilt" / drive.town
-    reconstruct(RECIPE, drive.recorded(WORK / "towns"), folder, WORK / "cache")
+    folder = WORK / ("rebuilt" if recipe is RECIPE else recipe.name) / drive.town
+    reconstruct(recipe, drive.recorded(WORK / "towns"), folder, WORK / "cache")
     return folder
 
 

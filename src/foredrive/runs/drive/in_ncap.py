@@ -8,17 +8,23 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import torch
+
 from foredrive.data.boxes import read_track_ids
 from foredrive.data.logs import Log
 from foredrive.driving.drive import Drive
+from foredrive.driving.ncap.drawing import draw_run
 from foredrive.driving.ncap.hd import hd_score_of
 from foredrive.driving.ncap.outcome import SafetyResult, judge
-from foredrive.driving.ncap.proposing import propose
+from foredrive.driving.ncap.placing import place_actors
+from foredrive.driving.ncap.proposing import Approach, propose
 from foredrive.driving.ncap.rules import RULES, Rules
 from foredrive.driving.ncap.running import Place, SafetyRun, set_up_run
 from foredrive.driving.ncap.scenario import SafetyScenario
 from foredrive.driving.ncap.scenario_file import load_scenarios, outside_protocol, save_scenarios
 from foredrive.driving.ncap.self_test import SelfTest, run_reference, self_test
+from foredrive.driving.observation import FRAME_DT_S
+from foredrive.driving.replay.logged_drive import LoggedDrive
 from foredrive.errors import InputError
 from foredrive.methods.reconstruction.renderer import ReconstructedRenderer
 from foredrive.runs.drive.agent_inputs import check_seeing
@@ -35,6 +41,10 @@ from foredrive.runs.drive.in_reconstruction import (
 from foredrive.runs.drive.suite import DriveJob, DriveSetup, DriveSuite
 from foredrive.runs.reconstruction.reconstruction_run import open_run_log
 from foredrive.towns.driving.drive_log import drive_log, log_frame
+
+BEFORE_S = (2.0, 1.0)
+"""Times before the impact at which the images of a proposed scenario have to be trusted, s. Nearer, a vehicle
+in the way would fill them."""
 
 
 @dataclass(frozen=True)
@@ -153,8 +163,11 @@ def _judged(
 def propose_scenarios(runs: Sequence[str], file: Path, rules: str, count: int) -> SelfTest:
     """Find the feasible scenarios of reconstructions; write those that pass the self-test to a file.
 
+    Where the images of a vehicle that takes no action are not trusted shortly before the impact, a scenario
+    is left out. Of a reconstruction without cameras, this is not known.
+
     Returns:
-        The result of the self-test.
+        The result of the self-test, and what is left out for want of trust.
 
     Raises:
         InputError: the file exists, two folders have one name, or no scenario is feasible.
@@ -168,8 +181,36 @@ def propose_scenarios(runs: Sequence[str], file: Path, rules: str, count: int) -
     tested = self_test(proposals, lambda scenario: place_in(places[scenario.scene]), count, _rules(rules))
     if not tested.passed:
         raise InputError(f"no scenario passes the self-test: {tested.reasons}")
-    save_scenarios(tested.passed, file)
+    passed, left_out = list[SafetyScenario](), dict(tested.left_out)
+    for scenario in tested.passed:
+        untrusted_s = _untrusted_s(place_in(places[scenario.scene], trusted=True), scenario)
+        if untrusted_s is None:
+            passed.append(scenario)
+        else:
+            left_out[scenario.label] = f"its images {untrusted_s:g} s before the impact are not trusted"
+    tested = SelfTest(tuple(passed), left_out)
+    if not passed:
+        raise InputError(f"no scenario is where images are trusted: {tested.reasons}")
+    save_scenarios(passed, file)
     return tested
+
+
+def _untrusted_s(place: Place, scenario: SafetyScenario) -> float | None:
+    """Return the time before the impact at which the images of a proposal are not trusted; None if all are.
+
+    They are those of its first run, along the logged path.
+    """
+    drawn, drive = draw_run(scenario, 0), LoggedDrive(place.vehicle, torch.eye(4))
+    renderer = place.renderer(
+        place_actors(place.graph, drawn, place.vehicle.T_world_scene, place.track_ids, moving_stay=True)
+    )
+    impact_s = FRAME_DT_S * (drawn.start_frame + scenario.priming_frames) + Approach().impact_s
+    for before_s in BEFORE_S:
+        at_s = impact_s - before_s
+        seen = renderer.render(torch.from_numpy(drive.pose_at(at_s)), torch.zeros(6), at_s)
+        if seen.trusted is False:
+            return before_s
+    return None
 
 
 def _past_frames(agent: str, scenario: SafetyScenario) -> int:
