@@ -340,9 +340,12 @@ def prefetch(typing_context, array, index):
     return types.void(array, types.intp), codegen
 
 
-def _emit_floor(builder: ir.IRBuilder, row: ir.Value) -> ir.Value:
+def _built_in(name: str) -> Emit:
+    """Return the emission of a function of LLVM for rows."""
     kind = ir.FunctionType(_ROW_TYPE, [_ROW_TYPE])
-    return builder.call(cgutils.get_or_insert_function(builder.module, kind, f"llvm.floor.v{ROW}f32"), [row])
+    return lambda builder, row: builder.call(
+        cgutils.get_or_insert_function(builder.module, kind, f"llvm.{name}.v{ROW}f32"), [row]
+    )
 
 
 def _emit_power_of_2(builder: ir.IRBuilder, row: ir.Value) -> ir.Value:
@@ -352,7 +355,8 @@ def _emit_power_of_2(builder: ir.IRBuilder, row: ir.Value) -> ir.Value:
     return builder.bitcast(builder.shl(exponent, ir.Constant(_INT_ROW_TYPE, [23] * ROW)), _ROW_TYPE)
 
 
-_floor, _power_of_2 = _unary(_emit_floor), _unary(_emit_power_of_2)
+floor_row, sqrt_row = _unary(_built_in("floor")), _unary(_built_in("sqrt"))
+_power_of_2 = _unary(_emit_power_of_2)
 _C5, _C4, _C3, _C2, _C1 = (
     np.float32(c) for c in (1.86713e-3, 9.01703e-3, 5.579991e-2, 2.4016445e-1, 6.9315131e-1)
 )
@@ -367,7 +371,36 @@ def exp2_row(x):
     """Return 2^x for x ≤ 127, with relative error below 3e-7. For x < -126 return 2^-126."""
     x = maximum(x, _MIN_EXPONENT)
     # 2^x = 2^⌊x⌋ · 2^f
-    whole = _floor(x)
+    whole = floor_row(x)
     f = x - whole
     polynomial = ((((f * _C5 + _C4) * f + _C3) * f + _C2) * f + _C1) * f + ONE
     return polynomial * _power_of_2(whole)
+
+
+_A15, _A13, _A11, _A9, _A7, _A5, _A3, _A1 = (
+    np.float32(c)
+    for c in (
+        *(-0.0040540580, 0.0218612288, -0.0559098861, 0.0964200441),
+        *(-0.1390853351, 0.1994653599, -0.3332985605, 0.9999993329),
+    )
+)
+"""Coefficients of atan(a) ≈ a (A1 + A3 a² + …) for a from 0 to 1, with an error below 4e-8 (Abramowitz and
+Stegun, "Handbook of Mathematical Functions", 1964, 4.4.49)."""
+_QUARTER_TURN, _HALF_TURN = np.float32(np.pi / 2), np.float32(np.pi)
+_TINY = np.float32(1e-30)
+
+
+@inlined_part
+@no_type_check
+def atan2_row(y, x):
+    """Return the angle of (x, y), rad, with an error below 3e-7. At (0, 0) it is 0."""
+    across, along = maximum(y, ZERO - y), maximum(x, ZERO - x)
+    # The smaller over the larger one lies between 0 and 1
+    a = minimum(across, along) / maximum(maximum(across, along), _TINY)
+    a2 = a * a
+    even = ((((((a2 * _A15 + _A13) * a2 + _A11) * a2 + _A9) * a2 + _A7) * a2 + _A5) * a2 + _A3) * a2 + _A1
+    angle = even * a
+    # Octant by octant: above the diagonal, to the left, below
+    angle = select_greater(across, along, _QUARTER_TURN - angle, angle)
+    angle = select_greater(ZERO, x, _HALF_TURN - angle, angle)
+    return select_greater(ZERO, y, ZERO - angle, angle)

@@ -269,3 +269,63 @@ def test_twist_of_a_sensor() -> None:
     step = inverse_se3(T) @ exp_se3(1e-6 * TWIST) @ T  # the sensor's own motion while the ego frame moves
     twist = sensor_twist(T, TWIST)
     torch.testing.assert_close(step, exp_se3(1e-6 * twist), rtol=0, atol=1e-11)
+
+
+def differences(splats: Splats, truth: Splats) -> list[float]:
+    """Return for each field the largest difference from the truth, relative to the splat's own size there."""
+    relative = []
+    for value, true in zip(splats, truth, strict=True):
+        value, true = value.double().flatten(1) if value.dim() > 1 else value.double()[:, None], true.double()
+        true = true.flatten(1) if true.dim() > 1 else true[:, None]
+        if true.numel():
+            scale = true.abs().amax(-1, keepdim=True).clamp_min(true.abs().median().clamp_min(1e-12))
+            relative.append(float(((value - true).abs() / scale).max()))
+    return relative
+
+
+@pytest.mark.parametrize("moving", [False, True])
+@pytest.mark.parametrize("dist", [None, FLAT, BENT])
+def test_without_gradients_a_kernel_computes_the_same(dist: Tensor | None, moving: bool) -> None:
+    """Both are compared with double precision; 1,003 Gaussians do not fill the last block of sixteen."""
+    exact = some(1003, size_m=0.2, ahead_m=1.0 if dist is None else 6.0)
+    T = exp_se3(torch.tensor([0.3, -0.2, 0.4, 0.1, 0.2, -0.3], dtype=torch.float64))
+    velocity = torch.randn(1003, 3, generator=torch.Generator().manual_seed(3), dtype=torch.float64) * 5
+    scan_s = torch.linspace(-0.05, 0.05, 720, dtype=torch.float64)
+
+    def projected(dtype: torch.dtype) -> Splats:
+        gaussians = exact.map_tensors(lambda tensor: tensor.to(dtype))
+        motion = {"velocity_mps": velocity.to(dtype)} if moving else {}
+        if dist is None:
+            scanned = scan_s.to(dtype) if moving else None
+            return project_lidar(
+                gaussians, T.to(dtype), twist_lidar=TWIST.to(dtype), scan_s=scanned, **motion
+            )
+        twist = TWIST.to(dtype) if moving else None
+        return project_camera(
+            gaussians, T.to(dtype), K.to(dtype), dist.to(dtype), SIZE_HW, twist_cam=twist, **motion
+        )
+
+    truth, plain = projected(torch.float64), projected(torch.float32)
+    with torch.no_grad():
+        kernel = projected(torch.float32)
+    assert len(plain.opacity) == len(kernel.opacity) == len(truth.opacity) > 500
+    for ours, theirs in zip(differences(kernel, truth), differences(plain, truth), strict=True):
+        assert ours < max(4 * theirs, 2e-5)
+
+
+def test_a_kernel_projects_nothing_and_the_same_with_two_threads() -> None:
+    gaussians = some(5000, size_m=0.2).map_tensors(lambda tensor: tensor.float())
+    nowhere = gaussians[torch.zeros(5000, dtype=torch.bool)]
+    before, drawn = torch.get_num_threads(), []
+    with torch.no_grad():
+        camera = torch.eye(4), K.float(), FLAT.float(), SIZE_HW
+        assert project_camera(nowhere, *camera).mean.shape == (0, 2)
+        assert project_lidar(nowhere, torch.eye(4)).feature.shape == (0, 3)
+        try:
+            for threads in (1, 2):
+                torch.set_num_threads(threads)
+                drawn.append(project_camera(gaussians, *camera))
+        finally:
+            torch.set_num_threads(before)
+    for one, two in zip(*drawn, strict=True):
+        assert torch.equal(one, two)

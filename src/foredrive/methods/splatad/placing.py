@@ -1,6 +1,7 @@
 """Gaussians of a scene graph, placed for one time."""
 
 import dataclasses
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -12,6 +13,7 @@ from foredrive.methods.reconstruction.gaussians import Gaussians, joined
 from foredrive.methods.reconstruction.scene_graph import SceneGraph
 from foredrive.methods.reconstruction.tracks import states_at
 from foredrive.methods.splatad.content import gaussians_of
+from foredrive.ops.splatting import Splats
 from foredrive.scene.record import Record
 
 _MIRROR_XYZ = (1.0, -1.0, 1.0)
@@ -25,8 +27,8 @@ class PlacedGaussians(Record):
 
     gaussians: Gaussians
     """Gaussians in the scene's frame."""
-    velocity_mps: Float[Tensor, "M 3"]
-    """Velocities of the centres, in the scene's axes."""
+    velocity_mps: Float[Tensor, "M 3"] | None
+    """Velocities of the centres, in the scene's axes. None: all stand."""
     source: Int[Tensor, "M"]
     """Index of each one in the scene's Gaussians."""
 
@@ -34,7 +36,40 @@ class PlacedGaussians(Record):
 def place_gaussians(
     graph: SceneGraph, t_s: float | Tensor, mirror: Bool[Tensor, "A"] | None = None
 ) -> PlacedGaussians:
-    """Place the static part and every present actor at a time, with poses and velocities.
+    """Place the static part and every present actor at a time. The arguments are those of `placed_parts`."""
+    parts = placed_parts(graph, t_s, mirror)
+    if len(parts) == 1:
+        return parts[0]
+    standing, moved = parts
+    assert moved.velocity_mps is not None
+    return PlacedGaussians(
+        gaussians=joined([standing.gaussians, moved.gaussians]),
+        velocity_mps=torch.cat([torch.zeros_like(standing.gaussians.mean_m), moved.velocity_mps]),
+        source=torch.cat([standing.source, moved.source]),
+    )
+
+
+def projected_parts(
+    graph: SceneGraph,
+    t_s: float | Tensor,
+    mirror: Bool[Tensor, "A"] | None,
+    project: Callable[[Gaussians, Float[Tensor, "M 3"] | None], Splats],
+) -> Splats:
+    """Return the splats of the placed Gaussians, by a projection of Gaussians and their velocities.
+
+    Without gradients, the static part is projected where it is: joined with the actors it would be copied.
+    """
+    if torch.is_grad_enabled():
+        placed = place_gaussians(graph, t_s, mirror)
+        return project(placed.gaussians, placed.velocity_mps)
+    parts = [project(part.gaussians, part.velocity_mps) for part in placed_parts(graph, t_s, mirror)]
+    return Splats(*(torch.cat(field) for field in zip(*parts, strict=True)))
+
+
+def placed_parts(
+    graph: SceneGraph, t_s: float | Tensor, mirror: Bool[Tensor, "A"] | None = None
+) -> list[PlacedGaussians]:
+    """Return the static part, then the Gaussians of all present actors if there are any, at a time.
 
     Args:
         graph: a scene of Gaussians.
@@ -50,8 +85,9 @@ def place_gaussians(
         standing = content.gaussians[still]
     else:
         still, standing = content.static_part
+    parts = [PlacedGaussians(standing, None, still)]
     if len(moving) == 0:
-        return PlacedGaussians(standing, torch.zeros_like(standing.mean_m), still)
+        return parts
     owner = content.actor[moving]
     own = content.gaussians[moving]
     if mirror is not None:
@@ -70,11 +106,7 @@ def place_gaussians(
     )
     # Velocity of a point of a rigid body: v + ω × r
     velocity = of_owner(states.velocity_mps) + torch.linalg.cross(of_owner(states.turn_radps), arm)
-    return PlacedGaussians(
-        gaussians=joined([standing, moved]),
-        velocity_mps=torch.cat([torch.zeros_like(standing.mean_m), velocity]),
-        source=torch.cat([still, moving]),
-    )
+    return [*parts, PlacedGaussians(moved, velocity, moving)]
 
 
 def mirrored(gaussians: Gaussians) -> Gaussians:

@@ -23,7 +23,7 @@ from foredrive.methods.splatad.beams import PreparedSweep, prepared_sweep
 from foredrive.methods.splatad.camera import project_camera
 from foredrive.methods.splatad.content import GaussianContent, gaussians_of
 from foredrive.methods.splatad.lidar import project_lidar
-from foredrive.methods.splatad.placing import place_gaussians
+from foredrive.methods.splatad.placing import projected_parts
 from foredrive.methods.splatad.scene_config import GaussianSceneConfig
 from foredrive.ops.splat_points import TiledPoints, pixel_points
 from foredrive.ops.splatting import BeforeHit, composite_splats
@@ -140,17 +140,22 @@ class GaussianScene(ReconstructedScene):
             background_rgb: colour of the background "after_decoder"; None: `UNSEEN_RGB`.
         """
         exposed = self.corrected_camera(view, frame)
-        placed = place_gaussians(graph, exposed.t_s, mirror)
-        splats = project_camera(
-            # Gaussians at the time of exposure, with velocities for the time of each row
-            placed.gaussians,
-            inverse_se3(exposed.T_scene_cam),
-            view.K,
-            view.dist,
-            view.size_hw,
-            velocity_mps=placed.velocity_mps,
-            twist_cam=exposed.twist_cam,
-            near_m=self.config.camera_near_m,
+        T_cam_scene = inverse_se3(exposed.T_scene_cam)
+        # Gaussians at the time of exposure, with velocities for the time of each row
+        splats = projected_parts(
+            graph,
+            exposed.t_s,
+            mirror,
+            lambda gaussians, velocity_mps: project_camera(
+                gaussians,
+                T_cam_scene,
+                view.K,
+                view.dist,
+                view.size_hw,
+                velocity_mps=velocity_mps,
+                twist_cam=exposed.twist_cam,
+                near_m=self.config.camera_near_m,
+            ),
         )
         seen = composite_splats(splats, _pixels(view.size_hw, view.readout_s if self.config.rolling else 0.0))
         feature = seen.feature
@@ -199,21 +204,26 @@ class GaussianScene(ReconstructedScene):
             mirror: see `place_gaussians`.
             frame: index of a training sweep, counted after the images, for `frame_twist`.
         """
-        # The Gaussians are placed at the middle of the sweep, the time 0 of its beams
-        placed = place_gaussians(graph, t_s + points.middle_s, mirror)
-        T_scene_lidar = points.T_scene_lidar.to(placed.velocity_mps)
-        twist = points.twist_lidar.to(placed.velocity_mps)
+        T_scene_lidar, twist = points.T_scene_lidar.to(self.mean_m), points.twist_lidar.to(self.mean_m)
+        scan_s = None if points.scan_s is None else points.scan_s.to(self.mean_m)
         if frame is not None:
             more = self.frame_twist(frame)
             # The correction also moves the lidar between the sweep's time and its middle
             T_scene_lidar, twist = T_scene_lidar @ exp_se3(points.middle_s * more), twist + more
-        splats = project_lidar(
-            placed.gaussians,
-            inverse_se3(T_scene_lidar),
-            velocity_mps=placed.velocity_mps,
-            twist_lidar=twist,
-            reach_m=self.reach_m,
-            scan_s=None if points.scan_s is None else points.scan_s.to(placed.velocity_mps),
+        T_lidar_scene = inverse_se3(T_scene_lidar)
+        # The Gaussians are placed at the middle of the sweep, the time 0 of its beams
+        splats = projected_parts(
+            graph,
+            t_s + points.middle_s,
+            mirror,
+            lambda gaussians, velocity_mps: project_lidar(
+                gaussians,
+                T_lidar_scene,
+                velocity_mps=velocity_mps,
+                twist_lidar=twist,
+                reach_m=self.reach_m,
+                scan_s=scan_s,
+            ),
         )
         seen = composite_splats(splats, points.tiles, hit_range_m, before_hit=before_hit)
         intensity, drop_logit = self.lidar_decoder(
