@@ -24,7 +24,7 @@ from foredrive.methods.reconstruction.edits import (
 )
 from foredrive.methods.reconstruction.scene_graph import ANOTHER, STATIC, SceneGraph
 from foredrive.methods.splatad.content import gaussians_of
-from foredrive.methods.splatad.placing import place_gaussians
+from foredrive.methods.splatad.placing import place_actors
 
 
 def scene() -> SceneGraph:
@@ -42,7 +42,7 @@ def test_removing_takes_the_gaussians_along() -> None:
     edited = apply_edits(scene(), [Remove(7)]).graph
     assert edited.tracks.track_id.tolist() == [11]
     assert gaussians_of(edited).actor.tolist() == [STATIC, 0]
-    assert place_gaussians(edited, 0.0).source.tolist() == [0]
+    assert place_actors(edited, 0.0).source.tolist() == []
 
 
 def test_a_copy_is_another_actor() -> None:
@@ -51,7 +51,7 @@ def test_a_copy_is_another_actor() -> None:
     assert edited.looks_like.tolist() == [11, 7]
     again = apply_edits(edited, [Duplicate(8, copy=9)]).graph
     assert again.looks_like.tolist() == [11, 7, 7]
-    placed = place_gaussians(edited, 0.0).gaussians
+    placed = place_actors(edited, 0.0).gaussians
     assert torch.allclose(placed.mean_m[-1], torch.tensor([1.0, 3, 1]))
 
 
@@ -78,7 +78,7 @@ def test_a_sent_copy_goes_straight_on_all_the_time() -> None:
     assert torch.allclose(tracks.T_scene_actor[2, :, 1, 3], 4.0 + 2.0 * since_s)
     assert torch.allclose(tracks.T_scene_actor[2, :, :2, 0], torch.tensor([0.0, 1.0]), atol=1e-6)
     assert torch.equal(tracks.T_scene_actor[:2], scene().tracks.T_scene_actor)
-    placed = place_gaussians(edited, float(tracks.t_s[0])).gaussians.mean_m[-1]
+    placed = place_actors(edited, float(tracks.t_s[0])).gaussians.mean_m[-1]
     ahead_m = 1.0  # of its middle its Gaussian is
     at_first = torch.tensor([10.0, 4.0 + 2.0 * float(since_s[0]) + ahead_m, 1.0])
     assert torch.allclose(placed, at_first, atol=1e-5)

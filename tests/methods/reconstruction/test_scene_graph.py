@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 
 from foredrive.errors import InputError
 from foredrive.geometry.se3 import exp_se3, matrix_from_yaw
-from foredrive.methods.reconstruction.edits import Remove, apply_edits
 from foredrive.methods.reconstruction.scene_graph import STATIC, SceneGraph
 from foredrive.methods.reconstruction.tracks import (
     ActorTracks,
@@ -20,9 +19,10 @@ from foredrive.methods.reconstruction.tracks import (
     split_tracks,
     states_at,
 )
-from foredrive.methods.splatad import Gaussians
+from foredrive.methods.splatad import Gaussians, project_camera
 from foredrive.methods.splatad.content import GaussianContent, gaussians_of
-from foredrive.methods.splatad.placing import mirrored, place_gaussians
+from foredrive.methods.splatad.placing import mirrored, place_actors, project_scene
+from foredrive.ops.splatting import Splats
 from foredrive.scene import Category
 
 
@@ -98,21 +98,21 @@ def test_time_and_poses_have_gradients() -> None:
 
 def test_gaussians_turn_and_move_with_their_actor() -> None:
     graph = graph_of([[5.0, 5, 5], [2.0, 0, 0], [0.0, 0, 0]], [STATIC, 0, 1], two_actors())
-    placed = place_gaussians(graph, 2.0)
-    assert placed.source.tolist() == [0, 1]  # the late one is not there between the key times
-    assert torch.allclose(placed.gaussians.mean_m, torch.tensor([[5.0, 5, 5], [4, 2, 1]]), atol=1e-6)
+    placed = place_actors(graph, 2.0)
+    assert placed.source.tolist() == [1]  # the late one is not there between the key times
+    assert torch.allclose(placed.gaussians.mean_m, torch.tensor([[4.0, 2, 1]]), atol=1e-6)
     turned = torch.diag(torch.tensor([0.1, 1.0, 0.2]) ** 2)
-    assert torch.allclose(covariance(placed.gaussians)[1], turned, atol=1e-6)
+    assert torch.allclose(covariance(placed.gaussians)[0], turned, atol=1e-6)
     # 2 m in front of the middle, which turns by π/4 a second: at its left, which is -x now
-    expected = torch.tensor([[0.0, 0, 0], [2 - math.pi / 2, 0, 0]])
+    expected = torch.tensor([[2 - math.pi / 2, 0, 0]])
     assert torch.allclose(placed.velocity_mps, expected, atol=1e-5)
 
 
 def test_velocities_are_those_of_the_poses() -> None:
     graph = graph_of([[1.0, 0.5, 0.2]], [0], two_actors())
-    before, after = place_gaussians(graph, 0.999), place_gaussians(graph, 1.001)
+    before, after = place_actors(graph, 0.999), place_actors(graph, 1.001)
     measured = (after.gaussians.mean_m - before.gaussians.mean_m) / 0.002
-    assert torch.allclose(place_gaussians(graph, 1.0).velocity_mps, measured, atol=2e-3)
+    assert torch.allclose(place_actors(graph, 1.0).velocity_mps, measured, atol=2e-3)
 
 
 @pytest.fixture
@@ -131,7 +131,7 @@ def test_gradients_of_poses_have_the_same_bits_every_time() -> None:
     offset.requires_grad_()
 
     def gradient() -> torch.Tensor:
-        placed = place_gaussians(dataclasses.replace(graph, tracks=graph.tracks.moved(offset)), 0.7)
+        placed = place_actors(dataclasses.replace(graph, tracks=graph.tracks.moved(offset)), 0.7)
         change = (
             placed.gaussians.mean_m.sin() * placed.velocity_mps
         ).sum() + placed.gaussians.quaternion.sum()
@@ -154,8 +154,8 @@ def test_mirroring_is_a_reflection_of_place_and_shape(q: list[float]) -> None:
 
 def test_only_the_actors_that_are_named_are_mirrored() -> None:
     graph = graph_of([[0.0, 1, 0], [0.0, 1, 0]], [0, STATIC], two_actors())
-    placed = place_gaussians(graph, 0.0, mirror=torch.tensor([True, False]))
-    assert torch.allclose(placed.gaussians.mean_m, torch.tensor([[0.0, 1, 0], [0, -1, 1]]))
+    placed = place_actors(graph, 0.0, mirror=torch.tensor([True, False]))
+    assert torch.allclose(placed.gaussians.mean_m, torch.tensor([[0.0, -1, 1]]))
 
 
 def test_vehicles_look_alike_from_both_sides_and_people_do_not() -> None:
@@ -213,14 +213,31 @@ def test_what_was_met_once_stands() -> None:
     assert not bool(move_at_least(once, 0.01).any())
 
 
-def test_what_is_kept_for_drawing_places_the_same_as_what_is_trained() -> None:
-    """The static part is copied once; the actors move all the same, and an edited graph has its own copy."""
-    graph = graph_of([[1.0, 0, 0], [5.0, 5, 5], [0.0, 0, 0]], [0, STATIC, 1], two_actors())
-    shorter = apply_edits(graph, [Remove(7)]).graph
+def test_a_scene_is_projected_in_two_parts() -> None:
+    """The static part where it is, 5 m in front of the camera; then the actor, which is turned and moves."""
+    graph = graph_of([[2.0, 0, 0], [0.5, 0.2, 5], [0.0, 0, 0]], [0, STATIC, 1], two_actors())
+    K = torch.tensor([[100.0, 0, 50], [0, 100, 50], [0, 0, 1]])
+    T_cam_scene = torch.eye(4)
+    T_cam_scene[2, 3] = 1.0
+
+    def project(
+        gaussians: Gaussians, velocity_mps: torch.Tensor | None, among: torch.Tensor | None
+    ) -> Splats:
+        return project_camera(
+            gaussians, T_cam_scene, K, torch.zeros(5), (100, 100), velocity_mps=velocity_mps, among=among
+        )
+
+    splats = project_scene(graph, 1.0, None, project)
     with torch.no_grad():
-        kept = [place_gaussians(seen, t_s) for seen in (graph, shorter) for t_s in (0.0, 0.5, 1.0)]
-    fresh = [place_gaussians(seen, t_s) for seen in (graph, shorter) for t_s in (0.0, 0.5, 1.0)]
-    assert not torch.equal(kept[0].gaussians.mean_m, kept[1].gaussians.mean_m)
-    for one, other in zip(kept, fresh, strict=True):
-        assert torch.equal(one.gaussians.mean_m, other.gaussians.mean_m)
-        assert torch.equal(one.source, other.source)
+        drawn = project_scene(graph, 1.0, None, project)
+    # The static one at depth 6; that of the actor is 1.41 m along both axes from its middle (2, 0, 1)
+    assert splats.range_m.tolist() == pytest.approx([6.0, 2.0])
+    aside_m = 2 * math.sqrt(0.5)
+    expected = [50 + 50 * (2 + aside_m), 50 + 50 * aside_m]
+    assert splats.mean[1].tolist() == pytest.approx(expected, rel=1e-5)
+    assert splats.velocity[0].tolist() == [0.0, 0.0]
+    assert float(splats.velocity[1].abs().max()) > 0
+    for one, other in zip(drawn, splats, strict=True):
+        torch.testing.assert_close(one, other.detach())
+    # After the log only the static part is there
+    assert len(project_scene(graph, 9.0, None, project).mean) == 1

@@ -1,7 +1,7 @@
 """Projection of Gaussians to the image plane of a camera (Zwicker et al., "EWA splatting", 2002)."""
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from foredrive.geometry.projection import distort, distortion_jacobian, pixels_to_rays
@@ -29,6 +29,7 @@ def project_camera(
     size_hw: tuple[int, int],
     *,
     velocity_mps: Float[Tensor, "N 3"] | None = None,
+    among: Bool[Tensor, "N"] | None = None,
     twist_cam: Float[Tensor, "6"] | None = None,
     compensate: bool = True,
     near_m: float = NEAR_M,
@@ -44,6 +45,7 @@ def project_camera(
         T_cam_scene: scene -> camera (x right, y down, z forward) when the middle row is exposed.
         K, dist: intrinsics, px, for images of `size_hw`, and distortion k1 k2 p1 p2 k3.
         velocity_mps: velocity of each Gaussian in the scene's axes; None: all are static.
+        among: the Gaussians that count; None: all.
         twist_cam: velocity (m/s) then turn rate (rad/s) of the camera in its own axes, for rolling shutter;
             None: it is static. See `geometry.se3.sensor_twist`.
         compensate: lower the opacity by as much as ε = 0.3 px² widens a splat.
@@ -59,7 +61,7 @@ def project_camera(
             # Signed distance to the left and right (top and bottom) plane of the view, inside positive
             seen &= (across - low * z) / (1 + low * low).sqrt() > -reach_m
             seen &= (high * z - across) / (1 + high * high).sqrt() > -reach_m
-        chosen = seen.nonzero()[:, 0]
+        chosen = (seen if among is None else seen & among).nonzero()[:, 0]
     if not torch.is_grad_enabled() and numba_supports(position, K, dist):
         from foredrive.methods.splatad.projection_numba import camera_splats, sensor_arrays  # slow to import
 

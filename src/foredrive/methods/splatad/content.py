@@ -1,7 +1,6 @@
 """The Gaussians of a scene graph: which belong to the static part, and which to an actor."""
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import torch
 from jaxtyping import Int
@@ -26,12 +25,6 @@ class GaussianContent(Record):
     def device(self) -> torch.device:
         """The device of the Gaussians."""
         return self.actor.device
-
-    @cached_property
-    def static_part(self) -> tuple[Int[Tensor, "S"], Gaussians]:
-        """Return the indices of the static Gaussians, and these. They are kept: not for training."""
-        index = (self.actor < 0).nonzero()[:, 0]
-        return index, self.gaussians[index]
 
     def preview(self, row: int) -> Gaussians:
         """Return the Gaussians of an actor in its frame, or the static ones for `STATIC`."""

@@ -4,7 +4,7 @@ import math
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from foredrive.geometry.se3 import hat
@@ -27,6 +27,7 @@ def project_lidar(
     T_lidar_scene: Float[Tensor, "4 4"],
     *,
     velocity_mps: Float[Tensor, "N 3"] | None = None,
+    among: Bool[Tensor, "N"] | None = None,
     twist_lidar: Float[Tensor, "6"] | None = None,
     compensate: bool = True,
     reach_m: float = math.inf,
@@ -43,6 +44,7 @@ def project_lidar(
         gaussians: Gaussians in the scene's frame.
         T_lidar_scene: scene -> lidar (x forward, y left, z up) at time 0 of the beams.
         velocity_mps: velocity of each Gaussian in the scene's axes; None: all are static.
+        among: the Gaussians that count; None: all.
         twist_lidar: velocity (m/s) then turn rate (rad/s) of the lidar in its own axes; None: it is static.
             See `geometry.se3.sensor_twist`.
         compensate: lower the opacity by as much as ε widens a splat.
@@ -57,7 +59,7 @@ def project_lidar(
         range2 = level2 + z * z
         # Within reach, and not straight above or below, where the azimuth has no derivative
         seen = (range2 > NEAR_M**2) & (range2 <= reach_m**2) & (level2 > UPRIGHT**2 * range2)
-        chosen = seen.nonzero()[:, 0]
+        chosen = (seen if among is None else seen & among).nonzero()[:, 0]
     if not torch.is_grad_enabled() and numba_supports(position):
         from foredrive.methods.splatad.projection_numba import lidar_splats, sensor_arrays  # slow to import
 

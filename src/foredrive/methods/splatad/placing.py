@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from foredrive.geometry.quaternions import multiply_quaternions, quaternion_from_matrix
-from foredrive.methods.reconstruction.gaussians import Gaussians, joined
+from foredrive.methods.reconstruction.gaussians import Gaussians
 from foredrive.methods.reconstruction.scene_graph import SceneGraph
 from foredrive.methods.reconstruction.tracks import states_at
 from foredrive.methods.splatad.content import gaussians_of
@@ -23,53 +23,42 @@ _MIRROR_WXYZ = (1.0, -1.0, 1.0, -1.0)
 
 @dataclass(frozen=True)
 class PlacedGaussians(Record):
-    """M of a scene's Gaussians, placed for one time."""
+    """The M Gaussians of a scene's actors, placed for one time."""
 
     gaussians: Gaussians
     """Gaussians in the scene's frame."""
-    velocity_mps: Float[Tensor, "M 3"] | None
-    """Velocities of the centres, in the scene's axes. None: all stand."""
+    velocity_mps: Float[Tensor, "M 3"]
+    """Velocities of the centres, in the scene's axes."""
     source: Int[Tensor, "M"]
     """Index of each one in the scene's Gaussians."""
 
 
-def place_gaussians(
-    graph: SceneGraph, t_s: float | Tensor, mirror: Bool[Tensor, "A"] | None = None
-) -> PlacedGaussians:
-    """Place the static part and every present actor at a time. The arguments are those of `placed_parts`."""
-    parts = placed_parts(graph, t_s, mirror)
-    if len(parts) == 1:
-        return parts[0]
-    standing, moved = parts
-    assert moved.velocity_mps is not None
-    return PlacedGaussians(
-        gaussians=joined([standing.gaussians, moved.gaussians]),
-        velocity_mps=torch.cat([torch.zeros_like(standing.gaussians.mean_m), moved.velocity_mps]),
-        source=torch.cat([standing.source, moved.source]),
-    )
-
-
-def projected_parts(
+def project_scene(
     graph: SceneGraph,
     t_s: float | Tensor,
     mirror: Bool[Tensor, "A"] | None,
-    project: Callable[[Gaussians, Float[Tensor, "M 3"] | None], Splats],
+    project: Callable[[Gaussians, Float[Tensor, "N 3"] | None, Bool[Tensor, "N"] | None], Splats],
 ) -> Splats:
-    """Return the splats of the placed Gaussians, by a projection of Gaussians and their velocities.
+    """Return the splats of a scene at a time: those of the static part, then those of the actors.
 
-    Without gradients, the static part is projected where it is: joined with the actors it would be copied.
+    Args:
+        graph, t_s, mirror: see `place_actors`.
+        project: returns the splats of Gaussians in the scene's frame, by their velocities (None: all stand)
+            and those that count (None: all). The static part is not copied: it counts among all Gaussians.
     """
-    if torch.is_grad_enabled():
-        placed = place_gaussians(graph, t_s, mirror)
-        return project(placed.gaussians, placed.velocity_mps)
-    parts = [project(part.gaussians, part.velocity_mps) for part in placed_parts(graph, t_s, mirror)]
-    return Splats(*(torch.cat(field) for field in zip(*parts, strict=True)))
+    content = gaussians_of(graph)
+    splats = project(content.gaussians, None, content.actor < 0)
+    placed = place_actors(graph, t_s, mirror)
+    if len(placed.source) == 0:
+        return splats
+    moving = project(placed.gaussians, placed.velocity_mps, None)
+    return Splats(*(torch.cat(fields) for fields in zip(splats, moving, strict=True)))
 
 
-def placed_parts(
+def place_actors(
     graph: SceneGraph, t_s: float | Tensor, mirror: Bool[Tensor, "A"] | None = None
-) -> list[PlacedGaussians]:
-    """Return the static part, then the Gaussians of all present actors if there are any, at a time.
+) -> PlacedGaussians:
+    """Place every present actor at a time, with poses and velocities.
 
     Args:
         graph: a scene of Gaussians.
@@ -77,17 +66,8 @@ def placed_parts(
         mirror: actors whose left and right sides are swapped; None: none.
     """
     content, states = gaussians_of(graph), states_at(graph.tracks, t_s)
-    shown = torch.cat([states.present, states.present.new_ones(1)])[content.actor]  # STATIC, -1: last entry
-    # Gaussians of present actors; the static ones always count
-    moving = (shown & (content.actor >= 0)).nonzero()[:, 0]
-    if torch.is_grad_enabled():
-        still = (content.actor < 0).nonzero()[:, 0]
-        standing = content.gaussians[still]
-    else:
-        still, standing = content.static_part
-    parts = [PlacedGaussians(standing, None, still)]
-    if len(moving) == 0:
-        return parts
+    shown = torch.cat([states.present, states.present.new_zeros(1)])[content.actor]  # STATIC, -1: last entry
+    moving = shown.nonzero()[:, 0]
     owner = content.actor[moving]
     own = content.gaussians[moving]
     if mirror is not None:
@@ -106,7 +86,7 @@ def placed_parts(
     )
     # Velocity of a point of a rigid body: v + ω × r
     velocity = of_owner(states.velocity_mps) + torch.linalg.cross(of_owner(states.turn_radps), arm)
-    return [*parts, PlacedGaussians(moved, velocity, moving)]
+    return PlacedGaussians(moved, velocity, moving)
 
 
 def mirrored(gaussians: Gaussians) -> Gaussians:

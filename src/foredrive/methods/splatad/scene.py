@@ -23,7 +23,7 @@ from foredrive.methods.splatad.beams import PreparedSweep, prepared_sweep
 from foredrive.methods.splatad.camera import project_camera
 from foredrive.methods.splatad.content import GaussianContent, gaussians_of
 from foredrive.methods.splatad.lidar import project_lidar
-from foredrive.methods.splatad.placing import projected_parts
+from foredrive.methods.splatad.placing import project_scene
 from foredrive.methods.splatad.scene_config import GaussianSceneConfig
 from foredrive.ops.splat_points import TiledPoints, pixel_points
 from foredrive.ops.splatting import BeforeHit, composite_splats
@@ -135,24 +135,25 @@ class GaussianScene(ReconstructedScene):
         Args:
             graph: this scene, or an edited version of it.
             view: the camera; its image is not read.
-            mirror: see `place_gaussians`.
+            mirror: see `place_actors`.
             frame: index of a training image, for `frame_twist`.
             background_rgb: colour of the background "after_decoder"; None: `UNSEEN_RGB`.
         """
         exposed = self.corrected_camera(view, frame)
         T_cam_scene = inverse_se3(exposed.T_scene_cam)
         # Gaussians at the time of exposure, with velocities for the time of each row
-        splats = projected_parts(
+        splats = project_scene(
             graph,
             exposed.t_s,
             mirror,
-            lambda gaussians, velocity_mps: project_camera(
+            lambda gaussians, velocity_mps, among: project_camera(
                 gaussians,
                 T_cam_scene,
                 view.K,
                 view.dist,
                 view.size_hw,
                 velocity_mps=velocity_mps,
+                among=among,
                 twist_cam=exposed.twist_cam,
                 near_m=self.config.camera_near_m,
             ),
@@ -201,7 +202,7 @@ class GaussianScene(ReconstructedScene):
             points: result of `prepare_sweep`.
             t_s: time of the sweep.
             hit_range_m, before_hit: see `composite_splats`.
-            mirror: see `place_gaussians`.
+            mirror: see `place_actors`.
             frame: index of a training sweep, counted after the images, for `frame_twist`.
         """
         T_scene_lidar, twist = points.T_scene_lidar.to(self.mean_m), points.twist_lidar.to(self.mean_m)
@@ -212,14 +213,15 @@ class GaussianScene(ReconstructedScene):
             T_scene_lidar, twist = T_scene_lidar @ exp_se3(points.middle_s * more), twist + more
         T_lidar_scene = inverse_se3(T_scene_lidar)
         # The Gaussians are placed at the middle of the sweep, the time 0 of its beams
-        splats = projected_parts(
+        splats = project_scene(
             graph,
             t_s + points.middle_s,
             mirror,
-            lambda gaussians, velocity_mps: project_lidar(
+            lambda gaussians, velocity_mps, among: project_lidar(
                 gaussians,
                 T_lidar_scene,
                 velocity_mps=velocity_mps,
+                among=among,
                 twist_lidar=twist,
                 reach_m=self.reach_m,
                 scan_s=scan_s,
