@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from typing import NamedTuple
 
 import pytest
 import torch
@@ -275,57 +276,84 @@ def differences(splats: Splats, truth: Splats) -> list[float]:
     """Return for each field the largest difference from the truth, relative to the splat's own size there."""
     relative = []
     for value, true in zip(splats, truth, strict=True):
-        value, true = value.double().flatten(1) if value.dim() > 1 else value.double()[:, None], true.double()
-        true = true.flatten(1) if true.dim() > 1 else true[:, None]
-        if true.numel():
-            scale = true.abs().amax(-1, keepdim=True).clamp_min(true.abs().median().clamp_min(1e-12))
-            relative.append(float(((value - true).abs() / scale).max()))
+        ours, theirs = (field.detach().double().reshape(len(field), -1) for field in (value, true))
+        scale = theirs.abs().amax(-1, keepdim=True).clamp_min(theirs.abs().median().clamp_min(1e-12))
+        relative.append(float(((ours - theirs).abs() / scale).max()))
     return relative
+
+
+class Motion(NamedTuple):
+    """A drive of the sensor past moving Gaussians: everything that has a gradient."""
+
+    gaussians: Gaussians
+    T_sensor_scene: Tensor
+    velocity_mps: Tensor
+    twist: Tensor
+
+    def leaves(self) -> list[Tensor]:
+        of = self.gaussians
+        shape = [of.mean_m, of.quaternion, of.log_scale, of.opacity_logit, of.feature]
+        return [*shape, self.T_sensor_scene, self.velocity_mps, self.twist]
+
+
+def motion(count: int, ahead_m: float, dtype: torch.dtype) -> Motion:
+    rng = torch.Generator().manual_seed(3)
+    velocity_mps = 5 * torch.randn(count, 3, generator=rng, dtype=torch.float64)
+    T = exp_se3(torch.tensor([0.3, -0.2, 0.4, 0.1, 0.2, -0.3], dtype=torch.float64))
+
+    def leaf(tensor: Tensor) -> Tensor:
+        return tensor.to(dtype).detach().requires_grad_()
+
+    gaussians = some(count, size_m=0.2, ahead_m=ahead_m).map_tensors(leaf)
+    return Motion(gaussians, leaf(T), leaf(velocity_mps), leaf(TWIST))
 
 
 @pytest.mark.parametrize("moving", [False, True])
 @pytest.mark.parametrize("dist", [None, FLAT, BENT])
-def test_without_gradients_a_kernel_computes_the_same(dist: Tensor | None, moving: bool) -> None:
-    """Both are compared with double precision; 1,003 Gaussians do not fill the last block of sixteen."""
-    exact = some(1003, size_m=0.2, ahead_m=1.0 if dist is None else 6.0)
-    T = exp_se3(torch.tensor([0.3, -0.2, 0.4, 0.1, 0.2, -0.3], dtype=torch.float64))
-    velocity = torch.randn(1003, 3, generator=torch.Generator().manual_seed(3), dtype=torch.float64) * 5
-    scan_s = torch.linspace(-0.05, 0.05, 720, dtype=torch.float64)
+def test_kernels_compute_the_same_values_and_gradients(dist: Tensor | None, moving: bool) -> None:
+    """Double precision has no kernel; 1,003 Gaussians do not fill the last block of sixteen."""
 
-    def projected(dtype: torch.dtype) -> Splats:
-        gaussians = exact.map_tensors(lambda tensor: tensor.to(dtype))
-        motion = {"velocity_mps": velocity.to(dtype)} if moving else {}
+    def projected(dtype: torch.dtype) -> tuple[Splats, tuple[Tensor, ...]]:
+        of = motion(1003, 1.0 if dist is None else 6.0, dtype)
+        moves = {"velocity_mps": of.velocity_mps} if moving else {}
         if dist is None:
-            scanned = scan_s.to(dtype) if moving else None
-            return project_lidar(
-                gaussians, T.to(dtype), twist_lidar=TWIST.to(dtype), scan_s=scanned, **motion
+            scan_s = torch.linspace(-0.05, 0.05, 720, dtype=torch.float64).to(dtype) if moving else None
+            splats = project_lidar(
+                of.gaussians, of.T_sensor_scene, twist_lidar=of.twist, scan_s=scan_s, **moves
             )
-        twist = TWIST.to(dtype) if moving else None
-        return project_camera(
-            gaussians, T.to(dtype), K.to(dtype), dist.to(dtype), SIZE_HW, twist_cam=twist, **motion
-        )
+        else:
+            lens = K.to(dtype), dist.to(dtype), SIZE_HW
+            twist = of.twist if moving else None
+            splats = project_camera(of.gaussians, of.T_sensor_scene, *lens, twist_cam=twist, **moves)
+        rng = torch.Generator().manual_seed(5)
+        weights = [torch.randn(field.shape, generator=rng, dtype=torch.float64).to(dtype) for field in splats]
+        total = torch.stack([(field * weight).mean() for field, weight in zip(splats, weights, strict=True)])
+        gradients = torch.autograd.grad(total.sum(), of.leaves(), allow_unused=True)
+        return splats, tuple(torch.zeros(1) if each is None else each for each in gradients)
 
-    truth, plain = projected(torch.float64), projected(torch.float32)
-    with torch.no_grad():
-        kernel = projected(torch.float32)
-    assert len(plain.opacity) == len(kernel.opacity) == len(truth.opacity) > 500
-    for ours, theirs in zip(differences(kernel, truth), differences(plain, truth), strict=True):
-        assert ours < max(4 * theirs, 2e-5)
+    (truth, true_gradients), (kernel, gradients) = projected(torch.float64), projected(torch.float32)
+    assert len(kernel.opacity) == len(truth.opacity) > 500
+    assert max(differences(kernel, truth)) < 2e-3
+    for found, true in zip(gradients, true_gradients, strict=True):
+        assert float((found - true).abs().max()) <= 1e-5 * float(true.abs().max())
 
 
 def test_a_kernel_projects_nothing_and_the_same_with_two_threads() -> None:
-    gaussians = some(5000, size_m=0.2).map_tensors(lambda tensor: tensor.float())
-    nowhere = gaussians[torch.zeros(5000, dtype=torch.bool)]
+    of = motion(5000, 12.0, torch.float32)
+    nowhere = of.gaussians[torch.zeros(5000, dtype=torch.bool)]
+    lens = K.float(), FLAT.float(), SIZE_HW
+    assert project_camera(nowhere, of.T_sensor_scene, *lens).mean.shape == (0, 2)
+    assert project_lidar(nowhere, of.T_sensor_scene).feature.shape == (0, 3)
     before, drawn = torch.get_num_threads(), []
-    with torch.no_grad():
-        camera = torch.eye(4), K.float(), FLAT.float(), SIZE_HW
-        assert project_camera(nowhere, *camera).mean.shape == (0, 2)
-        assert project_lidar(nowhere, torch.eye(4)).feature.shape == (0, 3)
-        try:
-            for threads in (1, 2):
-                torch.set_num_threads(threads)
-                drawn.append(project_camera(gaussians, *camera))
-        finally:
-            torch.set_num_threads(before)
+    try:
+        for threads in (1, 2):
+            torch.set_num_threads(threads)
+            splats = project_camera(
+                of.gaussians, of.T_sensor_scene, *lens, velocity_mps=of.velocity_mps, twist_cam=of.twist
+            )
+            loss = torch.stack([field.square().mean() for field in splats]).sum()
+            drawn.append([*splats, *torch.autograd.grad(loss, of.leaves())])
+    finally:
+        torch.set_num_threads(before)
     for one, two in zip(*drawn, strict=True):
         assert torch.equal(one, two)

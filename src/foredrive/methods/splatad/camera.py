@@ -37,8 +37,8 @@ def project_camera(
     """Return splats on the image plane, for `pixel_points`. Those that cannot reach the image are left out.
 
     Centres are projected exactly, including lens distortion; covariances by the Jacobian of the projection
-    there. `Splats.range_m` is the depth along the camera's axis. Gradients reach all tensors; without
-    gradients, a kernel computes the same (`projection_kernels`).
+    there. `Splats.range_m` is the depth along the camera's axis. Gradients reach all tensors. Kernels
+    (`projection_kernels`) compute the same on the CPU, unless K or `dist` need gradients.
 
     Args:
         gaussians: Gaussians in the scene's frame.
@@ -62,11 +62,11 @@ def project_camera(
             seen &= (across - low * z) / (1 + low * low).sqrt() > -reach_m
             seen &= (high * z - across) / (1 + high * high).sqrt() > -reach_m
         chosen = (seen if among is None else seen & among).nonzero()[:, 0]
-    if not torch.is_grad_enabled() and numba_supports(position, K, dist):
-        from foredrive.methods.splatad.projection_numba import camera_splats, sensor_arrays  # slow to import
+    if numba_supports(position, K, dist) and not K.requires_grad and not dist.requires_grad:
+        from foredrive.methods.splatad.projection_numba import camera_projection, projected  # slow to import
 
-        sensor = sensor_arrays(T_cam_scene, twist_cam, SPREAD_PX2, compensate)
-        return camera_splats(gaussians, chosen, sensor, velocity_mps, K, dist, torch.cat([lower, upper]))
+        camera = camera_projection(K, dist, torch.cat([lower, upper]), SPREAD_PX2, compensate)
+        return projected(camera, gaussians, chosen, T_cam_scene, velocity_mps, twist_cam)
     in_view = in_sensor(gaussians, position, chosen, T_cam_scene, velocity_mps, twist_cam)
     # Linear images of the covariances at the centres: Σ' = J M (J M)ᵀ + ε I
     uv, jacobian = _project(in_view.position_m, K, dist, lower, upper)

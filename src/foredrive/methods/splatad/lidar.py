@@ -37,8 +37,8 @@ def project_lidar(
 
     With J the Jacobian of (azimuth, elevation, range) and Σ' = J Σ Jᵀ, the covariance of a splat is that of
     its angles plus ε. Where a beam passes beside the centre, its range is the conditional mean there: it
-    changes by Σ'_range,angles (Σ'_angles + ε)⁻¹ over the plane. Gradients reach all tensors; without
-    gradients, a kernel computes the same (`projection_kernels`).
+    changes by Σ'_range,angles (Σ'_angles + ε)⁻¹ over the plane. Gradients reach all tensors. Kernels
+    (`projection_kernels`) compute the same on the CPU.
 
     Args:
         gaussians: Gaussians in the scene's frame.
@@ -60,11 +60,11 @@ def project_lidar(
         # Within reach, and not straight above or below, where the azimuth has no derivative
         seen = (range2 > NEAR_M**2) & (range2 <= reach_m**2) & (level2 > UPRIGHT**2 * range2)
         chosen = (seen if among is None else seen & among).nonzero()[:, 0]
-    if not torch.is_grad_enabled() and numba_supports(position):
-        from foredrive.methods.splatad.projection_numba import lidar_splats, sensor_arrays  # slow to import
+    if numba_supports(position):
+        from foredrive.methods.splatad.projection_numba import lidar_projection, projected  # slow to import
 
-        sensor = sensor_arrays(T_lidar_scene, twist_lidar, SPREAD_RAD2, compensate)
-        return lidar_splats(gaussians, chosen, sensor, velocity_mps, scan_s)
+        lidar = lidar_projection(scan_s, SPREAD_RAD2, compensate)
+        return projected(lidar, gaussians, chosen, T_lidar_scene, velocity_mps, twist_lidar)
     in_view = in_sensor(gaussians, position, chosen, T_lidar_scene, velocity_mps, twist_lidar)
     # Motion of the centre over the angles and the range: tangent at time 0, or a line through two places
     if scan_s is None:

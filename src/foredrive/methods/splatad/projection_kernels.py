@@ -1,4 +1,4 @@
-"""Numba kernels that project Gaussians to a camera or a lidar, without gradients: what drawing needs.
+"""Numba kernels that project Gaussians to a camera or a lidar. `projection_back_kernels` has their gradients.
 
 They compute what `camera` and `lidar` compute in PyTorch, sixteen Gaussians at a time, with all intermediate
 values in registers. Results differ by rounding.
@@ -68,7 +68,7 @@ class SensorArrays(NamedTuple):
 
 @inlined_part
 @no_type_check
-def _gather(chosen, block, gaussians, rows):
+def gather(chosen, block, gaussians, rows):
     """Fill the rows of a block with its Gaussians. Behind the last one, it is repeated."""
     last = chosen.size - 1
     for lane in range(ROW):
@@ -86,7 +86,7 @@ def _gather(chosen, block, gaussians, rows):
 
 @inlined_part
 @no_type_check
-def _rotated(T, x, y, z):
+def rotated(T, x, y, z):
     """Return vectors in the axes of the sensor."""
     return (
         x * T[0] + y * T[1] + z * T[2],
@@ -97,23 +97,23 @@ def _rotated(T, x, y, z):
 
 @inlined_part
 @no_type_check
-def _cross(a, x, y, z):
+def cross(a, x, y, z):
     """Return the cross product of a vector with rows of vectors."""
     return z * a[1] - y * a[2], x * a[2] - z * a[0], y * a[0] - x * a[1]
 
 
 @inlined_part
 @no_type_check
-def _in_sensor(rows, sensor):
+def in_sensor(rows, sensor):
     """Return positions and relative velocities in the axes of the sensor."""
     T, linear, turn = sensor.T_sensor_scene, sensor.twist[:3], sensor.twist[3:]
-    x, y, z = _rotated(T, load_row(rows, 0), load_row(rows, ROW), load_row(rows, 2 * ROW))
+    x, y, z = rotated(T, load_row(rows, 0), load_row(rows, ROW), load_row(rows, 2 * ROW))
     x, y, z = x + T[9], y + T[10], z + T[11]
     first = VELOCITY * ROW
     vx, vy, vz = load_row(rows, first), load_row(rows, first + ROW), load_row(rows, first + 2 * ROW)
-    vx, vy, vz = _rotated(T, vx, vy, vz)
+    vx, vy, vz = rotated(T, vx, vy, vz)
     # v - v_sensor - ω × p
-    tx, ty, tz = _cross(turn, x, y, z)
+    tx, ty, tz = cross(turn, x, y, z)
     return x, y, z, vx - linear[0] - tx, vy - linear[1] - ty, vz - linear[2] - tz
 
 
@@ -136,15 +136,16 @@ def _factor(rows, T):
     b = exp2_row(minimum(load_row(rows, first + ROW) * LOG2_E, MAX_EXPONENT))
     c = exp2_row(minimum(load_row(rows, first + 2 * ROW) * LOG2_E, MAX_EXPONENT))
     xx, yy, zz, one = x * x, y * y, z * z, ONE
-    ax, ay, az = _rotated(T, (one - yy - zz) * a, (x * y + w * z) * a, (x * z - w * y) * a)
-    bx, by, bz = _rotated(T, (x * y - w * z) * b, (one - xx - zz) * b, (y * z + w * x) * b)
-    cx, cy, cz = _rotated(T, (x * z + w * y) * c, (y * z - w * x) * c, (one - xx - yy) * c)
+    ax, ay, az = rotated(T, (one - yy - zz) * a, (x * y + w * z) * a, (x * z - w * y) * a)
+    bx, by, bz = rotated(T, (x * y - w * z) * b, (one - xx - zz) * b, (y * z + w * x) * b)
+    cx, cy, cz = rotated(T, (x * z + w * y) * c, (y * z - w * x) * c, (one - xx - yy) * c)
     return ax, ay, az, bx, by, bz, cx, cy, cz
 
 
 @inlined_part
 @no_type_check
-def _dot(a, b, c, x, y, z):
+def dot(a, b, c, x, y, z):
+    """Return dot products of vectors."""
     return a * x + b * y + c * z
 
 
@@ -197,8 +198,8 @@ def project_to_camera(start, stop, chosen, gaussians, sensor, K, dist, limits, o
     """
     rows, count = np.zeros(ROWS * ROW, np.float32), chosen.size
     for block in range(start, stop):
-        _gather(chosen, block, gaussians, rows)
-        px, py, pz, vx, vy, vz = _in_sensor(rows, sensor)
+        gather(chosen, block, gaussians, rows)
+        px, py, pz, vx, vy, vz = in_sensor(rows, sensor)
         near = ONE / pz
         x, y = px * near, py * near
         # Clamped to the image with its margin, where the Jacobian is taken
@@ -226,12 +227,12 @@ def project_to_camera(start, stop, chosen, gaussians, sensor, K, dist, limits, o
             j3, j4, j5 = zero, near * fy, wy * near * (ZERO - fy)
         ax, ay, az, bx, by, bz, cx, cy, cz = _factor(rows, sensor.T_sensor_scene)
         xx, xy, yy, ratio = _footprint(
-            _dot(j0, j1, j2, ax, ay, az),
-            _dot(j0, j1, j2, bx, by, bz),
-            _dot(j0, j1, j2, cx, cy, cz),
-            _dot(j3, j4, j5, ax, ay, az),
-            _dot(j3, j4, j5, bx, by, bz),
-            _dot(j3, j4, j5, cx, cy, cz),
+            dot(j0, j1, j2, ax, ay, az),
+            dot(j0, j1, j2, bx, by, bz),
+            dot(j0, j1, j2, cx, cy, cz),
+            dot(j3, j4, j5, ax, ay, az),
+            dot(j3, j4, j5, bx, by, bz),
+            dot(j3, j4, j5, cx, cy, cz),
             sensor.epsilon,
         )
         opacity = _opacity(rows, sensor, ratio)
@@ -244,19 +245,19 @@ def project_to_camera(start, stop, chosen, gaussians, sensor, K, dist, limits, o
         _put(out, 6, block, count, rows, pz)
         _put(out, 7, block, count, rows, near * ZERO)
         _put(out, 8, block, count, rows, near * ZERO)
-        _put(out, 9, block, count, rows, _dot(j0, j1, j2, vx, vy, vz))
-        _put(out, 10, block, count, rows, _dot(j3, j4, j5, vx, vy, vz))
+        _put(out, 9, block, count, rows, dot(j0, j1, j2, vx, vy, vz))
+        _put(out, 10, block, count, rows, dot(j3, j4, j5, vx, vy, vz))
         _put(out, 11, block, count, rows, vz)
 
 
 @inlined_part
 @no_type_check
-def _moved(x, y, z, vx, vy, vz, twist, t):
+def moved(x, y, z, vx, vy, vz, twist, t):
     """Return positions in the lidar's frame at another time, to second order, as `lidar._moved`."""
     linear, turn = twist[:3], twist[3:]
     # p'' = -ω × (2 v + u + ω × p)
-    tx, ty, tz = _cross(turn, x, y, z)
-    ax, ay, az = _cross(turn, vx * TWO + linear[0] + tx, vy * TWO + linear[1] + ty, vz * TWO + linear[2] + tz)
+    tx, ty, tz = cross(turn, x, y, z)
+    ax, ay, az = cross(turn, vx * TWO + linear[0] + tx, vy * TWO + linear[1] + ty, vz * TWO + linear[2] + tz)
     half = t * HALF
     return x + t * (vx - half * ax), y + t * (vy - half * ay), z + t * (vz - half * az)
 
@@ -271,6 +272,14 @@ def _angles(x, y, z):
 
 @inlined_part
 @no_type_check
+def add_cross(row, t, turn):
+    """Return a vector plus t · ω × it."""
+    x, y, z = cross(turn, row[0], row[1], row[2])
+    return row[0] + t * x, row[1] + t * y, row[2] + t * z
+
+
+@inlined_part
+@no_type_check
 def _look_up(rows, place, azimuth, scan_s):
     """Write the times at which azimuths are scanned to a row."""
     sectors = scan_s.size
@@ -279,6 +288,20 @@ def _look_up(rows, place, azimuth, scan_s):
         turns = rows[place * ROW + lane]
         sector = int((turns - np.floor(turns)) * np.float32(sectors))
         rows[place * ROW + lane] = scan_s[min(sector, sectors - 1)]
+
+
+@inlined_part
+@no_type_check
+def find_scan_times(rows, x, y, z, vx, vy, vz, twist, scan_s, turn_s):
+    """Write the times at which a block's Gaussians are scanned, here and at the other side of the seam."""
+    # By the azimuth at time 0, and once more by that at the time that this gives
+    _look_up(rows, SCANNED, atan2_row(y, x), scan_s)
+    x, y, z = moved(x, y, z, vx, vy, vz, twist, load_row(rows, SCANNED * ROW))
+    _look_up(rows, SCANNED, atan2_row(y, x), scan_s)
+    # The same azimuth a turn earlier or later
+    for lane in range(ROW):
+        time_s = rows[SCANNED * ROW + lane]
+        rows[OTHER * ROW + lane] = time_s - turn_s if time_s > 0 else time_s + turn_s
 
 
 @kernel
@@ -294,22 +317,14 @@ def project_to_lidar(start, stop, chosen, gaussians, sensor, scan_s, turn_s, out
     rows, count = np.zeros(ROWS * ROW, np.float32), chosen.size
     twist, turn = sensor.twist, sensor.twist[3:]
     for block in range(start, stop):
-        _gather(chosen, block, gaussians, rows)
-        x, y, z, vx, vy, vz = _in_sensor(rows, sensor)
+        gather(chosen, block, gaussians, rows)
+        x, y, z, vx, vy, vz = in_sensor(rows, sensor)
         ax, ay, az, bx, by, bz, cx, cy, cz = _factor(rows, sensor.T_sensor_scene)
         qx, qy, qz, t = x, y, z, x * ZERO
         if scan_s.size > 0:
-            # Scan time by the azimuth at time 0, and once more by that at this time
-            _look_up(rows, SCANNED, atan2_row(y, x), scan_s)
+            find_scan_times(rows, x, y, z, vx, vy, vz, twist, scan_s, turn_s)
             t = load_row(rows, SCANNED * ROW)
-            qx, qy, qz = _moved(x, y, z, vx, vy, vz, twist, t)
-            _look_up(rows, SCANNED, atan2_row(qy, qx), scan_s)
-            # The same azimuth at the other side of the seam
-            for lane in range(ROW):
-                time_s = rows[SCANNED * ROW + lane]
-                rows[OTHER * ROW + lane] = time_s - turn_s if time_s > 0 else time_s + turn_s
-            t = load_row(rows, SCANNED * ROW)
-            qx, qy, qz = _moved(x, y, z, vx, vy, vz, twist, t)
+            qx, qy, qz = moved(x, y, z, vx, vy, vz, twist, t)
         azimuth, elevation, range_m = _angles(qx, qy, qz)
         # Rows of the Jacobian: gradients of azimuth, elevation and range
         level2 = qx * qx + qy * qy
@@ -321,7 +336,7 @@ def project_to_lidar(start, stop, chosen, gaussians, sensor, scan_s, turn_s, out
         j6, j7, j8 = qx * far, qy * far, qz * far
         if scan_s.size > 0:
             other = load_row(rows, OTHER * ROW)
-            ox, oy, oz = _moved(x, y, z, vx, vy, vz, twist, other)
+            ox, oy, oz = moved(x, y, z, vx, vy, vz, twist, other)
             azimuth1, elevation1, range1 = _angles(ox, oy, oz)
             # The line through both places; azimuths differ across ±π
             per_s = ONE / (other - t)
@@ -330,33 +345,30 @@ def project_to_lidar(start, stop, chosen, gaussians, sensor, scan_s, turn_s, out
             rate0, rate1, rate2 = swing * per_s, (elevation1 - elevation) * per_s, (range1 - range_m) * per_s
             azimuth, elevation, range_m = azimuth - t * rate0, elevation - t * rate1, range_m - t * rate2
             # Until then the axes turn by t · ω: J takes vectors in the axes at time 0
-            d0, d1, d2 = _cross(turn, j0, j1, j2)
-            j0, j1, j2 = j0 + t * d0, j1 + t * d1, j2 + t * d2
-            d0, d1, d2 = _cross(turn, j3, j4, j5)
-            j3, j4, j5 = j3 + t * d0, j4 + t * d1, j5 + t * d2
-            d0, d1, d2 = _cross(turn, j6, j7, j8)
-            j6, j7, j8 = j6 + t * d0, j7 + t * d1, j8 + t * d2
+            j0, j1, j2 = add_cross((j0, j1, j2), t, turn)
+            j3, j4, j5 = add_cross((j3, j4, j5), t, turn)
+            j6, j7, j8 = add_cross((j6, j7, j8), t, turn)
         else:
-            rate0, rate1 = _dot(j0, j1, j2, vx, vy, vz), _dot(j3, j4, j5, vx, vy, vz)
-            rate2 = _dot(j6, j7, j8, vx, vy, vz)
+            rate0, rate1 = dot(j0, j1, j2, vx, vy, vz), dot(j3, j4, j5, vx, vy, vz)
+            rate2 = dot(j6, j7, j8, vx, vy, vz)
         a, b, c = (
-            _dot(j0, j1, j2, ax, ay, az),
-            _dot(j0, j1, j2, bx, by, bz),
-            _dot(j0, j1, j2, cx, cy, cz),
+            dot(j0, j1, j2, ax, ay, az),
+            dot(j0, j1, j2, bx, by, bz),
+            dot(j0, j1, j2, cx, cy, cz),
         )
         d, e, f = (
-            _dot(j3, j4, j5, ax, ay, az),
-            _dot(j3, j4, j5, bx, by, bz),
-            _dot(j3, j4, j5, cx, cy, cz),
+            dot(j3, j4, j5, ax, ay, az),
+            dot(j3, j4, j5, bx, by, bz),
+            dot(j3, j4, j5, cx, cy, cz),
         )
         g, h, k = (
-            _dot(j6, j7, j8, ax, ay, az),
-            _dot(j6, j7, j8, bx, by, bz),
-            _dot(j6, j7, j8, cx, cy, cz),
+            dot(j6, j7, j8, ax, ay, az),
+            dot(j6, j7, j8, bx, by, bz),
+            dot(j6, j7, j8, cx, cy, cz),
         )
         xx, xy, yy, ratio = _footprint(a, b, c, d, e, f, sensor.epsilon)
         # Covariance of the range with both angles gives the slope of its conditional mean
-        with_azimuth, with_elevation = _dot(a, b, c, g, h, k), _dot(d, e, f, g, h, k)
+        with_azimuth, with_elevation = dot(a, b, c, g, h, k), dot(d, e, f, g, h, k)
         opacity = _opacity(rows, sensor, ratio)
         _put(out, 0, block, count, rows, azimuth)
         _put(out, 1, block, count, rows, elevation)
