@@ -16,10 +16,11 @@ from foredrive.engine.summary import read_summary
 from foredrive.errors import InputError
 from foredrive.methods.reconstruction.renderer import ReconstructedRenderer
 from foredrive.runs import Run, evaluate_run
-from foredrive.runs.drive.in_reconstruction import REPLAY, ReconstructedRoutes
+from foredrive.runs.drive.in_reconstruction import REPLAY, ReconstructedRoutes, shown_vehicle
 from foredrive.runs.drive.suite import DriveSuite, drive_suite
 from foredrive.runs.reconstruction.reconstruction_run import open_reconstruction
 from foredrive.scene import Renderer, VoxelSpec
+from foredrive.sensors.rigs import FRONT_TELE, camera_rig
 from foredrive.view.drive_report import write_drive_report
 
 VOXELS = VoxelSpec(lower_m=(-8.0, -8.0, -1.0), voxel_m=2.0, shape_zyx=(2, 8, 8))
@@ -78,6 +79,25 @@ def test_a_trained_run_drives_and_is_judged_on_what_was_driven(
     result = evaluate_run(trained, find_logs(out), tmp_path / "judged", views=False)
     assert result.failures == ()
     assert result.summary["command_source"] == "route"
+
+
+def test_an_agent_that_requires_other_cameras_is_shown_its_own(
+    reconstructed: Path, trained: Run, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """The driver of the package has two cameras with 100 and 45 degrees; the log has others."""
+    assert shown_vehicle(str(reconstructed), str(trained.folder)).rig.names == ("ahead", "left")
+    assert not caplog.messages
+    rig = shown_vehicle(str(reconstructed), "embedded").rig
+    assert [name.upper() for name in rig.names] == list(FRONT_TELE.cameras)
+    assert rig.size_hw == FRONT_TELE.image_hw
+    expected = camera_rig(None, 0.0, FRONT_TELE)
+    torch.testing.assert_close(rig.K, expected.K)
+    torch.testing.assert_close(rig.T_ego_cam, expected.T_ego_cam, atol=1e-6, rtol=0)
+    assert "the agent's own are rendered" in caplog.messages[0]
+    suite = DriveSuite("embedded", ReconstructedRoutes(str(reconstructed)))
+    (drive,) = drive_suite(suite, tmp_path).drives.values()
+    assert drive.error == ""
+    assert drive.score.duration_s > 1
 
 
 def test_what_lies_there_is_not_driven_again(reconstructed: Path, out: Path) -> None:

@@ -6,11 +6,12 @@ from dataclasses import dataclass
 from foredrive.driving.observation import FRAME_DT_S
 from foredrive.errors import InputError
 from foredrive.integrations.remote.json_http import read_address
+from foredrive.methods.reconstruction.vehicle import LoggedVehicle
 from foredrive.runs.drive.agents import Sees, agent_folder, find_agent, is_remote
 from foredrive.runs.train.driver import is_driver, open_driver
 from foredrive.runs.train.rigs import TrainedRigs, check_rig, read_rigs
 from foredrive.runs.train.run import open_run
-from foredrive.sensors.rigs import SURROUND, RigPlan
+from foredrive.sensors.rigs import SURROUND, RigPlan, rig_of_cameras
 
 
 @dataclass(frozen=True)
@@ -84,6 +85,23 @@ def chosen_cameras(agent: str, cameras: Sequence[str]) -> list[str]:
     rigs = _rigs_of(agent)
     usual = set(names) if rigs is None else {camera.lower() for camera in rigs.usual.cameras}
     return [name for name in names if name in usual] if usual <= set(names) else names
+
+
+def own_rig(agent: str, vehicle: LoggedVehicle) -> RigPlan | None:
+    """Return the cameras of an agent's training if a log's differ from them; None if it knows these.
+
+    Only an agent that requires cameras by name has cameras of its own.
+    """
+    required, rigs = inputs_of(agent).camera_names, _rigs_of(agent)
+    if required is None or rigs is None or len(required) != len(rigs.usual.cameras):
+        return None
+    logged, usual = rig_of_cameras(vehicle.rig), rigs.usual
+    try:
+        shown = {name: logged.cameras[vehicle.rig.names[vehicle.camera(name)]] for name in usual.cameras}
+        check_rig(rigs, RigPlan(logged.image_hw, shown), agent)
+    except InputError:  # a camera is missing, stands elsewhere or has another field of view
+        return RigPlan(usual.image_hw, dict(zip(required, usual.cameras.values(), strict=True)))
+    return None
 
 
 def check_rig_of(agent: str, rig: RigPlan) -> None:

@@ -37,6 +37,7 @@ from foredrive.runs.drive.in_reconstruction import (
     opened_trust,
     past_frames_of,
     renders_for,
+    shown_vehicle,
 )
 from foredrive.runs.drive.suite import DriveJob, DriveSetup, DriveSuite
 from foredrive.runs.reconstruction.reconstruction_run import open_run_log
@@ -112,7 +113,7 @@ class SafetyTests:
         scenario = next(entry for entry in load_scenarios(Path(self.scenarios)) if entry.label == job.route)
         folder = _folders(self.runs)[scenario.scene]
         sensors = renders_for(suite) or self.stay_trusted
-        place = place_in(folder, trusted=sensors, required=self.stay_trusted)
+        place = place_in(folder, trusted=sensors, required=self.stay_trusted, agent=suite.agent)
         check_lidar_of(suite.agent, self.sees, place.vehicle, folder)
         run = set_up_run(
             place,
@@ -271,13 +272,16 @@ def _tested(source: SafetyTests) -> SelfTest:
 
 
 @functools.lru_cache(maxsize=2)  # consecutive runs share one scene
-def place_in(folder: str, trusted: bool = False, required: bool = False) -> Place:
+def place_in(folder: str, trusted: bool = False, required: bool = False, agent: str | None = None) -> Place:
     """Return a reconstruction as a place of tests.
 
     Args:
+        folder: of the reconstruction.
         trusted: whether its renderers say which frames they trust; without cameras they do not.
         required: raise an error where they cannot say it.
+        agent: its cameras are rendered, see `shown_vehicle`; None: those of the log.
     """
+    shown = opened_reconstruction(folder).vehicle if agent is None else shown_vehicle(folder, agent)
     opened = opened_reconstruction(folder)
     trust = opened_trust(folder, required) if trusted else None
     ids = {str(track_id): track_id for track_id in opened.scene.graph.all_tracks.track_id.tolist()}
@@ -287,7 +291,7 @@ def place_in(folder: str, trusted: bool = False, required: bool = False) -> Plac
     return Place(
         opened.scene.graph,
         opened.vehicle,
-        lambda graph: ReconstructedRenderer(opened.scene, graph, opened.vehicle, trust),
+        lambda graph: ReconstructedRenderer(opened.scene, graph, shown, trust),
         ids,
         lanes_of(Path(folder)),
     )

@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 import functools
+import logging
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,7 +27,7 @@ from foredrive.methods.reconstruction.edits import Edit, load_edits
 from foredrive.methods.reconstruction.renderer import ReconstructedRenderer
 from foredrive.methods.reconstruction.trust import Trust
 from foredrive.methods.reconstruction.vehicle import LoggedVehicle
-from foredrive.runs.drive.agent_inputs import chosen_cameras, inputs_of
+from foredrive.runs.drive.agent_inputs import chosen_cameras, inputs_of, own_rig
 from foredrive.runs.drive.agents import CORRIDOR, EXPERT, REPLAY, Sees, is_remote, make_agent
 from foredrive.runs.drive.suite import DriveJob, DriveSetup, DriveSuite
 from foredrive.runs.reconstruction.reconstruction_run import (
@@ -38,7 +39,10 @@ from foredrive.runs.reconstruction.reconstruction_run import (
 )
 from foredrive.runs.reconstruction.trust import trust_of
 from foredrive.scene import Agent, Clip, Trajectory
+from foredrive.sensors.rigs import camera_rig
 from foredrive.towns.driving.drive_log import drive_log, log_frame
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -85,7 +89,8 @@ class ReconstructedRoutes:
     def set_up(self, job: DriveJob, suite: DriveSuite, out: Path) -> Iterator[DriveSetup]:
         """Set up a drive in the reconstructed scene."""
         opened, edits = opened_reconstruction(self.run), _edits_of(self.edits)
-        suite.faults.check_cameras(opened.vehicle.rig.names)
+        vehicle = shown_vehicle(self.run, suite.agent)
+        suite.faults.check_cameras(vehicle.rig.names)
         past_frames = past_frames_of(suite.agent)
         _, start_s, threat = next(planned for planned in self._plan(past_frames) if planned[0] == job)
         edited = edited_scene(opened.scene, edits)
@@ -96,7 +101,7 @@ class ReconstructedRoutes:
             graph = edited_scene(opened.scene, [*edits, sent]).graph
         sensors = renders_for(suite) or self.stay_trusted
         trust = opened_trust(self.run, self.stay_trusted) if sensors else None
-        renderer = ReconstructedRenderer(opened.scene, graph, opened.vehicle, trust)
+        renderer = ReconstructedRenderer(opened.scene, graph, vehicle, trust)
         lanes = lanes_of(opened.folder)
         simulator = ReconstructedSimulator(renderer, graph.all_tracks, drive, lanes)
         agent = agent_in(suite.agent, simulator)
@@ -143,6 +148,22 @@ def opened_trust(run: str, required: bool = False) -> Trust | None:
     """
     opened = opened_reconstruction(run)
     return trust_of(opened) if opened.vehicle.rig.names or required else None
+
+
+@functools.lru_cache(maxsize=1)
+def shown_vehicle(run: str, agent: str) -> LoggedVehicle:
+    """Return the vehicle of a log with the cameras that an agent is shown.
+
+    They are those of the log, or the agent's own where it requires others: a reconstruction shows any camera.
+    """
+    vehicle = opened_reconstruction(run).vehicle
+    own = own_rig(agent, vehicle) if vehicle.rig.names else None
+    if own is None:
+        return vehicle
+    _log.warning(
+        "%s: its cameras are not those that %s was trained with: the agent's own are rendered", run, agent
+    )
+    return dataclasses.replace(vehicle, rig=camera_rig(None, 0.0, own), other_names=())
 
 
 def renders_for(suite: DriveSuite) -> bool:

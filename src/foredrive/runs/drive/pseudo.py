@@ -50,7 +50,7 @@ def pseudo_simulate(
     scores, failed = list[PseudoScore](), 0
     for run in runs:
         sensors = inputs.cameras or inputs.lidar
-        place = place_in(run, trusted=sensors)
+        place = place_in(run, trusted=sensors, agent=agent)
         check_lidar_of(agent, None, place.vehicle, run)
         drive = LoggedDrive(place.vehicle, torch.eye(4))
         # an agent that cannot be made here is an error of the caller, and no failed start
