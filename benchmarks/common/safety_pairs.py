@@ -183,9 +183,9 @@ class PairedTests:
         """Return the drive with rendered sensors; drive it unless its file is there."""
         if file.is_file():
             return Driven(**json.loads(file.read_text()))
-        rig = dataclasses.replace(camera_rig(None, 0.0, agent.rig), exposed_dt_s=None)
         lidar = self._place.vehicle.lidar if agent.lidar else None
-        vehicle = dataclasses.replace(self._place.vehicle, rig=rig, other_names=(), lidar=lidar)
+        vehicle = self._place.vehicle.with_rig(camera_rig(None, 0.0, agent.rig))
+        vehicle = dataclasses.replace(vehicle, lidar=lidar)
         trust = NotedTrust(self._trust.scene, self._trust.views, self._trust.offset, self._trust.reference_db)
         shown: list[SceneGraph] = []
 

@@ -20,7 +20,7 @@ from foredrive.runs.drive.in_reconstruction import REPLAY, ReconstructedRoutes, 
 from foredrive.runs.drive.suite import DriveSuite, drive_suite
 from foredrive.runs.reconstruction.reconstruction_run import open_reconstruction
 from foredrive.scene import Renderer, VoxelSpec
-from foredrive.sensors.rigs import FRONT_TELE, camera_rig
+from foredrive.sensors.rigs import FRONT_TELE, SURROUND, TELE, RigPlan, camera_rig
 from foredrive.view.drive_report import write_drive_report
 
 VOXELS = VoxelSpec(lower_m=(-8.0, -8.0, -1.0), voxel_m=2.0, shape_zyx=(2, 8, 8))
@@ -87,7 +87,9 @@ def test_an_agent_that_requires_other_cameras_is_shown_its_own(
     """The driver of the package has two cameras with 100 and 45 degrees; the log has others."""
     assert shown_vehicle(str(reconstructed), str(trained.folder)).rig.names == ("ahead", "left")
     assert not caplog.messages
-    rig = shown_vehicle(str(reconstructed), "embedded").rig
+    shown = shown_vehicle(str(reconstructed), "embedded")
+    assert shown.learned == (0, 0)  # both look ahead
+    rig = shown.rig
     assert [name.upper() for name in rig.names] == list(FRONT_TELE.cameras)
     assert rig.size_hw == FRONT_TELE.image_hw
     expected = camera_rig(None, 0.0, FRONT_TELE)
@@ -98,6 +100,17 @@ def test_an_agent_that_requires_other_cameras_is_shown_its_own(
     (drive,) = drive_suite(suite, tmp_path).drives.values()
     assert drive.error == ""
     assert drive.score.duration_s > 1
+
+
+def test_other_cameras_take_what_was_learned_of_the_most_similar_ones(reconstructed: Path) -> None:
+    """The tilted narrow camera is like the narrow one, not like the wide one that looks straight ahead too."""
+    plan = RigPlan(SURROUND.image_hw, {**SURROUND.cameras, TELE: FRONT_TELE.cameras[TELE]})
+    vehicle = open_reconstruction(reconstructed).vehicle
+    logged = dataclasses.replace(vehicle, rig=camera_rig(None, 0.0, plan))
+    seen = logged.with_rig(camera_rig(None, 0.0, FRONT_TELE))
+    assert seen.learned == (0, 6)
+    # Once more, by way of the cameras in between
+    assert seen.with_rig(camera_rig(None, 0.0, FRONT_TELE.of_size((48, 128)))).learned == (0, 6)
 
 
 def test_what_lies_there_is_not_driven_again(reconstructed: Path, out: Path) -> None:

@@ -19,7 +19,7 @@ from foredrive.sensors import SpinningLidar
 
 @dataclass(frozen=True, eq=False)
 class ReconstructedRenderer:
-    """A `Renderer` of a reconstructed scene with the sensors of its log."""
+    """A `Renderer` of a reconstructed scene with the sensors of a vehicle, usually that of its log."""
 
     scene: ReconstructedScene
     graph: SceneGraph
@@ -30,7 +30,7 @@ class ReconstructedRenderer:
 
     @property
     def rig(self) -> CameraRig:
-        """The log's cameras at their mounts."""
+        """The vehicle's cameras at their mounts."""
         # Without exposure offsets, every camera is exposed at the given time
         return dataclasses.replace(self.vehicle.rig, exposed_dt_s=None)
 
@@ -43,7 +43,8 @@ class ReconstructedRenderer:
         T_scene_ego = (inverse_se3(self.vehicle.T_world_scene) @ T_world_ego).float()
         ego = EgoState(T_scene_ego, twist_ego, t_s)
         rig, lidar = self.rig, self.vehicle.lidar
-        views = [novel_camera_view(rig, camera, ego) for camera in range(len(rig.names))]
+        learned = self.vehicle.learned or range(len(rig.names))
+        views = [novel_camera_view(rig, camera, ego, sensor) for camera, sensor in enumerate(learned)]
         shown = [(view, self.scene.camera(self.graph, view.to(self.scene.device))) for view in views]
         images = torch.zeros(len(rig.names), 3, *rig.size_hw, dtype=torch.uint8)
         for camera, (_, image) in enumerate(shown):

@@ -64,6 +64,19 @@ class LoggedVehicle(Record):
     """Range of the lidar, m; infinite without one."""
     other_names: tuple[tuple[str, ...], ...] = ()
     """Further names of each camera, such as those in 123D; empty if none are known."""
+    learned: tuple[int, ...] = ()
+    """Index of the log's camera whose learned colours and corrections each camera takes. Empty: its own."""
+
+    def with_rig(self, rig: CameraRig) -> "LoggedVehicle":
+        """Return the vehicle with other cameras. Each takes what was learned of the most similar one."""
+        axes, logged = rig.T_ego_cam[:, :3, 2], self.rig.T_ego_cam[:, :3, 2]
+        turned_rad = (axes @ logged.T).clamp(-1, 1).acos()
+        # Fields of view, as focal lengths in image widths
+        focal, of_log = (one.K[:, 0, 0] / one.size_hw[1] for one in (rig, self.rig))
+        alike = turned_rad + (focal[:, None] / of_log).log().abs()
+        chosen = alike.argmin(1).tolist()
+        learned = tuple(self.learned[k] if self.learned else k for k in chosen)
+        return dataclasses.replace(self, rig=rig, other_names=(), learned=learned)
 
     def check_time(self, t_s: float) -> None:
         """Check that a time lies within the drive.

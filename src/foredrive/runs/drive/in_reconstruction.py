@@ -163,7 +163,7 @@ def shown_vehicle(run: str, agent: str) -> LoggedVehicle:
     _log.warning(
         "%s: its cameras are not those that %s was trained with: the agent's own are rendered", run, agent
     )
-    return dataclasses.replace(vehicle, rig=camera_rig(None, 0.0, own), other_names=())
+    return vehicle.with_rig(camera_rig(None, 0.0, own))
 
 
 def renders_for(suite: DriveSuite) -> bool:
