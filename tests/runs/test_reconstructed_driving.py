@@ -103,7 +103,7 @@ def test_an_agent_that_requires_other_cameras_is_shown_its_own(
 
 
 def test_other_cameras_take_what_was_learned_of_the_most_similar_ones(reconstructed: Path) -> None:
-    """The tilted narrow camera is like the narrow one, not like the wide one that looks straight ahead too."""
+    """The tilted narrow camera is like the narrow one, not like the wide one, which looks ahead too."""
     plan = RigPlan(SURROUND.image_hw, {**SURROUND.cameras, TELE: FRONT_TELE.cameras[TELE]})
     vehicle = open_reconstruction(reconstructed).vehicle
     logged = dataclasses.replace(vehicle, rig=camera_rig(None, 0.0, plan))
