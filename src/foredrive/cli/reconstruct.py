@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from foredrive.runs.recipes.reconstruction import ReconstructionRecipe
 
 FIGURES = (
-    *("minutes", "psnr_db", "nearest.psnr_db", "ssim", "lpips", "fid"),
+    *("minutes", "psnr_db", "nearest.psnr_db", "ssim", "lpips", "fid", "tower_lpips", "tower_fid"),
     *("depth_median_sq_m2", "intensity_rmse", "drop_accuracy", "chamfer_m2"),
 )
 
@@ -43,6 +43,7 @@ def reconstruct(
     cache: OptionalPath = None,
     lpips_weights: OptionalPath = None,
     fid_weights: OptionalPath = None,
+    tower_metrics: bool = False,
     set: Settings = (),
     workers: int = 1,
     ray: bool = False,
@@ -68,6 +69,8 @@ def reconstruct(
         cache: Folder for shrunk images; by default "cache" in OUT.
         lpips_weights: Evaluate LPIPS too, with this file of torchvision's AlexNet (.pth or .safetensors).
         fid_weights: Evaluate FID too, with this file of the Inception of 2015 that pytorch-fid publishes.
+        tower_metrics: Evaluate the formulas of LPIPS and FID too on the image tower that comes with the
+            package: tower_lpips and tower_fid. They compare runs with each other, not with published figures.
         set: Entries of the recipe to replace, such as representation.schedule.steps=2000; `foredrive recipes
             RECIPE` prints every entry with its meaning.
         workers: Number of logs reconstructed at a time, if there are several. On Ray it is the size of a
@@ -97,6 +100,7 @@ def reconstruct(
         recipe=chosen,
         cache=(cache or out / "cache").absolute(),
         weights=PerceptualWeights(lpips_weights, fid_weights),
+        tower_metrics=tower_metrics,
     )
     if len(log_paths) == 1 and not ray:
         print(work((log_paths[0], out)), flush=True)
@@ -109,19 +113,22 @@ def reconstruct_log(
     recipe: "ReconstructionRecipe[Any]",
     cache: Path,
     weights: "PerceptualWeights",
+    tower_metrics: bool,
     threads: int | None = None,
 ) -> str:
     """Reconstruct one log in a folder, draw its held-out frames, and return its figures as lines."""
     import torch
 
     from foredrive.methods.reconstruction.perceptual import PerceptualMetrics, PerceptualWeights
-    from foredrive.runs.reconstruction.reconstruct import Reconstruction, reconstruct
+    from foredrive.runs.reconstruction.reconstruct import Reconstruction, reconstruct, shipped_tower
     from foredrive.view.reconstruction_sheet import write_reconstruction_sheet
 
     if threads is not None:
         torch.set_num_threads(threads)
     log, out = job
-    perceptual = None if weights == PerceptualWeights() else PerceptualMetrics(weights)
+    perceptual = None
+    if tower_metrics or weights != PerceptualWeights():
+        perceptual = PerceptualMetrics(weights, shipped_tower() if tower_metrics else None)
 
     def draw(run: Reconstruction) -> None:
         if run.held_out.cameras:

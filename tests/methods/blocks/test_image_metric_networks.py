@@ -11,7 +11,12 @@ from torch import nn
 from foredrive.errors import InputError
 from foredrive.methods.blocks.inception import InceptionFeatures, resized
 from foredrive.methods.blocks.lpips import Lpips
-from foredrive.methods.reconstruction.perceptual import PerceptualMetrics, PerceptualWeights
+from foredrive.methods.reconstruction.perceptual import (
+    PerceptualMetrics,
+    PerceptualWeights,
+    feature_distance,
+)
+from foredrive.runs.reconstruction.reconstruct import shipped_tower
 
 ALEXNET = {0: (3, 64, 11), 3: (64, 192, 5), 6: (192, 384, 3), 8: (384, 256, 3), 10: (256, 256, 3)}
 """Convolutions of AlexNet: inputs, outputs, kernel."""
@@ -95,3 +100,27 @@ def test_images_are_resized_as_tensorflow_did() -> None:
     torch.testing.assert_close(resized(row)[0, 0, 7], torch.arange(0.0, 598, 2))
     up = resized(torch.arange(3.0).expand(1, 3, 299, 3))[0, 0, 0]
     assert up[[0, 50, 100, 299 - 1]].tolist() == pytest.approx([0, 150 / 299, 300 / 299, 2.0], abs=1e-5)
+
+
+def test_distance_of_features_by_hand() -> None:
+    """Two places of two channels: equal directions are 0 apart, opposite ones 4, right angles 2."""
+    a = torch.tensor([[3.0, 1.0], [0.0, 0.0]])[None, :, None]
+    b = torch.tensor([[5.0, -2.0], [0.0, 0.0]])[None, :, None]
+    c = torch.tensor([[0.0, 1.0], [2.0, 0.0]])[None, :, None]
+    assert float(feature_distance([a], [b])) == pytest.approx(2.0)
+    assert float(feature_distance([a], [c])) == pytest.approx(1.0)
+    assert float(feature_distance([a, a], [b, a])) == pytest.approx(1.0)
+
+
+def test_the_shipped_tower_finds_more_damage_farther() -> None:
+    """A photograph's stand-in: stripes and blobs. Noise and blur move it away, the more the farther."""
+    tower = shipped_tower()
+    v, u = torch.meshgrid(torch.arange(96.0), torch.arange(160.0), indexing="ij")
+    real = torch.stack([(u / 7).sin(), (v / 11).cos(), (u * v / 900).sin()]).add(1).div(2)[None]
+    noise = torch.randn(real.shape, generator=torch.Generator().manual_seed(0))
+    blurred = [real] + [torch.nn.functional.avg_pool2d(real, k, 1, k // 2) for k in (3, 9)]
+    noisy = [(real + amount * noise).clamp(0, 1) for amount in (0.0, 0.05, 0.2)]
+    for images in (blurred, noisy):
+        same, less, more = (float(feature_distance(*map(tower.features, (image, real)))) for image in images)
+        assert same == 0.0
+        assert 0.0 < less < more

@@ -55,11 +55,11 @@ class Lpips(nn.Module):
         for index, layer in enumerate(self.features):
             a, b = layer(a), layer(b)
             if index in _TAPS:
-                # Features are compared as unit vectors over the channels
-                difference = (_normalised(a) - _normalised(b)) ** 2
+                difference = (unit_features(a) - unit_features(b)) ** 2
                 distance = distance + self.heads[_TAPS.index(index)](difference).mean((1, 2, 3))
         return distance
 
 
-def _normalised(feature: Float[Tensor, "n C H W"]) -> Float[Tensor, "n C H W"]:
+def unit_features(feature: Float[Tensor, "n C H W"]) -> Float[Tensor, "n C H W"]:
+    """Return features as unit vectors over the channels."""
     return feature / (feature.square().sum(1, keepdim=True) + _TINY).sqrt()

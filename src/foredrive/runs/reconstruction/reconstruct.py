@@ -23,8 +23,9 @@ from foredrive.engine.provenance import collect_provenance, peak_rss_gib
 from foredrive.engine.summary import read_summary, write_summary
 from foredrive.errors import InputError
 from foredrive.files import atomic_path, together
+from foredrive.methods.lidarclip.image_tower import ImageTowerFeatures
 from foredrive.methods.reconstruction.evaluation import evaluate_cameras, evaluate_sweeps
-from foredrive.methods.reconstruction.perceptual import PerceptualMetrics
+from foredrive.methods.reconstruction.perceptual import PerceptualMetrics, PerceptualTower
 from foredrive.methods.reconstruction.reconstructed import ReconstructedScene
 from foredrive.methods.reconstruction.representation import Representation
 from foredrive.methods.reconstruction.scene_graph import STATIC
@@ -105,6 +106,14 @@ def reconstruct(
     data = read_reconstruction_data(recipe, path, (cache_dir or folder / "cache").absolute())
     with claim.claimed():
         return _reconstruct(recipe, path, folder, data, perceptual, report)
+
+
+def shipped_tower() -> PerceptualTower:
+    """Return the image tower that comes with the package as a network of perception."""
+    from foredrive.search.embedded import SHIPPED, load_image_tower  # few runs need it
+
+    tower = load_image_tower(SHIPPED).eval()
+    return PerceptualTower(ImageTowerFeatures(tower, enlarge=1), tower)
 
 
 def _reconstruct(
