@@ -1,8 +1,8 @@
 """Safety tests after NeuroNCAP in reconstructed towns and in PandaSet 002: `foredrive bench ncap`, hours.
 
-Three drives of 20 s are recorded with six cameras and a lidar, and reconstructed in runs/safety_rebuilds,
-for `ncap-transfer` too. In each reconstruction, four scenarios of each kind are driven ten times by each
-agent, under our rules, and by some under those of the paper and of its released code. `suite_minutes`
+Three drives of 20 s are recorded with seven cameras and a lidar, and reconstructed in runs/safety_rebuilds,
+for `ncap-transfer` too. In each reconstruction, up to four scenarios of each kind are driven four times by
+each agent, under our rules, and by some under those of the paper and of its released code. `suite_minutes`
 counts the drives of one suite alone, with the sensors that the agent needs. Intervals (`score_low`,
 `score_high`) hold 95 % over the runs of a town; the figures of an arm are means over its towns. PandaSet
 002 lasts 5.5 s, and a proposed scenario 6 s or more: its arm counts the scenarios that are feasible there.
@@ -29,7 +29,7 @@ from foredrive.runs.drive.in_ncap import propose_scenarios
 from foredrive.runs.recipes.reconstruction import gaussians_tiny
 from foredrive.runs.reconstruction.reconstruct import reconstruct
 
-SIZE = SuiteSize()
+SIZE = SuiteSize(runs=4)
 WORKERS = len(os.sched_getaffinity(0))
 NEMO = "embedded:nemo_town"
 AGENTS = {
@@ -38,12 +38,16 @@ AGENTS = {
     "log_replay": ("log", "ours"),
     "ego_mlp": (f"ego-mlp:{NEMO}", "ours"),
     "nemo_cameras": (NEMO, "ours"),
+    "driver": ("embedded", "ours"),
+    "idm_by_sight": ("idm:embedded", "ours"),
     "corridor_lidar": ("lidar-corridor", "ours"),
     "expert": ("expert", "ours"),
     "stop_paper": ("stop", "paper"),
     "nemo_cameras_paper": (NEMO, "paper"),
+    "driver_paper": ("embedded", "paper"),
     "corridor_lidar_paper": ("lidar-corridor", "paper"),
     "nemo_cameras_released": (NEMO, "released"),
+    "driver_released": ("embedded", "released"),
     "corridor_lidar_released": ("lidar-corridor", "released"),
 }
 """Agent and rules of each arm."""
