@@ -36,6 +36,7 @@ from foredrive.runs.recipes.reconstruction import (
 )
 from foredrive.runs.reconstruction.reconstruct import Reconstruction, reconstruct
 from foredrive.runs.reconstruction.reconstruction_run import open_reconstruction
+from foredrive.runs.reconstruction.trust import trust_of, trusted_place
 from foredrive.view.reconstruction_viewer import ReconstructedViewer
 
 STEPS = 6
@@ -407,3 +408,14 @@ def test_the_method_names_the_recipe(
     assert (
         "--method gaussians does not go with the recipe field_tiny, which is field" in capsys.readouterr().err
     )
+
+
+def test_it_says_where_its_images_are_trusted(run: Reconstruction) -> None:
+    """By the weights that were fitted to Gaussians: held-out images set the level."""
+    opened = open_reconstruction(run.folder)
+    trust = trust_of(opened)
+    assert trust.reference_db == pytest.approx(run.summary["psnr_db"], abs=0.5)  # of both cameras together
+    near, backwards = (
+        trusted_place(trust, opened.vehicle, 0.2, left_m, deg) for left_m, deg in ((0.0, 0.0), (6.0, 180.0))
+    )
+    assert backwards.psnr_db < near.psnr_db
