@@ -1,6 +1,7 @@
 """A log reconstructed as a neural field: trained, resumed to the same bits, opened, edited, rendered."""
 
 import dataclasses
+import math
 from pathlib import Path
 
 import numpy as np
@@ -36,7 +37,7 @@ from foredrive.runs.recipes.reconstruction import (
 )
 from foredrive.runs.reconstruction.reconstruct import Reconstruction, reconstruct
 from foredrive.runs.reconstruction.reconstruction_run import open_reconstruction
-from foredrive.runs.reconstruction.trust import trust_of, trusted_place
+from foredrive.runs.reconstruction.trust import expected_psnr_db, trust_of
 from foredrive.view.reconstruction_viewer import ReconstructedViewer
 
 STEPS = 6
@@ -410,12 +411,10 @@ def test_the_method_names_the_recipe(
     )
 
 
-def test_it_says_where_its_images_are_trusted(run: Reconstruction) -> None:
-    """By the weights that were fitted to Gaussians: held-out images set the level."""
+def test_trust_says_where_it_says_little(run: Reconstruction, caplog: pytest.LogCaptureFixture) -> None:
+    """After six steps a field is fog, in which nothing was seen again."""
     opened = open_reconstruction(run.folder)
     trust = trust_of(opened)
-    assert trust.reference_db == pytest.approx(run.summary["psnr_db"], abs=0.5)  # of both cameras together
-    near, backwards = (
-        trusted_place(trust, opened.vehicle, 0.2, left_m, deg) for left_m, deg in ((0.0, 0.0), (6.0, 180.0))
-    )
-    assert backwards.psnr_db < near.psnr_db
+    (warning,) = caplog.messages
+    assert warning.endswith(f"of the held-out images, which have {run.summary['psnr_db']:.1f} dB")
+    assert math.isfinite(expected_psnr_db(trust, opened.vehicle, opened.vehicle.at(0.2)))

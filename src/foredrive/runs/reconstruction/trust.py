@@ -33,6 +33,8 @@ OFFSETS_M = (0.0, 1.0, -1.0, 2.0, -2.0, 3.0, -3.0, 4.5, -4.5, 6.0, -6.0)
 HEADINGS_DEG = (0.0, 10.0, -10.0, 20.0, -20.0)
 """Places to the left and headings to the left that are judged, beside each moment of the log."""
 _log = logging.getLogger(__name__)
+CALIBRATED_DB = 1.0
+"""Largest difference of expected and actual PSNR of the held-out images, dB, without a warning."""
 REFERENCE_FRAMES = 12
 """Number of held-out frames, spread over the log, that the expectations are compared with."""
 
@@ -72,7 +74,16 @@ def trust_of(opened: OpenedReconstruction) -> Trust:
     actual_db = read_summary(opened.folder / SUMMARY).get("psnr_db")
     if isinstance(actual_db, float) and math.isfinite(actual_db):
         # The summary has the mean over single images, of each camera
-        offset = fitted_offset([image for frame in frames for image in frame], actual_db)
+        images = [image for frame in frames for image in frame]
+        offset = fitted_offset(images, actual_db)
+        expected_db = fmean(psnr_of(expected_errors(image, offset)) for image in images)
+        if abs(expected_db - actual_db) > CALIBRATED_DB:
+            _log.warning(
+                "%s: trust says little here: %.1f dB are expected of the held-out images, which have %.1f dB",
+                opened.folder,
+                expected_db,
+                actual_db,
+            )
     else:
         _log.warning("%s: no held-out images: what is expected is that of other logs", opened.folder)
         offset = 0.0
