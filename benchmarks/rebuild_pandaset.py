@@ -1,8 +1,8 @@
 """Reconstruct a real log, and measure the effect of each part of the sensor models.
 
 `foredrive bench rebuild-pandaset`, with the raw PandaSet log in FOREDRIVE_REAL_DATA/pandaset. Training uses
-the front camera and the lidar of every second frame; the other frames are for evaluation. Each arm is a run
-in runs/reconstruction/COMMIT, which continues where it stopped.
+the front camera (all six in one arm) and the lidar of every second frame; the others are for evaluation. Each
+arm is a run in runs/reconstruction/COMMIT, which continues where it stopped.
 """
 
 import dataclasses
@@ -29,6 +29,7 @@ SHORTER = rescheduled_recipe(
 ARMS: dict[str, ReconstructionRecipe[Any]] = {
     "gaussians_tiny": RECIPE,
     "gaussians_small": dataclasses.replace(gaussians_small(), cameras=RECIPE.cameras),
+    "six_cameras": dataclasses.replace(gaussians_small(), cameras=None),
     "shorter": SHORTER,
     "static_only": dataclasses.replace(SHORTER, actors=False),
     "no_rolling_shutter": dataclasses.replace(
@@ -47,7 +48,7 @@ ARMS: dict[str, ReconstructionRecipe[Any]] = {
 }
 FIGURES = (
     *("psnr_db", "ssim", "depth_median_sq_m2", "intensity_rmse", "drop_accuracy", "chamfer_m2"),
-    *("minutes", "computing_minutes", "gaussians", "camera_mp_per_s", "lidar_mrays_per_s"),
+    *("minutes", "computing_minutes", "peak_memory_gib", "gaussians", "camera_mp_per_s", "lidar_mrays_per_s"),
     *("nearest.psnr_db", "nearest.ssim", "moving.psnr_db", "moving.nearest.psnr_db"),
 )
 """Metrics: `nearest` compares with the training image nearest in time; `moving` uses the frames in which the
