@@ -64,6 +64,7 @@ def _values(pairs: Sequence[Pair]) -> dict[str, float]:
     same = town == rebuilt
     values = {
         "collision_agreement": float(same.mean()),
+        "majority_agreement": majority_agreement(pairs),
         "outcome_agreement": float(np.mean([p.town.outcome == p.reconstructed.outcome for p in pairs])),
         "collisions_in_town": float(town.mean()),
         "collisions_in_rebuild": float(rebuilt.mean()),
@@ -81,6 +82,22 @@ def _values(pairs: Sequence[Pair]) -> dict[str, float]:
         if (np.ptp(columns, axis=0) > 0).all() and np.isfinite(columns).all():
             values[f"{name}_correlation"] = float(stats.pearsonr(*columns.T).statistic)
     return values | _of_agents(pairs, scores) | _of_trust(pairs, same)
+
+
+def majority_agreement(pairs: Sequence[Pair]) -> float:
+    """Return how often a guess without any drive is right: what most other tests of agent and kind end in.
+
+    What a reconstruction predicts beyond that is due to what the sensors showed.
+    """
+    collided: dict[tuple[str, str], list[bool]] = {}
+    for pair in pairs:
+        collided.setdefault((pair.agent, pair.kind), []).append(pair.town.outcome == "collided")
+    right = 0
+    for outcomes in collided.values():
+        count, total = len(outcomes), sum(outcomes)
+        # Each test is left out of its own majority; a tie counts as no collision
+        right += sum(((total - outcome) > 0.5 * (count - 1)) == outcome for outcome in outcomes)
+    return right / len(pairs)
 
 
 def _of_agents(pairs: Sequence[Pair], scores: Float64[np.ndarray, "P 2"]) -> dict[str, float]:

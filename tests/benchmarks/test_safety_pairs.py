@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from benchmarks.common.reconstructed_towns import FRONT, TownDrive, TownTruth
-from benchmarks.common.safety_agreement import agreement, control_variate
+from benchmarks.common.safety_agreement import agreement, control_variate, majority_agreement
 from benchmarks.common.safety_pairs import Driven, NoisyAgent, Pair, SensorNoise, outline
 from benchmarks.common.safety_suites import spread
 from foredrive.driving.ncap.scenario import Polyline, SafetyScenario, ScenarioActor
@@ -50,6 +50,15 @@ def test_agreement_by_hand() -> None:
     assert figures["trusted_pairs"] == pytest.approx(2 / 3)
     assert figures["auc_disagreement"] == 1.0
     assert figures["calibration_error_db"] == 1.0
+
+
+def test_the_majority_is_that_of_other_tests() -> None:
+    """Three of four end in a collision: without itself, each of the three has two of three with it."""
+    ends = [driven("collided", 1.0)] * 3 + [driven("passed", 5.0)]
+    pairs = [Pair("side", "a", str(number), end, end) for number, end in enumerate(ends)]
+    assert majority_agreement(pairs) == 0.75
+    # Two that differ predict each other wrongly
+    assert majority_agreement(pairs[2:]) == 0.0
 
 
 def test_intervals_draw_whole_tests() -> None:
