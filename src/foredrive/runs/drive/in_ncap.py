@@ -161,11 +161,18 @@ def _judged(
     return dataclasses.replace(result, hd_score=None if judged is None else judged.hd_score)
 
 
-def propose_scenarios(runs: Sequence[str], file: Path, rules: str, count: int) -> SelfTest:
+def propose_scenarios(
+    runs: Sequence[str], file: Path, rules: str, count: int, *, trusted: bool = True
+) -> SelfTest:
     """Find the feasible scenarios of reconstructions; write those that pass the self-test to a file.
 
-    Where the images of a vehicle that takes no action are not trusted shortly before the impact, a scenario
-    is left out. Of a reconstruction without cameras, this is not known.
+    Args:
+        runs: folders of the reconstructions.
+        file: file to write.
+        rules: name of the rules.
+        count: number of runs of each scenario that have to pass.
+        trusted: leave a scenario out where the images of a vehicle that takes no action are not trusted
+            shortly before the impact. Of a reconstruction without cameras, this is not known.
 
     Returns:
         The result of the self-test, and what is left out for want of trust.
@@ -184,7 +191,8 @@ def propose_scenarios(runs: Sequence[str], file: Path, rules: str, count: int) -
         raise InputError(f"no scenario passes the self-test: {tested.reasons}")
     passed, left_out = list[SafetyScenario](), dict(tested.left_out)
     for scenario in tested.passed:
-        untrusted_s = _untrusted_s(place_in(places[scenario.scene], trusted=True), scenario)
+        place = place_in(places[scenario.scene], trusted=trusted)
+        untrusted_s = _untrusted_s(place, scenario) if trusted else None
         if untrusted_s is None:
             passed.append(scenario)
         else:
