@@ -136,7 +136,7 @@ class _Project(torch.autograd.Function):
         tensors, projection, rows = ctx.saved_tensors, ctx.projection, ctx.chosen
         gaussians, sensor = _arrays(projection, tensors)
         given = SplatGradients(*map(_array, gradients))
-        to = [torch.zeros_like(tensor) for tensor in tensors[:5]]
+        to = [torch.zeros(tensor.shape) for tensor in tensors[:5]]
         written = GaussianArrays(*(tensor.numpy() for tensor in to))
         blocks = -(-len(rows) // ROW)
         wants_pose = any(ctx.needs_input_grad[-2:])
@@ -152,7 +152,8 @@ class _Project(torch.autograd.Function):
             T = torch.zeros(4, 4)
             T[:3, :3], T[:3, 3] = total[:9].view(3, 3), total[9:12]
             of_pose = [T, total[12:]]
-        return None, None, *to, *of_pose
+        in_kind = (grad.to(tensor) for grad, tensor in zip(to, tensors, strict=False))
+        return None, None, *in_kind, *of_pose
 
 
 def _arrays(projection: Projection, tensors: tuple[Tensor, ...]) -> tuple[GaussianArrays, SensorArrays]:
