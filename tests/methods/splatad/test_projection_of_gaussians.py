@@ -15,7 +15,7 @@ from foredrive.geometry.se3 import exp_se3, inverse_se3, sensor_twist, transform
 from foredrive.methods.splatad import Gaussians, project_camera, project_lidar
 from foredrive.methods.splatad.camera import SPREAD_PX2
 from foredrive.methods.splatad.lidar import SPREAD_RAD2
-from foredrive.ops.splat_points import pixel_points
+from foredrive.ops.splat_points import beam_points, pixel_points
 from foredrive.ops.splatting import Splats, composite_splats
 
 SIZE_HW = (360, 640)
@@ -357,3 +357,24 @@ def test_a_kernel_projects_nothing_and_the_same_with_two_threads() -> None:
         torch.set_num_threads(before)
     for one, two in zip(*drawn, strict=True):
         assert torch.equal(one, two)
+
+
+@pytest.mark.parametrize(
+    "field", ["quaternion", "log_scale", "opacity_logit", "feature", "velocity_mps", "twist"]
+)
+def test_what_has_diverged_is_refused_and_not_drawn(field: str) -> None:
+    """Kernels neither hide NaN behind a bound nor read a scan time at an index that is none."""
+    of = motion(100, 1.0, torch.float32)
+    values = getattr(of, field) if field in ("velocity_mps", "twist") else getattr(of.gaussians, field)
+    with torch.no_grad():
+        values[0] = torch.nan
+        splats = project_lidar(
+            of.gaussians,
+            of.T_sensor_scene,
+            velocity_mps=of.velocity_mps,
+            twist_lidar=of.twist,
+            scan_s=torch.linspace(-0.05, 0.05, 720),
+        )
+        beams = beam_points(torch.linspace(-0.5, 0.5, 40), torch.zeros(40), torch.zeros(40))
+        with pytest.raises(ValueError, match="is not finite"):
+            composite_splats(splats, beams)

@@ -38,7 +38,7 @@ def project_camera(
 
     Centres are projected exactly, including lens distortion; covariances by the Jacobian of the projection
     there. `Splats.range_m` is the depth along the camera's axis. Gradients reach all tensors. Kernels
-    (`projection_kernels`) compute the same on the CPU, unless K or `dist` need gradients.
+    (`camera_kernels`) compute the same on the CPU, unless K or `dist` need gradients.
 
     Args:
         gaussians: Gaussians in the scene's frame.

@@ -38,7 +38,7 @@ def project_lidar(
     With J the Jacobian of (azimuth, elevation, range) and Σ' = J Σ Jᵀ, the covariance of a splat is that of
     its angles plus ε. Where a beam passes beside the centre, its range is the conditional mean there: it
     changes by Σ'_range,angles (Σ'_angles + ε)⁻¹ over the plane. Gradients reach all tensors. Kernels
-    (`projection_kernels`) compute the same on the CPU.
+    (`lidar_kernels`) compute the same on the CPU.
 
     Args:
         gaussians: Gaussians in the scene's frame.

@@ -1,4 +1,4 @@
-"""Projections of Gaussians by the kernels of `projection_kernels`, as an autograd function."""
+"""Projections of Gaussians by `camera_kernels` and `lidar_kernels`, as an autograd function."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -10,25 +10,51 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from foredrive.methods.reconstruction.gaussians import Gaussians
-from foredrive.methods.splatad.projection_back_kernels import (
-    SUMS,
-    SplatGradients,
-    project_to_camera_backward,
-    project_to_lidar_backward,
-)
-from foredrive.methods.splatad.projection_kernels import (
-    OUTPUTS,
-    GaussianArrays,
-    SensorArrays,
-    project_to_camera,
-    project_to_lidar,
-)
+from foredrive.methods.splatad.camera_kernels import project_to_camera, project_to_camera_backward
+from foredrive.methods.splatad.gaussian_kernels import OUTPUTS, SUMS
+from foredrive.methods.splatad.lidar_kernels import project_to_lidar, project_to_lidar_backward
 from foredrive.ops.splatting import Splats
 from foredrive.ops.threads import in_parallel
 from foredrive.ops.vectors import ROW
 
 MIN_BLOCKS = 128
 """Minimum number of blocks per thread."""
+
+
+class GaussianArrays(NamedTuple):
+    """Fields of `Gaussians` without features, float32 and contiguous, and their velocities."""
+
+    mean_m: np.ndarray
+    quaternion: np.ndarray
+    log_scale: np.ndarray
+    opacity_logit: np.ndarray
+    velocity_mps: np.ndarray
+    """Float32[N 3], or Float32[0 3] if all are static."""
+
+
+class SensorArrays(NamedTuple):
+    """A sensor: its pose, its motion, and the size of its pixels or beams."""
+
+    T_sensor_scene: np.ndarray
+    """Float32[12]: the rotation row by row, then the position."""
+    twist: np.ndarray
+    """Float32[6]."""
+    epsilon: np.float32
+    """Variance that a pixel or a beam adds."""
+    compensate: bool
+    """True if the opacity is lowered by as much as that widens a splat."""
+
+
+class SplatGradients(NamedTuple):
+    """Gradients with respect to the fields of `Splats` without features, float32 and contiguous."""
+
+    mean: np.ndarray
+    inverse_covariance: np.ndarray
+    opacity: np.ndarray
+    range_m: np.ndarray
+    range_slope: np.ndarray
+    velocity: np.ndarray
+    range_rate_mps: np.ndarray
 
 
 class Projection(NamedTuple):
@@ -41,7 +67,7 @@ class Projection(NamedTuple):
     epsilon: float
     """Variance that a pixel or a beam adds."""
     compensate: bool
-    """Whether the opacity is lowered by as much as that widens a splat."""
+    """True if the opacity is lowered by as much as that widens a splat."""
 
 
 def camera_projection(
