@@ -1,4 +1,4 @@
-"""How well drives in a reconstruction predict those in the town: figures of pairs, with intervals.
+"""Agreement of drives in a reconstruction with those in the town: figures of pairs, with intervals.
 
 Intervals hold 95 %. They are percentiles over draws of whole tests with replacement: the agents of one test
 meet the same actor.
@@ -11,12 +11,11 @@ from jaxtyping import Float64
 from scipy import stats
 
 from benchmarks.common.safety_pairs import Pair
+from foredrive.methods.reconstruction.trust import TRUSTED_LOSS_DB
 
 RESAMPLES = 1_000
 TRUE_DRIVES = 30
 """Number of drives in the town of the estimate by control variates."""
-CALIBRATED_DB = 3.0
-"""Largest loss of expected PSNR of a pair that counts as trusted, dB."""
 
 
 def agreement(pairs: Sequence[Pair]) -> dict[str, float]:
@@ -122,7 +121,7 @@ def _of_trust(pairs: Sequence[Pair], same: np.ndarray) -> dict[str, float]:
     )
     if not np.isfinite(lost_db).all():
         return {}
-    trusted = lost_db <= CALIBRATED_DB
+    trusted = lost_db <= TRUSTED_LOSS_DB
     values = {
         "lost_db": float(lost_db.mean()),
         "trusted_pairs": float(trusted.mean()),

@@ -97,7 +97,7 @@ class Pair:
 
 @dataclass(frozen=True, eq=False)
 class NotedTrust(Trust):
-    """What a reconstruction expects of its images, kept image by image."""
+    """A reconstruction's expectations of its images, kept image by image."""
 
     noted_db: list[float] = field(default_factory=list)
 

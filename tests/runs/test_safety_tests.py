@@ -18,11 +18,21 @@ from foredrive.driving.ncap.scenario import Polyline, Rectilinear
 from foredrive.driving.ncap.scenario_file import load_scenarios
 from foredrive.engine.summary import read_summary
 from foredrive.errors import InputError
-from foredrive.runs.drive.in_ncap import SafetyTests, _folders, place_in, propose_scenarios
+from foredrive.methods.reconstruction.renderer import ReconstructedRenderer
+from foredrive.methods.reconstruction.scene_graph import SceneGraph
+from foredrive.methods.reconstruction.trust import Trust
+from foredrive.runs.drive.in_ncap import (
+    SafetyTests,
+    _folders,
+    _untrusted_s,
+    place_in,
+    propose_scenarios,
+)
 from foredrive.runs.drive.in_reconstruction import ReconstructedRoutes
 from foredrive.runs.drive.pseudo import pseudo_simulate
 from foredrive.runs.drive.suite import DriveSuite, drive_suite
 from foredrive.runs.reconstruction.reconstruction_run import open_run_log
+from foredrive.scene import Renderer
 from foredrive.view.ncap_pictures import write_scenario_picture
 
 
@@ -190,3 +200,21 @@ def test_a_safety_test_says_how_much_of_it_is_trusted(
     drive = json.loads((tmp_path / "drives" / "stationary-on_rep0.json").read_text())
     assert drive["trusted_share"] == pytest.approx(share)
     assert "trusted, %" in capsys.readouterr().out
+
+
+def test_proposals_are_left_out_where_their_images_are_not_trusted(
+    reconstructed: Path, scenarios: Path
+) -> None:
+    """The same images against expectations along the logged way that are worse, and far better."""
+    place, (scenario, _) = place_in(str(reconstructed), trusted=True), load_scenarios(scenarios)
+    renderer = place.renderer(place.graph)
+    assert isinstance(renderer, ReconstructedRenderer)
+    assert renderer.trust is not None
+    for reference_db, untrusted_s in ((-50.0, None), (100.0, 2.0)):
+        judge = dataclasses.replace(renderer.trust, reference_db=reference_db)
+
+        def render(graph: SceneGraph, judge: Trust = judge) -> Renderer:
+            return dataclasses.replace(renderer, graph=graph, trust=judge)
+
+        assert _untrusted_s(dataclasses.replace(place, renderer=render), scenario) == untrusted_s
+    assert _untrusted_s(place_in(str(reconstructed)), scenario) is None  # not known

@@ -59,8 +59,8 @@ def reconstruct(
         out: Folder of the run; of several logs, each has its run in SPLIT/NAME there. If it holds a run
             already, the run continues from the last checkpoint, and a finished run is kept.
         method: Representation of the scene; by default the recipe's.
-        recipe: Name of the recipe: gaussians_tiny (minutes on two cores), gaussians_small (a quarter of an
-            hour, better), field_tiny (half an hour), gaussians_base, gaussians_published or field_base (a
+        recipe: Name of the recipe: gaussians_tiny (minutes on two cores), gaussians_small (ten minutes of a
+            core, better), field_tiny (half an hour), gaussians_base, gaussians_published or field_base (a
             GPU), or a YAML file; by default METHOD_tiny.
         cameras: Use only these cameras, by their own names or 123D's, such as pcam_f0; by default the
             recipe's.

@@ -173,6 +173,24 @@ def test_copies_were_seen_where_the_actor_was_that_they_look_like() -> None:
     assert middle(of_another_log["unseen"]) == 1.0
 
 
+def test_two_copies_in_one_image_are_looked_up_each_by_its_own_pose() -> None:
+    """The actor's rear was straight ahead at 10 m; its copies stand 20 m ahead, 5 m to either side."""
+    sides = []
+    for y_m, track_id in ((5.0, 8), (-5.0, 9)):
+        copy = tracks((21.0, 21.0), track_id)
+        poses = matrix_from_yaw(torch.zeros(2), torch.tensor([[21.0, y_m, 0.0]] * 2))[None]
+        size_lwh = torch.tensor([[2.0, 8.0, 60.0]])
+        sides.append(dataclasses.replace(copy, T_scene_actor=poses, size_lwh=size_lwh))
+    both = joined_tracks(*sides)
+    known = features(observed(actor_m=11.0), view(), image(2 * WALL_M), both, looks=(7, 7))
+    row, columns = 8, (12, 19)  # 5 m aside at 20 m: 4 px from the middle
+    for column in columns:
+        assert float(known["actor"].view(SIZE_HW)[row, column]) == 1.0
+        assert float(known["unseen"].view(SIZE_HW)[row, column]) == 0.0
+        # Each rear was seen head on, from half the distance
+        assert float(known["farther_than_seen"].view(SIZE_HW)[row, column]) < -0.6
+
+
 def test_psnr_is_that_of_the_mean_error() -> None:
     assert psnr_of(torch.tensor([[0.001, 0.003]])) == pytest.approx(-10 * math.log10(0.002))
 

@@ -4,6 +4,7 @@ import math
 from collections.abc import Callable
 from typing import NamedTuple
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
@@ -17,6 +18,7 @@ from foredrive.methods.splatad.camera import SPREAD_PX2
 from foredrive.methods.splatad.lidar import SPREAD_RAD2
 from foredrive.ops.splat_points import beam_points, pixel_points
 from foredrive.ops.splatting import Splats, composite_splats
+from foredrive.ops.vectors import ROW, atan2_row, kernel, load_row, store
 
 SIZE_HW = (360, 640)
 K = torch.tensor([[500.0, 0, 330], [0, 490, 170], [0, 0, 1]], dtype=torch.float64)
@@ -378,3 +380,19 @@ def test_what_has_diverged_is_refused_and_not_drawn(field: str) -> None:
         beams = beam_points(torch.linspace(-0.5, 0.5, 40), torch.zeros(40), torch.zeros(40))
         with pytest.raises(ValueError, match="is not finite"):
             composite_splats(splats, beams)
+
+
+@kernel
+def angles_of(y: np.ndarray, x: np.ndarray, angle_rad: np.ndarray) -> None:
+    for first in range(0, x.size, ROW):
+        store(angle_rad, first, atan2_row(load_row(y, first), load_row(x, first)))
+
+
+def test_angles_are_right_in_all_octants_and_on_the_axes() -> None:
+    around = np.linspace(-np.pi, np.pi, 1601)[1:]
+    far = 10.0 ** np.linspace(-6, 6, 1600)
+    x, y = (far * np.cos(around)).astype(np.float32), (far * np.sin(around)).astype(np.float32)
+    x[:5], y[:5] = [0, 0, 0, 3, -3], [0, 2, -2, 0, 0]
+    angle_rad = np.zeros_like(x)
+    angles_of(y, x, angle_rad)
+    assert np.abs(angle_rad - np.arctan2(y.astype(float), x.astype(float))).max() < 3e-7

@@ -55,7 +55,7 @@ MODELS = 3
 
 @dataclass(frozen=True)
 class Approach:
-    """How the actor of a proposed test comes to the place of the impact."""
+    """Time and speed at which the actor of a proposed test comes to the place of the impact."""
 
     impact_s: float = 4.0
     """Time from the end of the priming to the impact without action."""

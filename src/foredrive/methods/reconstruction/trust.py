@@ -205,7 +205,7 @@ def image_features(
 
 
 class _Surfaces(NamedTuple):
-    """What the N blocks of an image show."""
+    """The surfaces that the N blocks of an image show."""
 
     points: Float[Tensor, "N 3"]
     """Places in the scene; sky is far away."""
@@ -231,7 +231,7 @@ def _surfaces(
 
 
 class _Sightings(NamedTuple):
-    """How V training views saw N surfaces."""
+    """Sightings of N surfaces by V training views."""
 
     saw: Bool[Tensor, "V N"]
     """True where the surface was in the image and not hidden."""

@@ -104,7 +104,7 @@ def tiny_gaussians() -> GaussianRecipe:
 
 
 def small_gaussians() -> GaussianRecipe:
-    """Return Gaussians for a quarter of an hour on one core, with images of 480×270."""
+    """Return Gaussians for ten minutes on one core, with images of 480×270."""
     tiny = tiny_gaussians()
     schedule = replace(tiny.schedule, steps=2_000, max_gaussians=400_000, grow_from=100, grow_until=1_600)
     return replace(tiny, schedule=schedule)

@@ -70,10 +70,10 @@ def gaussians_tiny() -> ReconstructionRecipe[GaussianRecipe]:
 
 
 def gaussians_small() -> ReconstructionRecipe[GaussianRecipe]:
-    """Return a recipe for a quarter of an hour on one core, with images of 480×270."""
+    """Return a recipe for ten minutes on one core, with images of 480×270."""
     return ReconstructionRecipe(
         name="gaussians_small",
-        about="a log reconstructed from more Gaussians, in a quarter of an hour on one CPU core",
+        about="a log reconstructed from more Gaussians, in ten minutes on one CPU core",
         image_hw=(270, 480),
         representation=small_gaussians(),
     )
