@@ -28,6 +28,13 @@ SHORTER = rescheduled_recipe(
 """Less than a third of the steps, with as much growth: the recipe that arms change in one thing each."""
 ARMS: dict[str, ReconstructionRecipe[Any]] = {
     "gaussians_tiny": RECIPE,
+    "deformed_people": dataclasses.replace(
+        RECIPE,
+        representation=dataclasses.replace(
+            RECIPE.representation,
+            scene=dataclasses.replace(RECIPE.representation.scene, deformed_people=True),
+        ),
+    ),
     "gaussians_small": dataclasses.replace(gaussians_small(), cameras=RECIPE.cameras),
     "six_cameras": dataclasses.replace(gaussians_small(), cameras=None),
     "shorter": SHORTER,
@@ -50,6 +57,7 @@ FIGURES = (
     *("psnr_db", "ssim", "depth_median_sq_m2", "intensity_rmse", "drop_accuracy", "chamfer_m2"),
     *("minutes", "computing_minutes", "peak_memory_gib", "gaussians", "camera_mp_per_s", "lidar_mrays_per_s"),
     *("nearest.psnr_db", "nearest.ssim", "moving.psnr_db", "moving.nearest.psnr_db"),
+    *("people.psnr_db", "vehicles.psnr_db"),
 )
 """Metrics: `nearest` compares with the training image nearest in time; `moving` uses the frames in which the
 ego vehicle drives.

@@ -10,12 +10,18 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from foredrive.geometry.boxes import box_corners
+from foredrive.geometry.projection import project
+from foredrive.geometry.se3 import inverse_se3, transform_points
 from foredrive.methods.reconstruction.reconstructed import ReconstructedScene
 from foredrive.methods.reconstruction.scene_graph import SceneGraph
+from foredrive.methods.reconstruction.tracks import ActorTracks, nonrigid_rows, states_at
+from foredrive.methods.reconstruction.trust import psnr_of
 from foredrive.methods.reconstruction.views import CameraView, SweepView
 from foredrive.tasks.rendering.image_scores import psnr_db, ssim
 from foredrive.tasks.rendering.lidar_scores import SweepScores, score_sweep
 
+MIN_DEPTH_M = 0.1
 MOVING_MPS = 0.5
 """From this speed on a vehicle counts as moving."""
 
@@ -31,7 +37,9 @@ def evaluate_cameras(
     """Return PSNR and SSIM, mean over images, and under "nearest." those of the baseline.
 
     The baseline shows the nearest learned image of the same camera. Under "moving." are means over the images
-    taken at speed: where a vehicle stands, the image before is nearly the same.
+    taken at speed: where a vehicle stands, the image before is nearly the same. `people.psnr_db` and
+    `vehicles.psnr_db` are those of all pixels of the actors' boxes in all images together (after OmniRe, Chen
+    et al., 2025, Table 1).
 
     Args:
         scene: to judge.
@@ -44,6 +52,9 @@ def evaluate_cameras(
         return {}
     scores: dict[str, list[float]] = defaultdict(list)
     graph, took_s, pixels = graph or scene.graph, 0.0, 0
+    people = nonrigid_rows(graph.tracks)
+    actors = {"people": graph.tracks.only(people), "vehicles": graph.tracks.only(~people)}
+    squared: dict[str, list[Tensor]] = defaultdict(list)
     for number, view in enumerate(views):
         # The time covers rendering and the copy to the CPU, which waits for the device
         started = time.perf_counter()
@@ -54,6 +65,9 @@ def evaluate_cameras(
         known = torch.ones_like(real[:, 0], dtype=torch.bool) if where is None else where[number][None]
         same_camera = [other for other in learned if other.sensor == view.sensor]
         # Baseline: the learned image of the same camera nearest in time
+        for kind, tracks in actors.items():
+            where_kind = actor_pixels(tracks.to("cpu"), view) & known[0]
+            squared[kind].append((rgb - real).square()[0, :, where_kind].flatten())
         shown = {"": rgb}
         if same_camera:
             shown["nearest."] = _image(min(same_camera, key=lambda other: abs(other.t_s - view.t_s)))
@@ -64,10 +78,37 @@ def evaluate_cameras(
                 # Speed of the camera over ground
                 if float(view.twist_cam[:3].norm()) > MOVING_MPS:
                     scores[f"moving.{prefix}{name}"].append(float(value))
-    return {name: fmean(values) for name, values in scores.items()} | {
+    errors = {kind: torch.cat(parts) for kind, parts in squared.items()}
+    return {
+        **{name: fmean(values) for name, values in scores.items()},
+        **{f"{kind}.psnr_db": psnr_of(error) for kind, error in errors.items() if len(error)},
         "images": float(len(views)),
         "camera_mp_per_s": pixels / took_s * 1e-6,
     }
+
+
+def actor_pixels(tracks: ActorTracks, view: CameraView) -> Bool[Tensor, "H W"]:
+    """Return the pixels of an image in the rectangles around the boxes of all actors that are there.
+
+    What hides an actor counts too.
+    """
+    states = states_at(tracks, view.t_s)
+    here = tracks.size_lwh[states.present]
+    corners = box_corners(torch.zeros_like(here), here, torch.zeros_like(here[:, 0]))
+    T_cam_actor = inverse_se3(view.T_scene_cam) @ states.T_scene_actor[states.present]
+    uv, depth_m, _ = project(
+        transform_points(T_cam_actor, corners),
+        view.K.expand(len(here), 3, 3),
+        view.dist.expand(len(here), -1),
+        view.size_hw,
+    )
+    # A box that reaches behind the camera has no rectangle
+    uv = uv[(depth_m > MIN_DEPTH_M).all(-1)]
+    first, last = uv.amin(1), uv.amax(1)
+    v, u = (torch.arange(count) + 0.5 for count in view.size_hw)
+    columns = (u >= first[:, :1]) & (u <= last[:, :1])
+    rows = (v >= first[:, 1:]) & (v <= last[:, 1:])
+    return (rows[:, :, None] & columns[:, None, :]).any(0)
 
 
 def _image(view: CameraView) -> Float[Tensor, "1 3 H W"]:

@@ -205,8 +205,13 @@ def split_tracks(
     """
     actors = move_at_least(tracks, moves_m) if moves_m else torch.ones_like(tracks.present[:, 0])
     if not nonrigid:
-        actors &= ~torch.isin(tracks.category, torch.tensor(NONRIGID_CATEGORIES, device=actors.device))
+        actors &= ~nonrigid_rows(tracks)
     return tracks.only(actors), tracks.only(~actors)
+
+
+def nonrigid_rows(tracks: ActorTracks) -> Bool[Tensor, "A"]:
+    """Return which actors change their shape while they move."""
+    return torch.isin(tracks.category, torch.tensor(NONRIGID_CATEGORIES, device=tracks.category.device))
 
 
 def read_tracks(clip: Clip, T_world_scene: Float64[Tensor, "4 4"]) -> ActorTracks:

@@ -1,5 +1,6 @@
 """The Gaussians of a scene graph: which belong to the static part, and which to an actor."""
 
+import dataclasses
 from dataclasses import dataclass
 
 import torch
@@ -9,7 +10,11 @@ from torch import Tensor
 from foredrive.errors import InputError
 from foredrive.methods.reconstruction.gaussians import Gaussians, joined
 from foredrive.methods.reconstruction.scene_graph import Content, SceneGraph
+from foredrive.methods.splatad.deformation import Deformation
 from foredrive.scene.record import Record
+
+RIGID = -1
+"""In place of the row of an actor's code."""
 
 
 @dataclass(frozen=True)
@@ -20,6 +25,10 @@ class GaussianContent(Record):
     """Static Gaussians are in the scene's frame, those of actors in the frame of their boxes."""
     actor: Int[Tensor, "N"]
     """Row in the tracks, or `STATIC`."""
+    deformation: Deformation | None = None
+    """Moves the Gaussians of some actors in their boxes; None: all actors are rigid."""
+    code: Int[Tensor, "A"] | None = None
+    """Row of each actor in the codes of the deformation, or `RIGID`; None: as `deformation`."""
 
     @property
     def device(self) -> torch.device:
@@ -38,11 +47,16 @@ class GaussianContent(Record):
         """Return the content without the Gaussians of an actor."""
         kept = self.actor != row
         actor = self.actor[kept]
+        code = None if self.code is None else torch.cat([self.code[:row], self.code[row + 1 :]])
         # Rows behind the removed actor move up by one
-        return GaussianContent(self.gaussians[kept], actor - (actor > row).to(actor))
+        return dataclasses.replace(
+            self, gaussians=self.gaussians[kept], actor=actor - (actor > row).to(actor), code=code
+        )
 
     def with_copy(self, source: Content, source_row: int, row: int) -> "GaussianContent":
         """Return the content with the Gaussians of an actor of `source` as one more actor in `row`.
+
+        Actors of other scenes are rigid here.
 
         Raises:
             InputError: `source` has no Gaussians, or Gaussians of another number of features.
@@ -55,7 +69,36 @@ class GaussianContent(Record):
         if features != others:
             raise InputError(f"Gaussians of {features} features do not fit into a scene of {others} features")
         added = torch.full((len(own.opacity_logit),), row).to(self.actor)
-        return GaussianContent(joined([self.gaussians, own]), torch.cat([self.actor, added]))
+        code = self.code
+        if code is not None:
+            known = source.code if source.deformation is self.deformation else None
+            copied = code.new_full((1,), RIGID) if known is None else known[source_row : source_row + 1]
+            code = torch.cat([code, copied])
+        return dataclasses.replace(
+            self,
+            gaussians=joined([self.gaussians, own]),
+            actor=torch.cat([self.actor, added]),
+            code=code,
+        )
+
+    def shaped(self, own: Gaussians, owner: Int[Tensor, "M"], t_s: float | Tensor) -> Gaussians:
+        """Return Gaussians of actors, in the frames of their boxes, as they are at a time.
+
+        Args:
+            own: M Gaussians.
+            owner: row of the actor of each one.
+            t_s: seconds since the start of the drive.
+        """
+        if self.deformation is None or self.code is None:
+            return own
+        code = self.code[owner]
+        changing = (code != RIGID).nonzero()[:, 0]
+        then = self.deformation(own[changing], code[changing], t_s)
+        return dataclasses.replace(
+            own,
+            mean_m=own.mean_m.index_copy(0, changing, then.mean_m),
+            quaternion=own.quaternion.index_copy(0, changing, then.quaternion),
+        )
 
 
 def gaussians_of(graph: SceneGraph) -> GaussianContent:

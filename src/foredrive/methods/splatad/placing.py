@@ -69,7 +69,7 @@ def place_actors(
     shown = torch.cat([states.present, states.present.new_zeros(1)])[content.actor]  # STATIC, -1: last entry
     moving = shown.nonzero()[:, 0]
     owner = content.actor[moving]
-    own = content.gaussians[moving]
+    own = content.shaped(content.gaussians[moving], owner, t_s)
     if mirror is not None:
         own = _mirrored(own, mirror[owner])
 

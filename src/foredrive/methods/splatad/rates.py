@@ -23,6 +23,8 @@ class LearningRates:
     """Rate of the features besides albedo."""
     decoders: Rate = Rate(1e-3)
     """Rate of the decoders of images and of beams."""
+    deformation: Rate = Rate(1e-3)
+    """Rate of the shapes of people, if they are learned."""
     actor_offset: Rate = Rate(1e-4)
     """Rate of the offsets of the actors' poses."""
     camera_offset: Rate = Rate(1e-5)

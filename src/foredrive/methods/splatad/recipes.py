@@ -1,5 +1,6 @@
 """Scenes of Gaussians as a representation that recipes can name."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
@@ -9,6 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from foredrive.engine.learning_rates import Rate
+from foredrive.methods.blocks.losses import ImageFeatures
 from foredrive.methods.reconstruction.decoders import CameraDecoderConfig
 from foredrive.methods.reconstruction.tracks import ActorTracks
 from foredrive.methods.reconstruction.training import SensorViews
@@ -48,8 +50,10 @@ class GaussianRecipe:
         """Return a scene of the sizes of saved weights, which are to be loaded into it."""
         return saved_scene(weights, self.scene, reach_m)
 
-    def training(self, scene: GaussianScene, views: SensorViews) -> GaussianTraining:
-        """Return the training of a scene on views."""
+    def training(
+        self, scene: GaussianScene, views: SensorViews, tower: Callable[[], ImageFeatures] | None = None
+    ) -> GaussianTraining:
+        """Return the training of a scene on views. Gaussians have no perceptual loss."""
         return GaussianTraining(scene, views, self.schedule)
 
     def complete(self, scene: GaussianScene, T_scene_ego: Float[Tensor, "K 4 4"], views: SensorViews) -> None:

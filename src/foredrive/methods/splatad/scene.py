@@ -18,10 +18,12 @@ from foredrive.methods.reconstruction.gaussians import Gaussians
 from foredrive.methods.reconstruction.reconstructed import ReconstructedScene, saved_tracks
 from foredrive.methods.reconstruction.rendered import RenderedImage, RenderedSweep
 from foredrive.methods.reconstruction.scene_graph import STATIC, SceneGraph
+from foredrive.methods.reconstruction.tracks import nonrigid_rows
 from foredrive.methods.reconstruction.views import CameraView, SweepView
 from foredrive.methods.splatad.beams import PreparedSweep, prepared_sweep
 from foredrive.methods.splatad.camera import project_camera
-from foredrive.methods.splatad.content import GaussianContent, gaussians_of
+from foredrive.methods.splatad.content import RIGID, GaussianContent, gaussians_of
+from foredrive.methods.splatad.deformation import Deformation
 from foredrive.methods.splatad.lidar import project_lidar
 from foredrive.methods.splatad.placing import project_scene
 from foredrive.methods.splatad.scene_config import GaussianSceneConfig
@@ -49,6 +51,7 @@ class GaussianScene(ReconstructedScene):
     """
 
     actor: Tensor
+    code: Tensor | None
 
     def __init__(
         self,
@@ -76,6 +79,11 @@ class GaussianScene(ReconstructedScene):
         self.feature = nn.Parameter(own.feature[:, ALBEDO:])
         self.register_buffer("actor", content.actor)
         self.camera_decoder, self.lidar_decoder = camera_decoder, lidar_decoder
+        nonrigid = nonrigid_rows(graph.tracks)
+        deformed = config.deformed_people and bool(nonrigid.any())
+        code = torch.where(nonrigid, nonrigid.cumsum(0) - 1, RIGID)
+        self.deformation = Deformation(graph.tracks) if deformed else None
+        self.register_buffer("code", code if deformed else None, persistent=False)
 
     @property
     def gaussians(self) -> Gaussians:
@@ -86,7 +94,7 @@ class GaussianScene(ReconstructedScene):
     @property
     def content(self) -> GaussianContent:
         """The Gaussians, and what each belongs to."""
-        return GaussianContent(self.gaussians, self.actor)
+        return GaussianContent(self.gaussians, self.actor, self.deformation, self.code)
 
     @property
     def sizes(self) -> dict[str, int]:

@@ -24,6 +24,8 @@ class GaussianSceneConfig:
     """Minimum depth of the Gaussians that a camera sees, m."""
     lidar_reach_m: float | None = None
     """Range beyond which nothing stops a beam, m; None: the reach of the log's lidar."""
+    deformed_people: bool = False
+    """Pedestrians and animals change their shape in their boxes (`Deformation`). If False, they are rigid."""
     frame_velocities: bool = False
     """Learn corrections of the velocity and turn rate of each training image and sweep. They are not used for
     other views."""

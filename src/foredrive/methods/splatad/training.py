@@ -219,10 +219,10 @@ class GaussianTraining:
         for rate in dataclasses.fields(rates):
             if rate.name == "decoders":
                 parameters = [*scene.camera_decoder.parameters(), *scene.lidar_decoder.parameters()]
-            elif getattr(scene, rate.name) is None:
+            elif (learned := getattr(scene, rate.name)) is None:
                 continue
             else:
-                parameters = [getattr(scene, rate.name)]
+                parameters = list(learned.parameters()) if isinstance(learned, nn.Module) else [learned]
             groups.append(ParameterGroup(rate.name, parameters, getattr(rates, rate.name)))
         return groups
 
