@@ -35,7 +35,7 @@ from foredrive.runs.recipes.reconstruction import (
     field_tiny,
     rescheduled_recipe,
 )
-from foredrive.runs.reconstruction.reconstruct import Reconstruction, reconstruct
+from foredrive.runs.reconstruction.reconstruct import Reconstruction, reconstruct, shipped_tower
 from foredrive.runs.reconstruction.reconstruction_run import open_reconstruction
 from foredrive.runs.reconstruction.trust import expected_psnr_db, trust_of
 from foredrive.view.reconstruction_viewer import ReconstructedViewer
@@ -293,6 +293,22 @@ def test_a_perceptual_loss_where_there_are_weights(run: Reconstruction, tmp_path
     assert set(scene.state_dict()) == names
     with pytest.raises(InputError, match="no such file of VGG-19 weights"):
         FieldTraining(scene, run.train, dataclasses.replace(schedule, perceptual="missing.pth"))
+
+
+def test_a_perceptual_loss_of_the_shipped_tower(run: Reconstruction) -> None:
+    """LPIPS's distance, between 0 and 4, whose gradient reaches the field."""
+    scene = run.scene
+    assert isinstance(scene, FieldScene)
+    schedule = dataclasses.replace(run.recipe.representation.schedule, perceptual="tower")
+    training = run.recipe.representation.training(scene, run.train, lambda: shipped_tower().features)
+    assert "perceptual" not in training.losses(0, torch.Generator().manual_seed(0)).losses
+    training = FieldTraining(scene, run.train, schedule, lambda: shipped_tower().features)
+    losses = training.losses(0, torch.Generator().manual_seed(0)).losses
+    assert 0 < float(losses["perceptual"].detach()) < 4
+    (gradient,) = torch.autograd.grad(losses["perceptual"], next(scene.camera_decoder.parameters()))
+    assert bool(gradient.any())
+    with pytest.raises(InputError, match="no image tower here"):
+        FieldTraining(scene, run.train, schedule)
 
 
 def test_a_film_of_it_without_an_actor(run: Reconstruction, tmp_path: Path) -> None:

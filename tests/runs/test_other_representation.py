@@ -173,7 +173,7 @@ class BoxRecipe:
         saved = load_file(weights)
         return BoxScene(saved_tracks(saved), len(saved["camera_late_s"]), reach_m)
 
-    def training(self, scene: Any, views: SensorViews) -> BoxTraining:
+    def training(self, scene: Any, views: SensorViews, tower: object = None) -> BoxTraining:
         return BoxTraining(scene, views, self.schedule)
 
     def complete(self, scene: Any, T_scene_ego: Float[Tensor, "K 4 4"], views: SensorViews) -> None:

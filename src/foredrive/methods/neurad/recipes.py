@@ -1,5 +1,6 @@
 """Scenes that are neural fields as a representation that recipes can name."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
@@ -10,6 +11,7 @@ from torch import Tensor
 
 from foredrive.engine.learning_rates import Rate
 from foredrive.geometry.se3 import transform_points
+from foredrive.methods.blocks.losses import ImageFeatures
 from foredrive.methods.neurad.config import FieldConfig, GridConfig, GridsConfig
 from foredrive.methods.neurad.decoders import PatchDecoderConfig
 from foredrive.methods.neurad.scene import FieldScene, FieldSceneConfig, saved_field
@@ -59,9 +61,11 @@ class FieldRecipe:
         """Return a scene of the sizes of saved weights, which are to be loaded into it."""
         return saved_field(weights, self.scene, reach_m)
 
-    def training(self, scene: FieldScene, views: SensorViews) -> FieldTraining:
+    def training(
+        self, scene: FieldScene, views: SensorViews, tower: Callable[[], ImageFeatures] | None = None
+    ) -> FieldTraining:
         """Return the training of a scene on views."""
-        return FieldTraining(scene, views, self.schedule)
+        return FieldTraining(scene, views, self.schedule, tower)
 
     def complete(self, scene: FieldScene, T_scene_ego: Float[Tensor, "K 4 4"], views: SensorViews) -> None:
         """Do nothing: a field is defined everywhere."""

@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections import defaultdict
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import torch
@@ -12,6 +13,7 @@ from torch.optim import Optimizer
 from foredrive.engine.learning_rates import Rate
 from foredrive.engine.ranges import check_at_least, check_shares
 from foredrive.errors import InputError
+from foredrive.methods.blocks.losses import ImageFeatures
 from foredrive.methods.blocks.vgg import VggFeatures
 from foredrive.methods.neurad.decoders import UPSAMPLING
 from foredrive.methods.neurad.losses import (
@@ -25,6 +27,7 @@ from foredrive.methods.neurad.losses import (
 from foredrive.methods.neurad.rays import FieldRays
 from foredrive.methods.neurad.render import Intervals, SeenAlongRays
 from foredrive.methods.neurad.scene import FieldScene, tables_of
+from foredrive.methods.reconstruction.perceptual import feature_distance
 from foredrive.methods.reconstruction.training import ParameterGroup, SensorViews, StepLosses
 from foredrive.methods.splatad.losses import drop_loss, intensity_loss
 
@@ -39,7 +42,7 @@ class FieldWeights:
     rgb: float = 5.0
     """Weight of the mean squared error of colours."""
     perceptual: float = 0.05
-    """Weight of L1 of VGG-19's features; needs `FieldSchedule.perceptual`."""
+    """Weight of the distance of image features; needs `FieldSchedule.perceptual`."""
     depth: float = 0.01
     """Weight of the error of expected ranges of beams, L1 in m."""
     carving: float = 0.01
@@ -96,7 +99,9 @@ class FieldSchedule:
     sweeps: int = 4
     """Sweeps that the beams of a step are from."""
     perceptual: str | None = None
-    """File of torchvision's VGG-19 for the perceptual loss, or "download"; None: there is no such loss."""
+    """Network of the perceptual loss: a file of torchvision's VGG-19, "download", or "tower", the image tower
+    that comes with the package; None: there is no such loss. The loss is L1 of VGG-19's features, or LPIPS's
+    distance of the tower's (`feature_distance`)."""
     weights: FieldWeights = field(default_factory=FieldWeights)
     rates: FieldRates = field(default_factory=FieldRates)
     margin_m: float = 0.1
@@ -134,13 +139,20 @@ class FieldTraining:
         scene: trained in place.
         views: training data.
         schedule: length, rates and losses.
+        tower: loads the features for the perceptual loss "tower".
 
     Raises:
         InputError: there are neither images nor sweeps that a step looks at, images are too small, or the
             weights for the perceptual loss cannot be read.
     """
 
-    def __init__(self, scene: FieldScene, views: SensorViews, schedule: FieldSchedule) -> None:
+    def __init__(
+        self,
+        scene: FieldScene,
+        views: SensorViews,
+        schedule: FieldSchedule,
+        tower: Callable[[], ImageFeatures] | None = None,
+    ) -> None:
         # Beams are prepared once for all steps
         beams = [(view, scene.prepare_sweep(view)) for view in views.sweeps]
         self._sweeps = [(view, rays) for view, rays in beams if len(rays.t_s)] if schedule.beams else []
@@ -150,7 +162,7 @@ class FieldTraining:
             raise InputError(f"images of a field need {UPSAMPLING} pixels a side or more")
         self.scene, self.views, self.schedule = scene, views, schedule
         # Not a part of the scene: it is neither trained nor saved.
-        self._vgg = VggFeatures(schedule.perceptual, 19).to(scene.device) if schedule.perceptual else None
+        self._features, self._likeness = _perceptual(schedule.perceptual, tower, scene.device)
         self.steps, self.checkpoint_every, self.seed = (
             schedule.steps,
             schedule.checkpoint_every,
@@ -267,14 +279,14 @@ class FieldTraining:
             )
             real = torch.stack([patch.rgb for _, patch in patches_of_size]).to(rgb)
             squares, count = squares + ((rgb - real) ** 2).sum(), count + rgb.numel()
-            if self._vgg is not None:
+            if self._features is not None:
                 with torch.no_grad():
-                    wanted = self._vgg(real)
+                    wanted = self._features(real)
                 # Each group counts by its number of patches
                 share = len(patches_of_size) / len(patches)
-                likeness = likeness + share * weighted_feature_loss(self._vgg(rgb), wanted)
+                likeness = likeness + share * self._likeness(self._features(rgb), wanted).mean()
         losses = {"rgb": squares / count}
-        return losses if self._vgg is None else losses | {"perceptual": likeness}
+        return losses if self._features is None else losses | {"perceptual": likeness}
 
     def _decoded(
         self, feature: Float[Tensor, "n H W D"], camera: Int[Tensor, "n"]
@@ -368,3 +380,15 @@ class _Beams:
 
 def _draw(count: int, generator: torch.Generator) -> int:
     return int(torch.randint(count, (), generator=generator))
+
+
+def _perceptual(
+    network: str | None, tower: Callable[[], ImageFeatures] | None, device: torch.device
+) -> tuple[ImageFeatures | None, Callable[[Sequence[Tensor], Sequence[Tensor]], Tensor]]:
+    """Return the features of the perceptual loss, None for no such loss, and their distance."""
+    if network != "tower":
+        vgg = VggFeatures(network, 19).to(device) if network else None
+        return vgg, weighted_feature_loss
+    if tower is None:
+        raise InputError("perceptual=tower: there is no image tower here")
+    return tower(), feature_distance

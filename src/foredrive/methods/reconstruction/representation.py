@@ -1,11 +1,13 @@
 """The protocol of the representations that a recipe for reconstructing logs can name."""
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
 from jaxtyping import Float
 from torch import Tensor
 
+from foredrive.methods.blocks.losses import ImageFeatures
 from foredrive.methods.reconstruction.reconstructed import ReconstructedScene
 from foredrive.methods.reconstruction.tracks import ActorTracks
 from foredrive.methods.reconstruction.training import SceneTraining, SensorViews
@@ -49,8 +51,15 @@ class Representation(Protocol):
         """
         ...
 
-    def training(self, scene: Any, views: SensorViews) -> SceneTraining:
+    def training(
+        self, scene: Any, views: SensorViews, tower: Callable[[], ImageFeatures] | None = None
+    ) -> SceneTraining:
         """Return the training of a scene from `begin` on views.
+
+        Args:
+            scene: the scene.
+            views: training views.
+            tower: loads the features of the image tower that comes with the package, for perceptual losses.
 
         Raises:
             InputError: there are neither images nor sweeps.

@@ -138,7 +138,8 @@ def _reconstruct(
         for finding in calibration_findings(names, train.cameras, train.sweeps, tracks):
             if finding.large:
                 _log.warning("%s: the calibration may be wrong: %s", path.folder, finding.text)
-        train_representation(representation.training(scene, data.train), folder)
+        training = representation.training(scene, data.train, lambda: shipped_tower().features)
+        train_representation(training, folder)
         representation.complete(scene, data.vehicle.T_scene_ego, data.train)
         with atomic_path(weights) as temporary:
             save_weights(scene, temporary)
