@@ -4,6 +4,11 @@ Drives of six towns are reconstructed from a front camera and a lidar. Held-out 
 random places and headings beside the logged way, and compared with the town's own sensors there. An arm
 predicts the errors in one town with weights fitted to the others; `fit` fits to all of them, and prints the
 weights that methods/reconstruction/trust.py holds. Towns are kept in runs/trust.
+
+Arms TOWN_sight use the weights as they are, on the reconstructions of `bench ncap` (seven cameras, twenty
+seconds, another recipe), and show what a moment that is not trusted means to those who look: how far off the
+beams of the lidar are, and whether the shipped driver finds road users in the same places of its images as
+in the town's own ones.
 """
 
 import dataclasses
@@ -16,16 +21,25 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Float64
 from safetensors.torch import load_file, save_file
 from scipy import stats
 from torch import Tensor
 
 from benchmarks.common.reconstructed_towns import TownDrive, TownTruth
+from benchmarks.common.safety_pairs import NotedTrust
+from benchmarks.common.safety_suites import DRIVES as SAFETY_DRIVES
+from benchmarks.common.safety_suites import RECONSTRUCTION, reconstructed_town
+from foredrive.data.batches import stack_records
+from foredrive.driver.agent import Driver
+from foredrive.driving.observation import KeyFrame, make_clip
 from foredrive.engine.bench import Benchmark, study_identity
 from foredrive.files import atomic_path
+from foredrive.geometry.se3 import inverse_se3, matrix_from_yaw
 from foredrive.methods.reconstruction.edits import ShiftEgo
 from foredrive.methods.reconstruction.reconstructed import ReconstructedScene
+from foredrive.methods.reconstruction.renderer import ReconstructedRenderer
+from foredrive.methods.reconstruction.tracks import boxes_at
 from foredrive.methods.reconstruction.trust import (
     IMAGE_WEIGHTS,
     TRUSTED_LOSS_DB,
@@ -37,10 +51,16 @@ from foredrive.methods.reconstruction.trust import (
     psnr_of,
 )
 from foredrive.methods.reconstruction.views import CameraView, SweepView
+from foredrive.runs.drive.seeing_agents import driver_of
 from foredrive.runs.recipes.reconstruction import gaussians_tiny
 from foredrive.runs.reconstruction.reconstruct import reconstruct
 from foredrive.runs.reconstruction.reconstruction_run import open_reconstruction
-from foredrive.runs.reconstruction.trust import trained_views
+from foredrive.runs.reconstruction.trust import trained_views, trust_of
+from foredrive.runs.shipped import run_folder
+from foredrive.scene import Boxes, Clip, Command, Rendered
+from foredrive.sensors.rigs import FRONT_TELE, camera_rig
+from foredrive.towns.driving.town_replay import TownReplayRenderer
+from foredrive.towns.sensing.capture import SensorSuite
 
 DRIVES = {
     town: TownDrive(town, seed)
@@ -59,11 +79,18 @@ POSES, ASIDE_M, TURNED_DEG = 24, 6.0, 25.0
 """Number of random poses at each moment beside the logged one, and their bounds."""
 BEAMS_APART = 7
 """Every seventh beam is compared."""
+SIGHT_FRAMES_APART, SIGHT_POSES = 16, 16
+"""Distance of the frames that are judged in twenty seconds, an even number; random poses at each moment."""
+SIGHT_DRIVES = {drive.town: drive for drive in SAFETY_DRIVES}
+DRIVER = Path("embedded:driver")
+FOUND = 0.0
+"""Logit from which a place of an image counts as a road user."""
 RECIPE = gaussians_tiny()
 CONFIG = {
     "drives": [dataclasses.asdict(drive) for drive in DRIVES.values()],
     "recipe": dataclasses.asdict(RECIPE),
     "poses": [FRAMES_APART, POSES, ASIDE_M, TURNED_DEG, BEAMS_APART],
+    "sight": [SIGHT_FRAMES_APART, SIGHT_POSES, RECONSTRUCTION],
 }
 DECIDED_BY = ("foredrive.methods.reconstruction.trust", "foredrive.methods.splatad")
 WORK = Path("runs/trust") / study_identity(CONFIG, DECIDED_BY[1:])
@@ -195,12 +222,143 @@ def of_town(town: str, _: int) -> dict[str, float]:
         "right_beams": float(right[~held].mean()),
     }
     if good.any() and not good.all():
-        above = stats.mannwhitneyu(expected[good], expected[~good]).statistic
-        figures["auc_good_frame"] = float(above / good.sum() / (~good).sum())
+        figures["auc_good_frame"] = auc_of(expected, good)
     if trusted.any():
         figures["good_of_trusted"] = float(good[trusted].mean())
         figures["nearly_good_of_trusted"] = float((true >= least_db - 1.0)[trusted].mean())
     return figures
+
+
+class SightMoment(NamedTuple):
+    """What the reconstruction shows at one pose, against the town's own sensors."""
+
+    logged: bool
+    """On the logged way."""
+    expected_db: float
+    true_db: float
+    trusted: bool
+    range_error_m: float
+    """Median absolute error of the ranges of the beams that return in both."""
+    right_share: float
+    """As `Judged.right_share`."""
+    found_both: int
+    """Places in which the driver finds road users in both images."""
+    found_either: int
+    """Those in the town's images plus those in the rendered ones."""
+
+
+def in_sight(town: str, _: int) -> dict[str, float]:
+    """Return what trust says about ranges, and about what the driver finds, in one town."""
+    drive = SIGHT_DRIVES[town]
+    folder = reconstructed_town(drive)
+    opened, truth = open_reconstruction(folder), TownTruth(drive)
+    driver, rng = driver_of(run_folder(DRIVER, WORK / "models")), np.random.default_rng(0)
+    rig, expected = camera_rig(None, 0.0, FRONT_TELE), trust_of(opened)
+    trust = NotedTrust(expected.scene, expected.views, expected.offset, expected.reference_db)
+    graph, vehicle = opened.scene.graph, opened.vehicle
+    rendered = ReconstructedRenderer(opened.scene, graph, vehicle.with_rig(rig), trust)
+    sensors = SensorSuite(rig, drive.sensors.lidar)
+    real = TownReplayRenderer(truth.world, sensors, truth.snapshots, graph.tracks, vehicle.T_world_scene, {})
+    moments = list[SightMoment]()
+    # Odd frames: all of them are held out
+    for frame in range(1, drive.frames, SIGHT_FRAMES_APART):
+        snapshot = truth.snapshots[frame]
+        aside_m, turned_deg = rng.uniform(-1, 1, (2, SIGHT_POSES)) * np.array([[ASIDE_M], [TURNED_DEG]])
+        for left_m, deg in zip((0.0, *aside_m), (0.0, *turned_deg), strict=True):
+            T_ego_shifted = matrix_from_yaw(
+                torch.tensor(math.radians(deg)).double(), torch.tensor([0.0, float(left_m), 0.0]).double()
+            )
+            T_world_ego = torch.from_numpy(snapshot.T_world_ego) @ T_ego_shifted
+            T_scene_ego = (inverse_se3(vehicle.T_world_scene) @ T_world_ego).float()
+            boxes = boxes_at(graph.all_tracks, T_scene_ego, snapshot.t_s)
+            pose = T_world_ego, torch.zeros(6), snapshot.t_s
+            both = real.render(*pose), rendered.render(*pose)
+            of_town, of_scene = (found(driver, frame, boxes, T_world_ego) for frame in both)
+            moments.append(
+                SightMoment(
+                    left_m == 0 and deg == 0,
+                    trust.noted_db[-1],
+                    psnr_of((both[0].images.float() - both[1].images.float()).square() / 255**2),
+                    bool(both[1].trusted),
+                    *_of_beams(*both),
+                    int((of_town & of_scene).sum()),
+                    int(of_town.sum() + of_scene.sum()),
+                )
+            )
+        print(f"{town}: frame {frame} of {drive.frames}", flush=True)
+    return _sight_figures(moments, trust.reference_db)
+
+
+@torch.no_grad()
+def found(
+    driver: Driver, frame: Rendered, boxes: Boxes, T_world_ego: Float64[Tensor, "4 4"]
+) -> Bool[Tensor, "_"]:
+    """Return in which places of its images the driver finds road users."""
+    # Road users are found in single images: the frames before may be the same
+    key = KeyFrame(0.0, T_world_ego.numpy(), 0.0, frame.images, None, boxes)
+    past = dataclasses.replace(key, t_s=-0.5)
+    clip = make_clip([past, key], camera_rig(None, 0.0, FRONT_TELE), Command.STRAIGHT)
+    batch: Clip = stack_records([clip])
+    return driver.see(batch).user_pixels.flatten() > FOUND
+
+
+def _of_beams(real: Rendered, rendered: Rendered) -> tuple[float, float]:
+    """Return the median error of the ranges of a sweep, m, and the share of its beams that are right."""
+    assert real.sweep is not None
+    assert rendered.sweep is not None
+    true, seen = real.sweep, rendered.sweep
+    error_m = (seen.range_m - true.range_m).abs()
+    returned = true.returned & seen.returned
+    close = error_m < 0.1 + 0.02 * true.range_m
+    right = (true.returned == seen.returned) & (close | ~true.returned)
+    return float(error_m[returned].median()), float(right.float().mean())
+
+
+def _sight_figures(moments: Sequence[SightMoment], reference_db: float) -> dict[str, float]:
+    """Return the figures of the moments beside the logged way; those on it have names of their own."""
+    least_db = reference_db - TRUSTED_LOSS_DB
+    groups = {
+        "logged": [moment for moment in moments if moment.logged],
+        "trusted": [moment for moment in moments if not moment.logged and moment.trusted],
+        "untrusted": [moment for moment in moments if not moment.logged and not moment.trusted],
+    }
+    figures = {"reference_db": reference_db}
+    for name, of in groups.items():
+        figures[f"images_{name}"] = float(len(of))
+        if not of:
+            continue
+        either = sum(moment.found_either for moment in of)
+        figures |= {
+            f"psnr_{name}_db": float(np.mean([moment.true_db for moment in of])),
+            f"range_error_{name}_m": float(np.mean([moment.range_error_m for moment in of])),
+            f"right_beams_{name}": float(np.mean([moment.right_share for moment in of])),
+        }
+        if either:
+            figures[f"found_f1_{name}"] = 2 * sum(moment.found_both for moment in of) / either
+    beside = groups["trusted"] + groups["untrusted"]
+    expected, true = (
+        np.array([getattr(moment, key) for moment in beside]) for key in ("expected_db", "true_db")
+    )
+    good = true >= least_db
+    figures |= {
+        "calibration_error_db": float(np.abs(expected - true).mean()),
+        "bias_db": float((expected - true).mean()),
+        "correlation": float(stats.pearsonr(expected, true).statistic),
+        "good_share": float(good.mean()),
+        "trusted_share": len(groups["trusted"]) / len(beside),
+    }
+    if good.any() and not good.all():
+        figures["auc_good_frame"] = auc_of(expected, good)
+    if groups["trusted"]:
+        trusted_db = np.array([moment.true_db for moment in groups["trusted"]])
+        figures["good_of_trusted"] = float((trusted_db >= least_db).mean())
+    return figures
+
+
+def auc_of(expected: Float[np.ndarray, "N"], good: Bool[np.ndarray, "N"]) -> float:
+    """Return how often more is expected of a good frame than of another one."""
+    above = stats.mannwhitneyu(expected[good], expected[~good]).statistic
+    return float(above / good.sum() / (~good).sum())
 
 
 def fit(_: int) -> dict[str, float]:
@@ -212,7 +370,11 @@ def fit(_: int) -> dict[str, float]:
 
 BENCHMARK = Benchmark(
     question="Does a reconstruction know from where its images are good?",
-    arms={**{town: functools.partial(of_town, town) for town in DRIVES}, "fit": fit},
+    arms={
+        **{town: functools.partial(of_town, town) for town in DRIVES},
+        "fit": fit,
+        **{f"{town}_sight": functools.partial(in_sight, town) for town in SIGHT_DRIVES},
+    },
     seeds=(0,),
     config=CONFIG,
     decided_by=DECIDED_BY,
