@@ -139,9 +139,9 @@ def reconstructed(
 BENCHMARK = Benchmark(
     question="Which representation of a reconstructed log is better: for how much CPU time, and from where?",
     arms={
-        **{f"{arm}@pandaset": functools.partial(on_pandaset, arm) for arm in RECIPES},
-        **{f"{arm}@{town}": functools.partial(in_town, arm, town) for town in TOWNS for arm in RECIPES},
-        **{f"{arm}@kitti": functools.partial(on_kitti, arm) for arm in RECIPES},
+        **{f"pandaset_{arm}": functools.partial(on_pandaset, arm) for arm in RECIPES},
+        **{f"{town}_{arm}": functools.partial(in_town, arm, town) for town in TOWNS for arm in RECIPES},
+        **{f"kitti_{arm}": functools.partial(on_kitti, arm) for arm in RECIPES},
     },
     config=CONFIG,
     decided_by=DECIDED_BY,
