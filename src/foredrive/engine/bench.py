@@ -18,6 +18,8 @@ from pathlib import Path
 from statistics import mean, stdev
 from typing import Any
 
+from filelock import FileLock
+
 from foredrive.engine.provenance import collect_provenance
 from foredrive.engine.summary import write_json
 from foredrive.errors import InputError
@@ -49,22 +51,24 @@ def run_benchmark(
     folder: Path,
     *,
     arms: Sequence[str] | None = None,
+    seeds: Sequence[int] | None = None,
     say: Callable[[str], None] = print,
 ) -> Path:
     """Run the missing measurements of a benchmark; return the path of its results, `folder`/NAME.json.
 
     Args:
         arms: only these; None means all.
+        seeds: only these; None means all.
         say: called with one line about each measurement.
 
     Raises:
-        InputError: on an arm that the benchmark does not have.
+        InputError: on an arm or a seed that the benchmark does not have.
     """
-    unknown = set(arms or ()) - set(benchmark.arms)
-    if unknown:
-        raise InputError(
-            f"{name} has no arm {', '.join(sorted(unknown))}; it has {', '.join(benchmark.arms)}"
-        )
+    for kind, requested, available in (("arm", arms, benchmark.arms), ("seed", seeds, benchmark.seeds)):
+        if unknown := [str(value) for value in requested or () if value not in available]:
+            raise InputError(
+                f"{name} has no {kind} {', '.join(unknown)}; it has {', '.join(map(str, available))}"
+            )
     path = folder / f"{name}.json"
     origin = collect_provenance()
     same = _identity(benchmark, origin)
@@ -72,7 +76,7 @@ def run_benchmark(
         say(f"{path.name}: measured on other code, configuration or machine; starting anew")
     chosen = [arm for arm in benchmark.arms if arms is None or arm in arms]
     # Seeds are the outer loop, so that an interrupted benchmark has the same seeds for all arms
-    for seed, arm in product(benchmark.seeds, chosen):
+    for seed, arm in product([seed for seed in benchmark.seeds if seeds is None or seed in seeds], chosen):
         # The file is read again before each measurement: another process may fill it at the same time
         runs = _kept_runs(path, same, benchmark, origin) or []
         if any(run["arm"] == arm and run["seed"] == seed for run in runs):
@@ -84,13 +88,23 @@ def run_benchmark(
         wall_s = time.perf_counter() - started
         made_on = {key: origin[key] for key in MADE_ON}
         # Other processes may have added measurements while this one ran
-        runs = _kept_runs(path, same, benchmark, origin) or []
-        runs.append({"arm": arm, "seed": seed, "figures": figures, "wall_s": wall_s, **made_on})
-        write_json(path, _report(name, benchmark, origin, same, runs))
+        lock = path.with_name(f".{path.name}.lock")
+        with FileLock(lock):
+            runs = _kept_runs(path, same, benchmark, origin) or []
+            runs.append({"arm": arm, "seed": seed, "figures": figures, "wall_s": wall_s, **made_on})
+            write_json(path, _report(name, benchmark, origin, same, runs))
+            lock.unlink()
         say(f"{name}: {arm}, seed {seed}: " + ", ".join(f"{k} {v:.4g}" for k, v in figures.items()))
     if not path.is_file():
         raise InputError(f"{name} has no arms or no seeds")
     return path
+
+
+def measured_before(name: str, benchmark: Benchmark, folder: Path) -> set[tuple[str, int]]:
+    """Return the arms and seeds of a benchmark that need not be measured again."""
+    origin = collect_provenance()
+    runs = _kept_runs(folder / f"{name}.json", _identity(benchmark, origin), benchmark, origin)
+    return {(run["arm"], run["seed"]) for run in runs or []}
 
 
 def spread(runs: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, dict[str, float]]]:

@@ -128,8 +128,14 @@ def read_values(path: Path) -> Any:
     return read_yaml(path, "a recipe")
 
 
-def validated(kind: Any, written: Any, source: str) -> Any:
+def validated(kind: Any, written: Any, source: str, what: str = "recipe") -> Any:
     """Return plain values as a dataclass, generic or not.
+
+    Args:
+        kind: the dataclass.
+        written: plain values.
+        source: where they are from, for messages.
+        what: what they should be, for messages.
 
     Raises:
         InputError: an entry is wrong, missing or unknown. The message names it.
@@ -139,7 +145,7 @@ def validated(kind: Any, written: Any, source: str) -> Any:
     except ValidationError as error:
         first = error.errors()[0]
         where = ".".join(str(part) for part in first["loc"])
-        raise InputError(f"{source}: not a recipe: {f'{where}: ' if where else ''}{first['msg']}") from error
+        raise InputError(f"{source}: not a {what}: {f'{where}: ' if where else ''}{first['msg']}") from error
 
 
 def overridden(written: Mapping[str, Any], settings: Sequence[str]) -> dict[str, Any]:
