@@ -2,12 +2,13 @@
 
 import dataclasses
 import json
+import sys
 from collections.abc import Mapping
 from pathlib import Path
 
 import pytest
 
-from foredrive.engine.bench import Benchmark, run_benchmark
+from foredrive.engine.bench import Benchmark, run_benchmark, study_identity
 from foredrive.errors import InputError
 
 
@@ -147,6 +148,48 @@ def test_a_study_starts_anew_where_what_decides_it_changes(
         _module(tmp_path, "def half(x):\n    return x // 2\n")
     run_benchmark("study", _study(decided_by, size=4 if change == "config" else 3), tmp_path, say=said.append)
     assert any("starting anew" in line for line in said)
+
+
+SLICED = """import math
+from os.path import join
+
+SCALE = 2.0
+
+def half(x):
+    return _scaled(x) / 2
+
+def _scaled(x):
+    return SCALE * x
+
+def other(x):
+    return math.sqrt(x)
+"""
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "anew"),
+    [
+        ("math.sqrt(x)", "math.exp(x)", False),
+        ("def other", "def another", False),
+        ("from os.path import join", "from os.path import split", False),
+        ("/ 2", "/ 3", True),
+        ("SCALE * x", "SCALE + x", True),
+        ("SCALE = 2.0", "SCALE = 3.0", True),
+    ],
+)
+def test_a_definition_decides_with_what_it_uses(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, before: str, after: str, anew: bool
+) -> None:
+    monkeypatch.syspath_prepend(str(tmp_path))
+    # Looking a module up imports its package
+    monkeypatch.delitem(sys.modules, "decisive", raising=False)
+    _module(tmp_path, SLICED)
+    first = study_identity({}, ("decisive.model:half",))
+    assert before in SLICED
+    _module(tmp_path, SLICED.replace(before, after))
+    assert (study_identity({}, ("decisive.model:half",)) != first) == anew
+    with pytest.raises(ImportError, match=r"no definition 'decisive\.model:quarter'"):
+        study_identity({}, ("decisive.model:quarter",))
 
 
 def test_the_parts_of_an_arm_stand_together(tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 from statistics import mean, stdev
-from typing import Any
+from typing import Any, TypeGuard
 
 from filelock import FileLock
 
@@ -41,8 +41,8 @@ class Benchmark:
     config: Mapping[str, Any] | None = None
     """Values that the figures depend on besides the code, JSON-able. Changed values restart the benchmark."""
     decided_by: tuple[str, ...] | None = None
-    """Modules and packages whose code decides the figures of a study of quality, by full name. None: the
-    figures are speeds, which depend on commit and machine."""
+    """The code that decides the figures of a study of quality: modules and packages by full name, and single
+    definitions as MODULE:NAME. None: the figures are speeds, which depend on commit and machine."""
 
 
 def run_benchmark(
@@ -165,15 +165,19 @@ def study_identity(config: Mapping[str, Any], decided_by: Sequence[str]) -> str:
 
     Args:
         config: JSON-able values.
-        decided_by: modules and packages by full name; a package stands for all modules in it.
+        decided_by: modules and packages by full name; a package stands for all modules in it. MODULE:NAME
+            is a function, class or constant with what it uses of its own module.
 
     Raises:
-        ImportError: there is no such module.
+        ImportError: there is no such module or definition.
     """
     digest = hashlib.sha256(json.dumps(dict(config), sort_keys=True).encode())
-    for name in sorted(decided_by):
-        for path in _sources(name):
-            digest.update(f"{name}/{path.name}".encode() + _code_of(path).encode())
+    for entry in sorted(decided_by):
+        module, _, definition = entry.partition(":")
+        for path in _sources(module):
+            tree = _without_docstrings(path)
+            code = ast.dump(tree) if not definition else _slice(tree, definition, entry)
+            digest.update(f"{entry}/{path.name}".encode() + code.encode())
     return digest.hexdigest()[:16]
 
 
@@ -186,13 +190,47 @@ def _sources(name: str) -> list[Path]:
     return sorted(path.parent.rglob("*.py")) if path.name == "__init__.py" else [path]
 
 
-def _code_of(path: Path) -> str:
+def _without_docstrings(path: Path) -> ast.Module:
     """Return the syntax tree of a file without its docstrings."""
     tree = ast.parse(path.read_text())
     for node in ast.walk(tree):
         if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
             node.body = [part for part in node.body if not _is_text(part)]
-    return ast.dump(tree)
+    return tree
+
+
+def _slice(tree: ast.Module, definition: str, entry: str) -> str:
+    """Return the code of a definition of a module, and of all that it uses of the same module.
+
+    Raises:
+        ImportError: the module has no such definition.
+    """
+    nodes: dict[str, list[ast.stmt]] = {}
+    for node in tree.body:
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
+            names = [node.name]
+        elif isinstance(node, ast.Import | ast.ImportFrom):
+            names = [alias.asname or alias.name.partition(".")[0] for alias in node.names]
+        else:
+            names = [part.id for part in ast.walk(node) if _is_bound(part)]
+        for name in names:
+            nodes.setdefault(name, []).append(node)
+    if definition not in nodes:
+        raise ImportError(f"no definition {entry!r}")
+    # Every name that a part reads, as far as this module defines it
+    used, waiting = {definition}, [definition]
+    while waiting:
+        for node in nodes[waiting.pop()]:
+            read = {part.id for part in ast.walk(node) if isinstance(part, ast.Name)}
+            waiting += (read & nodes.keys()) - used
+            used |= read & nodes.keys()
+    kept = {id(node) for name in used for node in nodes[name]}
+    return "".join(ast.dump(node) for node in tree.body if id(node) in kept)
+
+
+def _is_bound(node: ast.AST) -> TypeGuard[ast.Name]:
+    """Return whether a part of a statement is a name that gets a value."""
+    return isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store)
 
 
 def _is_text(node: ast.stmt) -> bool:
