@@ -22,7 +22,7 @@ from typing import Any
 from benchmarks.common.measuring import forget_peak
 from benchmarks.common.points_aside import aside_figures
 from benchmarks.common.reconstructed_towns import TownDrive, TownTruth
-from benchmarks.common.study import kitti_drive, pandaset_log
+from benchmarks.common.study import RECONSTRUCTED_BY, kitti_drive, pandaset_log
 from benchmarks.rebuild_pandaset import FIGURES
 from foredrive.data import LogPath
 from foredrive.engine.bench import Benchmark, study_identity
@@ -62,21 +62,7 @@ RENAMED = {"moving.psnr_db": "psnr_driving_db", "moving.nearest.psnr_db": "neare
 DECIDED_BY = (
     "benchmarks.common.points_aside",
     "benchmarks.common.reconstructed_towns",
-    "foredrive.geometry",
-    "foredrive.methods.neurad.losses",
-    "foredrive.methods.splatad.losses",
-    "foredrive.ops.hash_grid",
-    "foredrive.ops.hash_grid_kernels",
-    "foredrive.ops.ray_box_kernels",
-    "foredrive.ops.ray_boxes",
-    "foredrive.ops.splatting",
-    "foredrive.ops.splatting_back_kernels",
-    "foredrive.ops.splatting_kernels",
-    "foredrive.methods.neurad.recipes",
-    "foredrive.methods.splatad.recipes",
-    "foredrive.methods.reconstruction",
-    "foredrive.methods.neurad.training",
-    "foredrive.methods.splatad.training",
+    *RECONSTRUCTED_BY,
 )
 CONFIG = {
     "recipes": {arm: dataclasses.asdict(recipe) for arm, recipe in RECIPES.items()},

@@ -2,7 +2,7 @@
 
 `foredrive bench rebuild-pandaset`, with the raw PandaSet log in FOREDRIVE_REAL_DATA/pandaset. Training uses
 the front camera (all six in one arm) and the lidar of every second frame; the others are for evaluation. Each
-arm is a run in runs/reconstruction/COMMIT, which continues where it stopped.
+arm is a run in runs/rebuild, which continues where it stopped.
 """
 
 import dataclasses
@@ -10,8 +10,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from benchmarks.common.study import pandaset_log, work_folder
-from foredrive.engine.bench import Benchmark
+from benchmarks.common.study import RECONSTRUCTED_BY, pandaset_log
+from foredrive.engine.bench import Benchmark, study_identity
 from foredrive.runs.recipes.reconstruction import (
     ReconstructionRecipe,
     gaussians_small,
@@ -20,7 +20,7 @@ from foredrive.runs.recipes.reconstruction import (
 )
 from foredrive.runs.reconstruction.reconstruct import reconstruct
 
-WORK = work_folder(Path("runs/rebuild"))
+ROOT = Path("runs/rebuild")
 RECIPE = dataclasses.replace(gaussians_tiny(), cameras=("pcam_f0",))
 SHORTER = rescheduled_recipe(
     RECIPE, steps=150, shrink_steps=(15,), grow_from=15, grow_until=120, grow_every=15
@@ -53,6 +53,8 @@ ARMS: dict[str, ReconstructionRecipe[Any]] = {
     ),
     "published_lidar_losses": rescheduled_recipe(SHORTER, lidar_losses="published"),
 }
+CONFIG = {"arms": {arm: dataclasses.asdict(recipe) for arm, recipe in ARMS.items()}}
+WORK = ROOT / study_identity(CONFIG, RECONSTRUCTED_BY)
 FIGURES = (
     *("psnr_db", "ssim", "depth_median_sq_m2", "intensity_rmse", "drop_accuracy", "chamfer_m2"),
     *("minutes", "computing_minutes", "peak_memory_gib", "gaussians", "camera_mp_per_s", "lidar_mrays_per_s"),
@@ -67,9 +69,8 @@ ego vehicle drives.
 def reconstructed(arm: str) -> Callable[[int], dict[str, float]]:
     def measure(seed: int) -> dict[str, float]:
         recipe = rescheduled_recipe(ARMS[arm], seed=seed)
-        summary = reconstruct(
-            recipe, pandaset_log(WORK / "pandaset"), WORK / f"{arm}_seed{seed}", WORK / "cache"
-        ).summary
+        log, folder = pandaset_log(ROOT / "pandaset"), WORK / f"{arm}_seed{seed}"
+        summary = reconstruct(recipe, log, folder, ROOT / "cache").summary
         return {name: float(value) for name in FIGURES if isinstance(value := summary.get(name), float | int)}
 
     return measure
@@ -78,5 +79,6 @@ def reconstructed(arm: str) -> Callable[[int], dict[str, float]]:
 BENCHMARK = Benchmark(
     question="How well is a real log reconstructed, and what is each part of the sensor models worth?",
     arms={arm: reconstructed(arm) for arm in ARMS},
-    config={"arms": {arm: dataclasses.asdict(recipe) for arm, recipe in ARMS.items()}},
+    config=CONFIG,
+    decided_by=RECONSTRUCTED_BY,
 )

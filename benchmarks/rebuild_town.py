@@ -2,8 +2,8 @@
 
 `foredrive bench rebuild-town`. Training uses the front camera and the lidar of every second frame. The scene
 is then rendered from the held-out poses, from poses beside them, and with an actor removed or moved. Each
-view is compared with the town's own sensors at the same pose. Each arm is a run in runs/rebuild_town/COMMIT,
-which continues where it stopped.
+view is compared with the town's own sensors at the same pose. Each arm is a run in runs/rebuild_town, which
+continues where it stopped.
 """
 
 import dataclasses
@@ -17,8 +17,8 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from benchmarks.common.reconstructed_towns import TownDrive, TownTruth, TrueViews
-from benchmarks.common.study import work_folder
-from foredrive.engine.bench import Benchmark
+from benchmarks.common.study import RECONSTRUCTED_BY
+from foredrive.engine.bench import Benchmark, study_identity
 from foredrive.engine.summary import numbers
 from foredrive.methods.reconstruction.edits import Edit, Move, Remove, ShiftEgo, apply_edits
 from foredrive.methods.reconstruction.evaluation import evaluate_cameras, evaluate_sweeps
@@ -29,7 +29,6 @@ from foredrive.runs.reconstruction.reconstruct import Reconstruction, reconstruc
 from foredrive.scene import Category
 from foredrive.view.reconstruction_sheet import write_reconstruction_sheet
 
-WORK = work_folder(Path("runs/rebuild_town"))
 DRIVE = TownDrive("Town10HD", seed=3)
 ASIDE_M, AHEAD_M = (-5.0, -2.0), (2.0, 25.0)
 """Lateral position of the lane to the right, and the distance ahead in which a car in it is searched, m."""
@@ -50,6 +49,13 @@ ARMS: dict[str, ReconstructionRecipe[Any]] = {
     "gaussians": RECIPE,
     "static_only": dataclasses.replace(RECIPE, actors=False),
 }
+DECIDED_BY = ("benchmarks.common.reconstructed_towns", *RECONSTRUCTED_BY)
+CONFIG = {
+    "drive": dataclasses.asdict(DRIVE),
+    "views": NAMES,
+    "arms": {arm: dataclasses.asdict(recipe) for arm, recipe in ARMS.items()},
+}
+WORK = Path("runs/rebuild_town") / study_identity(CONFIG, DECIDED_BY)
 
 
 @functools.cache
@@ -170,9 +176,6 @@ def named(prefix: str, figures: Mapping[str, float]) -> dict[str, float]:
 BENCHMARK = Benchmark(
     question="How true is a reconstructed town off the driven lane, and with a road user removed or moved?",
     arms={arm: functools.partial(reconstructed, arm) for arm in ARMS},
-    config={
-        "drive": dataclasses.asdict(DRIVE),
-        "views": NAMES,
-        "arms": {arm: dataclasses.asdict(recipe) for arm, recipe in ARMS.items()},
-    },
+    config=CONFIG,
+    decided_by=DECIDED_BY,
 )

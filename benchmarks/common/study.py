@@ -27,6 +27,25 @@ HEADLINE = "uniad"
 """The protocol of NeMo's own tables."""
 JUDGED_EVERY_S = 1.0
 """Time between evaluated key frames, s; neighbouring key frames give nearly the same result."""
+RECONSTRUCTED_BY = (
+    "foredrive.geometry.boxes",
+    "foredrive.geometry.projection",
+    "foredrive.geometry.se3",
+    "foredrive.methods.neurad",
+    "foredrive.methods.splatad",
+    *(
+        f"foredrive.methods.reconstruction.{module}"
+        for module in (
+            *("decoders", "evaluation", "gaussians", "reconstructed", "rendered"),
+            *("scene_graph", "seed_points", "tracks", "training", "views"),
+        )
+    ),
+    "foredrive.ops.hash_grid",
+    "foredrive.ops.ray_boxes",
+    "foredrive.ops.splatting",
+    "foredrive.tasks.rendering",
+)
+"""The code that decides how well a log is reconstructed. Kernels are tested against the references here."""
 PLANNERS = ("stand_still", "constant_velocity", "ego_mlp")
 
 

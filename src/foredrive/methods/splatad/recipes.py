@@ -94,6 +94,7 @@ def tiny_gaussians() -> GaussianRecipe:
                 albedo=Rate(1e-2),
                 feature=Rate(5e-3),
                 decoders=Rate(3e-3),
+                deformation=Rate(5e-3),
             ),
             images_per_sweep=2,
             beam_stride=4,
