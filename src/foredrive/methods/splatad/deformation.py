@@ -20,8 +20,8 @@ CODE = 8
 """Length of an actor's code."""
 WIDTH = 32
 TIME_HZ = (0.25, 0.5, 1.0)
-"""Frequencies in which time is written: a leg swings about once a second. With 2 Hz as well, the shapes between
-training frames of 5 Hz get worse."""
+"""Frequencies in which time is written: a leg swings about once a second. With 2 Hz as well, the shapes
+between training frames of 5 Hz get worse."""
 PLACE_CYCLES = (0.5,)
 """Cycles per box in which a place is written."""
 REACH = 0.5
