@@ -19,19 +19,22 @@ from foredrive.scene import Category, VoxelSpec
 from foredrive.sensors.rigs import camera_rig
 from foredrive.towns import virtual_egos
 from foredrive.towns.sensing.capture import SensorSuite
-from foredrive.towns.virtual_egos import IMAGES, LATER, record_virtual_egos
+from foredrive.towns.virtual_egos import FORESEEN, IMAGES, LATER, record_virtual_egos
 from foredrive.towns.world import World
 
 SMALL = SensorSuite(camera_rig((24, 40)), None)
 COUNT = 18
 """More than come from one window of the traffic."""
 
+GRID = VoxelSpec(lower_m=(-16.0, -16.0, -1.0), voxel_m=1.0, shape_zyx=(4, 32, 32))
+
 
 @pytest.fixture(scope="module")
 def logs(world02: World, tmp_path_factory: pytest.TempPathFactory) -> list[LogPath]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(virtual_egos, "World", lambda town, seed, conditions: world02)
-        return record_virtual_egos("Town02", 3, COUNT, tmp_path_factory.mktemp("egos"), SMALL)
+        out = tmp_path_factory.mktemp("egos")
+        return record_virtual_egos("Town02", 3, COUNT, out, SMALL, occupancy=GRID)
 
 
 def test_each_log_has_images_first_and_then_its_future(logs: list[LogPath]) -> None:
@@ -128,16 +131,42 @@ def test_clips_are_those_that_see_something(logs: list[LogPath]) -> None:
     assert bool(clip.future.valid.all())
 
 
+def test_a_world_model_learns_from_past_now_and_what_comes(logs: list[LogPath]) -> None:
+    """The last image has occupancy two seconds later; road users fill it, those who move with their flow."""
+    config = ClipConfig(1, FORESEEN, (24, 40), GRID, occupancy_source="recorded", future_images=False)
+    clips = ClipDataset(logs, config, None)
+    assert len(clips) == COUNT * (IMAGES - 1)
+    filled = moving = 0
+    for index in range(0, len(clips), 3):
+        example, now = clips[index], 1
+        boxes = example.clip.boxes
+        for frame in (now, now + FORESEEN):
+            occupied, flow_mps = example.occupancy.values[frame, 0] > 0, example.flow.values[frame]
+            inside = boxes.valid[frame] & (boxes.centre[frame, :, :2].abs() < 14).all(-1)
+            inside &= (boxes.category[frame] == int(Category.CAR)) & (boxes.centre[frame, :, 2] < 2.5)
+            for row in inside.nonzero()[:, 0].tolist():
+                x, y, z = ((boxes.centre[frame, row] - torch.tensor(GRID.lower_m)) / GRID.voxel_m).long()
+                around = (slice(z - 1, z + 1), slice(y - 1, y + 2), slice(x - 1, x + 2))
+                assert bool(occupied[around].any())
+                filled += 1
+                if float(speed := boxes.velocity[frame, row].norm()) > 3.0:
+                    fastest = flow_mps[(slice(None), *around)].norm(dim=0).max()
+                    assert float(fastest) == pytest.approx(float(speed), rel=0.1)
+                    moving += 1
+    assert filled > 20
+    assert moving > 2
+
+
 def test_equal_seeds_give_equal_bytes_and_whole_logs_are_kept(
     logs: list[LogPath], world02: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The second log is made first, and again after it was removed: the others make no difference to it."""
     monkeypatch.setattr(virtual_egos, "World", lambda town, seed, conditions: world02)
-    again = record_virtual_egos("Town02", 3, 2, tmp_path, SMALL)
+    again = record_virtual_egos("Town02", 3, 2, tmp_path, SMALL, occupancy=GRID)
     assert [digests(log.folder) for log in again] == [digests(log.folder) for log in logs[:2]]
     shutil.rmtree(again[1].folder)
     marked = again[0].folder / "kept"
     marked.touch()
-    record_virtual_egos("Town02", 3, 2, tmp_path, SMALL)
+    record_virtual_egos("Town02", 3, 2, tmp_path, SMALL, occupancy=GRID)
     assert marked.exists()
     assert digests(again[1].folder) == digests(logs[1].folder)

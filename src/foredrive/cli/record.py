@@ -37,6 +37,7 @@ def record(
     people: Range = "20",
     conditions: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME [NAME ...]")] = (),
     virtual_egos: int = 0,
+    occupancy: bool = False,
     workers: int = 0,
     ray: bool = False,
 ) -> None:
@@ -64,6 +65,8 @@ def record(
         virtual_egos: In place of drives, this many short logs for each town and seed. In each, another car
             of the traffic is the recording vehicle: six key frames of images without lidar, then 4 s of
             boxes. --seconds, --rate, --vehicles and --people do not apply.
+        occupancy: Record exact occupancy with flow for virtual egos too, to pre-train world models on them.
+            Drives always have it.
         workers: Number of drives recorded at a time; 0: one for each core.
         ray: Record on Ray: on the cluster at RAY_ADDRESS, or on a cluster that is started here.
     """
@@ -72,6 +75,8 @@ def record(
     check_number("--rate", rate, above=0)
     check_image_size(image_size)
     check_number("--virtual-egos", virtual_egos, low=0)
+    if occupancy and not virtual_egos:
+        raise InputError("--occupancy belongs to --virtual-egos; drives always have it")
     check_number("--workers", workers, low=0)
     check_out_folder(out)
     between = _range("vehicles", vehicles), _range("people", people)
@@ -86,7 +91,7 @@ def record(
         from foredrive.towns.campaign import Campaign, plan_drives
 
     if virtual_egos:
-        _record_egos(town, some_seeds, weather, virtual_egos, out, cameras, workers, ray)
+        _record_egos(town, some_seeds, weather, virtual_egos, occupancy, out, cameras, workers, ray)
         return
     plans = plan_drives(Campaign(town, some_seeds, weather, *between, seconds=seconds, rate_hz=rate))
     # A single drive is recorded without worker processes
@@ -106,6 +111,7 @@ def _record_egos(
     seeds: tuple[int, ...] | int,
     conditions: tuple[str, ...],
     count: int,
+    occupancy: bool,
     out: Path,
     rig: "RigPlan",
     workers: int,
@@ -121,7 +127,9 @@ def _record_egos(
 
     some = tuple(CONDITIONS) if conditions == (ANY_CONDITIONS,) else conditions
     numbers = range(seeds) if isinstance(seeds, int) else seeds
-    plans = [EgosPlan(town, seed, count, some) for town in dict.fromkeys(towns) for seed in numbers]
+    plans = [
+        EgosPlan(town, seed, count, some, occupancy) for town in dict.fromkeys(towns) for seed in numbers
+    ]
     with job_progress("recording virtual egos", len(plans)) as tick:
         logs, failed = record_egos(
             plans, out, rig, workers or len(os.sched_getaffinity(0)), on_ray=ray, tick=tick

@@ -27,7 +27,7 @@ def train(
     logs: SomePaths,
     out: Path,
     cache: OptionalPath = None,
-    occupancy: Occupancy = "lidar",
+    occupancy: Occupancy | None = None,
     start: OptionalPath = None,
     tasks: str = "",
     probe: bool = False,
@@ -144,17 +144,18 @@ def _probe(
     print(f"next: foredrive evaluate {out} --logs ...")
 
 
-def _plain(recipe: str, occupancy: Occupancy, settings: Settings) -> "Recipe[Any, Any]":
+def _plain(recipe: str, occupancy: Occupancy | None, settings: Settings) -> "Recipe[Any, Any]":
     """Return the recipe of a name."""
     with importing():
         from foredrive.methods.recipe import with_occupancy_source
         from foredrive.runs.recipes.known import find_recipe
 
-    return with_occupancy_source(find_recipe(recipe, settings), occupancy)
+    chosen = find_recipe(recipe, settings)
+    return chosen if occupancy is None else with_occupancy_source(chosen, occupancy)
 
 
 def _with_heads(
-    recipe: str, occupancy: Occupancy, tasks: str, settings: Settings
+    recipe: str, occupancy: Occupancy | None, tasks: str, settings: Settings
 ) -> "tuple[Recipe[Any, Any], TaskHeadsRecipe]":
     """Return the recipe of a name and the recipe of its heads. Settings with `tasks.` belong to the heads."""
     with importing():
@@ -166,7 +167,7 @@ def _with_heads(
     return chosen, with_settings(heads_for(chosen, tasks.split(",")), of_heads)
 
 
-def _jointly(recipe: str, occupancy: Occupancy, tasks: str, settings: Settings) -> "Recipe[Any, Any]":
+def _jointly(recipe: str, occupancy: Occupancy | None, tasks: str, settings: Settings) -> "Recipe[Any, Any]":
     """Return the recipe with heads that fine-tuning trains together with the world model."""
     with importing():
         from foredrive.runs.recipes.task_heads import heads_for, with_joint_heads

@@ -16,7 +16,7 @@ from jaxtyping import Float64, Int
 from foredrive.data.log_paths import LogPath
 from foredrive.data.log_writer import Frame, LogWriter
 from foredrive.geometry.polylines import arc_lengths, points_at
-from foredrive.scene import Category
+from foredrive.scene import Category, VoxelSpec
 from foredrive.scene.actors import ActorState, boxes_in_ego_frame, in_box_range
 from foredrive.scene.conditions import Conditions, draw_daylight
 from foredrive.towns.map.names import TEST_TOWNS
@@ -40,6 +40,8 @@ KEY_DT_S, STEP_S = 0.5, 0.1
 """Time between key frames and between steps of the traffic, s."""
 IMAGES, LATER = 6, 8
 """Key frames of a log with images, and after them without: the last image has a future of 4 s."""
+FORESEEN = 4
+"""Key frames after those with images that have occupancy: what a world model foresees from the last one."""
 EGOS_PER_WINDOW = 16
 """Logs that are taken of the same time of the traffic."""
 VEHICLES, PEOPLE = 90, 40
@@ -123,6 +125,7 @@ def record_virtual_egos(
     out: Path,
     sensors: SensorSuite,
     conditions: Sequence[Conditions] = (),
+    occupancy: VoxelSpec | None = None,
     tick: Callable[[], None] = lambda: None,
 ) -> list[LogPath]:
     """Record `count` short logs of one town. The same arguments give the same bytes on one kind of processor.
@@ -137,6 +140,8 @@ def record_virtual_egos(
         out: 123D data root.
         sensors: the cameras. A lidar is used if there is one.
         conditions: of which one is drawn for each log. Empty: `WORLDS` kinds of daylight.
+        occupancy: grid of the occupancy with flow, recorded for the key frames with images and `FORESEEN`
+            after them; None: none is recorded.
         tick: called after each log.
 
     Raises:
@@ -166,7 +171,8 @@ def record_virtual_egos(
                 place = (out, split, path.folder.name, camera_specs(sensors.rig), maps, town, ego.route_xyz)
                 with LogWriter(*place) as writer:
                     for k in range(len(window.moments)):
-                        writer.write(_frame(world, window, ego, inserted, k, sensors, (seed, len(logs), k)))
+                        numbers = (seed, len(logs), k)
+                        writer.write(_frame(world, window, ego, inserted, k, sensors, numbers, occupancy))
             logs.append(path)
             tick()
         if len(logs) == count:
@@ -328,6 +334,7 @@ def _frame(
     k: int,
     sensors: SensorSuite,
     seed: tuple[int, int, int],
+    occupancy: VoxelSpec | None,
 ) -> Frame:
     """Return the recorded data of one key frame; from `IMAGES` on without images."""
     moment = window.moments[k]
@@ -354,6 +361,9 @@ def _frame(
         sweep=sweep,
         boxes=boxes_in_ego_frame(near, T_world_ego),
         visibility=visibility,
+        occupancy=None
+        if occupancy is None or k >= IMAGES + FORESEEN
+        else world.occupancy(actors, T_world_ego, occupancy),
         traffic_lights=traffic_light_states(window.town, moment.lights),
         signal_lamps=lamps_near(window.town, world.signal_xyz, T_world_ego),
     )

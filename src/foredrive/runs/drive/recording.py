@@ -23,7 +23,7 @@ from foredrive.sensors.rigs import RigPlan, camera_rig, same_rig
 from foredrive.sensors.vehicle import roof_lidar
 from foredrive.towns import virtual_egos
 from foredrive.towns.campaign import DrivePlan
-from foredrive.towns.recorder import record, split_of
+from foredrive.towns.recorder import OCCUPANCY, record, split_of
 from foredrive.towns.sensing.capture import SensorSuite
 
 
@@ -131,6 +131,8 @@ class EgosPlan:
     count: int
     conditions: tuple[str, ...]
     """Names of `CONDITIONS`, of which one is drawn for each ego. Empty: bright daylight."""
+    occupancy: bool = False
+    """Record exact occupancy with flow."""
 
     @property
     def name(self) -> str:
@@ -174,4 +176,5 @@ def _record_egos(plan: EgosPlan, out: Path, rig: RigPlan) -> list[LogPath]:
     torch.set_num_threads(1)
     sensors = SensorSuite(camera_rig(plan=rig), None)
     conditions = [find_conditions(name) for name in plan.conditions]
-    return virtual_egos.record_virtual_egos(plan.town, plan.seed, plan.count, out, sensors, conditions)
+    spec = OCCUPANCY if plan.occupancy else None
+    return virtual_egos.record_virtual_egos(plan.town, plan.seed, plan.count, out, sensors, conditions, spec)
