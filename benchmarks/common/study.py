@@ -31,8 +31,20 @@ RECONSTRUCTED_BY = (
     "foredrive.geometry.boxes",
     "foredrive.geometry.projection",
     "foredrive.geometry.se3",
-    "foredrive.methods.neurad",
-    "foredrive.methods.splatad",
+    *(
+        f"foredrive.methods.neurad.{module}"
+        for module in (
+            *("config", "content", "decoders", "losses", "network", "rays", "recipes"),
+            *("render", "sampling", "scene", "training"),
+        )
+    ),
+    *(
+        f"foredrive.methods.splatad.{module}"
+        for module in (
+            *("beams", "camera", "content", "footprint", "initial", "lidar", "losses", "placing", "rates"),
+            *("recipes", "relocation", "scene", "training", "unseen_ground"),
+        )
+    ),
     *(
         f"foredrive.methods.reconstruction.{module}"
         for module in (

@@ -150,6 +150,22 @@ def test_a_study_starts_anew_where_what_decides_it_changes(
     assert any("starting anew" in line for line in said)
 
 
+@pytest.mark.parametrize(
+    ("config", "same"),
+    [
+        ({"rate": 0.1, "sizes": [1, 2], "inner": {"on": True}, "added": None}, True),
+        ({"rate": 0.1, "sizes": [1, 2], "inner": {"on": True, "added": False, "more": {"x": []}}}, True),
+        ({"rate": 0.1, "sizes": [1, 2], "inner": {"on": False}}, False),
+        ({"rate": 0.1, "sizes": [1, 2], "inner": {"on": True}, "added": 0.0}, False),
+        ({"rate": 0.1, "sizes": [1, 2, None], "inner": {"on": True}}, False),
+        ({"sizes": [1, 2], "inner": {"on": True}}, False),
+    ],
+)
+def test_options_that_are_off_decide_nothing(config: dict[str, object], same: bool) -> None:
+    before = {"rate": 0.1, "sizes": [1, 2], "inner": {"on": True}}
+    assert (study_identity(config, ()) == study_identity(before, ())) == same
+
+
 SLICED = """import math
 from os.path import join
 

@@ -163,6 +163,9 @@ def _identity(benchmark: Benchmark, origin: Mapping[str, Any]) -> str:
 def study_identity(config: Mapping[str, Any], decided_by: Sequence[str]) -> str:
     """Return a digest of a configuration and of the code of modules, without comments and docstrings.
 
+    Entries of the configuration that are None, False or empty count as absent: an option that is added, and
+    is off, restarts no study.
+
     Args:
         config: JSON-able values.
         decided_by: modules and packages by full name; a package stands for all modules in it. MODULE:NAME
@@ -171,7 +174,7 @@ def study_identity(config: Mapping[str, Any], decided_by: Sequence[str]) -> str:
     Raises:
         ImportError: there is no such module or definition.
     """
-    digest = hashlib.sha256(json.dumps(dict(config), sort_keys=True).encode())
+    digest = hashlib.sha256(json.dumps(_without_absent(config), sort_keys=True).encode())
     for entry in sorted(decided_by):
         module, _, definition = entry.partition(":")
         for path in _sources(module):
@@ -179,6 +182,20 @@ def study_identity(config: Mapping[str, Any], decided_by: Sequence[str]) -> str:
             code = ast.dump(tree) if not definition else _slice(tree, definition, entry)
             digest.update(f"{entry}/{path.name}".encode() + code.encode())
     return digest.hexdigest()[:16]
+
+
+def _without_absent(value: Any) -> Any:
+    """Return JSON-able values without the entries of mappings that are None, False or empty."""
+    if isinstance(value, Mapping):
+        kept = {str(key): _without_absent(entry) for key, entry in value.items()}
+        return {key: entry for key, entry in kept.items() if not _is_absent(entry)}
+    if isinstance(value, list | tuple):
+        return [_without_absent(entry) for entry in value]
+    return value
+
+
+def _is_absent(value: Any) -> bool:
+    return value is None or value is False or (isinstance(value, dict | list | str) and not value)
 
 
 def _sources(name: str) -> list[Path]:
