@@ -4,6 +4,7 @@ import importlib.util
 import os
 import sys
 from collections.abc import Mapping
+from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -85,8 +86,11 @@ def _run_queue(files: Mapping[str, Path], folder: Path, workers: int, dry_run: b
     todo, cores = missing(), sorted(os.sched_getaffinity(0))[: workers or None]
     minutes = sum(one.cpu_minutes for one in todo)
     if dry_run:
-        for one in todo:
-            print(f"{one.name}: {one.cpu_minutes:.0f} minutes; {one.claim}")
+        for claim, measurements in groupby(todo, key=lambda one: one.claim):
+            left = list(measurements)
+            print(f"{claim}: {len(left)} measurements, {sum(one.cpu_minutes for one in left):.0f} minutes")
+            for one in left:
+                print(f"    {one.name}")
     print(
         f"{len(todo)} measurements are missing, about {minutes / 60:.1f} hours of computing, "
         f"{minutes / 60 / len(cores):.1f} on {len(cores)} cores"
