@@ -4,6 +4,9 @@ The recipe `nemo_town` and the one of commit 9544e57 are pre-trained for the sam
 test drives of `learning_towns.py`, which are recorded first. Drives, cache and run folders are kept in
 runs/learning, so that an interrupted study continues where it stopped.
 
+`nemo_town_egos` learns from virtual egos with exact occupancy in place of drives: many cars of one traffic, six
+key frames of each. All arms are judged by labels from lidar.
+
 An arm ARM@BUDGET is one point of a curve: a whole training with its own learning rate schedule. Its length is
 a number of steps, chosen by `ARM@speed` on one machine: CPU time is that of one process with one thread which
 also loads the data.
@@ -21,17 +24,20 @@ import torch
 from torch.utils.data import DataLoader
 
 from benchmarks.common.study import seeded
-from benchmarks.learning_towns import DIGEST, TEST_TOWNS, plan_learning, record_missing
+from benchmarks.learning_towns import DIGEST, TEST_TOWNS, TRAIN_TOWNS, plan_learning, record_missing
 from foredrive.data import ClipDataset, LogPath, collate
 from foredrive.engine.bench import Benchmark, study_identity
 from foredrive.engine.metrics_log import read_metrics
 from foredrive.engine.summary import numbers
-from foredrive.methods.recipe import Recipe, rescheduled
-from foredrive.runs.drive.recording import log_of
+from foredrive.errors import InputError
+from foredrive.methods.recipe import Recipe, rescheduled, with_occupancy_source
+from foredrive.runs.drive.recording import EgosPlan, log_of, record_egos
 from foredrive.runs.evaluate.predict import AgentPredictor
 from foredrive.runs.recipes.known import find_recipe
 from foredrive.runs.recipes.world_models import load_recipe
 from foredrive.runs.train.run import Run, load_agent, train_run
+from foredrive.scene.conditions import CONDITIONS
+from foredrive.sensors.rigs import SURROUND
 from foredrive.tasks.evaluation.run import evaluate
 from foredrive.tasks.occupancy.occupancy_metric import CONTINUED, EGO_COMPENSATED, OccupancyMetric
 from foredrive.tasks.occupancy.vehicles_metric import VehicleMetric
@@ -70,15 +76,19 @@ class Budget:
     drives: int
     steps: Mapping[str, int]
     """By recipe."""
+    egos: tuple[int, int] = (0, 0)
+    """Seeds of each town, and virtual egos of each seed."""
 
 
 BUDGETS = {
-    "10min": Budget(1200.0, 56, {"nemo_town": 3200, "nemo_town_9544e57": 600}),
-    "30min": Budget(3600.0, 98, {"nemo_town": 9600, "nemo_town_9544e57": 1800}),
-    "1h": Budget(7200.0, 252, {"nemo_town": 19200, "nemo_town_9544e57": 3600}),
+    "10min": Budget(1200.0, 56, {"nemo_town": 3200, "nemo_town_9544e57": 600}, (2, 140)),
+    "30min": Budget(3600.0, 98, {"nemo_town": 9600, "nemo_town_9544e57": 1800}, (4, 200)),
+    "1h": Budget(7200.0, 252, {"nemo_town": 19200, "nemo_town_9544e57": 3600}, (8, 240)),
     "best": Budget(28800.0, 252, {"nemo_town": 76800}),
 }
 """Minutes and hours of two cores."""
+EGO_HW = (96, 160)
+"""Size of the images of virtual egos, px: that of the recipe, so that none are resized."""
 
 
 def pretraining_alone(recipe: Recipe[Any, Any], steps: int) -> Recipe[Any, Any]:
@@ -104,15 +114,32 @@ def logs_of(drives: int) -> tuple[tuple[LogPath, ...], tuple[LogPath, ...]]:
     return tuple(log_of(plan, DRIVES) for plan in train), tuple(log_of(plan, DRIVES) for plan in test)
 
 
-def learned(name: str, budget_name: str) -> Callable[[int], dict[str, float]]:
+def egos_of(seeds: int, count: int) -> tuple[LogPath, ...]:
+    """Record the virtual egos that are missing; return them. Every other seed has all conditions."""
+    plans = [
+        EgosPlan(town, seed, count, tuple(CONDITIONS) if seed % 2 else (), occupancy=True)
+        for seed in range(seeds)
+        for town in TRAIN_TOWNS
+    ]
+    rig = dataclasses.replace(SURROUND, image_hw=EGO_HW)
+    logs, failed = record_egos(plans, ROOT / "egos", rig, workers=1)
+    if failed:
+        raise InputError(f"{len(failed)} recordings failed: {next(iter(failed.values()))}")
+    return tuple(logs)
+
+
+def learned(name: str, budget_name: str, *, egos: bool = False) -> Callable[[int], dict[str, float]]:
     """Return an arm that trains a recipe for a budget and judges it in the town of the test drives."""
 
     def measure(seed: int) -> dict[str, float]:
         torch.set_num_threads(1)
         budget = BUDGETS[budget_name]
-        train_logs, test_logs = logs_of(budget.drives)
+        train_logs, test_logs = logs_of(0 if egos else budget.drives)
         recipe = seeded(pretraining_alone(RECIPES[name], budget.steps[name]), seed)
         folder = ROOT / IDENTITY / f"{name}_{budget_name}_seed{seed}"
+        if egos:
+            train_logs, folder = egos_of(*budget.egos), folder.with_name(f"egos_{folder.name}")
+            recipe = with_occupancy_source(recipe, "recorded")
         run = train_run(recipe, train_logs, folder, ROOT / "cache")
         lines = read_metrics(folder / "pretrain" / "metrics.jsonl")
         cpu_s = sum(float(line["cpu_s"]) for line in lines)
@@ -129,7 +156,12 @@ def learned(name: str, budget_name: str) -> Callable[[int], dict[str, float]]:
 
 def judge(run: Run, logs: Sequence[LogPath], budget_name: str) -> dict[str, float]:
     """Return IoU above the ground now and later, ego-compensated persistence, and the recall of cars."""
-    clips = dataclasses.replace(run.recipe.clips.judged, future_images=False, now_stride_s=JUDGED_EVERY_S)
+    clips = dataclasses.replace(
+        run.recipe.clips.judged,
+        future_images=False,
+        now_stride_s=JUDGED_EVERY_S,
+        occupancy_source="lidar",
+    )
     dataset = ClipDataset(logs, clips, run.cache_dir)
     result = evaluate(
         AgentPredictor(load_agent(run), clips.future_frames, ray_stride=0),
@@ -187,6 +219,11 @@ BENCHMARK = Benchmark(
         f"{name}@{budget_name}": learned(name, budget_name)
         for budget_name, budget in BUDGETS.items()
         for name in budget.steps
+    }
+    | {
+        f"nemo_town_egos@{budget_name}": learned("nemo_town", budget_name, egos=True)
+        for budget_name, budget in BUDGETS.items()
+        if budget.egos[0]
     },
     config=CONFIG,
     decided_by=DECIDED_BY,
