@@ -4,8 +4,8 @@ The recipe `nemo_town` and the one of commit 9544e57 are pre-trained for the sam
 test drives of `learning_towns.py`, which are recorded first. Drives, cache and run folders are kept in
 runs/learning, so that an interrupted study continues where it stopped.
 
-`nemo_town_egos` learns from virtual egos with exact occupancy in place of drives: many cars of one traffic, six
-key frames of each. All arms are judged by labels from lidar.
+`nemo_town_egos` learns from virtual egos with exact occupancy in place of drives: many cars of one traffic,
+six key frames of each. All arms are judged by labels from lidar.
 
 An arm ARM@BUDGET is one point of a curve: a whole training with its own learning rate schedule. Its length is
 a number of steps, chosen by `ARM@speed` on one machine: CPU time is that of one process with one thread which
