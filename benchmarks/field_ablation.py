@@ -3,7 +3,8 @@
 PandaSet 002 (raw, in FOREDRIVE_REAL_DATA/pandaset), front camera and lidar, every second frame held out. All
 arms train `field_tiny` for 1500 of its 12,000 steps, with the whole decay of the rates; each changes one
 thing. `no_appearance` has appearance codes of no length, so that one camera and the lidar differ by their
-decoders alone. `sdf` has a signed distance in place of a density. Runs are kept in runs/field_ablation.
+decoders alone. `sdf` has a signed distance in place of a density. `perceptual` has a perceptual loss of the
+shipped image tower's features. Runs are kept in runs/field_ablation.
 """
 
 import dataclasses
@@ -11,11 +12,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from benchmarks.common.study import pandaset_log
+from benchmarks.common.study import RECONSTRUCTED_BY, pandaset_log
 from benchmarks.rebuild_pandaset import FIGURES
 from foredrive.engine.bench import Benchmark, study_identity
+from foredrive.methods.reconstruction.perceptual import PerceptualMetrics, PerceptualWeights
 from foredrive.runs.recipes.reconstruction import ReconstructionRecipe, field_tiny, rescheduled_recipe
-from foredrive.runs.reconstruction.reconstruct import reconstruct
+from foredrive.runs.reconstruction.reconstruct import reconstruct, shipped_tower
 
 ROOT = Path("runs/field_ablation")
 STEPS = 1500
@@ -45,16 +47,9 @@ ARMS: dict[str, ReconstructionRecipe[Any]] = {
     "no_appearance": with_network(appearance=0),
     "sdf": with_network(surface="sdf"),
     "static_only": dataclasses.replace(SHORT, actors=False),
+    "perceptual": rescheduled_recipe(SHORT, perceptual="tower"),
 }
-DECIDED_BY = (
-    "foredrive.methods.neurad.losses",
-    "foredrive.methods.splatad.losses",
-    "foredrive.ops.hash_grid",
-    "foredrive.ops.ray_boxes",
-    "foredrive.methods.neurad.recipes",
-    "foredrive.methods.reconstruction",
-    "foredrive.methods.neurad.training",
-)
+DECIDED_BY = (*RECONSTRUCTED_BY, "foredrive.methods.reconstruction.perceptual")
 CONFIG = {"arms": {arm: dataclasses.asdict(recipe) for arm, recipe in ARMS.items()}}
 WORK = ROOT / study_identity(CONFIG, DECIDED_BY)
 
@@ -64,14 +59,16 @@ def reconstructed(arm: str) -> Callable[[int], dict[str, float]]:
 
     def measure(seed: int) -> dict[str, float]:
         recipe, log = rescheduled_recipe(ARMS[arm], seed=seed), pandaset_log(ROOT / "pandaset")
-        summary = reconstruct(recipe, log, WORK / f"{arm}_seed{seed}", ROOT / "cache").summary
-        return {name: float(value) for name in FIGURES if isinstance(value := summary.get(name), float | int)}
+        metrics = PerceptualMetrics(PerceptualWeights(), shipped_tower())
+        summary = reconstruct(recipe, log, WORK / f"{arm}_seed{seed}", ROOT / "cache", metrics).summary
+        names = (*FIGURES, "tower_lpips", "tower_fid")
+        return {name: float(value) for name in names if isinstance(value := summary.get(name), float | int)}
 
     return measure
 
 
 BENCHMARK = Benchmark(
-    question="What are rolling shutter, ray drop, appearance codes, density and actors worth to a field?",
+    question="What are rolling shutter, ray drop, appearance, density, actors and a perceptual loss worth?",
     arms={arm: reconstructed(arm) for arm in ARMS},
     config=CONFIG,
     decided_by=DECIDED_BY,

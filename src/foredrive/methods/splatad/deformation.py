@@ -44,13 +44,13 @@ class Deformation(nn.Module):
 
     def __init__(self, tracks: ActorTracks) -> None:
         super().__init__()
-        mine = tracks.only(nonrigid_rows(tracks))
-        early = torch.where(mine.present, mine.t_s, math.inf).amin(1)
-        late = torch.where(mine.present, mine.t_s, -math.inf).amax(1)
-        self.register_buffer("half_lwh", mine.size_lwh / 2, persistent=False)
+        people = tracks.only(nonrigid_rows(tracks))
+        early = torch.where(people.present, people.t_s, math.inf).amin(1)
+        late = torch.where(people.present, people.t_s, -math.inf).amax(1)
+        self.register_buffer("half_lwh", people.size_lwh / 2, persistent=False)
         self.register_buffer("from_s", early, persistent=False)
         self.register_buffer("during_s", late - early, persistent=False)
-        self.code = nn.Parameter(_CODE_STD * torch.randn(len(mine), CODE))
+        self.code = nn.Parameter(_CODE_STD * torch.randn(len(people), CODE))
         inputs = 3 * (1 + 2 * len(PLACE_CYCLES)) + 2 * len(TIME_HZ) + CODE
         last = nn.Linear(WIDTH, 6)
         # Actors are rigid at first
