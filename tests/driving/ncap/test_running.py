@@ -12,7 +12,7 @@ from foredrive.driving.drive import drive_route
 from foredrive.driving.ncap.drawing import draw_run
 from foredrive.driving.ncap.hd import hd_score_of
 from foredrive.driving.ncap.outcome import Outcome, SafetyResult, first_collision, judge
-from foredrive.driving.ncap.proposing import propose
+from foredrive.driving.ncap.proposing import propose, propose_kinds
 from foredrive.driving.ncap.rules import OURS, PAPER, RELEASED, RULES, Rules
 from foredrive.driving.ncap.running import Place, drive_without_action, reference_mps, set_up_run
 from foredrive.driving.ncap.scenario import Jitter, Rectilinear, SafetyScenario, ScenarioActor
@@ -244,6 +244,21 @@ def test_every_kind_is_proposed_where_the_way_is_free() -> None:
     assert max(0.5 * scenario.start_frame + scenario.length_s for scenario in found) <= END_S
     tested = self_test(first, lambda scenario: here, 1, OURS)
     assert tested.passed == tuple(first)
+
+
+def test_a_kind_that_is_feasible_nowhere_is_tried_nearer_and_slower() -> None:
+    """A wall 14 m to the right: from behind it, 20 m away, nobody crosses; from 9 m away somebody does."""
+    here = place(parked_m=(10.0, -14.0))
+    wall = dataclasses.replace(here.graph.tracks, size_lwh=torch.tensor([[300.0, 1.8, 1.6]]))
+    here = dataclasses.replace(here, graph=dataclasses.replace(here.graph, tracks=wall))
+    assert {scenario.kind for scenario in propose(here, "log")} == {Threat.STATIONARY, Threat.FRONTAL}
+    found = propose_kinds(here, "log")
+    assert [scenario for scenario in found if scenario.kind is not Threat.SIDE] == propose(here, "log")
+    ways = [scenario.actors[0].way for scenario in found if scenario.kind is Threat.SIDE]
+    assert {way.speed_mps for way in ways if isinstance(way, Rectilinear)} == {3.0}
+    assert len({scenario.label for scenario in found}) == len(found)
+    free = place(parked_m=(10.0, 8.0))
+    assert propose_kinds(free, "log") == propose(free, "log")
 
 
 def test_proposals_read_boxes_that_the_reconstruction_has_refined() -> None:

@@ -63,6 +63,27 @@ class Approach:
     """Speed of an actor that comes head-on or crosses."""
 
 
+APPROACHES = (Approach(), Approach(3.0, 3.0), Approach(2.0, 3.0))
+"""Approaches in the order in which they are tried."""
+
+
+def propose_kinds(place: Place, scene: str) -> list[SafetyScenario]:
+    """Return the feasible scenarios of a reconstructed log, each kind by the first approach that has any.
+
+    Arguments and errors are those of `propose`.
+    """
+    of_kind: dict[Threat, list[SafetyScenario]] = {}
+    for approach in APPROACHES:
+        if len(of_kind) < len(Threat):
+            proposals = propose(place, scene, approach)
+            for kind in Threat:
+                feasible = [proposal for proposal in proposals if proposal.kind is kind]
+                if feasible and kind not in of_kind:
+                    of_kind[kind] = feasible
+    proposals = [proposal for kind in of_kind.values() for proposal in kind]
+    return sorted(proposals, key=lambda proposal: proposal.start_frame)
+
+
 def propose(place: Place, scene: str, approach: Approach = Approach()) -> list[SafetyScenario]:
     """Return the feasible scenarios of a reconstructed log, in the order of their starts.
 

@@ -17,13 +17,12 @@ from foredrive.driving.ncap.drawing import draw_run
 from foredrive.driving.ncap.hd import hd_score_of
 from foredrive.driving.ncap.outcome import SafetyResult, judge
 from foredrive.driving.ncap.placing import place_actors
-from foredrive.driving.ncap.proposing import Approach, propose
+from foredrive.driving.ncap.proposing import propose_kinds
 from foredrive.driving.ncap.rules import RULES, Rules
 from foredrive.driving.ncap.running import Place, SafetyRun, set_up_run
-from foredrive.driving.ncap.scenario import SafetyScenario
+from foredrive.driving.ncap.scenario import Polyline, SafetyScenario
 from foredrive.driving.ncap.scenario_file import load_scenarios, outside_protocol, save_scenarios
 from foredrive.driving.ncap.self_test import SelfTest, run_reference, self_test
-from foredrive.driving.observation import FRAME_DT_S
 from foredrive.driving.replay.logged_drive import LoggedDrive
 from foredrive.errors import InputError
 from foredrive.methods.reconstruction.renderer import ReconstructedRenderer
@@ -183,7 +182,9 @@ def propose_scenarios(
     if file.exists():
         raise InputError(f"{file}: exists already; proposed scenarios are written to a new file")
     places = _by_name(runs)
-    proposals = [proposal for scene, run in places.items() for proposal in propose(place_in(run), scene)]
+    proposals = [
+        proposal for scene, run in places.items() for proposal in propose_kinds(place_in(run), scene)
+    ]
     if not proposals:
         raise InputError("no scenario is feasible in these logs: they are too short, too slow or too full")
     tested = self_test(proposals, lambda scenario: place_in(places[scenario.scene]), count, _rules(rules))
@@ -213,7 +214,9 @@ def _untrusted_s(place: Place, scenario: SafetyScenario) -> float | None:
     renderer = place.renderer(
         place_actors(place.graph, drawn, place.vehicle.T_world_scene, place.track_ids, moving_stay=True)
     )
-    impact_s = FRAME_DT_S * (drawn.start_frame + scenario.priming_frames) + Approach().impact_s
+    way = scenario.actors[0].way
+    # Proposed ways end, or pass the path, at the impact
+    impact_s = way.t_s[-1] if isinstance(way, Polyline) else way.at_s
     for before_s in BEFORE_S:
         at_s = impact_s - before_s
         seen = renderer.render(torch.from_numpy(drive.pose_at(at_s)), torch.zeros(6), at_s)
