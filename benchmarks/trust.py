@@ -34,6 +34,7 @@ from foredrive.data.batches import stack_records
 from foredrive.driver.agent import Driver
 from foredrive.driving.observation import KeyFrame, make_clip
 from foredrive.engine.bench import Benchmark, study_identity
+from foredrive.errors import InputError
 from foredrive.files import atomic_path
 from foredrive.geometry.se3 import inverse_se3, matrix_from_yaw
 from foredrive.methods.reconstruction.edits import ShiftEgo
@@ -83,7 +84,7 @@ SIGHT_FRAMES_APART, SIGHT_POSES = 16, 16
 """Distance of the frames that are judged in twenty seconds, an even number; random poses at each moment."""
 SIGHT_DRIVES = {drive.town: drive for drive in SAFETY_DRIVES}
 DRIVER = Path("embedded:driver")
-FOUND = 0.0
+USER_LOGIT = 0.0
 """Logit from which a place of an image counts as a road user."""
 RECIPE = gaussians_tiny()
 CONFIG = {
@@ -230,7 +231,7 @@ def of_town(town: str, _: int) -> dict[str, float]:
 
 
 class SightMoment(NamedTuple):
-    """What the reconstruction shows at one pose, against the town's own sensors."""
+    """One pose, seen by the town's own sensors and by those of the reconstruction."""
 
     logged: bool
     """On the logged way."""
@@ -241,10 +242,10 @@ class SightMoment(NamedTuple):
     """Median absolute error of the ranges of the beams that return in both."""
     right_share: float
     """As `Judged.right_share`."""
-    found_both: int
-    """Places in which the driver finds road users in both images."""
-    found_either: int
-    """Those in the town's images plus those in the rendered ones."""
+    in_town: Bool[Tensor, "_"]
+    """Places of the town's images in which the driver finds road users."""
+    in_scene: Bool[Tensor, "_"]
+    """The same of the rendered images."""
 
 
 def in_sight(town: str, _: int) -> dict[str, float]:
@@ -273,7 +274,7 @@ def in_sight(town: str, _: int) -> dict[str, float]:
             boxes = boxes_at(graph.all_tracks, T_scene_ego, snapshot.t_s)
             pose = T_world_ego, torch.zeros(6), snapshot.t_s
             both = real.render(*pose), rendered.render(*pose)
-            of_town, of_scene = (found(driver, frame, boxes, T_world_ego) for frame in both)
+            places = [road_user_places(driver, seen, boxes, T_world_ego) for seen in both]
             moments.append(
                 SightMoment(
                     left_m == 0 and deg == 0,
@@ -281,8 +282,7 @@ def in_sight(town: str, _: int) -> dict[str, float]:
                     psnr_of((both[0].images.float() - both[1].images.float()).square() / 255**2),
                     bool(both[1].trusted),
                     *_of_beams(*both),
-                    int((of_town & of_scene).sum()),
-                    int(of_town.sum() + of_scene.sum()),
+                    *places,
                 )
             )
         print(f"{town}: frame {frame} of {drive.frames}", flush=True)
@@ -290,7 +290,7 @@ def in_sight(town: str, _: int) -> dict[str, float]:
 
 
 @torch.no_grad()
-def found(
+def road_user_places(
     driver: Driver, frame: Rendered, boxes: Boxes, T_world_ego: Float64[Tensor, "4 4"]
 ) -> Bool[Tensor, "_"]:
     """Return in which places of its images the driver finds road users."""
@@ -299,7 +299,7 @@ def found(
     past = dataclasses.replace(key, t_s=-0.5)
     clip = make_clip([past, key], camera_rig(None, 0.0, FRONT_TELE), Command.STRAIGHT)
     batch: Clip = stack_records([clip])
-    return driver.see(batch).user_pixels.flatten() > FOUND
+    return driver.see(batch).user_pixels.flatten() > USER_LOGIT
 
 
 def _of_beams(real: Rendered, rendered: Rendered) -> tuple[float, float]:
@@ -327,20 +327,22 @@ def _sight_figures(moments: Sequence[SightMoment], reference_db: float) -> dict[
         figures[f"images_{name}"] = float(len(of))
         if not of:
             continue
-        either = sum(moment.found_either for moment in of)
         figures |= {
             f"psnr_{name}_db": float(np.mean([moment.true_db for moment in of])),
             f"range_error_{name}_m": float(np.mean([moment.range_error_m for moment in of])),
             f"right_beams_{name}": float(np.mean([moment.right_share for moment in of])),
+            f"detection_f1_{name}": f1_of([(moment.in_town, moment.in_scene) for moment in of]),
         }
-        if either:
-            figures[f"found_f1_{name}"] = 2 * sum(moment.found_both for moment in of) / either
     beside = groups["trusted"] + groups["untrusted"]
     expected, true = (
         np.array([getattr(moment, key) for moment in beside]) for key in ("expected_db", "true_db")
     )
     good = true >= least_db
+    # By chance: the town's own images against those at another pose 1.6 s later
+    later = [*moments[SIGHT_POSES + 1 :], *moments[: SIGHT_POSES + 1]]
+    pairs = [(now.in_town, other.in_town) for now, other in zip(moments, later, strict=True)]
     figures |= {
+        "detection_f1_by_chance": f1_of(pairs),
         "calibration_error_db": float(np.abs(expected - true).mean()),
         "bias_db": float((expected - true).mean()),
         "correlation": float(stats.pearsonr(expected, true).statistic),
@@ -353,6 +355,19 @@ def _sight_figures(moments: Sequence[SightMoment], reference_db: float) -> dict[
         trusted_db = np.array([moment.true_db for moment in groups["trusted"]])
         figures["good_of_trusted"] = float((trusted_db >= least_db).mean())
     return figures
+
+
+def f1_of(pairs: Sequence[tuple[Bool[Tensor, "_"], Bool[Tensor, "_"]]]) -> float:
+    """Return F1 of places in one image against those in another, over all pairs together.
+
+    Raises:
+        InputError: there are no such places, so that nothing is compared.
+    """
+    both = sum(int((one & other).sum()) for one, other in pairs)
+    either = sum(int(one.sum() + other.sum()) for one, other in pairs)
+    if not either:
+        raise InputError("the driver finds nobody in any image")
+    return 2 * both / either
 
 
 def auc_of(expected: Float[np.ndarray, "N"], good: Bool[np.ndarray, "N"]) -> float:
