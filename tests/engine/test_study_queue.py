@@ -11,6 +11,7 @@ import pytest
 
 from foredrive.cli.main import main
 from foredrive.engine.bench import Benchmark
+from foredrive.engine.folder import held
 from foredrive.engine.study_queue import (
     Measurement,
     QueuedStudy,
@@ -147,6 +148,14 @@ def test_two_queues_share_the_work(folder: Path) -> None:
     assert [queue.wait(timeout=120) for queue in queues] == [0, 0]
     ran = [line.split()[0] for line in _ran(folder).splitlines()]
     assert len(ran) == len(set(ran)) == 5
+
+
+def test_what_another_queue_measures_is_said(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with held(folder / "runs" / "queue" / "cheap.with.1"):
+        assert main(["bench", "--queue", "--folder", "."]) == 0
+    assert "another queue measures cheap.with.1" in capsys.readouterr().out
+    assert "cheap" not in _ran(folder)
+    assert (folder / "results/costly.json").exists()
 
 
 def _ran(folder: Path) -> str:

@@ -21,7 +21,7 @@ from foredrive.engine.config import save_recipe
 from foredrive.engine.learning_rates import Rate
 from foredrive.errors import InputError
 from foredrive.methods.blocks.inception import InceptionFeatures
-from foredrive.methods.reconstruction.evaluation import evaluate_cameras, evaluate_sweeps
+from foredrive.methods.reconstruction.evaluation import actor_pixels, evaluate_cameras, evaluate_sweeps
 from foredrive.methods.reconstruction.perceptual import PerceptualMetrics, PerceptualWeights
 from foredrive.methods.reconstruction.scene_graph import STATIC
 from foredrive.methods.splatad.initial import InitialGaussians
@@ -109,6 +109,21 @@ def test_held_out_frames_are_shown_better_than_before_learning(run: Path, log: L
     assert after["drop_accuracy"] > before["drop_accuracy"]
     assert after["depth_median_sq_m2"] < 2.0
     assert after["moving.psnr_db"] == pytest.approx(after["psnr_db"])  # it drives all the time
+
+
+def test_vehicles_have_a_psnr_of_their_own_over_all_images_together(run: Path, log: LogPath) -> None:
+    done = reconstruct(recipe(), log, run)
+    squared = []
+    for view in done.held_out.cameras:
+        assert view.image is not None
+        with torch.no_grad():
+            rgb = done.scene.camera(done.scene.graph, view).rgb.clamp(0, 1)
+        where = actor_pixels(done.scene.tracks, view)
+        assert 0 < int(where.sum()) < where.numel()
+        squared.append((rgb - view.image / 255).square()[:, where].flatten())
+    mean = float(torch.cat(squared).mean())
+    assert done.summary["vehicles.psnr_db"] == pytest.approx(-10 * math.log10(mean), abs=1e-3)
+    assert "people.psnr_db" not in done.summary
 
 
 def test_an_interrupted_run_comes_to_the_same(

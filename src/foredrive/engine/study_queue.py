@@ -45,7 +45,7 @@ class QueuedStudy:
     seeds: tuple[int, ...] | None = None
     """Seeds that are wanted; None: those of the benchmark."""
     value: Annotated[float, Field(gt=0)] = 1.0
-    """What the claim is worth beside the others."""
+    """Worth of the claim beside the others."""
 
 
 class Measurement(NamedTuple):
@@ -98,12 +98,12 @@ def missing_measurements(
     left: list[tuple[float, list[Measurement]]] = []
     for study in studies:
         benchmark = benchmarks[study.bench]
-        known = measured_before(study.bench, benchmark, results)
+        measured = measured_before(study.bench, benchmark, results)
         missing = [
             Measurement(study.bench, arm, seed, study.cpu_minutes, study.claim)
             for seed in study.seeds or benchmark.seeds
             for arm in study.arms
-            if (arm, seed) not in known
+            if (arm, seed) not in measured
         ]
         if missing:
             left.append((study.value / (study.cpu_minutes * len(missing)), missing))
@@ -167,6 +167,8 @@ def run_queue(
                     running.append(started)
                     say(f"{started.of.name}: about {started.of.cpu_minutes:.0f} minutes; {started.of.claim}")
             if not running:
+                if elsewhere := [one.name for one in left if not failures[one.name]]:
+                    say(f"another queue measures {', '.join(elsewhere)}")
                 return sorted(one.name for one in left if failures[one.name])
             time.sleep(_POLL_S)
     finally:

@@ -345,6 +345,9 @@ def _frame(
     actors = [actor for actor in moment.actors if actor.track_id != int(vehicles.track_id[0])]
     actors += [person.at(KEY_DT_S * k) for person in inserted]
     near = in_box_range([*actors, *world.parked], T_world_ego)
+    occupied = None
+    if occupancy is not None and k < IMAGES + FORESEEN:
+        occupied = world.occupancy(actors, T_world_ego, occupancy)
     # Later key frames have no sensor data: they are the future of the others
     images, sweep, visibility = {}, None, None
     if k < IMAGES:
@@ -361,9 +364,7 @@ def _frame(
         sweep=sweep,
         boxes=boxes_in_ego_frame(near, T_world_ego),
         visibility=visibility,
-        occupancy=None
-        if occupancy is None or k >= IMAGES + FORESEEN
-        else world.occupancy(actors, T_world_ego, occupancy),
+        occupancy=occupied,
         traffic_lights=traffic_light_states(window.town, moment.lights),
         signal_lamps=lamps_near(window.town, world.signal_xyz, T_world_ego),
     )

@@ -1,4 +1,4 @@
-"""What counts as the pixels of actors, by hand."""
+"""Pixels of actors, and errors in them, by hand."""
 
 import math
 

@@ -1,5 +1,6 @@
 """People whose Gaussians move in their boxes."""
 
+import dataclasses
 import math
 from pathlib import Path
 
@@ -80,6 +81,30 @@ def test_a_shift_and_a_turn_are_in_the_axes_of_the_box() -> None:
     assert torch.allclose(moved.mean_m - still.mean_m, expected, atol=1e-6)
     yaw = 2 * torch.atan2(moved.quaternion[:, 3], moved.quaternion[:, 0])
     assert yaw.tolist() == pytest.approx([0.0, math.pi / 2 + 0.02, 0.02], abs=1e-5)
+
+
+def test_a_turn_comes_after_the_gaussians_own_rotation_and_before_the_actors() -> None:
+    """Rotations about different axes: R_actor · R_turn · R_gaussian, which no other order gives."""
+    scene = scene_of(moved=False)
+    assert scene.deformation is not None
+    scene.deformation.layers[-1].bias.data = torch.tensor([0.0, 0, 0, 0.3, 0, 0])
+    # The Gaussians are turned by 90° about y
+    half = math.sqrt(0.5)
+    scene.quaternion.data = torch.tensor([[half, 0, half, 0]]).repeat(4, 1)
+    placed = place_actors(scene.graph, 2.0).gaussians
+    scale_free = dataclasses.replace(placed, log_scale=torch.zeros(3, 3))
+    axes = scale_free.factor().permute(2, 0, 1)[1]
+    about = 2 * math.atan(0.15)
+    turn = torch.tensor(
+        [
+            [1.0, 0, 0],
+            [0, math.cos(about), -math.sin(about)],
+            [0, math.sin(about), math.cos(about)],
+        ]
+    )
+    own = torch.tensor([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])
+    actor = scene.T_scene_actor[1, 2, :3, :3]
+    assert torch.allclose(axes, actor @ turn @ own, atol=1e-5)
 
 
 def test_each_person_has_a_shape_of_its_own_that_changes_with_time() -> None:

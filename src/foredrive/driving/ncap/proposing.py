@@ -74,12 +74,11 @@ def propose_kinds(place: Place, scene: str) -> list[SafetyScenario]:
     """
     of_kind: dict[Threat, list[SafetyScenario]] = {}
     for approach in APPROACHES:
-        if len(of_kind) < len(Threat):
-            proposals = propose(place, scene, approach)
-            for kind in Threat:
-                feasible = [proposal for proposal in proposals if proposal.kind is kind]
-                if feasible and kind not in of_kind:
-                    of_kind[kind] = feasible
+        missing = [kind for kind in Threat if kind not in of_kind]
+        proposals = propose(place, scene, approach) if missing else []
+        for kind in missing:
+            if feasible := [proposal for proposal in proposals if proposal.kind is kind]:
+                of_kind[kind] = feasible
     proposals = [proposal for kind in of_kind.values() for proposal in kind]
     return sorted(proposals, key=lambda proposal: proposal.start_frame)
 

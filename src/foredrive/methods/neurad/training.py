@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import torch
 from jaxtyping import Bool, Float, Int
-from torch import Tensor
+from torch import Tensor, nn
 from torch.optim import Optimizer
 
 from foredrive.engine.learning_rates import Rate
@@ -391,4 +391,5 @@ def _perceptual(
         return vgg, weighted_feature_loss
     if tower is None:
         raise InputError("perceptual=tower: there is no image tower here")
-    return tower(), feature_distance
+    features = tower()
+    return features.to(device) if isinstance(features, nn.Module) else features, feature_distance

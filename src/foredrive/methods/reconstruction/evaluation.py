@@ -21,7 +21,8 @@ from foredrive.methods.reconstruction.views import CameraView, SweepView
 from foredrive.tasks.rendering.image_scores import psnr_db, ssim
 from foredrive.tasks.rendering.lidar_scores import SweepScores, score_sweep
 
-MIN_DEPTH_M = 0.1
+NEAREST_CORNER_M = 0.1
+"""Least depth of all corners of a box that has a rectangle in an image, m."""
 MOVING_MPS = 0.5
 """From this speed on a vehicle counts as moving."""
 
@@ -103,7 +104,7 @@ def actor_pixels(tracks: ActorTracks, view: CameraView) -> Bool[Tensor, "H W"]:
         view.size_hw,
     )
     # A box that reaches behind the camera has no rectangle
-    uv = uv[(depth_m > MIN_DEPTH_M).all(-1)]
+    uv = uv[(depth_m > NEAREST_CORNER_M).all(-1)]
     first, last = uv.amin(1), uv.amax(1)
     v, u = (torch.arange(count) + 0.5 for count in view.size_hw)
     columns = (u >= first[:, :1]) & (u <= last[:, :1])

@@ -71,8 +71,9 @@ class GaussianContent(Record):
         added = torch.full((len(own.opacity_logit),), row).to(self.actor)
         code = self.code
         if code is not None:
-            known = source.code if source.deformation is self.deformation else None
-            copied = code.new_full((1,), RIGID) if known is None else known[source_row : source_row + 1]
+            source_code = source.code if source.deformation is self.deformation else None
+            rigid = code.new_full((1,), RIGID)
+            copied = rigid if source_code is None else source_code[source_row : source_row + 1]
             code = torch.cat([code, copied])
         return dataclasses.replace(
             self,

@@ -2,7 +2,8 @@
 
 After the deformable nodes of OmniRe (Chen et al., 2025, §4.2): each such actor has a learned code, and a
 network that all of them share turns code, place and time into a shift and a turn of each Gaussian. The
-Gaussians stay the same ones, so that relocation and growth work as for rigid actors.
+Gaussians stay the same ones, so that relocation and growth work as for rigid actors. Within an exposure or a
+sweep a shape stays as it is in the middle: only the box moves.
 """
 
 import dataclasses
@@ -71,6 +72,7 @@ class Deformation(nn.Module):
         half_lwh = self.half_lwh.index_select(0, shape)
         place = gaussians.mean_m / half_lwh
         then_s = self._observed_s(torch.as_tensor(t_s).to(place)).index_select(0, shape)
+        # From -1 to 1 across the box: half a wave for each π
         waves = [math.pi * cycles * place for cycles in PLACE_CYCLES]
         waves += [(2 * math.pi * place.new_tensor(TIME_HZ)) * then_s[:, None]]
         waves_of = [f(wave) for wave in waves for f in (torch.sin, torch.cos)]
