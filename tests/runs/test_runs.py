@@ -1,6 +1,7 @@
 """Runs as a whole, in miniature: what they leave on disk, how they go on, that they learn."""
 
 import dataclasses
+import logging
 import os
 import shutil
 import signal
@@ -142,6 +143,23 @@ def test_a_recipe_without_pretraining_starts_from_scratch(trained: Run, tmp_path
     assert open_run(tmp_path) == run
     assert not (tmp_path / "pretrain").exists()
     assert losses(tmp_path, "finetune")[0]["wpts"] != losses(trained.folder, "finetune")[0]["wpts"]
+
+
+def test_logs_without_anything_to_label_voxels_from_are_said(
+    log: LogPath, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    folder = tmp_path / "logs" / "flat_train" / "less"
+    folder.mkdir(parents=True)
+    for file in log.folder.iterdir():
+        if not file.name.startswith(("lidar", "custom.lidar")):
+            shutil.copy(file, folder)
+    recipe = with_steps(miniature(), 1, 1)
+    with caplog.at_level(logging.WARNING):
+        train_run(recipe, [log], tmp_path / "whole")
+    assert "none of the logs has lidar" not in caplog.text
+    with caplog.at_level(logging.WARNING):
+        train_run(recipe, [LogPath(folder, log.maps_dir)], tmp_path / "less")
+    assert "none of the logs has lidar" in caplog.text
 
 
 def test_logs_that_cannot_be_read_make_no_run(tmp_path: Path) -> None:

@@ -24,7 +24,8 @@ def check_recorded_occupancy(log: Log) -> None:
     """
     if not log.file(f"custom.{FULL_OCCUPANCY}").is_file():
         raise InputError(
-            f"{log.path.folder}: no recorded occupancy; use the labels from lidar (--occupancy lidar)"
+            f"{log.path.folder}: no recorded occupancy; record virtual egos with --occupancy, or use "
+            "the labels from lidar (--occupancy lidar)"
         )
 
 

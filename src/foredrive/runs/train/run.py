@@ -2,6 +2,7 @@
 
 import contextlib
 import json
+import logging
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -11,6 +12,7 @@ import torch
 from safetensors.torch import save_file
 
 from foredrive.data import ClipDataset, LogPath, collate
+from foredrive.data.lidar import frames_with_lidar
 from foredrive.engine.checkpoints import load_weights, save_weights, whole_weights
 from foredrive.engine.config import read_values, save_recipe
 from foredrive.engine.folder import CONFIG, LOGS, WEIGHTS, RunFolder
@@ -38,6 +40,7 @@ if TYPE_CHECKING:
 
     from foredrive.engine.fabric import Sharing
 
+_log = logging.getLogger(__name__)
 STAGES = ("pretrain", "finetune")
 PATH = "path"
 
@@ -153,8 +156,20 @@ def train_run(
             rigs = trained_rigs(run.logs, dataset.camera_names)
             if rigs is not None:
                 write_rigs(rigs, folder)
+        if fabric.is_global_zero:
+            _warn_without_labels(dataset)
         _train_stages(run, dataset, pretrained or kept, fabric)
     return run
+
+
+def _warn_without_labels(dataset: ClipDataset) -> None:
+    """Warn if no log has what the voxel labels are made from."""
+    source = dataset.config.occupancy_source
+    if source != "recorded" and not any(len(frames_with_lidar(log)) for log in dataset.logs):
+        _log.warning(
+            "none of the logs has lidar, so occupancy is not learned; logs of towns may have "
+            "recorded occupancy (--occupancy recorded)"
+        )
 
 
 def begin_run(
