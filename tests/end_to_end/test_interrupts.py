@@ -23,6 +23,8 @@ from foredrive.runs import Run, train_run
 TESTS = Path(__file__).parents[1]
 PATIENCE_S = 300.0
 PRELUDE = """
+import warnings
+warnings.simplefilter("ignore", ResourceWarning)  # Ctrl-C between `open` and `with`
 import foredrive.runs.drive.recording, foredrive.runs.evaluate.run, foredrive.runs.train.run
 import foredrive.view.overview, foredrive.view.run_report, foredrive.view.summary_tables
 from miniature import miniature
