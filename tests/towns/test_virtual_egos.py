@@ -1,5 +1,6 @@
 """Short logs from virtual egos: what is in them, and that equal seeds give equal bytes."""
 
+import dataclasses
 import shutil
 from pathlib import Path
 
@@ -7,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from file_digests import digests
+from miniature import miniature
 
 from foredrive.data import ClipConfig, ClipDataset
 from foredrive.data.boxes import read_boxes
@@ -15,6 +17,9 @@ from foredrive.data.commands import route_at
 from foredrive.data.log_paths import LogPath
 from foredrive.data.logs import Log
 from foredrive.data.truth.affordances import read_affordances
+from foredrive.data.truth.store import TaskTruthConfig
+from foredrive.runs.build import build_agent
+from foredrive.runs.train.kept_volumes import KeptVolumes
 from foredrive.scene import Category, VoxelSpec
 from foredrive.sensors.rigs import camera_rig
 from foredrive.towns import virtual_egos
@@ -155,6 +160,22 @@ def test_a_world_model_learns_from_past_now_and_what_comes(logs: list[LogPath]) 
                     moving += 1
     assert filled > 20
     assert moving > 2
+
+
+def test_heads_learn_from_the_clips_that_have_images(logs: list[LogPath], tmp_path: Path) -> None:
+    """The key frames after the images are kept out of the volumes and of their truth alike."""
+    recipe = miniature()
+    clips = dataclasses.replace(recipe.clips, future_frames=1, tasks=TaskTruthConfig())
+    kept = KeptVolumes(build_agent(recipe, fetch=False), logs[:3], clips, ("occupancy",), tmp_path)
+    assert len(kept) == 3 * (IMAGES - 1)
+    for index in (0, 4, 5, 14):
+        number, frame = divmod(index, IMAGES - 1)
+        log = Log(logs[number])
+        boxes = read_boxes(log, frame + 1)
+        assert boxes is not None
+        assert kept[index].key == (f"{logs[number].name}@{log.t_us[frame + 1]}",)
+        torch.testing.assert_close(kept[index].boxes.centre[kept[index].boxes.valid], boxes.centre)
+        assert kept[index].volumes.volume.std() > 0
 
 
 def test_equal_seeds_give_equal_bytes_and_whole_logs_are_kept(

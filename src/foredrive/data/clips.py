@@ -238,8 +238,8 @@ class ClipDataset(Dataset[Example]):
             return log.driven_future(now, steps, dt_s)
         return _at_times(plan, dt_s * np.arange(1, steps + 1))
 
-    def clip(self, index: int) -> Clip:
-        """Read one clip without its labels.
+    def clip(self, index: int, *, images: bool = True) -> Clip:
+        """Read one clip without its labels, and on request without its images: all views are then unseen.
 
         Raises:
             InputError: data cannot be read.
@@ -251,7 +251,8 @@ class ClipDataset(Dataset[Example]):
         command, _ = command_at(log, now, driven)
         cameras = [find_camera(self._cameras[number], name) for name in self.camera_names]
         seen = [
-            self._frames.read(log, frame, cameras, config.future_images or frame <= now) for frame in frames
+            self._frames.read(log, frame, cameras, images and (config.future_images or frame <= now))
+            for frame in frames
         ]
         return assemble_clip(
             log,

@@ -60,11 +60,9 @@ class KeptVolumes(Dataset[TaskExample]):
         folder = cache_dir / "volumes" / _key(agent, clips, (*tasks, *([f"later {later}"] if later else [])))
         self._files = [folder / f"{_name(dataset, index)}.safetensors" for index in range(len(dataset))]
         self._keep(agent, dataset)
-        without_images = dataclasses.replace(clips, cameras=(), future_images=False, tasks=None)
-        unseen = ClipDataset(logs, without_images, cache_dir)
-        numbers = track(range(len(unseen)), description="reading truth")
+        numbers = track(range(len(dataset)), description="reading truth")
         self.examples = [
-            _without_volumes(unseen.clip(number), dataset.truth(number), dataset.key(number))
+            _without_volumes(dataset.clip(number, images=False), dataset.truth(number), dataset.key(number))
             for number in numbers
         ]
 
