@@ -16,17 +16,18 @@ from foredrive.errors import InputError
 from foredrive.integrations.graph import AgentGraph, GraphInputs
 from foredrive.methods.recipe import Recipe
 from foredrive.runs import Run, evaluate_run, load_agent, open_run, train_run
-from foredrive.runs.build import build_agent
+from foredrive.runs.build import build_agent, build_objective
 from foredrive.runs.drive.seeing_agents import SeeingAgent, following
 from foredrive.runs.export import export_run
 from foredrive.runs.open_clips import open_clips
 from foredrive.runs.recipes.task_heads import base_heads, heads_for, with_joint_heads
 from foredrive.runs.recipes.world_models import load_recipe
+from foredrive.runs.train.kept_parts import load_perception
 from foredrive.runs.train.tasks import load_heads, probe_run, train_heads
 
-WITHOUT_MAP = ("detection", "motion", "occupancy")
+WITHOUT_MAP = ("detection", "motion", "occupancy", "instances")
 """Tasks that the log has truth of."""
-TERMS = ("centres", "cells", "queries", "velocity", "attribute", "motion", "voxels")
+TERMS = ("centres", "cells", "queries", "velocity", "attribute", "motion", "voxels", "instances")
 
 
 def test_a_joint_run_is_trained_end_to_end_and_evaluated(trained: Run, log: LogPath, tmp_path: Path) -> None:
@@ -42,7 +43,65 @@ def test_a_joint_run_is_trained_end_to_end_and_evaluated(trained: Run, log: LogP
     summary = evaluate_run(run, [log], tmp_path / "evaluated", views=False).summary
     assert summary["failed"] == 0
     assert summary["detection.frames_counted"] == summary["items"]
-    assert "motion.uniad.car.min_ade_m" in summary
+    assert {"motion.uniad.car.min_ade_m", "occupancy.uniad.vpq_near_pct.constant_velocity"} < set(summary)
+
+
+@pytest.mark.parametrize(
+    ("make", "imagining"), [(miniature, "motion"), (miniature_driveworld, "states.prior_net")]
+)
+def test_instances_train_the_imagination(
+    make: Callable[[], Recipe], imagining: str, log: LogPath, tmp_path: Path
+) -> None:
+    """The gradient of the vehicles' later cells reaches what only imagined key frames use, and the images."""
+    recipe = with_joint_heads(make(), small_heads(("detection", "instances")))
+    data = open_clips([log], recipe.clips, tmp_path)
+    torch.manual_seed(0)
+    agent = build_agent(recipe, fetch=False)
+    objective = build_objective(recipe, recipe.finetune, agent)
+    losses = objective(collate([data[0], data[3]]), torch.Generator().manual_seed(0))
+    losses["task_instances"].backward()
+    for part in (imagining, "backbone"):
+        gradients = [value.grad for value in agent.world_model.get_submodule(part).parameters()]
+        assert max(float(grad.abs().max()) for grad in gradients if grad is not None) > 0, part
+    assert all(value.grad is None for value in agent.planner.parameters())
+
+    slow = dataclasses.replace(recipe, tasks=None, clips=dataclasses.replace(recipe.clips, frame_dt_s=0.25))
+    with pytest.raises(InputError, match=r"key frames are 0\.25 s apart, instances need 0\.5 s"):
+        with_joint_heads(slow, small_heads(("detection", "instances")))
+
+
+def test_a_second_stage_begins_with_the_heads_of_the_first(
+    trained: Run, log: LogPath, tmp_path: Path
+) -> None:
+    """As in UniAD: first tracks, then all tasks and the planner, on an encoder that stays as it is."""
+    first = with_small_heads(trained.recipe, ("detection", "tracking"))
+    no_plan = dataclasses.replace(first.finetune.weights, wpts=0.0)
+    first = dataclasses.replace(first, finetune=dataclasses.replace(first.finetune, weights=no_plan))
+    one = train_run(first, [log], tmp_path / "one", trained.cache_dir, trained.folder)
+    tasks = ("detection", "tracking", "motion", "occupancy", "instances")
+    second = dataclasses.replace(with_small_heads(trained.recipe, tasks), transfer="perception")
+
+    begun = build_agent(second, fetch=False)
+    load_perception(begun, one.weights)
+    before, start = load_file(one.weights), begun.state_dict()
+    learned = {name for name in before if name.startswith(("world_model.", "heads."))}
+    assert all(torch.equal(start[name], before[name]) for name in learned)
+    assert {"heads.agents.renew.1.weight", "heads.planes.join.0.weight"} < learned < start.keys()
+
+    two = train_run(second, [log], tmp_path / "two", trained.cache_dir, one.folder)
+    after = load_file(two.weights)
+    kept = {name for name in before if name.startswith(("world_model.backbone.", "world_model.encoder."))}
+    assert any("running_mean" in name for name in kept)
+    assert all(torch.equal(before[name], after[name]) for name in kept)
+    for part in ("world_model.motion.", "heads.agents.layers.", "heads.planes."):
+        assert any(not torch.equal(before[name], after[name]) for name in before if name.startswith(part))
+    assert not (two.folder / "pretrain").exists()
+    alone = dataclasses.replace(trained.recipe, transfer="perception")
+    with pytest.raises(InputError, match="which trains heads: name them with --tasks"):
+        train_run(alone, [log], tmp_path / "no", trained.cache_dir, one.folder)
+    with pytest.raises(InputError, match="has no task heads that were trained with its world model"):
+        train_run(second, [log], tmp_path / "no", trained.cache_dir, trained.folder)
+    assert not (tmp_path / "no").exists()
 
 
 @pytest.mark.slow

@@ -48,11 +48,12 @@ def train(
         start: Another run's folder, or a model that comes with the package (embedded:nemo_town): use its
             pre-trained weights and begin with fine-tuning. For a driver, the run of another driver: continue
             from its weights, and draw clips in which it is wrong more often than others. With --probe, use
-            its world model and planner unchanged. With --set transfer=frozen, keep its world model and its
+            its world model and planner unchanged. With --set transfer=perception, use its last world model
+            and its heads, and keep its encoder unchanged. With transfer=frozen, keep its world model and its
             heads unchanged and train only the planner.
-        tasks: Tasks to train heads for, separated by commas: detection, tracking, map, motion, occupancy.
-            Fine-tuning trains them together with the world model. With --probe also instances: the vehicles'
-            cells now and in imagined key frames.
+        tasks: Tasks to train heads for, separated by commas: detection, tracking, map, motion, occupancy, or
+            instances, the vehicles' cells now and in imagined key frames. Fine-tuning trains them together
+            with the world model.
         probe: Train the heads of --tasks on the frozen world model instead. Its volumes are computed once and
             kept.
         strategy: How the processes that torchrun started, or the GPUs of this machine, share the training:

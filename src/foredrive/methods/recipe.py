@@ -32,11 +32,12 @@ class Recipe(Generic[M, S]):
     """Stage of fine-tuning."""
     pretrained_model: M | None = None
     """World model of pre-training if it is another than `model`. Both have the same encoder."""
-    transfer: Literal["world_model", "encoder", "frozen"] = "world_model"
+    transfer: Literal["world_model", "encoder", "perception", "frozen"] = "world_model"
     """Part of the pre-trained weights that fine-tuning starts from: the whole world model, or its backbone
     and encoder from images to a volume or plane. All other parts then start fresh, by the seed alone. With
-    "frozen", the last world model and the task heads of another run are kept as they are, and fine-tuning
-    trains the planner alone."""
+    "perception", it starts from the last world model of another run and from the task heads that both have,
+    and keeps backbone and encoder as they are (the second stage of UniAD). With "frozen", the last world
+    model and the task heads of another run are kept as they are, and fine-tuning trains the planner alone."""
     tasks: JointTasks | None = None
     """Task heads that are part of the agent; fine-tuning trains them with the world model, unless that is
     frozen. Their truth is `clips.tasks`."""

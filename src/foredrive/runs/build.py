@@ -66,6 +66,8 @@ def build_objective(
     else:
         tasks = None if recipe.tasks is None else TaskTerms(recipe.tasks, recipe.clips.voxels, class_weight)
         objective = WORLD_MODELS[stage.kind].objective(stage, agent, recipe.clips, tasks)
+        if recipe.transfer == "perception":
+            agent.keep(agent.world_model.backbone, agent.world_model.encoder)
     if recipe.path is not None and agent.planner.path is not None:
         agent.planner.path.requires_grad_(False)  # It is fitted after the last stage
     return objective

@@ -116,7 +116,7 @@ class DriveWorldObjective(nn.Module):
         if stage.weights.wpts > 0 or self.tasks is not None:
             # The belief of use, not of training: planner and heads read what they get in evaluation
             now = world.belief_about_now(lifted)
-            output = None if self.tasks is None else self.agent.perceive(now, clip)
+            output = None if self.tasks is None else self.agent.perceive(now, clip, instances=True)
             if stage.weights.wpts > 0:
                 future = world.imagine(now, 1) if self.agent.planner.imagined_frames else []
                 plan = self.agent.plan(observed, [now, *future], output)

@@ -126,7 +126,7 @@ class NemoObjective(nn.Module):
         # Imagine at least as far as the planner reads, also in steps that train the present alone
         steps = self.steps if self.sampler.imagines_now() else 0
         beliefs = self.sampler.rollout(observed, max(steps, needed))
-        output = None if self.tasks is None else self.agent.perceive(beliefs[0], clip)
+        output = None if self.tasks is None else self.agent.perceive(beliefs[0], clip, instances=True)
         decoded = [world.decode(belief) for belief in beliefs[: steps + 1]]
 
         losses = {name: clip.t_s.new_zeros(()) for name in ("l1", "perc", "occ")}

@@ -42,6 +42,18 @@ class PlanningAgent(nn.Module, Generic[W]):
         self.world_model: W = world_model
         self.planner = planner
         self.heads = heads
+        self._kept: tuple[nn.Module, ...] = ()
+
+    def keep(self, *parts: nn.Module) -> None:
+        """Keep the weights of some of its modules, and the statistics of their norms, as they are."""
+        self._kept = (*self._kept, *(part.requires_grad_(False).eval() for part in parts))
+
+    def train(self, mode: bool = True) -> "PlanningAgent[W]":
+        """Set the mode of all modules but those that are kept."""
+        super().train(mode)
+        for part in self._kept:
+            part.eval()
+        return self
 
     def forward(self, clip: Clip, steps: int) -> AgentOutput:
         """Observe the clip, imagine `steps` key frames (and those the planner needs), and plan."""
@@ -55,34 +67,43 @@ class PlanningAgent(nn.Module, Generic[W]):
         now = self.world_model.observe(clip)
         return [now, *self.world_model.imagine(now, steps)] if steps else [now]
 
-    def perceive(self, now: Belief, sequences: Clip | None = None) -> HeadOutput | None:
+    def perceive(
+        self, now: Belief, sequences: Clip | None = None, *, instances: bool = False
+    ) -> HeadOutput | None:
         """Return the output of the agent's task heads for a belief about now; None without heads.
 
         Args:
             now: belief about now.
             sequences: the clips, if they are the sequences in which heads that carry agents on are trained.
+            instances: imagine the key frames in which the head of instances finds vehicles. No planner reads
+                its output, so it is asked in training alone.
         """
-        return None if self.heads is None else self.perceived(now, sequences)
+        return None if self.heads is None else self.perceived(now, sequences, instances=instances)
 
     def perceived(
-        self, now: Belief, sequences: Clip | None = None, carried: CarriedAgents | None = None
+        self,
+        now: Belief,
+        sequences: Clip | None = None,
+        carried: CarriedAgents | None = None,
+        *,
+        instances: bool = False,
     ) -> HeadOutput:
         """Return the output of the task heads of an agent that has some.
 
-        Heads compute in 32 bits, because positions in 16 are off by tenths of a cell. No planner reads
-        instances, so nothing is imagined for them.
+        Heads compute in 32 bits, because positions in 16 are off by tenths of a cell.
 
         Args:
             now: belief about now.
             sequences: as for `perceive`.
             carried: agents of the frame before, for heads that carry agents on.
+            instances: as for `perceive`.
         """
         assert self.heads is not None
-        steps = None
+        config, steps = self.heads.config, None
         if sequences is not None:
             # Heads that carry agents from frame to frame need the ego motion between the frames
-            steps = self.heads.config.steps(sequences.T_world_ego[:, sequences.now])
-        read = volumes_of(self.world_model, now, self.heads.config.volumes)
+            steps = config.steps(sequences.T_world_ego[:, sequences.now])
+        read = volumes_of(self.world_model, now, config.volumes, config.later if instances else 0)
         # Tasks that read one volume share its cast, so it is converted once
         with full_precision(now.volume):
             cast = {id(volume): volume.map_tensors(Tensor.float) for volume in read.values()}

@@ -21,16 +21,9 @@ class PlannerObjective(nn.Module):
 
     def __init__(self, agent: PlanningAgent[Any]) -> None:
         super().__init__()
-        self.agent = agent.requires_grad_(False)
+        self.agent = agent
+        agent.keep(*(part for part in (agent.world_model, agent.heads) if part is not None))
         set_planner_trainable(agent.planner, trainable=True)
-
-    def train(self, mode: bool = True) -> "PlannerObjective":
-        """Set the mode of the planner alone, so that the statistics of norms do not move."""
-        super().train(mode)
-        for part in (self.agent.world_model, self.agent.heads):
-            if part is not None:
-                part.eval()
-        return self
 
     def forward(self, example: Example, generator: torch.Generator) -> dict[str, Float[Tensor, ""]]:
         """Return losses by name; "loss" is minimised. Nothing is drawn from the generator."""

@@ -92,12 +92,12 @@ def with_joint_heads(recipe: R, heads: TaskHeadsRecipe, settings: Sequence[str] 
         settings: entries of `Recipe.tasks` to replace, such as "weights.raster=2".
 
     Raises:
-        InputError: the recipe keeps the heads of another run, or a setting does not fit.
+        InputError: the recipe keeps the heads of another run, a setting does not fit, or instances need key
+            frames of another time step.
     """
     if recipe.transfer == "frozen":
         raise InputError(f"{recipe.name}: transfer is frozen, which keeps the heads of --start: no --tasks")
-    if heads.heads.instances is not None:
-        raise InputError(f"{INSTANCES} are trained on a frozen world model: use --probe")
+    check_instances(recipe, heads)
     joint = JointTasks(replace(heads.heads, volume_of=None), heads.weights)
     if settings:
         joint = validated(JointTasks, overridden(asdict(joint), settings), "--set")
@@ -108,6 +108,19 @@ def with_joint_heads(recipe: R, heads: TaskHeadsRecipe, settings: Sequence[str] 
         clips=replace(recipe.clips, tasks=heads.truth),
         tasks=joint,
     )
+
+
+def check_instances(recipe: Recipe[Any, Any], heads: TaskHeadsRecipe) -> None:
+    """Refuse heads that read imagined key frames of another time step than the recipe's.
+
+    Raises:
+        InputError: the time steps differ.
+    """
+    instances, dt_s = heads.heads.instances, recipe.clips.frame_dt_s
+    if instances is not None and instances.dt_s != dt_s:
+        raise InputError(
+            f"{recipe.name}: key frames are {dt_s:g} s apart, {INSTANCES} need {instances.dt_s:g} s"
+        )
 
 
 def with_settings(recipe: TaskHeadsRecipe, settings: Sequence[str]) -> TaskHeadsRecipe:

@@ -1,8 +1,10 @@
-"""World model and heads of a finished run, kept as they are by a run that trains the planner alone."""
+"""World model and heads of a finished run, with which another run begins."""
 
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+
+from safetensors import safe_open
 
 from foredrive.engine.checkpoints import load_weights
 from foredrive.engine.folder import CONFIG, WEIGHTS
@@ -48,3 +50,26 @@ def load_kept(agent: PlanningAgent[Any], kept: Recipe[Any, Any], folder: Path, w
         load_weights(agent.heads, weights, "heads")
     elif agent.heads is not None:
         load_weights(agent.heads, folder / TASKS / WEIGHTS)
+
+
+def load_perception(agent: PlanningAgent[Any], weights: Path) -> None:
+    """Load the world model of another run, and the parts of its heads that the agent has too.
+
+    Args:
+        agent: its other parts stay as they are.
+        weights: of the last stage of the other run.
+
+    Raises:
+        InputError: the file cannot be read, or is of another architecture.
+    """
+    load_weights(agent.world_model, weights, "world_model")
+    assert agent.heads is not None
+    # Agents with forecasts begin from agents without them, so their parts are loaded one by one
+    parts = dict(agent.heads.named_children())
+    agents = parts.pop("agents", None)
+    parts |= {} if agents is None else {f"agents.{name}": part for name, part in agents.named_children()}
+    with safe_open(weights, framework="pt") as file:
+        stored = tuple(file.keys())
+    for name, part in parts.items():
+        if any(key.startswith(f"heads.{name}.") for key in stored):
+            load_weights(part, weights, f"heads.{name}")

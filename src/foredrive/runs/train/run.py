@@ -27,7 +27,7 @@ from foredrive.runs.build import build_agent, build_objective
 from foredrive.runs.open_clips import open_clips
 from foredrive.runs.recipes.world_models import load_recipe
 from foredrive.runs.train.baselines import fit_baselines
-from foredrive.runs.train.kept_parts import load_kept, with_kept_heads
+from foredrive.runs.train.kept_parts import load_kept, load_perception, with_kept_heads
 from foredrive.runs.train.path_features import sample_paths
 from foredrive.runs.train.rigs import RIGS, trained_rigs, write_rigs
 from foredrive.runs.train.sequences import in_sequences
@@ -122,8 +122,8 @@ def train_run(
         start: a run folder. The part of its pre-trained world model that the recipe transfers is used, and
             this run skips that stage. It allows pre-training on many logs and fine-tuning on few, or with
             another planner. A model that comes with the package has its last weights only; these are then
-            used. If the recipe's `transfer` is "frozen", its last world model and its heads are
-            used instead.
+            used. If the recipe's `transfer` is "perception" or "frozen", its last world model and its heads
+            are used instead.
         sharing: how the processes that torchrun started share the training, if there are several.
 
     Raises:
@@ -135,15 +135,16 @@ def train_run(
 
     start = None if start is None else start.absolute()
     kept: Run | None = None
-    if recipe.transfer == "frozen":
+    if recipe.transfer in ("perception", "frozen"):
         kept = _kept(recipe, start)
+    if kept is not None and recipe.transfer == "frozen":
         recipe = with_kept_heads(recipe, kept.recipe, kept.folder)
     logs = tuple(log.absolute() for log in logs)  # a run opens from any working directory
     run = Run(folder, recipe, logs, (cache_dir or folder / "cache").absolute(), start)
     claim = _folder_of(run)
     claim.check()
     dataset = open_clips(run.logs, recipe.clips, run.cache_dir)
-    if recipe.tasks is not None and kept is None:
+    if recipe.tasks is not None and recipe.transfer != "frozen":
         check_truth(recipe.tasks.heads, run.logs)
     pretrained = None if start is None or kept is not None else pretrained_weights(start)
     if recipe.planner.attends or recipe.tasks is not None:
@@ -193,8 +194,8 @@ def _train_stages(run: Run, dataset: ClipDataset, start: "Path | Run | None", fa
     """Train the stages that are not finished yet, in order.
 
     Args:
-        start: pre-trained weights, or the run whose world model and heads are kept. None: pre-train, if the
-            recipe says so.
+        start: pre-trained weights, or the run whose last world model and heads are used. None: pre-train, if
+            the recipe says so.
     """
     recipe, folder = run.recipe, run.folder
     if start is None and recipe.pretrain is not None:
@@ -204,7 +205,9 @@ def _train_stages(run: Run, dataset: ClipDataset, start: "Path | Run | None", fa
             data = dataset if recipe.clips.tasks is None else open_clips(run.logs, first.clips, run.cache_dir)
             _train_stage(replace(run, recipe=first), "pretrain", fresh_agent(first), data, fabric)
     agent = fresh_agent(recipe)
-    if isinstance(start, Run):
+    if isinstance(start, Run) and recipe.transfer == "perception":
+        load_perception(agent, start.weights)
+    elif isinstance(start, Run):
         load_kept(agent, start.recipe, start.folder, start.weights)
     elif start is not None:
         load_pretrained(agent, recipe, start)
@@ -264,11 +267,15 @@ def pretrained_weights(start: Path) -> Path:
 
 
 def _kept(recipe: Recipe, start: Path | None) -> Run:
-    """Return the run whose world model and heads are kept."""
+    """Return the run whose last world model and heads are used."""
+    if recipe.transfer == "perception" and recipe.tasks is None:
+        raise InputError(f"{recipe.name}: transfer is perception, which trains heads: name them with --tasks")
     if start is None:
-        raise InputError(f"{recipe.name}: transfer is frozen; --start has to name a trained run")
+        raise InputError(f"{recipe.name}: transfer is {recipe.transfer}; --start has to name a trained run")
     source = open_run(start)
     assert source.weights
+    if recipe.transfer == "perception" and source.recipe.tasks is None:
+        raise InputError(f"{start}: has no task heads that were trained with its world model")
     return source
 
 

@@ -16,7 +16,7 @@ from foredrive.engine.loop import train
 from foredrive.errors import InputError
 from foredrive.files import atomic_path
 from foredrive.methods.recipe import Recipe
-from foredrive.runs.recipes.task_heads import TaskHeadsRecipe, load_task_heads
+from foredrive.runs.recipes.task_heads import TaskHeadsRecipe, check_instances, load_task_heads
 from foredrive.runs.train.kept_volumes import KeptVolumes, collate_kept
 from foredrive.runs.train.run import Run, begin_run, load_agent, open_run
 from foredrive.runs.train.sequences import in_sequences
@@ -83,7 +83,7 @@ def train_heads(run: Run, heads: TaskHeadsRecipe) -> TrainedHeads:
     if (folder / CONFIG).is_file() and load_task_heads(folder / CONFIG) != heads:
         raise InputError(f"{folder}: holds other heads; choose another folder for the run")
     if not (folder / WEIGHTS).is_file():
-        _check_later(run, heads)
+        check_instances(run.recipe, heads)
         check_truth(heads.heads, run.logs)
         agent = load_agent(run)
         clips = dataclasses.replace(run.recipe.clips, tasks=heads.truth, now_stride_s=heads.now_stride_s)
@@ -142,12 +142,3 @@ def _build(run: Run, recipe: TaskHeadsRecipe) -> TaskHeads:
         raster=recipe.truth.raster,
         instance_grid=recipe.truth.instances,
     )
-
-
-def _check_later(run: Run, heads: TaskHeadsRecipe) -> None:
-    """Refuse heads that read imagined key frames of another time step than the run's."""
-    instances, dt_s = heads.heads.instances, run.recipe.clips.frame_dt_s
-    if instances is not None and instances.dt_s != dt_s:
-        raise InputError(
-            f"{run.folder}: key frames are {dt_s:g} s apart, instances need {instances.dt_s:g} s"
-        )
