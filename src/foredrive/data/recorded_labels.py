@@ -50,7 +50,8 @@ def resampled_labels(recorded: FullOccupancy, spec: VoxelSpec) -> VoxelLabels:
     of its content. All voxels inside the recorded grid are known. Voxels under the ground are free, because
     the ground is a surface.
     """
-    held, known = held_voxels(recorded, (recorded.velocity_mps**2).sum(axis=-1), spec)
+    squared_speed = np.einsum("kc,kc->k", recorded.velocity_mps, recorded.velocity_mps)
+    held, known = held_voxels(recorded, squared_speed, spec)
     occupied = known & (held != NOTHING)
     flow_mps = np.zeros((3, *spec.shape_zyx), dtype=np.float32)
     flow_mps[:, occupied] = recorded.velocity_mps[held[occupied]].T
@@ -73,18 +74,27 @@ def held_voxels(
     Returns:
         Index of a recorded voxel, or NOTHING; True for voxels that are completely inside the recorded grid.
     """
-    order = np.argsort(priority, kind="stable")
+    holders, middles = _voxels_at_middles(recorded.spec, spec), _voxels_at_middles(spec, recorded.spec)
+    # Most of the recording is far outside: only layers that the other grid reads are looked at
+    read = [
+        (holder >= 0) | np.isin(np.arange(len(holder)), middle)
+        for holder, middle in zip(holders, middles, strict=True)
+    ]
+    z, y, x = recorded.index_zyx.T
+    near = np.flatnonzero(read[0][z] & read[1][y] & read[2][x])
+    order = near[np.argsort(priority[near], kind="stable")]
     # From here a recorded voxel is its rank by priority, so that the maximum is the one to keep
     index = recorded.index_zyx[order]
     # One more layer on each axis holds NOTHING: index -1, for places outside, reads it
-    which = np.full(np.add(recorded.spec.shape_zyx, 1), NOTHING)
+    which = np.full(np.add(recorded.spec.shape_zyx, 1), NOTHING, dtype=np.int32)
     which[tuple(index.T)] = np.arange(len(index))
     # First the recorded voxel at the centre of each voxel, then the recorded centres inside each voxel
-    held = which[np.ix_(*_voxels_at_middles(spec, recorded.spec))]
-    middles = _voxels_at_middles(recorded.spec, spec)
-    z, y, x = (of_axis[index[:, axis]] for axis, of_axis in enumerate(middles))
+    held = which[np.ix_(*middles)]
+    z, y, x = (holder[index[:, axis]] for axis, holder in enumerate(holders))
     within = np.flatnonzero((z >= 0) & (y >= 0) & (x >= 0))
-    np.maximum.at(held, (z[within], y[within], x[within]), within)
+    inside = np.full_like(held, NOTHING)
+    inside[z[within], y[within], x[within]] = within  # ranks ascend, and the last one stays
+    held = np.maximum(held, inside)
     # Rank -1 reads the appended NOTHING
     return np.append(order, NOTHING)[held], _within(spec, recorded.spec)
 
