@@ -144,6 +144,23 @@ def test_true_boxes_switch_nowhere_and_the_simple_tracker_keeps_them(example: Ex
     assert figures["tracking.scenes"] == 1
 
 
+def test_cars_within_30_m_have_a_figure_of_their_own(example: Example) -> None:
+    """One of the two cars stays 40 m ahead and is never found; the other one is, at all times."""
+    agents = near_truth(example).agents
+    assert agents is not None
+    boxes = example.clip.boxes
+    far, score = boxes.centre.clone(), torch.ones(len(agents.score), 4)
+    far[:, :, 1, :2] = torch.tensor([40.0, 0.0])
+    score[:, 1] = 0.0
+    clip = dataclasses.replace(example.clip, boxes=dataclasses.replace(boxes, centre=far))
+    found = dataclasses.replace(of_truth(example, agents), score=score)
+    figures = evaluated(Prediction(agents=found), dataclasses.replace(example, clip=clip))
+    for suffix in ("", BASELINE):
+        assert figures[f"tracking.car_amota_30m{suffix}"] == pytest.approx(1.0)
+        assert figures[f"tracking.car_ids_30m{suffix}"] == 0
+        assert float(figures[f"tracking.nuscenes.car.amota{suffix}"]) < 0.6
+
+
 def test_without_identities_there_is_the_baseline_alone(example: Example) -> None:
     agents = near_truth(example).agents
     assert agents is not None

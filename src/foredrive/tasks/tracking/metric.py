@@ -12,8 +12,8 @@ from foredrive.tasks.evaluation.frame_keys import continues, time_of
 from foredrive.tasks.evaluation.metric import EvaluationContext, Figures, Shown
 from foredrive.tasks.evaluation.predictor import Part, Prediction
 from foredrive.tasks.tracking.in_world import agent_rows, box_rows, likely, stacked
-from foredrive.tasks.tracking.object_rows import Frames, ObjectRows
-from foredrive.tasks.tracking.protocols import TRACKING_PROTOCOLS
+from foredrive.tasks.tracking.object_rows import Frames, ObjectRows, Region
+from foredrive.tasks.tracking.protocols import TRACKING_PROTOCOLS, evaluate_tracking
 from foredrive.tasks.tracking.score import tracking_figures
 
 MAX_AGE_FRAMES = 3
@@ -29,6 +29,9 @@ MAX_DISTANCE_M = {
 }
 """Maximum distance of a detection from a track, by class, for frames 0.5 s apart."""
 FRAME_S = 0.5
+CARS_30M = replace(
+    TRACKING_PROTOCOLS["nuscenes"], title="cars within 30 m", region=Region("circle", {"car": (30.0, 30.0)})
+)
 
 
 @dataclass(frozen=True)
@@ -138,7 +141,7 @@ BASELINE = ".greedy_association"
 
 
 class TrackingMetric:
-    """Keys: `nuscenes.amota`, `nuscenes.amotp_m`, `nuscenes.ids`, `nuscenes.car.ids`, `uniad.amota`, ….
+    """Keys: `nuscenes.amota`, `nuscenes.ids`, `nuscenes.car.ids`, `uniad.amota`, `car_amota_30m`, ….
 
     The keys of the baseline end in `.greedy_association`: the same detections with the identities of
     `greedy_tracks`. A model whose agents have no identities has the baseline's figures alone. Frames without
@@ -149,6 +152,7 @@ class TrackingMetric:
     title = "Tracking"
     shown: tuple[Shown, ...] = (
         Shown("AMOTA", "nuscenes.amota", "greedy_association"),
+        Shown("AMOTA of cars within 30 m", "car_amota_30m", "greedy_association"),
         Shown("changed identities", "nuscenes.ids", "greedy_association"),
     )
     needs: frozenset[Part] = frozenset({"agents"})
@@ -184,7 +188,14 @@ class TrackingMetric:
         out: Figures = {"frames_counted": len(frames), "scenes": self._scene[-1] + 1}
         if (predicted.track >= 0).any():
             # Identities of the model, if it has any
-            out |= tracking_figures(predicted[predicted.track >= 0], true, true[:0], frames)
+            out |= _figures(predicted[predicted.track >= 0], true, frames)
         # The baseline takes the same detections
-        simple = tracking_figures(greedy_tracks(predicted, frames, CLASSES), true, true[:0], frames)
+        simple = _figures(greedy_tracks(predicted, frames, CLASSES), true, frames)
         return out | {f"{key}{BASELINE}": value for key, value in simple.items()}
+
+
+def _figures(tracks: ObjectRows, true: ObjectRows, frames: Frames) -> Figures:
+    """Return the figures of every protocol, and of the cars nearby."""
+    cars = evaluate_tracking(tracks, true, true[:0], frames, CARS_30M).by_class["car"]
+    near = {"car_amota_30m": cars["amota"], "car_ids_30m": cars["ids"]} if cars["gt"] > 0 else {}
+    return tracking_figures(tracks, true, true[:0], frames) | near
