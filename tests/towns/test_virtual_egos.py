@@ -19,6 +19,7 @@ from foredrive.data.logs import Log
 from foredrive.data.truth.affordances import read_affordances
 from foredrive.data.truth.store import TaskTruthConfig
 from foredrive.runs.build import build_agent
+from foredrive.runs.train.baselines import fit_baselines
 from foredrive.runs.train.kept_volumes import KeptVolumes
 from foredrive.scene import Category, VoxelSpec
 from foredrive.sensors.rigs import camera_rig
@@ -176,6 +177,18 @@ def test_heads_learn_from_the_clips_that_have_images(logs: list[LogPath], tmp_pa
         assert kept[index].key == (f"{logs[number].name}@{log.t_us[frame + 1]}",)
         torch.testing.assert_close(kept[index].boxes.centre[kept[index].boxes.valid], boxes.centre)
         assert kept[index].volumes.volume.std() > 0
+
+
+def test_baselines_learn_from_the_clips_that_have_images(logs: list[LogPath], tmp_path: Path) -> None:
+    """Later key frames have no occupancy; the prior counts the clips in which a voxel is filled."""
+    recipe = miniature()
+    clips = dataclasses.replace(recipe.clips, future_frames=FORESEEN, occupancy_source="recorded")
+    few = tuple(logs[:3])
+    prior, mlp = fit_baselines(few, dataclasses.replace(recipe, clips=clips), tmp_path, past_frames=1)
+    data = ClipDataset(few, clips, None)
+    filled = torch.stack([data[index].occupancy.values[1:, 0] for index in range(len(data))])
+    assert torch.equal(prior.occupied, filled.sum(dim=0).int())
+    assert bool(torch.cat([value.flatten() for value in mlp.parameters()]).isfinite().all())
 
 
 def test_equal_seeds_give_equal_bytes_and_whole_logs_are_kept(

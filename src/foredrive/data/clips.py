@@ -89,6 +89,7 @@ class ClipDataset(Dataset[Example]):
     Args:
         logs: at least one log.
         cache_dir: folder for voxel labels and frames with resized images. None disables the cache.
+        images: False reads the same clips without their images: all views are then unseen.
 
     Raises:
         InputError: a log cannot be read, is too short for one clip or lacks the requested occupancy, or no
@@ -97,10 +98,12 @@ class ClipDataset(Dataset[Example]):
 
     camera_names: tuple[str, ...]
 
-    def __init__(self, logs: Sequence[LogPath], config: ClipConfig, cache_dir: Path | None) -> None:
+    def __init__(
+        self, logs: Sequence[LogPath], config: ClipConfig, cache_dir: Path | None, *, images: bool = True
+    ) -> None:
         if not logs:
             raise InputError("a data set needs at least one log")
-        self.config = config
+        self.config, self._images = config, images
         self.logs = [Log(path) for path in logs]
         self._cameras = [pinhole_cameras(log) for log in self.logs]
         self.camera_names = self._choose_cameras()
@@ -238,8 +241,8 @@ class ClipDataset(Dataset[Example]):
             return log.driven_future(now, steps, dt_s)
         return _at_times(plan, dt_s * np.arange(1, steps + 1))
 
-    def clip(self, index: int, *, images: bool = True) -> Clip:
-        """Read one clip without its labels, and on request without its images: all views are then unseen.
+    def clip(self, index: int) -> Clip:
+        """Read one clip without its labels.
 
         Raises:
             InputError: data cannot be read.
@@ -251,7 +254,7 @@ class ClipDataset(Dataset[Example]):
         command, _ = command_at(log, now, driven)
         cameras = [find_camera(self._cameras[number], name) for name in self.camera_names]
         seen = [
-            self._frames.read(log, frame, cameras, images and (config.future_images or frame <= now))
+            self._frames.read(log, frame, cameras, self._images and (config.future_images or frame <= now))
             for frame in frames
         ]
         return assemble_clip(

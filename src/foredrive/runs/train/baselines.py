@@ -1,6 +1,5 @@
 """Baselines of a trained model, fitted to the logs that the model was trained on."""
 
-import dataclasses
 from collections.abc import Iterable, Iterator
 from functools import lru_cache
 from pathlib import Path
@@ -35,8 +34,8 @@ def fit_baselines(
         InputError: a log cannot be read.
     """
     clips, target = recipe.clips.judged, recipe.planner.target
-    without_images = dataclasses.replace(clips, cameras=(), future_images=False)
-    loader = DataLoader(ClipDataset(logs, without_images, cache_dir), batch_size=16, collate_fn=collate)
+    dataset = ClipDataset(logs, clips, cache_dir, images=False)
+    loader = DataLoader(dataset, batch_size=16, collate_fn=collate)
     prior, status = read_training_set(loader, clips.future_frames + 1, past_frames, target=target)
     sizes = recipe.planner.ego_mlp or EgoMLPConfig()
     mlp = fit_ego_mlp(

@@ -60,9 +60,10 @@ class KeptVolumes(Dataset[TaskExample]):
         folder = cache_dir / "volumes" / _key(agent, clips, (*tasks, *([f"later {later}"] if later else [])))
         self._files = [folder / f"{_name(dataset, index)}.safetensors" for index in range(len(dataset))]
         self._keep(agent, dataset)
-        numbers = track(range(len(dataset)), description="reading truth")
+        unseen = ClipDataset(logs, dataset.config, cache_dir, images=False)
+        numbers = track(range(len(unseen)), description="reading truth")
         self.examples = [
-            _without_volumes(dataset.clip(number, images=False), dataset.truth(number), dataset.key(number))
+            _without_volumes(unseen.clip(number), unseen.truth(number), unseen.key(number))
             for number in numbers
         ]
 

@@ -26,7 +26,7 @@ from foredrive.methods.recipe import Recipe
 from foredrive.runs.build import build_agent, build_objective
 from foredrive.runs.open_clips import open_clips
 from foredrive.runs.recipes.world_models import load_recipe
-from foredrive.runs.train.baselines import fit_baselines
+from foredrive.runs.train.baselines import run_baselines
 from foredrive.runs.train.kept_parts import load_kept, load_perception, with_kept_heads
 from foredrive.runs.train.path_features import sample_paths
 from foredrive.runs.train.rigs import RIGS, trained_rigs, write_rigs
@@ -214,7 +214,7 @@ def _train_stages(run: Run, dataset: ClipDataset, start: "Path | Run | None", fa
     if agent.planner.ego_mlp is not None and not (folder / "finetune" / WEIGHTS).is_file():
         # The base of the planner is the same MLP that is its baseline in the evaluation.
         base = agent.planner.ego_mlp
-        _, fitted = fit_baselines(run.logs, recipe, run.cache_dir, base.past_frames)
+        _, fitted = run_baselines(folder, run.logs, recipe, run.cache_dir, base.past_frames)
         base.load_state_dict(fitted.state_dict())
     _train_stage(run, "finetune", agent, dataset, fabric)
     if recipe.tasks is not None and fabric.is_global_zero and not (folder / TASKS / PRIORS).is_file():

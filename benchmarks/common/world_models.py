@@ -1,0 +1,137 @@
+"""World models that learn from the virtual egos of `learning`: pre-trainings, and fine-tunings from them.
+
+All studies of NeMo and DriveWorld share the egos of `learning`'s ten minutes (six images of each of 1,960
+cars in seven towns, exact occupancy), its test drives through Town05, and pre-trainings: one of the same
+recipe, steps and seed is made once. All are judged by labels from lidar. Runs are kept in runs/world_models,
+where an interrupted study continues.
+"""
+
+import dataclasses
+import shutil
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from benchmarks import learning
+from benchmarks.common.study import StudyLogs, run_arm, seeded, share_of
+from foredrive.data import LogPath
+from foredrive.engine.bench import study_identity
+from foredrive.engine.small_weights import save_small
+from foredrive.files import atomic_path
+from foredrive.methods.planner.path_fit import PathFit
+from foredrive.methods.recipe import Recipe, rescheduled, with_occupancy_source
+from foredrive.runs.recipes.known import find_recipe
+from foredrive.runs.recipes.task_heads import town_heads, with_joint_heads
+from foredrive.runs.train.baselines import Baselines, baselines_file, fit_baselines
+from foredrive.runs.train.run import Run, train_run
+
+ROOT = Path("runs/world_models")
+EGOS = learning.BUDGETS["10min"].egos
+STEPS: Mapping[str, int] = {"nemo": 3200, "driveworld": 800}
+"""Steps of pre-training by kind of world model, of four clips each: about 20 minutes on one core."""
+FINETUNING_STEPS, WARMUP_STEPS = 300, 30
+PATH_STRIDE_S = 2.0
+"""Time between the clips on which the head along the path is fitted."""
+CONFIG = {
+    "egos": EGOS,
+    "steps": dict(STEPS),
+    "finetuning_steps": FINETUNING_STEPS,
+    "path_stride_s": PATH_STRIDE_S,
+    "drives": learning.DIGEST,
+}
+
+
+def study_logs(share: float = 1.0) -> StudyLogs:
+    """Record what is missing; return the first part of the egos, from all towns, and the test drives."""
+    _, test = learning.logs_of(0)
+
+    def turn(log: LogPath) -> tuple[str, str]:
+        town, ego = log.name.rsplit("_", 1)
+        return ego, town
+
+    return StudyLogs(share_of(sorted(learning.egos_of(*EGOS), key=turn), share), test)
+
+
+def of_the_study(name: str, seed: int, pretraining_seed: int) -> Recipe[Any, Any]:
+    """Return a recipe with the lengths and the labels of the studies.
+
+    Args:
+        name: of the recipe.
+        seed: of the fine-tuning.
+        pretraining_seed: of the pre-training, if the recipe has one.
+    """
+    recipe = with_occupancy_source(find_recipe(name), "recorded")
+    pretrain = recipe.pretrain
+    if pretrain is not None:
+        steps = STEPS[recipe.model.kind]
+        warmup = max(1, round(0.08 * steps))
+        pretrain = rescheduled(pretrain, steps=steps, warmup_steps=warmup, seed=pretraining_seed, workers=0)
+    return dataclasses.replace(
+        recipe,
+        path=PathFit(stride_s=PATH_STRIDE_S) if recipe.path else None,
+        pretrain=pretrain,
+        finetune=rescheduled(
+            recipe.finetune, steps=FINETUNING_STEPS, warmup_steps=WARMUP_STEPS, seed=seed, workers=0
+        ),
+    )
+
+
+def pretrained(recipe: Recipe[Any, Any], decided_by: Sequence[str]) -> Run:
+    """Return the run with the pre-training of a recipe of the studies, and nothing after it; make it once.
+
+    Args:
+        recipe: has a pre-training.
+        decided_by: modules that decide what it learns, as for `study_identity`.
+    """
+    assert recipe.pretrain is not None
+    schedule, usual = recipe.pretrain.schedule, find_recipe(f"{recipe.model.kind}_town")
+    # Rows that differ in what comes after share the pre-training
+    alone = dataclasses.replace(
+        recipe.of_pretraining,
+        name=f"{usual.name}, pre-training",
+        planner=usual.planner,
+        finetune=usual.finetune,
+        pretrained_model=None,
+        transfer="world_model",
+    )
+    alone = seeded(learning.pretraining_alone(alone, schedule.steps), schedule.seed)
+    identity = study_identity({"recipe": dataclasses.asdict(alone), "egos": EGOS}, decided_by)
+    return train_run(alone, study_logs().train, ROOT / "pretrained" / identity, learning.ROOT / "cache")
+
+
+def fine_tuned(
+    recipe: Recipe[Any, Any],
+    folder: Path,
+    decided_by: Sequence[str],
+    share: float = 1.0,
+    tasks: Sequence[str] = (),
+) -> dict[str, float]:
+    """Fine-tune a recipe of the studies, after its pre-training, and return its figures on the test drives.
+
+    Args:
+        recipe: one without pre-training starts from scratch.
+        folder: folder of the fine-tuning's run.
+        decided_by: as for `pretrained`.
+        share: part of the egos that fine-tuning learns from. Pre-training has them all.
+        tasks: tasks whose heads are trained in fine-tuning too.
+    """
+    start = None if recipe.pretrain is None else pretrained(recipe, decided_by).folder
+    if tasks:
+        recipe = with_joint_heads(recipe, town_heads(tasks))
+    for past_frames in {recipe.planner.history, recipe.clips.past_frames}:
+        _share_baselines(recipe, past_frames, folder)
+    return run_arm(recipe, study_logs(share), folder, learning.ROOT / "cache", start)
+
+
+def _share_baselines(recipe: Recipe[Any, Any], past_frames: int, folder: Path) -> None:
+    """Put the baselines of the whole training data into the folder of a run: fitting them takes minutes."""
+    clips = dataclasses.asdict(dataclasses.replace(recipe.clips, tasks=None))
+    identity = study_identity({"clips": clips, "egos": EGOS}, ("foredrive.methods.planner.ego_mlp_fit",))
+    file = ROOT / "baselines" / identity / baselines_file(past_frames)
+    if not file.is_file():
+        baselines = fit_baselines(study_logs().train, recipe, learning.ROOT / "cache", past_frames)
+        with atomic_path(file) as temporary:
+            save_small(Baselines(*baselines), temporary)
+    folder.mkdir(parents=True, exist_ok=True)
+    with atomic_path(folder / file.name) as temporary:
+        shutil.copyfile(file, temporary)
