@@ -1,8 +1,8 @@
 """Does a planner gain by attending to what task heads find? `foredrive bench planner-attention`, an hour.
 
 World model and heads are those of `task-probes` (the shipped `nemo_town`, heads of seed 0), and stay as they
-are. Arms train the planner alone, for as long as `nemo-ablation` fine-tunes: from the volume alone, with the
-agents that the heads find, and with agents and map elements, as VAD and UniAD do. Seeds are the planner's.
+are. Arms train the planner alone: from the volume alone, with the agents that the heads find, and with agents
+and map elements, as VAD and UniAD do. Seeds are the planner's.
 """
 
 import dataclasses
@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks import learning, task_probes
-from benchmarks.common.fine_tuning import PATH_STRIDE_S, STEPS, WARMUP_STEPS
 from benchmarks.common.study import StudyLogs, run_arm
+from benchmarks.common.world_models import PATH_STRIDE_S
 from foredrive.engine.bench import Benchmark, study_identity
 from foredrive.methods.planner.path_fit import PathFit
 from foredrive.methods.recipe import Recipe, rescheduled
@@ -24,6 +24,7 @@ ATTENDED: dict[str, tuple[Attended, ...]] = {
     "agents": ("agents",),
     "agents_and_map": ("agents", "map"),
 }
+STEPS, WARMUP_STEPS = 600, 50
 DRIVES = 56
 """Training drives: eight of each town."""
 CONFIG = {

@@ -11,7 +11,7 @@ from foredrive.methods.recipe import Recipe
 from foredrive.runs.evaluate.inputs import FUTURES
 from foredrive.runs.evaluate.predict import AgentPredictor
 from foredrive.runs.open_clips import open_clips
-from foredrive.runs.train.baselines import fit_baselines
+from foredrive.runs.train.baselines import run_baselines
 from foredrive.runs.train.run import Run, load_agent
 from foredrive.tasks.evaluation.run import evaluate
 
@@ -40,15 +40,28 @@ def forecasting(
     return replace(recipe, clips=clips, planner=planner, pretrain=None, finetune=stage, path=None)
 
 
-def judge_forecast(run: Run, logs: Sequence[LogPath], part_s: tuple[float, float]) -> dict[str, float]:
-    """Evaluate occupancy and flow of another part of logs, now and later, beside persistence.
+def judge_forecast(
+    run: Run, logs: Sequence[LogPath], part_s: tuple[float, float], stride_s: float | None = None
+) -> dict[str, float]:
+    """Evaluate occupancy by labels from lidar, and flow, now and later, beside persistence.
+
+    Args:
+        part_s: the judged part of the logs.
+        stride_s: time between the clips' nows, s; None: as in the recipe.
 
     Raises:
         InputError: there is nothing to evaluate.
     """
     clips = run.recipe.clips
-    dataset = open_clips(logs, replace(clips, part_s=part_s, future_images=False), run.cache_dir)
-    prior, _ = fit_baselines(run.logs, run.recipe, run.cache_dir, clips.past_frames)
+    judged = replace(
+        clips,
+        part_s=part_s,
+        now_stride_s=stride_s or clips.now_stride_s,
+        future_images=False,
+        occupancy_source="lidar",
+    )
+    dataset = open_clips(logs, judged, run.cache_dir)
+    prior, _ = run_baselines(run.folder, run.logs, run.recipe, run.cache_dir, clips.past_frames)
     result = evaluate(
         AgentPredictor(load_agent(run), clips.future_frames, 0, FUTURES),
         DataLoader(dataset, batch_size=BATCH, collate_fn=collate),

@@ -14,8 +14,7 @@ from foredrive.engine.provenance import collect_provenance
 from foredrive.engine.summary import read_summary
 from foredrive.errors import InputError
 from foredrive.files import atomic_path
-from foredrive.methods.planner.path_fit import PathFit
-from foredrive.methods.recipe import Recipe, rescheduled
+from foredrive.methods.recipe import Recipe, rescheduled, with_occupancy_source
 from foredrive.runs.drive.recording import record_drives
 from foredrive.runs.evaluate.run import SUMMARY, evaluate_run
 from foredrive.runs.train.run import train_run
@@ -59,6 +58,12 @@ RECONSTRUCTED_BY = (
 )
 """The code that decides how well a log is reconstructed. Kernels are tested against the references here."""
 PLANNERS = ("stand_still", "constant_velocity", "ego_mlp")
+TASK_FIGURES = (
+    "detection.car_ap_2m_30m", "detection.nuscenes.map", "detection.nuscenes.nds", "tracking.car_amota_30m",
+    "motion.uniad.car.min_ade_m", "map.uniad_covered.iou_", "map.maptr.map", "occupancy.uniad.vpq_near_pct",
+    "occupancy.occ3d_unmasked.miou_pct",
+)  # fmt: skip
+"""Beginnings of the figures of task heads that a study keeps."""
 
 
 @dataclass(frozen=True)
@@ -150,24 +155,6 @@ def seeded(recipe: Recipe, seed: int) -> Recipe:
     )
 
 
-def shortened(recipe: Recipe) -> Recipe:
-    """Return a shorter training of a planning recipe, for comparisons of many runs.
-
-    It has fewer steps, uses bfloat16, and fits the path features on fewer clips, so that a run takes a
-    quarter of an hour on one core.
-    """
-    pretrain = recipe.pretrain
-    if pretrain is not None:
-        pretrain = rescheduled(pretrain, steps=300, warmup_steps=20)
-    return dataclasses.replace(
-        recipe,
-        pretrain=pretrain,
-        finetune=rescheduled(recipe.finetune, steps=100, warmup_steps=20),
-        path=PathFit(stride_s=3.0),
-        precision="bf16-mixed",
-    )
-
-
 def run_arm(
     recipe: Recipe, logs: StudyLogs, folder: Path, cache_dir: Path, start: Path | None = None
 ) -> dict[str, float]:
@@ -175,13 +162,14 @@ def run_arm(
 
     An evaluated arm is not evaluated again: `folder` belongs to one commit and one set of test drives.
 
-    `occupancy_iou` is the present IoU of voxels above the ground. `l2_m` and `collision_pct` follow
-    UniAD's protocol, as NeMo's tables do. Metrics of other protocols, later frames and baselines have longer
-    names. `train_s` is the time of the training steps of this run.
+    `occupancy_iou` is the present IoU of voxels above the ground, by labels from lidar. `l2_m` and
+    `collision_pct` follow UniAD's protocol, as NeMo's tables do. Metrics of other protocols, later frames,
+    baselines and task heads have longer names. `train_s` is the time of the training steps of this run.
     """
     run = train_run(recipe, logs.train, folder, cache_dir, start)
     if not (folder / SUMMARY).is_file():
-        evaluate_run(run, logs.test, folder, batch_size=8, views=False, stride_s=JUDGED_EVERY_S)
+        judged = dataclasses.replace(run, recipe=with_occupancy_source(run.recipe, "lidar"))
+        evaluate_run(judged, logs.test, folder, batch_size=8, views=False, stride_s=JUDGED_EVERY_S)
     summary: Mapping[str, Any] = read_summary(folder / SUMMARY)
     lines = [
         line for name in ("pretrain", "finetune") for line in read_metrics(folder / name / "metrics.jsonl")
@@ -203,7 +191,7 @@ def study_figures(summary: Mapping[str, Any]) -> dict[str, float]:
     for scope in ("", "above_ground."):
         prefixes = (f"occupancy.{scope}iou_", f"occupancy.{scope}spread_")
         kept |= {key.removeprefix("occupancy."): key for key in summary if key.startswith(prefixes)}
-    kept |= {key: key for key in summary if key.startswith("flow.")}
+    kept |= {key: key for key in summary if key.startswith(("flow.", *TASK_FIGURES))}
     for planner in ("", *(f"{name}." for name in PLANNERS)):
         for protocol in PROTOCOLS:
             for kind in ("l2_avg_m", "collision_avg_pct"):

@@ -1,4 +1,4 @@
-"""World models that learn from the virtual egos of `learning`: pre-trainings, and fine-tunings from them.
+"""World models that learn from virtual egos: pre-trainings, and fine-tunings from them.
 
 All studies of NeMo and DriveWorld share the egos of `learning`'s ten minutes (six images of each of 1,960
 cars in seven towns, exact occupancy), its test drives through Town05, and pre-trainings: one of the same
@@ -20,7 +20,7 @@ from foredrive.engine.small_weights import save_small
 from foredrive.files import atomic_path
 from foredrive.methods.planner.path_fit import PathFit
 from foredrive.methods.recipe import Recipe, rescheduled, with_occupancy_source
-from foredrive.runs.recipes.known import find_recipe
+from foredrive.runs.recipes.known import RECIPES, find_recipe
 from foredrive.runs.recipes.task_heads import town_heads, with_joint_heads
 from foredrive.runs.train.baselines import Baselines, baselines_file, fit_baselines
 from foredrive.runs.train.run import Run, train_run
@@ -32,13 +32,41 @@ STEPS: Mapping[str, int] = {"nemo": 3200, "driveworld": 800}
 FINETUNING_STEPS, WARMUP_STEPS = 300, 30
 PATH_STRIDE_S = 2.0
 """Time between the clips on which the head along the path is fitted."""
-CONFIG = {
-    "egos": EGOS,
-    "steps": dict(STEPS),
-    "finetuning_steps": FINETUNING_STEPS,
-    "path_stride_s": PATH_STRIDE_S,
-    "drives": learning.DIGEST,
+LEARNED_BY: Mapping[str, tuple[str, ...]] = {
+    "nemo": ("foredrive.methods.nemo", "foredrive.methods.blocks.plane_context"),
+    "driveworld": ("foredrive.methods.driveworld", "foredrive.methods.blocks.pooled_lifting"),
 }
+"""The code that decides what each kind of world model learns, beside that of both."""
+DECIDED_BY = (
+    "foredrive.data.recorded_labels",
+    "foredrive.engine.parameter_groups",
+    "foredrive.methods.blocks.averaging",
+    "foredrive.methods.blocks.backbone",
+    "foredrive.methods.blocks.lifting",
+    "foredrive.methods.planner.ego_mlp_fit",
+    "foredrive.methods.planner.path_fit",
+    "foredrive.methods.planner.planner",
+    "foredrive.tasks.occupancy.losses",
+    "foredrive.tasks.occupancy.occupancy_metric",
+    "foredrive.tasks.planning.protocols",
+    "foredrive.tasks.planning.scores",
+    *LEARNED_BY["nemo"],
+    *LEARNED_BY["driveworld"],
+)
+
+
+def config_of(prefix: str) -> dict[str, Any]:
+    """Return the configuration of a study of the recipes whose names begin with `prefix`."""
+    return {
+        "recipes": {
+            name: dataclasses.asdict(recipe) for name, recipe in RECIPES.items() if name.startswith(prefix)
+        },
+        "egos": EGOS,
+        "steps": dict(STEPS),
+        "finetuning_steps": FINETUNING_STEPS,
+        "path_stride_s": PATH_STRIDE_S,
+        "drives": learning.DIGEST,
+    }
 
 
 def study_logs(share: float = 1.0) -> StudyLogs:
@@ -76,34 +104,38 @@ def of_the_study(name: str, seed: int, pretraining_seed: int) -> Recipe[Any, Any
     )
 
 
-def pretrained(recipe: Recipe[Any, Any], decided_by: Sequence[str]) -> Run:
+def pretrained(recipe: Recipe[Any, Any], share: float = 1.0) -> Run:
     """Return the run with the pre-training of a recipe of the studies, and nothing after it; make it once.
 
     Args:
         recipe: has a pre-training.
-        decided_by: modules that decide what it learns, as for `study_identity`.
+        share: part of the egos that it learns from.
     """
     assert recipe.pretrain is not None
-    schedule, usual = recipe.pretrain.schedule, find_recipe(f"{recipe.model.kind}_town")
+    kind, schedule = recipe.model.kind, recipe.pretrain.schedule
+    usual = find_recipe(f"{kind}_town")
     # Rows that differ in what comes after share the pre-training
     alone = dataclasses.replace(
         recipe.of_pretraining,
         name=f"{usual.name}, pre-training",
+        about="",
         planner=usual.planner,
         finetune=usual.finetune,
         pretrained_model=None,
         transfer="world_model",
     )
     alone = seeded(learning.pretraining_alone(alone, schedule.steps), schedule.seed)
-    identity = study_identity({"recipe": dataclasses.asdict(alone), "egos": EGOS}, decided_by)
-    return train_run(alone, study_logs().train, ROOT / "pretrained" / identity, learning.ROOT / "cache")
+    config = {"recipe": dataclasses.asdict(alone), "egos": EGOS, "share": share}
+    folder = ROOT / "pretrained" / study_identity(config, LEARNED_BY[kind])
+    return train_run(alone, study_logs(share).train, folder, learning.ROOT / "cache")
 
 
 def fine_tuned(
     recipe: Recipe[Any, Any],
     folder: Path,
-    decided_by: Sequence[str],
+    *,
     share: float = 1.0,
+    pretraining_share: float = 1.0,
     tasks: Sequence[str] = (),
 ) -> dict[str, float]:
     """Fine-tune a recipe of the studies, after its pre-training, and return its figures on the test drives.
@@ -111,19 +143,19 @@ def fine_tuned(
     Args:
         recipe: one without pre-training starts from scratch.
         folder: folder of the fine-tuning's run.
-        decided_by: as for `pretrained`.
-        share: part of the egos that fine-tuning learns from. Pre-training has them all.
+        share: part of the egos that fine-tuning learns from.
+        pretraining_share: part of them that pre-training learns from.
         tasks: tasks whose heads are trained in fine-tuning too.
     """
-    start = None if recipe.pretrain is None else pretrained(recipe, decided_by).folder
+    start = None if recipe.pretrain is None else pretrained(recipe, pretraining_share).folder
     if tasks:
         recipe = with_joint_heads(recipe, town_heads(tasks))
     for past_frames in {recipe.planner.history, recipe.clips.past_frames}:
-        _share_baselines(recipe, past_frames, folder)
+        share_baselines(recipe, past_frames, folder)
     return run_arm(recipe, study_logs(share), folder, learning.ROOT / "cache", start)
 
 
-def _share_baselines(recipe: Recipe[Any, Any], past_frames: int, folder: Path) -> None:
+def share_baselines(recipe: Recipe[Any, Any], past_frames: int, folder: Path) -> None:
     """Put the baselines of the whole training data into the folder of a run: fitting them takes minutes."""
     clips = dataclasses.asdict(dataclasses.replace(recipe.clips, tasks=None))
     identity = study_identity({"clips": clips, "egos": EGOS}, ("foredrive.methods.planner.ego_mlp_fit",))
@@ -132,6 +164,5 @@ def _share_baselines(recipe: Recipe[Any, Any], past_frames: int, folder: Path) -
         baselines = fit_baselines(study_logs().train, recipe, learning.ROOT / "cache", past_frames)
         with atomic_path(file) as temporary:
             save_small(Baselines(*baselines), temporary)
-    folder.mkdir(parents=True, exist_ok=True)
     with atomic_path(folder / file.name) as temporary:
         shutil.copyfile(file, temporary)
