@@ -130,6 +130,11 @@ def test_examples_carry_it_where_it_is_asked_for(tmp_path: Path) -> None:
     assert torch.equal(example.flow.known, example.occupancy.values[:, 0] > 0)
     seen = ClipDataset([log], config("lidar"), tmp_path / "cache")[1]
     assert not seen.occupancy.known.all()
+    again = ClipDataset([log], config("recorded"), tmp_path / "cache")[1]  # from the cache, beside lidar's
+    for grid in ("occupancy", "flow"):
+        one, two = getattr(example, grid), getattr(again, grid)
+        assert torch.equal(one.values, two.values)
+        assert torch.equal(one.known, two.known)
 
 
 def test_a_log_or_a_frame_without_it_is_named(flat_log: Path, tmp_path: Path) -> None:

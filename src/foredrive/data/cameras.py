@@ -9,7 +9,7 @@ from pathlib import Path, PurePath
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float64, UInt8
+from jaxtyping import Float, Float64, Int64, UInt8
 from PIL import Image, UnidentifiedImageError
 from py123d.api.scene.arrow.modalities.sync_utils import get_modality_table
 from py123d.api.utils.arrow_metadata_utils import get_metadata_from_arrow_schema
@@ -214,8 +214,9 @@ def _extrinsics(log: Log, modality_key: str) -> Float64[np.ndarray, "F 4 4"]:
     stamp_us = table[f"{modality_key}.timestamp_us"].to_numpy()[rows].astype(np.float64)
     logged = column_array(table, f"{modality_key}.camera_to_global_se3")
     T_world_cam = pose_matrices(fixed_lists(logged, 7)[rows])
-    T_stamped = log.poses_at(stamp_us)[0]
-    T_exposed = log.poses_at(_exposed_us(log, modality_key)[frames])[0]
+    exposed_us = _exposed_us(log, modality_key)[frames]
+    T_stamped = _poses_at(log, stamp_us, frames)
+    T_exposed = T_stamped if np.array_equal(exposed_us, stamp_us) else _poses_at(log, exposed_us, frames)
     unlogged = logged.is_null().to_numpy(zero_copy_only=False)[rows]
     # Without a logged camera pose: the mounted camera on the vehicle at the time of the image
     T_world_cam[unlogged] = T_stamped[unlogged] @ mounted
@@ -224,6 +225,14 @@ def _extrinsics(log: Log, modality_key: str) -> Float64[np.ndarray, "F 4 4"]:
         np.linalg.inv(log.T_world_ego[frames]) @ T_exposed @ np.linalg.inv(T_stamped) @ T_world_cam
     )
     return T_ego_cam
+
+
+def _poses_at(
+    log: Log, t_us: Float64[np.ndarray, "N"], frames: Int64[np.ndarray, "N"]
+) -> Float64[np.ndarray, "N 4 4"]:
+    """Return the vehicle's poses at some times; those of the frames, without interpolating, if they agree."""
+    same = np.array_equal(t_us, log.t_us[frames])
+    return log.T_world_ego[frames] if same else log.poses_at(t_us)[0]
 
 
 def _scaled_intrinsics(metadata: PinholeCameraMetadata, image_hw: tuple[int, int]) -> Float[Tensor, "3 3"]:

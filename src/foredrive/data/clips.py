@@ -17,14 +17,13 @@ from foredrive.data.assemble import assemble_clip
 from foredrive.data.cameras import find_camera, pinhole_cameras, told_cameras
 from foredrive.data.commands import command_at, count_command_sources, route_ahead_at
 from foredrive.data.frame_store import FrameStore
-from foredrive.data.label_store import LabelStore
-from foredrive.data.labels import VoxelLabels
+from foredrive.data.label_store import LabelStore, OccupancySource
 from foredrive.data.lidar import frames_with_lidar, read_sweep
 from foredrive.data.log_paths import LogPath
 from foredrive.data.logs import Log
 from foredrive.data.maps import read_map_patch
 from foredrive.data.recorded import read_expert_plan
-from foredrive.data.recorded_labels import check_recorded_occupancy, recorded_labels
+from foredrive.data.recorded_labels import check_recorded_occupancy
 from foredrive.data.truth.store import TaskTruthConfig, TaskTruthStore
 from foredrive.errors import InputError
 from foredrive.scene import Clip, Example, Trajectory, VoxelGrid, VoxelSpec
@@ -59,7 +58,7 @@ class ClipConfig:
     """Read lidar sweeps into the clip."""
     map: bool = False
     """Read the patch of the road map around the vehicle at now."""
-    occupancy_source: Literal["lidar", "accumulated", "recorded"] = "lidar"
+    occupancy_source: OccupancySource = "lidar"
     """Source of the voxel labels: "lidar" for beams of the frame's own sweep, "accumulated" for those of the
     frames within 3 s too, or "recorded" for the exact occupancy and flow in recordings of towns, which
     includes voxels that no sensor has observed. Evaluations use "lidar" in place of "accumulated"."""
@@ -108,9 +107,7 @@ class ClipDataset(Dataset[Example]):
         self._cameras = [pinhole_cameras(log) for log in self.logs]
         self.camera_names = self._choose_cameras()
         self._frames = FrameStore(cache_dir, config.image_hw, self.camera_names)
-        self._labels = LabelStore(
-            cache_dir, config.voxels, "accumulated" if config.occupancy_source == "accumulated" else "lidar"
-        )
+        self._labels = LabelStore(cache_dir, config.voxels, config.occupancy_source)
         self._truth = None if config.tasks is None else TaskTruthStore(cache_dir, config.tasks, config.voxels)
         if config.occupancy_source == "recorded":
             for log in self.logs:
@@ -180,7 +177,7 @@ class ClipDataset(Dataset[Example]):
         """
         number, frames = self.frames_of(index)
         log = self.logs[number]
-        labels = [self._voxel_labels(log, frame) for frame in frames]
+        labels = [self._labels.labels(log, frame) for frame in frames]
         occupied = torch.stack([label.occupied for label in labels])
         return Example(
             clip=self.clip(index),
@@ -219,11 +216,6 @@ class ClipDataset(Dataset[Example]):
         number, frames = self.frames_of(index)
         cameras = [find_camera(self._cameras[number], name) for name in self.camera_names]
         return self._truth.read(self.logs[number], frames[self.config.past_frames], cameras)
-
-    def _voxel_labels(self, log: Log, frame: int) -> VoxelLabels:
-        if self.config.occupancy_source == "recorded":
-            return recorded_labels(log, frame, self.config.voxels)  # As fast as reading a cache entry
-        return self._labels.labels(log, frame)
 
     def _choose_cameras(self) -> tuple[str, ...]:
         if self.config.cameras is None:

@@ -24,6 +24,7 @@ from foredrive.data.labels import (
 from foredrive.data.lidar import read_sweep
 from foredrive.data.logs import Log
 from foredrive.data.modalities import expand_array, squeeze_array
+from foredrive.data.recorded_labels import recorded_labels
 from foredrive.geometry.se3 import transform_points
 from foredrive.scene import VoxelSpec
 
@@ -89,7 +90,8 @@ def _state_from(log: Log, neighbour: int, frame: int, spec: VoxelSpec) -> UInt8[
 LABEL_VERSION = 2
 """Version in every cache key. Increase it when the labels change."""
 
-_MAKERS = {"lidar": make_labels, "accumulated": accumulated_labels}
+OccupancySource = Literal["lidar", "accumulated", "recorded"]
+_MAKERS = {"lidar": make_labels, "accumulated": accumulated_labels, "recorded": recorded_labels}
 
 
 class LabelStore:
@@ -98,17 +100,20 @@ class LabelStore:
     Args:
         cache_dir: folder of the cache. None disables it.
         spec: grid of the labels.
-        source: sweeps that the labels are made from: the frame's own, or those of its neighbours too.
+        source: what the labels are made from: the frame's sweep, those of its neighbours too, or the recorded
+            occupancy.
     """
 
-    def __init__(
-        self, cache_dir: Path | None, spec: VoxelSpec, source: Literal["lidar", "accumulated"] = "lidar"
-    ) -> None:
+    def __init__(self, cache_dir: Path | None, spec: VoxelSpec, source: OccupancySource = "lidar") -> None:
         self._cache = DiskCache(None if cache_dir is None else Path(cache_dir) / "labels", "labels")
         self._spec, self._source = spec, source
 
     def labels(self, log: Log, frame: int) -> VoxelLabels:
-        """Return the labels of one frame. All voxels are unknown if the log has no sweep there."""
+        """Return the labels of one frame. Without a sweep there, labels from lidar are all unknown.
+
+        Raises:
+            InputError: there is no recorded occupancy, or the log cannot be read.
+        """
         return self._cache.get(
             self._key(log, frame),
             lambda: _MAKERS[self._source](log, frame, self._spec),
