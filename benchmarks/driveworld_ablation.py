@@ -8,21 +8,20 @@ pre-training. `pretrained_50` and `finetuned_75` are rows of Table 2, the full r
 
 import functools
 
-from benchmarks.common.world_models import DECIDED_BY, ROOT, config_of, fine_tuned, of_the_study
+from benchmarks.common.world_models import (
+    DECIDED_BY,
+    ROOT,
+    TASKS_DECIDED_BY,
+    config_of,
+    fine_tuned,
+    of_the_study,
+)
 from foredrive.engine.bench import Benchmark, study_identity
 from foredrive.runs.recipes.known import RECIPES
 
 FULL, PROMPTS = "driveworld_town", "driveworld_town_prompts"
 TASKS = ("detection", "map")
 CONFIG = config_of(FULL) | {"tasks": TASKS}
-TASKS_DECIDED_BY = (
-    "foredrive.tasks.detection.agent_losses",
-    "foredrive.tasks.detection.agents_head",
-    "foredrive.tasks.detection.proposals",
-    "foredrive.tasks.heads",
-    "foredrive.tasks.maps.head",
-    "foredrive.tasks.maps.losses",
-)
 IDENTITY = study_identity(CONFIG, (*DECIDED_BY, *TASKS_DECIDED_BY))
 
 

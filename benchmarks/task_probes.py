@@ -1,140 +1,144 @@
-"""Probe frozen world models with task heads: `foredrive bench task-probes`, hours on two cores.
+"""Heads of the six tasks on world models: `foredrive bench task-probes`, hours on two cores.
 
-An arm is a world model. Its weights stay as they are, its volumes are computed once and kept, and the same
-heads are trained on them with the same data, steps and seeds. Heads of an arm without any training show what
-the heads learn from places and shapes alone. Drives are those of `learning`, which are recorded first.
-
-`nemo_town` is the model that comes with the package. The rows of DriveWorld's Table 1 are pre-trained here,
-or taken from the run folders runs/task_probes/RECIPE_seedN if they are there. Each row's own world model is
-probed, not its encoder in a fresh model. Volumes and runs are kept in runs/task_probes, where an interrupted
-study continues.
+A probe keeps the world model as it is: its volumes are computed once and kept, and the same heads are trained
+on them with the same clips, steps and seeds. Heads on a world model without any training show what they learn
+from places and shapes alone. In a joint arm they are trained together with the world model, on as many clips.
+World models are the pre-trainings of nemo_ablation and driveworld_ablation (common/world_models.py); heads
+learn from a part of their virtual egos, whose volumes fit on a disk. Runs are kept in runs/world_models.
 """
 
 import dataclasses
+import functools
 from collections.abc import Callable, Mapping
-from pathlib import Path
 from typing import Any
 
 import torch
 from torch.utils.data import DataLoader
 
+from benchmarks import learning
 from benchmarks.common.study import seeded
-from benchmarks.learning import logs_of
-from benchmarks.learning_towns import DIGEST
+from benchmarks.common.world_models import (
+    DECIDED_BY,
+    ROOT,
+    TASKS_DECIDED_BY,
+    config_of,
+    of_the_study,
+    pretrained,
+    study_logs,
+)
 from foredrive.data import ClipDataset, collate
 from foredrive.engine.bench import Benchmark, study_identity
 from foredrive.engine.summary import Summary, numbers
-from foredrive.methods.recipe import Recipe, rescheduled
+from foredrive.methods.recipe import Recipe, rescheduled, with_occupancy_source
 from foredrive.runs.evaluate.predict import AgentPredictor
-from foredrive.runs.recipes.known import find_recipe
-from foredrive.runs.recipes.task_heads import HEADED, INSTANCES, TaskHeadsRecipe, town_heads
-from foredrive.runs.shipped import run_folder
-from foredrive.runs.train.run import Run, load_agent, open_run, train_run
-from foredrive.runs.train.tasks import TrainedHeads, probe_run, train_heads
+from foredrive.runs.recipes.task_heads import (
+    HEADED,
+    INSTANCES,
+    TaskHeadsRecipe,
+    town_heads,
+    with_joint_heads,
+)
+from foredrive.runs.train.run import Run, load_agent, train_run
+from foredrive.runs.train.tasks import TrainedHeads, load_heads, probe_run, train_heads
 from foredrive.tasks.evaluation.metrics import METRICS
 from foredrive.tasks.evaluation.run import evaluate, parts_needed
 
-ROOT = Path("runs/task_probes")
-DRIVES = 14
-"""Training drives: two of each town."""
-STEPS = 600
-"""Steps of the heads, of eight clips each."""
+SHARE = 0.2
+"""Part of the egos that heads learn from."""
+STEPS, BATCH = 1200, 8
+"""Steps of the heads, and clips of a step."""
 JUDGED_EVERY_S = 0.5
 """Time between judged key frames, s: that of the key frames, because tracks are judged too."""
 TASKS = (*HEADED, INSTANCES)
-NEMO, DRIVEWORLD = "nemo_town", "driveworld_town"
-ROWS = ("occupancy", "rssm", "ssp", "dmb", "mln", "prompts")
-"""Rows of Table 1 that pre-train: single frames (3-D), then one part of DriveWorld after the other (4-D)."""
+WORLDS = ("nemo_town", "driveworld_town")
 JUDGED_PARTS = frozenset({"agents", "map_lines", "map_layers", "semantics", "instances"})
 KEPT = (
-    "detection.car_ap", "detection.nuscenes.", "tracking.nuscenes.", "motion.uniad.", "motion.sparsedrive.",
-    "map.uniad", "map.maptr.", "map.streammapnet.", "occupancy.",
+    "detection.car_ap", "detection.nuscenes.", "tracking.nuscenes.", "tracking.car_", "motion.uniad.",
+    "motion.sparsedrive.", "map.uniad", "map.maptr.", "map.streammapnet.", "occupancy.",
 )  # fmt: skip
 """Beginnings of the keys of a summary that are kept."""
-DECIDED_BY = (
-    "foredrive.data.label_store",
-    "foredrive.data.clips",
-    "foredrive.geometry",
-    "foredrive.tasks",
-    "foredrive.methods.blocks.backbone",
-    "foredrive.methods.driveworld",
-    "foredrive.methods.blocks.lifting",
-    "foredrive.methods.nemo",
-    "foredrive.engine.loop",
-)
 
 
 def heads_recipe(seed: int = 0) -> TaskHeadsRecipe:
     """Return the heads of every arm."""
     recipe = town_heads(TASKS)
-    return dataclasses.replace(recipe, schedule=dataclasses.replace(recipe.schedule, steps=STEPS, seed=seed))
+    schedule = dataclasses.replace(recipe.schedule, steps=STEPS, batch_size=BATCH, seed=seed)
+    return dataclasses.replace(recipe, schedule=schedule)
 
 
-def world_model_alone(recipe: Recipe[Any, Any]) -> Recipe[Any, Any]:
-    """Return the recipe of the world model that a recipe pre-trains, as it is, without fine-tuning."""
-    return dataclasses.replace(
-        recipe,
-        model=recipe.pretrained_model or recipe.model,
-        pretrained_model=None,
-        transfer="world_model",
-        planner=dataclasses.replace(recipe.planner, ego_mlp=None, path=None),
-        path=None,
-        pretrain=None if recipe.pretrain is None else rescheduled(recipe.pretrain, workers=0),
-        finetune=rescheduled(recipe.finetune, steps=0, workers=0),
-    )
+def untrained(name: str, seed: int) -> Run:
+    """Return a run of fresh weights."""
+    recipe = of_the_study(name, seed, seed)
+    assert recipe.pretrain is not None
+    alone = seeded(learning.pretraining_alone(dataclasses.replace(recipe, pretrained_model=None), 0), seed)
+    return train_run(alone, study_logs(SHARE).train, ROOT / "untrained" / f"{name}_seed{seed}", CACHE)
 
 
-def shipped(seed: int) -> Run:
-    """Return the run of the model that comes with the package; seeds differ in the heads alone."""
-    return open_run(run_folder(Path(f"embedded:{NEMO}"), ROOT))
+def trained(name: str, seed: int) -> Run:
+    """Return the run of the recipe's pre-training."""
+    return pretrained(of_the_study(name, seed, seed))
 
 
-def trained(name: str, *, pretrained: bool = True) -> Callable[[int], Run]:
-    """Return a function that pre-trains the world model of a recipe, or opens the run that is there."""
+def probe(name: str, world: Run, seed: int) -> tuple[Run, TrainedHeads]:
+    """Return heads that are trained on a frozen world model, and their run; train what is missing.
 
-    def begin(seed: int) -> Run:
-        recipe = find_recipe(name)
-        recipe = recipe if pretrained else dataclasses.replace(recipe, pretrain=None)
-        folder = ROOT / f"{name}_seed{seed}" if pretrained else ROOT / f"{name}_untrained_seed{seed}"
-        if (folder / "finetune" / "model.safetensors").is_file():
-            return open_run(folder)
-        logs, _ = logs_of(DRIVES)
-        return train_run(seeded(world_model_alone(recipe), seed), logs, folder, ROOT / "cache")
-
-    return begin
-
-
-def probe(name: str, world_of: Callable[[int], Run], seed: int) -> tuple[Run, TrainedHeads]:
-    """Return heads that are trained on a frozen world model, and their run; train what is missing."""
-    train_logs, _ = logs_of(DRIVES)
-    world = world_of(seed)
-    folder = ROOT / IDENTITY / f"{name}_seed{seed}"
-    run = probe_run(world.recipe, train_logs, folder, ROOT / "cache", world.folder)
+    Args:
+        name: of the arm.
+        world: run of the world model.
+        seed: of the heads.
+    """
+    folder = ROOT / "task_probes" / IDENTITY / f"{name}_seed{seed}"
+    run = probe_run(world.recipe, study_logs(SHARE).train, folder, CACHE, world.folder)
     return run, train_heads(run, heads_recipe(seed))
 
 
-def probed(name: str, world_of: Callable[[int], Run]) -> Callable[[int], dict[str, float]]:
-    """Return an arm that trains heads on a frozen world model and judges them in the test town."""
+def probed(name: str, world_of: Callable[[str, int], Run], arm: str, seed: int) -> dict[str, float]:
+    """Probe a world model, and return the figures of the heads in the test town."""
+    return judged(*probe(arm, world_of(name, seed), seed))
 
-    def measure(seed: int) -> dict[str, float]:
-        torch.set_num_threads(1)
-        _, test_logs = logs_of(DRIVES)
-        run, found = probe(name, world_of, seed)
-        clips = run.recipe.clips
-        read = dataclasses.replace(
-            clips.judged, future_images=False, now_stride_s=JUDGED_EVERY_S, tasks=found.recipe.truth
-        )
-        result = evaluate(
-            AgentPredictor(load_agent(run), clips.future_frames, ray_stride=0, heads=found.heads),
-            DataLoader(ClipDataset(test_logs, read, run.cache_dir), batch_size=4, collate_fn=collate),
-            frame_dt_s=clips.frame_dt_s,
-            metrics=[metric for metric in METRICS if parts_needed([metric]) & JUDGED_PARTS],
-            task_priors=found.priors,
-        )
-        summary = numbers(result.summary)
-        return kept_figures(summary) | {"clips": summary["items"], "failed": summary["failed"]}
 
-    return measure
+def joint(name: str, seed: int) -> dict[str, float]:
+    """Train heads and world model together, without a planner, and return the figures of the heads."""
+    recipe = joint_recipe(of_the_study(name, seed, seed), heads_recipe(seed))
+    start, folder = trained(name, seed).folder, ROOT / "task_probes" / IDENTITY / f"{name}_joint_seed{seed}"
+    run = train_run(recipe, study_logs(SHARE).train, folder, CACHE, start)
+    heads = load_heads(run)
+    assert heads is not None
+    return judged(run, heads)
+
+
+def joint_recipe(recipe: Recipe[Any, Any], heads: TaskHeadsRecipe) -> Recipe[Any, Any]:
+    """Return a recipe that goes on with its pre-training, together with heads, for as long as they learn."""
+    assert recipe.pretrain is not None
+    schedule = dataclasses.replace(
+        recipe.finetune.schedule, steps=heads.schedule.steps, batch_size=heads.schedule.batch_size
+    )
+    recipe = dataclasses.replace(
+        recipe,
+        planner=dataclasses.replace(recipe.planner, ego_mlp=None, path=None),
+        path=None,
+        finetune=rescheduled(dataclasses.replace(recipe.pretrain, schedule=schedule), workers=0),
+        clips=dataclasses.replace(recipe.clips, now_stride_s=heads.now_stride_s),
+    )
+    return with_joint_heads(recipe, heads)
+
+
+def judged(run: Run, heads: TrainedHeads) -> dict[str, float]:
+    """Return the figures of heads in the test town, and those of the baselines."""
+    torch.set_num_threads(1)
+    clips = with_occupancy_source(run.recipe, "lidar").clips
+    read = dataclasses.replace(
+        clips, future_images=False, now_stride_s=JUDGED_EVERY_S, tasks=heads.recipe.truth
+    )
+    result = evaluate(
+        AgentPredictor(load_agent(run), clips.future_frames, ray_stride=0, heads=heads.heads),
+        DataLoader(ClipDataset(study_logs().test, read, run.cache_dir), batch_size=4, collate_fn=collate),
+        frame_dt_s=clips.frame_dt_s,
+        metrics=[metric for metric in METRICS if parts_needed([metric]) & JUDGED_PARTS],
+        task_priors=heads.priors,
+    )
+    summary = numbers(result.summary)
+    return kept_figures(summary) | {"clips": summary["items"], "failed": summary["failed"]}
 
 
 def kept_figures(summary: Summary) -> dict[str, float]:
@@ -142,24 +146,22 @@ def kept_figures(summary: Summary) -> dict[str, float]:
     return {key: value for key, value in numbers(summary).items() if key.startswith(KEPT)}
 
 
-WORLDS: Mapping[str, Callable[[int], Run]] = {
-    NEMO: shipped,
-    f"{NEMO}_untrained": trained(NEMO, pretrained=False),
-    DRIVEWORLD: trained(DRIVEWORLD),
-    f"{DRIVEWORLD}_untrained": trained(DRIVEWORLD, pretrained=False),
-    **{f"{DRIVEWORLD}_{row}": trained(f"{DRIVEWORLD}_{row}") for row in ROWS},
-}
+CACHE = learning.ROOT / "cache"
 CONFIG = {
-    "heads": dataclasses.asdict(heads_recipe()),
-    "recipes": {name: dataclasses.asdict(find_recipe(name)) for name in (NEMO, DRIVEWORLD)},
-    "training_drives": DRIVES,
-    "drives": DIGEST,
-    "judged_every_s": JUDGED_EVERY_S,
+    name: {**config_of(name), "heads": dataclasses.asdict(heads_recipe()), "share": SHARE} for name in WORLDS
+} | {"judged_every_s": JUDGED_EVERY_S}
+IDENTITY = study_identity(CONFIG, (*DECIDED_BY, *TASKS_DECIDED_BY))
+ARMS: Mapping[str, Callable[[int], Mapping[str, float]]] = {
+    **{name: functools.partial(probed, name, trained, name) for name in WORLDS},
+    **{
+        f"{name}_untrained": functools.partial(probed, name, untrained, f"{name}_untrained")
+        for name in WORLDS
+    },
+    **{f"{name}_joint": functools.partial(joint, name) for name in WORLDS},
 }
-IDENTITY = study_identity(CONFIG, DECIDED_BY)
 BENCHMARK = Benchmark(
-    question="What do heads of the six tasks learn on a frozen world model, and what does its training add?",
-    arms={name: probed(name, world) for name, world in WORLDS.items()},
+    question="What do heads of the six tasks learn on a world model, frozen and with it?",
+    arms=ARMS,
     config=CONFIG,
-    decided_by=DECIDED_BY,
+    decided_by=(*DECIDED_BY, *TASKS_DECIDED_BY),
 )

@@ -54,6 +54,16 @@ DECIDED_BY = (
     *LEARNED_BY["driveworld"],
 )
 
+TASKS_DECIDED_BY = (
+    "foredrive.tasks.detection.agent_losses",
+    "foredrive.tasks.detection.agents_head",
+    "foredrive.tasks.detection.proposals",
+    "foredrive.tasks.heads",
+    "foredrive.tasks.maps.head",
+    "foredrive.tasks.maps.losses",
+)
+"""The code that decides what task heads learn."""
+
 
 def config_of(prefix: str) -> dict[str, Any]:
     """Return the configuration of a study of the recipes whose names begin with `prefix`."""
