@@ -29,7 +29,7 @@ from benchmarks.common.world_models import (
 from foredrive.data import ClipDataset, collate
 from foredrive.engine.bench import Benchmark, study_identity
 from foredrive.engine.summary import Summary, numbers
-from foredrive.methods.recipe import Recipe, rescheduled, with_occupancy_source
+from foredrive.methods.recipe import Recipe, rescheduled
 from foredrive.runs.evaluate.predict import AgentPredictor
 from foredrive.runs.recipes.task_heads import (
     HEADED,
@@ -126,7 +126,7 @@ def joint_recipe(recipe: Recipe[Any, Any], heads: TaskHeadsRecipe) -> Recipe[Any
 def judged(run: Run, heads: TrainedHeads) -> dict[str, float]:
     """Return the figures of heads in the test town, and those of the baselines."""
     torch.set_num_threads(1)
-    clips = with_occupancy_source(run.recipe, "lidar").clips
+    clips = run.recipe.clips
     read = dataclasses.replace(
         clips, future_images=False, now_stride_s=JUDGED_EVERY_S, tasks=heads.recipe.truth
     )

@@ -43,7 +43,7 @@ def forecasting(
 def judge_forecast(
     run: Run, logs: Sequence[LogPath], part_s: tuple[float, float], stride_s: float | None = None
 ) -> dict[str, float]:
-    """Evaluate occupancy by labels from lidar, and flow, now and later, beside persistence.
+    """Evaluate occupancy and flow, now and later, beside persistence.
 
     Args:
         part_s: the judged part of the logs.
@@ -58,7 +58,6 @@ def judge_forecast(
         part_s=part_s,
         now_stride_s=stride_s or clips.now_stride_s,
         future_images=False,
-        occupancy_source="lidar",
     )
     dataset = open_clips(logs, judged, run.cache_dir)
     prior, _ = run_baselines(run.folder, run.logs, run.recipe, run.cache_dir, clips.past_frames)

@@ -14,7 +14,7 @@ from foredrive.engine.provenance import collect_provenance
 from foredrive.engine.summary import read_summary
 from foredrive.errors import InputError
 from foredrive.files import atomic_path
-from foredrive.methods.recipe import Recipe, rescheduled, with_occupancy_source
+from foredrive.methods.recipe import Recipe, rescheduled
 from foredrive.runs.drive.recording import record_drives
 from foredrive.runs.evaluate.run import SUMMARY, evaluate_run
 from foredrive.runs.train.run import train_run
@@ -162,14 +162,13 @@ def run_arm(
 
     An evaluated arm is not evaluated again: `folder` belongs to one commit and one set of test drives.
 
-    `occupancy_iou` is the present IoU of voxels above the ground, by labels from lidar. `l2_m` and
-    `collision_pct` follow UniAD's protocol, as NeMo's tables do. Metrics of other protocols, later frames,
-    baselines and task heads have longer names. `train_s` is the time of the training steps of this run.
+    `occupancy_iou` is the present IoU of voxels above the ground. `l2_m` and `collision_pct` follow UniAD's
+    protocol, as NeMo's tables do. Metrics of other protocols, later frames, baselines and task heads have
+    longer names. `train_s` is the time of the training steps of this run.
     """
     run = train_run(recipe, logs.train, folder, cache_dir, start)
     if not (folder / SUMMARY).is_file():
-        judged = dataclasses.replace(run, recipe=with_occupancy_source(run.recipe, "lidar"))
-        evaluate_run(judged, logs.test, folder, batch_size=8, views=False, stride_s=JUDGED_EVERY_S)
+        evaluate_run(run, logs.test, folder, batch_size=8, views=False, stride_s=JUDGED_EVERY_S)
     summary: Mapping[str, Any] = read_summary(folder / SUMMARY)
     lines = [
         line for name in ("pretrain", "finetune") for line in read_metrics(folder / name / "metrics.jsonl")

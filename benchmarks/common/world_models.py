@@ -2,8 +2,8 @@
 
 All studies of NeMo and DriveWorld share the egos of `learning`'s ten minutes (six images of each of 1,960
 cars in seven towns, exact occupancy), its test drives through Town05, and pre-trainings: one of the same
-recipe, steps and seed is made once. All are judged by labels from lidar. Runs are kept in runs/world_models,
-where an interrupted study continues.
+recipe, steps and seed is made once. All learn from exact occupancy and are judged by it. Runs are kept in
+runs/world_models, where an interrupted study continues.
 """
 
 import dataclasses

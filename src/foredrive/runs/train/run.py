@@ -31,7 +31,15 @@ from foredrive.runs.train.kept_parts import load_kept, load_perception, with_kep
 from foredrive.runs.train.path_features import sample_paths
 from foredrive.runs.train.rigs import RIGS, trained_rigs, write_rigs
 from foredrive.runs.train.sequences import in_sequences
-from foredrive.runs.train.task_priors import PRIORS, TASKS, check_truth, save_priors, semantic_weights
+from foredrive.runs.train.task_priors import (
+    PRIORS,
+    SURVEYED,
+    TASKS,
+    check_truth,
+    place_map_elements,
+    save_priors,
+    semantic_weights,
+)
 from foredrive.scene.task_truth import TaskTruth
 from foredrive.tasks.evaluation.task_priors import fit_task_priors
 
@@ -205,6 +213,8 @@ def _train_stages(run: Run, dataset: ClipDataset, start: "Path | Run | None", fa
             data = dataset if recipe.clips.tasks is None else open_clips(run.logs, first.clips, run.cache_dir)
             _train_stage(replace(run, recipe=first), "pretrain", fresh_agent(first), data, fabric)
     agent = fresh_agent(recipe)
+    if agent.heads is not None and recipe.transfer != "frozen":
+        place_map_elements(agent.heads, _truths(dataset), recipe.finetune.schedule.seed)
     if isinstance(start, Run) and recipe.transfer == "perception":
         load_perception(agent, start.weights)
     elif isinstance(start, Run):
@@ -303,8 +313,8 @@ def _train_stage(
 
 
 def _truths(dataset: ClipDataset) -> Iterator[TaskTruth]:
-    """Yield the truth of every clip."""
-    for index in range(len(dataset)):
+    """Yield the truth of at most `SURVEYED` clips, evenly spaced."""
+    for index in range(0, len(dataset), -(-len(dataset) // SURVEYED)):
         if (truth := dataset.truth(index)) is not None:
             yield truth
 

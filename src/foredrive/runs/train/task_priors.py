@@ -1,4 +1,4 @@
-"""What the training set tells about the tasks of heads: baselines, and weights of semantic classes."""
+"""What the training set tells about the tasks of heads: baselines, class weights, and typical map lines."""
 
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Float
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
+from scipy.cluster.vq import kmeans2
 from torch import Tensor
 
 from foredrive.data import LogPath
@@ -17,13 +18,16 @@ from foredrive.files import atomic_path
 from foredrive.scene.semantics import VOXEL_CLASSES
 from foredrive.scene.task_truth import TaskTruth
 from foredrive.tasks.evaluation.task_priors import TaskPriors
-from foredrive.tasks.heads.heads import TaskHeadsConfig
+from foredrive.tasks.heads.heads import TaskHeads, TaskHeadsConfig
+from foredrive.tasks.heads.targets import map_targets
 from foredrive.tasks.occupancy.semantic_losses import class_weights
 
 TASKS = "tasks"
 """Folder of what belongs to the heads in the folder of a run."""
 PRIORS = "priors.safetensors"
 """File of the baselines in it."""
+SURVEYED = 2000
+"""Number of clips that are enough for class weights, constant masks and typical lines."""
 
 
 def save_priors(priors: TaskPriors, path: Path) -> None:
@@ -73,3 +77,41 @@ def semantic_weights(truths: Iterable[TaskTruth | None]) -> Float[Tensor, "C"] |
             class_counts = torch.bincount(voxels.index[voxels.known].long(), minlength=classes)
             counts = class_counts if counts is None else counts + class_counts
     return None if counts is None else class_weights(counts)
+
+
+def place_map_elements(heads: TaskHeads, truths: Iterable[TaskTruth | None], seed: int) -> None:
+    """Let the map elements of fresh heads start at typical lines of a training set, if heads have them."""
+    if heads.elements is None or heads.config.elements is None:
+        return
+    config = heads.config.elements
+    lines_m = typical_lines(truths, config.elements, config.points, config.kinds, seed)
+    if lines_m is not None:
+        heads.elements.begin_at(lines_m)
+
+
+def typical_lines(
+    truths: Iterable[TaskTruth | None], elements: int, points: int, kinds: int, seed: int
+) -> Float[Tensor, "elements points 2"] | None:
+    """Return the middles of clusters of the true map elements, m; None if there are too few elements.
+
+    Lines are compared point by point, from the end that lies farther back.
+
+    Args:
+        truths: of the training set.
+        elements: number of clusters.
+        points: points of a line, at equal distances.
+        kinds: the first so many of `ElementKind` count.
+        seed: of the clustering.
+    """
+    lines = [torch.zeros(0, points, 2)]
+    for truth in truths:
+        if truth is not None and truth.elements is not None and bool(truth.elements.known):
+            lines.append(map_targets(truth.elements, kinds, points).orders[:, 0])
+    every = torch.cat(lines)
+    if len(every) < elements:
+        return None
+    # Both directions describe an open line: begin at the end with the smaller x
+    backwards = every[:, 0, 0] > every[:, -1, 0]
+    every = torch.where(backwards[:, None, None], every.flip(1), every)
+    middles, _ = kmeans2(every.flatten(1).double().numpy(), elements, minit="++", seed=seed)
+    return torch.from_numpy(middles).float().unflatten(1, (points, 2))

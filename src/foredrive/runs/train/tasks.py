@@ -22,9 +22,11 @@ from foredrive.runs.train.run import Run, begin_run, load_agent, open_run
 from foredrive.runs.train.sequences import in_sequences
 from foredrive.runs.train.task_priors import (
     PRIORS,
+    SURVEYED,
     TASKS,
     check_truth,
     load_priors,
+    place_map_elements,
     save_priors,
     semantic_weights,
 )
@@ -93,6 +95,8 @@ def train_heads(run: Run, heads: TaskHeadsRecipe) -> TrainedHeads:
             save_recipe(heads, folder / CONFIG)
         torch.manual_seed(heads.schedule.seed)
         fresh = _build(run, heads)
+        few = dataset.examples[:: -(-len(dataset) // SURVEYED)]
+        place_map_elements(fresh, (example.truth for example in few), heads.schedule.seed)
         class_weight = semantic_weights(example.truth for example in dataset.examples)
         voxels = run.recipe.clips.voxels
         objective = ProbeObjective(fresh, voxels, heads.weights, class_weight, heads.mirror)

@@ -48,6 +48,7 @@ class MapHead(nn.Module):
     """Queries for each point of each element; a query is the sum of its element's and its point's embedding.
 
     As in MapTR (Liao et al. 2023), with plain attention. Each point refines its position from layer to layer.
+    Elements may start at typical lines of the training set (`begin_at`), as in SparseDrive (Sun et al. 2024).
 
     Args:
         planes: the module that makes the planes.
@@ -76,6 +77,11 @@ class MapHead(nn.Module):
         final = self.kind[-1]
         assert isinstance(final, nn.Linear)
         nn.init.constant_(final.bias, -2.0)  # most elements are empty
+
+    @torch.no_grad()
+    def begin_at(self, lines_m: Float[Tensor, "E P 2"]) -> None:
+        """Start the elements at these lines; without this call, they are short and spread over the plane."""
+        self.start_m.copy_(lines_m)
 
     def forward(self, planes: Planes) -> list[MapSet]:
         """Return the elements after each layer."""
