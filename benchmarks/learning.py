@@ -4,8 +4,8 @@ The recipe `nemo_town` and the one of commit 9544e57 are pre-trained for the sam
 test drives of `learning_towns.py`, which are recorded first. Drives, cache and run folders are kept in
 runs/learning, so that an interrupted study continues where it stopped.
 
-`nemo_town_egos` learns from virtual egos with exact occupancy in place of drives: many cars of one traffic,
-six key frames of each. All arms are judged by labels from lidar.
+`nemo_town_egos` and `nemo_town_egos_exact` learn from virtual egos in place of drives: many cars of one
+traffic, six key frames of each, with labels from lidar or exact occupancy. All arms are judged by either.
 
 An arm ARM@BUDGET is one point of a curve: a whole training with its own learning rate schedule. Its length is
 a number of steps, chosen by `ARM@speed` on one machine: CPU time is that of one process with one thread which
@@ -18,7 +18,7 @@ import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from torch.utils.data import DataLoader
@@ -26,6 +26,7 @@ from torch.utils.data import DataLoader
 from benchmarks.common.study import seeded
 from benchmarks.learning_towns import DIGEST, TEST_TOWNS, TRAIN_TOWNS, plan_learning, record_missing
 from foredrive.data import ClipDataset, LogPath, collate
+from foredrive.data.label_store import OccupancySource
 from foredrive.engine.bench import Benchmark, study_identity
 from foredrive.engine.metrics_log import read_metrics
 from foredrive.engine.summary import numbers
@@ -83,10 +84,12 @@ class Budget:
 BUDGETS = {
     "10min": Budget(1200.0, 56, {"nemo_town": 3200, "nemo_town_9544e57": 600}, (2, 140)),
     "30min": Budget(3600.0, 98, {"nemo_town": 9600, "nemo_town_9544e57": 1800}, (4, 200)),
-    "1h": Budget(7200.0, 252, {"nemo_town": 19200, "nemo_town_9544e57": 3600}, (8, 240)),
+    "1h": Budget(7200.0, 252, {"nemo_town": 19200, "nemo_town_9544e57": 3600}, (4, 240)),
     "best": Budget(28800.0, 252, {"nemo_town": 76800}),
 }
 """Minutes and hours of two cores."""
+Egos = Literal["none", "lidar", "exact"]
+EGO_ARMS: tuple[tuple[Egos, str], ...] = (("lidar", ""), ("exact", "_exact"))
 EGO_HW = (96, 160)
 """Size of the images of virtual egos, px: that of the recipe, so that none are resized."""
 
@@ -114,32 +117,40 @@ def logs_of(drives: int) -> tuple[tuple[LogPath, ...], tuple[LogPath, ...]]:
     return tuple(log_of(plan, DRIVES) for plan in train), tuple(log_of(plan, DRIVES) for plan in test)
 
 
-def egos_of(seeds: int, count: int) -> tuple[LogPath, ...]:
+def egos_of(seeds: int, count: int, *, lidar: bool = False) -> tuple[LogPath, ...]:
     """Record the virtual egos that are missing; return them. Every other seed has all conditions."""
     plans = [
-        EgosPlan(town, seed, count, tuple(CONDITIONS) if seed % 2 else (), occupancy=True)
+        EgosPlan(town, seed, count, tuple(CONDITIONS) if seed % 2 else (), occupancy=True, lidar=lidar)
         for seed in range(seeds)
         for town in TRAIN_TOWNS
     ]
     rig = dataclasses.replace(SURROUND, image_hw=EGO_HW)
-    logs, failed = record_egos(plans, ROOT / "egos", rig, workers=1)
+    out = ROOT / ("egos_with_lidar" if lidar else "egos")
+    logs, failed = record_egos(plans, out, rig, workers=1)
     if failed:
         raise InputError(f"{len(failed)} recordings failed: {next(iter(failed.values()))}")
     return tuple(logs)
 
 
-def learned(name: str, budget_name: str, *, egos: bool = False) -> Callable[[int], dict[str, float]]:
-    """Return an arm that trains a recipe for a budget and judges it in the town of the test drives."""
+def learned(name: str, budget_name: str, egos: Egos = "none") -> Callable[[int], dict[str, float]]:
+    """Return an arm that trains a recipe for a budget and judges it in the town of the test drives.
+
+    Args:
+        name: of the recipe.
+        budget_name: of `BUDGETS`.
+        egos: labels of the virtual egos that it learns from; none: it learns from drives.
+    """
 
     def measure(seed: int) -> dict[str, float]:
         torch.set_num_threads(1)
         budget = BUDGETS[budget_name]
-        train_logs, test_logs = logs_of(0 if egos else budget.drives)
+        train_logs, test_logs = logs_of(budget.drives if egos == "none" else 0)
         recipe = seeded(pretraining_alone(RECIPES[name], budget.steps[name]), seed)
         folder = ROOT / IDENTITY / f"{name}_{budget_name}_seed{seed}"
-        if egos:
-            train_logs, folder = egos_of(*budget.egos), folder.with_name(f"egos_{folder.name}")
-            recipe = with_occupancy_source(recipe, "recorded")
+        if egos != "none":
+            train_logs = egos_of(*budget.egos, lidar=egos == "lidar")
+            folder = folder.with_name(f"egos_{egos}_{folder.name}")
+            recipe = with_occupancy_source(recipe, "recorded" if egos == "exact" else "lidar")
         run = train_run(recipe, train_logs, folder, ROOT / "cache")
         lines = read_metrics(folder / "pretrain" / "metrics.jsonl")
         cpu_s = sum(float(line["cpu_s"]) for line in lines)
@@ -155,12 +166,18 @@ def learned(name: str, budget_name: str, *, egos: bool = False) -> Callable[[int
 
 
 def judge(run: Run, logs: Sequence[LogPath], budget_name: str) -> dict[str, float]:
+    """Return the figures by labels from lidar, and `exact_…`, those by exact occupancy."""
+    return _judged(run, logs, budget_name, "lidar") | {
+        f"exact_{key}": value
+        for key, value in _judged(run, logs, budget_name, "recorded").items()
+        if key.startswith("iou")
+    }
+
+
+def _judged(run: Run, logs: Sequence[LogPath], budget_name: str, source: OccupancySource) -> dict[str, float]:
     """Return IoU above the ground now and later, ego-compensated persistence, and the recall of cars."""
     clips = dataclasses.replace(
-        run.recipe.clips.judged,
-        future_images=False,
-        now_stride_s=JUDGED_EVERY_S,
-        occupancy_source="lidar",
+        run.recipe.clips, future_images=False, now_stride_s=JUDGED_EVERY_S, occupancy_source=source
     )
     dataset = ClipDataset(logs, clips, run.cache_dir)
     result = evaluate(
@@ -221,9 +238,10 @@ BENCHMARK = Benchmark(
         for name in budget.steps
     }
     | {
-        f"nemo_town_egos@{budget_name}": learned("nemo_town", budget_name, egos=True)
+        f"nemo_town_egos{suffix}@{budget_name}": learned("nemo_town", budget_name, egos)
         for budget_name, budget in BUDGETS.items()
         if budget.egos[0]
+        for egos, suffix in EGO_ARMS
     },
     config=CONFIG,
     decided_by=DECIDED_BY,

@@ -14,8 +14,11 @@ from foredrive.data import ClipConfig, ClipDataset
 from foredrive.data.boxes import read_boxes
 from foredrive.data.cameras import pinhole_cameras, read_camera
 from foredrive.data.commands import route_at
+from foredrive.data.labels import make_labels
+from foredrive.data.lidar import frames_with_lidar
 from foredrive.data.log_paths import LogPath
 from foredrive.data.logs import Log
+from foredrive.data.recorded_labels import recorded_labels
 from foredrive.data.truth.affordances import read_affordances
 from foredrive.data.truth.store import TaskTruthConfig
 from foredrive.runs.build import build_agent
@@ -23,6 +26,7 @@ from foredrive.runs.train.baselines import fit_baselines
 from foredrive.runs.train.kept_volumes import KeptVolumes
 from foredrive.scene import Category, VoxelSpec
 from foredrive.sensors.rigs import camera_rig
+from foredrive.sensors.vehicle import roof_lidar
 from foredrive.towns import virtual_egos
 from foredrive.towns.sensing.capture import SensorSuite
 from foredrive.towns.virtual_egos import FORESEEN, IMAGES, LATER, record_virtual_egos
@@ -204,3 +208,24 @@ def test_equal_seeds_give_equal_bytes_and_whole_logs_are_kept(
     record_virtual_egos("Town02", 3, 2, tmp_path, SMALL, occupancy=GRID)
     assert marked.exists()
     assert digests(again[1].folder) == digests(logs[1].folder)
+
+
+def test_lidar_sweeps_come_with_the_images(
+    logs: list[LogPath], world02: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Labels agree with exact occupancy where beams hit; images and boxes are the same as without lidar."""
+    monkeypatch.setattr(virtual_egos, "World", lambda town, seed, conditions: world02)
+    sensors = dataclasses.replace(SMALL, lidar=roof_lidar())
+    (path,) = record_virtual_egos("Town02", 3, 1, tmp_path, sensors, occupancy=GRID)
+    log = Log(path)
+    assert frames_with_lidar(log).tolist() == list(range(IMAGES))
+    seen, exact = make_labels(log, 3, GRID), recorded_labels(log, 3, GRID)
+    hit = seen.occupied & seen.known
+    hit[:1] = False  # the ground lies between the first two layers
+    assert int(hit.sum()) > 30
+    assert float(exact.occupied[hit].float().mean()) > 0.8
+    without, beside = digests(logs[0].folder), digests(path.folder)
+    assert set(without) < set(beside)
+    same = [name for name in without if "camera" in name or "box" in name]
+    assert len(same) > 6
+    assert all(without[name] == beside[name] for name in same)

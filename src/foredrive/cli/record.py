@@ -38,6 +38,7 @@ def record(
     conditions: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME [NAME ...]")] = (),
     virtual_egos: int = 0,
     occupancy: bool = False,
+    lidar: bool = False,
     workers: int = 0,
     ray: bool = False,
 ) -> None:
@@ -63,10 +64,11 @@ def record(
         conditions: clear, morning, overcast, dusk, night, rain, night_rain or fog: every drive under each;
             any: one for each drive, evenly; none: a bright day.
         virtual_egos: In place of drives, this many short logs for each town and seed. In each, another car
-            of the traffic is the recording vehicle: six key frames of images without lidar, then 4 s of
-            boxes. --seconds, --rate, --vehicles and --people do not apply.
+            of the traffic is the recording vehicle: six key frames of images, then 4 s of boxes. --seconds,
+            --rate, --vehicles and --people do not apply.
         occupancy: Record exact occupancy with flow for virtual egos too, to pre-train world models on them.
             Drives always have it.
+        lidar: Record lidar sweeps of virtual egos too. Drives always have them.
         workers: Number of drives recorded at a time; 0: one for each core.
         ray: Record on Ray: on the cluster at RAY_ADDRESS, or on a cluster that is started here.
     """
@@ -75,8 +77,9 @@ def record(
     check_number("--rate", rate, above=0)
     check_image_size(image_size)
     check_number("--virtual-egos", virtual_egos, low=0)
-    if occupancy and not virtual_egos:
-        raise InputError("--occupancy belongs to --virtual-egos; drives always have it")
+    for name, asked in (("--occupancy", occupancy), ("--lidar", lidar)):
+        if asked and not virtual_egos:
+            raise InputError(f"{name} belongs to --virtual-egos; drives always have it")
     check_number("--workers", workers, low=0)
     check_out_folder(out)
     between = _range("vehicles", vehicles), _range("people", people)
@@ -91,7 +94,8 @@ def record(
         from foredrive.towns.campaign import Campaign, plan_drives
 
     if virtual_egos:
-        _record_egos(town, some_seeds, weather, virtual_egos, occupancy, out, cameras, workers, ray)
+        recorded = occupancy, lidar
+        _record_egos(town, some_seeds, weather, virtual_egos, recorded, out, cameras, workers, ray)
         return
     plans = plan_drives(Campaign(town, some_seeds, weather, *between, seconds=seconds, rate_hz=rate))
     # A single drive is recorded without worker processes
@@ -111,13 +115,16 @@ def _record_egos(
     seeds: tuple[int, ...] | int,
     conditions: tuple[str, ...],
     count: int,
-    occupancy: bool,
+    recorded: tuple[bool, bool],
     out: Path,
     rig: "RigPlan",
     workers: int,
     ray: bool,
 ) -> None:
     """Record virtual egos of each town and seed, and print the results.
+
+    Args:
+        recorded: whether to record occupancy, and lidar.
 
     Raises:
         InputError: some failed.
@@ -128,7 +135,7 @@ def _record_egos(
     some = tuple(CONDITIONS) if conditions == (ANY_CONDITIONS,) else conditions
     numbers = range(seeds) if isinstance(seeds, int) else seeds
     plans = [
-        EgosPlan(town, seed, count, some, occupancy) for town in dict.fromkeys(towns) for seed in numbers
+        EgosPlan(town, seed, count, some, *recorded) for town in dict.fromkeys(towns) for seed in numbers
     ]
     with job_progress("recording virtual egos", len(plans)) as tick:
         logs, failed = record_egos(

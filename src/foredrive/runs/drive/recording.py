@@ -133,6 +133,8 @@ class EgosPlan:
     """Names of `CONDITIONS`, of which one is drawn for each ego. Empty: bright daylight."""
     occupancy: bool = False
     """Record exact occupancy with flow."""
+    lidar: bool = False
+    """Record the sweep of the lidar on the roof beside the images."""
 
     @property
     def name(self) -> str:
@@ -149,7 +151,7 @@ def record_egos(
     on_ray: bool = False,
     tick: Callable[[], None] = lambda: None,
 ) -> tuple[list[LogPath], dict[str, str]]:
-    """Record virtual egos without lidar; logs that are in the data root are kept.
+    """Record virtual egos; logs that are in the data root are kept.
 
     Args:
         out, rig, workers, on_ray: as of `record_drives`.
@@ -174,7 +176,7 @@ def record_egos(
 
 def _record_egos(plan: EgosPlan, out: Path, rig: RigPlan) -> list[LogPath]:
     torch.set_num_threads(1)
-    sensors = SensorSuite(camera_rig(plan=rig), None)
+    sensors = SensorSuite(camera_rig(plan=rig), roof_lidar() if plan.lidar else None)
     conditions = [find_conditions(name) for name in plan.conditions]
     spec = OCCUPANCY if plan.occupancy else None
     return virtual_egos.record_virtual_egos(plan.town, plan.seed, plan.count, out, sensors, conditions, spec)
