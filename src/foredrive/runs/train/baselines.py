@@ -1,5 +1,6 @@
 """Baselines of a trained model, fitted to the logs that the model was trained on."""
 
+import dataclasses
 from collections.abc import Iterable, Iterator
 from functools import lru_cache
 from pathlib import Path
@@ -33,7 +34,7 @@ def fit_baselines(
     Raises:
         InputError: a log cannot be read.
     """
-    clips, target = recipe.clips.judged, recipe.planner.target
+    clips, target = dataclasses.replace(recipe.clips.judged, tasks=None), recipe.planner.target
     dataset = ClipDataset(logs, clips, cache_dir, images=False)
     loader = DataLoader(dataset, batch_size=16, collate_fn=collate)
     prior, status = read_training_set(loader, clips.future_frames + 1, past_frames, target=target)
