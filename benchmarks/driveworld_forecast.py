@@ -33,7 +33,7 @@ and steps of training on it.
 FRAMES = 2
 """Number of imagined frames, 1 s: the log has 56 frames, and no clip of 2 s begins after the first 40."""
 WHOLE_S = 1e6
-CONFIG = config_of("") | {
+CONFIG = config_of(DRIVEWORLD, NEMO) | {
     "learned_s": LEARNED_S,
     "stride_s": STRIDE_S,
     "real_steps": REAL_STEPS,

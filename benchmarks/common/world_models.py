@@ -37,16 +37,19 @@ LEARNED_BY: Mapping[str, tuple[str, ...]] = {
     "driveworld": ("foredrive.methods.driveworld", "foredrive.methods.blocks.pooled_lifting"),
 }
 """The code that decides what each kind of world model learns, beside that of both."""
-DECIDED_BY = (
+LEARNED_BY_BOTH = (
     "foredrive.data.recorded_labels",
     "foredrive.engine.parameter_groups",
     "foredrive.methods.blocks.averaging",
     "foredrive.methods.blocks.backbone",
     "foredrive.methods.blocks.lifting",
+    "foredrive.tasks.occupancy.losses",
+)
+DECIDED_BY = (
+    *LEARNED_BY_BOTH,
     "foredrive.methods.planner.ego_mlp_fit",
     "foredrive.methods.planner.path_fit",
     "foredrive.methods.planner.planner",
-    "foredrive.tasks.occupancy.losses",
     "foredrive.tasks.occupancy.occupancy_metric",
     "foredrive.tasks.planning.protocols",
     "foredrive.tasks.planning.scores",
@@ -65,11 +68,11 @@ TASKS_DECIDED_BY = (
 """The code that decides what task heads learn."""
 
 
-def config_of(prefix: str) -> dict[str, Any]:
-    """Return the configuration of a study of the recipes whose names begin with `prefix`."""
+def config_of(*names: str) -> dict[str, Any]:
+    """Return the configuration of a study of these recipes and of those whose names begin with theirs."""
     return {
         "recipes": {
-            name: dataclasses.asdict(recipe) for name, recipe in RECIPES.items() if name.startswith(prefix)
+            name: dataclasses.asdict(recipe) for name, recipe in RECIPES.items() if name.startswith(names)
         },
         "egos": EGOS,
         "steps": dict(STEPS),
@@ -136,7 +139,7 @@ def pretrained(recipe: Recipe[Any, Any], share: float = 1.0) -> Run:
     )
     alone = seeded(learning.pretraining_alone(alone, schedule.steps), schedule.seed)
     config = {"recipe": dataclasses.asdict(alone), "egos": EGOS, "share": share}
-    folder = ROOT / "pretrained" / study_identity(config, LEARNED_BY[kind])
+    folder = ROOT / "pretrained" / study_identity(config, (*LEARNED_BY_BOTH, *LEARNED_BY[kind]))
     return train_run(alone, study_logs(share).train, folder, learning.ROOT / "cache")
 
 
