@@ -60,6 +60,7 @@ def test_instances_train_the_imagination(
     objective = build_objective(recipe, recipe.finetune, agent)
     losses = objective(collate([data[0], data[3]]), torch.Generator().manual_seed(0))
     losses["task_instances"].backward()
+    assert recipe.name == f"{make().name} (detection+instances)"
     for part in (imagining, "backbone"):
         gradients = [value.grad for value in agent.world_model.get_submodule(part).parameters()]
         assert max(float(grad.abs().max()) for grad in gradients if grad is not None) > 0, part

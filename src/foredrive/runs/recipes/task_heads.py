@@ -101,7 +101,7 @@ def with_joint_heads(recipe: R, heads: TaskHeadsRecipe, settings: Sequence[str] 
     joint = JointTasks(replace(heads.heads, volume_of=None), heads.weights)
     if settings:
         joint = validated(JointTasks, overridden(asdict(joint), settings), "--set")
-    names = "+".join(joint.heads.tasks)
+    names = "+".join((*joint.heads.tasks, *([INSTANCES] if joint.heads.instances else [])))
     return replace(
         recipe,
         name=f"{recipe.name} ({names})",

@@ -213,7 +213,8 @@ def _train_stages(run: Run, dataset: ClipDataset, start: "Path | Run | None", fa
             data = dataset if recipe.clips.tasks is None else open_clips(run.logs, first.clips, run.cache_dir)
             _train_stage(replace(run, recipe=first), "pretrain", fresh_agent(first), data, fabric)
     agent = fresh_agent(recipe)
-    if agent.heads is not None and recipe.transfer != "frozen":
+    finished = (folder / "finetune" / WEIGHTS).is_file()
+    if agent.heads is not None and recipe.transfer != "frozen" and not finished:
         place_map_elements(agent.heads, _truths(dataset), recipe.finetune.schedule.seed)
     if isinstance(start, Run) and recipe.transfer == "perception":
         load_perception(agent, start.weights)
@@ -221,7 +222,7 @@ def _train_stages(run: Run, dataset: ClipDataset, start: "Path | Run | None", fa
         load_kept(agent, start.recipe, start.folder, start.weights)
     elif start is not None:
         load_pretrained(agent, recipe, start)
-    if agent.planner.ego_mlp is not None and not (folder / "finetune" / WEIGHTS).is_file():
+    if agent.planner.ego_mlp is not None and not finished:
         # The base of the planner is the same MLP that is its baseline in the evaluation.
         base = agent.planner.ego_mlp
         _, fitted = run_baselines(folder, run.logs, recipe, run.cache_dir, base.past_frames)

@@ -1,4 +1,4 @@
-"""What the training set tells about the tasks of heads: baselines, class weights, and typical map lines."""
+"""Survey a training set for task heads: baselines, class weights, and typical map lines."""
 
 from collections.abc import Iterable, Sequence
 from pathlib import Path
