@@ -2,10 +2,12 @@
 
 All rows learn from the same virtual egos for equally many steps (common/world_models.py), and have the same
 fine-tuning: world model, planner, and heads of detection and map together. As in the paper, the rows of
-Table 1 carry backbone and encoder over to it, and all other parts start fresh. Every seed has its own
-pre-training. `pretrained_50` and `finetuned_75` are rows of Table 2, the full recipe on parts of the egos.
+Table 1 carry backbone and encoder over to it, and all other parts start fresh. The planner has no head along
+the path, which is not the paper's. Every seed has its own pre-training. `pretrained_50` and `finetuned_75`
+are rows of Table 2, the full recipe on parts of the egos.
 """
 
+import dataclasses
 import functools
 
 from benchmarks.common.world_models import (
@@ -21,7 +23,7 @@ from foredrive.runs.recipes.known import RECIPES
 
 FULL, PROMPTS = "driveworld_town", "driveworld_town_prompts"
 TASKS = ("detection", "map")
-CONFIG = config_of(FULL) | {"tasks": TASKS}
+CONFIG = config_of(FULL) | {"tasks": TASKS, "path": None}
 IDENTITY = study_identity(CONFIG, (*DECIDED_BY, *TASKS_DECIDED_BY))
 
 
@@ -34,6 +36,7 @@ def arm(name: str, seed: int, *, pretraining_share: float = 1.0, share: float = 
         pretraining_share, share: parts of the egos that they learn from.
     """
     recipe = of_the_study(name, seed, pretraining_seed=seed)
+    recipe = dataclasses.replace(recipe, path=None, planner=dataclasses.replace(recipe.planner, path=None))
     run = f"{name}_{100 * pretraining_share:.0f}pct_then_{100 * share:.0f}pct_seed{seed}"
     return fine_tuned(
         recipe,
