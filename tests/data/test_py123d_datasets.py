@@ -355,7 +355,6 @@ TREES = {
     "nuplan": "nuplan-v1.1/splits/mini/x.db",
     "waymo": "training/segment-1.tfrecord",
     "waymo-motion": "validation/x.tfrecord-00000-of-00150",
-    "ncore": "clips/c/pai_c.json",
 }
 
 

@@ -24,6 +24,7 @@ from foredrive.cli.drive import drive
 from foredrive.cli.evaluate import evaluate
 from foredrive.cli.export import export
 from foredrive.cli.export_mcap import export_mcap
+from foredrive.cli.export_ncore import export_ncore
 from foredrive.cli.export_nuscenes import export_nuscenes
 from foredrive.cli.fetch import fetch_av2
 from foredrive.cli.imagine import imagine
@@ -98,6 +99,7 @@ VERBS: dict[str, Callable[..., Any]] = {
     "imagine": imagine,
     "export": export,
     "export mcap": export_mcap,
+    "export ncore": export_ncore,
     "export nuscenes": export_nuscenes,
     "view": view,
     "bench": bench,

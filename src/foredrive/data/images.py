@@ -55,6 +55,33 @@ def read_rgb(
     return grey_to_rgb(pixels, value_range)
 
 
+def whole_jpeg(image: Path | str | bytes) -> bytes | None:
+    """Return the bytes of an RGB image in JPEG that is not cut off, or None for other images.
+
+    Decoding it at an eighth of its size is fast and finds those that are cut.
+
+    Raises:
+        InputError: it cannot be decoded.
+    """
+    name = "" if isinstance(image, bytes) else f"{image}: "
+    try:
+        data = image if isinstance(image, bytes) else Path(image).read_bytes()
+        with Image.open(io.BytesIO(data)) as opened:
+            if (opened.format, opened.mode) != ("JPEG", "RGB"):
+                return None
+            opened.draft("RGB", (opened.width // 8, opened.height // 8))
+            opened.load()
+        return data
+    except (OSError, UnidentifiedImageError, Image.DecompressionBombError, SyntaxError, ValueError) as error:
+        raise InputError(f"{name}cannot read the image: {error}") from error
+
+
+def image_size(image: bytes) -> tuple[int, int]:
+    """Return height and width of an encoded image, px."""
+    with Image.open(io.BytesIO(image)) as opened:
+        return opened.height, opened.width
+
+
 def grey_to_rgb(
     pixels: Shaped[np.ndarray, "H W"], value_range: tuple[float, float]
 ) -> UInt8[np.ndarray, "H W 3"]:

@@ -58,19 +58,22 @@ def frames_with_lidar(log: Log) -> Int64[np.ndarray, "_"]:
     return np.unique(np.concatenate([np.zeros(0, dtype=np.int64), *frames]))
 
 
-def main_lidar_mount(log: Log) -> Float64[np.ndarray, "4 4"] | None:
-    """Return `T_ego_lidar` of 123D's LIDAR_TOP, else of the highest lidar. None if the log has no lidar."""
-    sensors: dict[LidarID, LidarMetadata] = {}
+def lidar_mounts(log: Log) -> dict[str, Float64[np.ndarray, "4 4"]]:
+    """Return `T_ego_lidar` of each lidar by its name: 123D's LIDAR_TOP first, then the highest."""
+    T_ego_imu, lidars = np.linalg.inv(log.T_imu_ego), list[LidarMetadata]()
     for metadata in log.scene.get_all_modality_metadatas().values():
         if isinstance(metadata, LidarMetadata):
-            sensors[metadata.lidar_id] = metadata
+            lidars.append(metadata)
         elif isinstance(metadata, LidarMergedMetadata):
-            sensors |= metadata.lidar_metadatas
-    T_ego_imu = np.linalg.inv(log.T_imu_ego)
-    mounts = {name: T_ego_imu @ one.lidar_to_imu_se3.transformation_matrix for name, one in sensors.items()}
-    if LidarID.LIDAR_TOP in mounts:
-        return mounts[LidarID.LIDAR_TOP]
-    return max(mounts.values(), key=lambda T: float(T[2, 3]), default=None)
+            lidars += metadata.lidar_metadatas.values()
+    mounts = [(one, T_ego_imu @ one.lidar_to_imu_se3.transformation_matrix) for one in lidars]
+    mounts.sort(key=lambda mount: (mount[0].lidar_id != LidarID.LIDAR_TOP, -float(mount[1][2, 3])))
+    return {one.lidar_name: T_ego_lidar for one, T_ego_lidar in mounts}
+
+
+def main_lidar_mount(log: Log) -> Float64[np.ndarray, "4 4"] | None:
+    """Return `T_ego_lidar` of 123D's LIDAR_TOP, else of the highest lidar. None if the log has no lidar."""
+    return next(iter(lidar_mounts(log).values()), None)
 
 
 def _recorded_beams(log: Log, frame: int) -> tuple[Float[np.ndarray, "R 3"] | None, LidarSweep | None]:

@@ -44,7 +44,7 @@ from py123d.datatypes.custom.custom_modality import CustomModality, CustomModali
 from py123d.datatypes.modalities.base_modality import BaseModality
 from py123d.datatypes.sensors.base_camera import BaseCameraMetadata
 from py123d.geometry import PoseSE3, Vector3D
-from py123d.parser.base_dataset_parser import ModalitiesSync
+from py123d.parser.base_dataset_parser import ModalitiesSync, ParsedCamera
 
 from foredrive.data.camera_streams import (
     CameraSpec,
@@ -54,6 +54,7 @@ from foredrive.data.camera_streams import (
     instance_metadata,
     semantic_metadata,
 )
+from foredrive.data.images import image_size
 from foredrive.data.modalities import (
     CAPTION,
     EXPERT_PLAN,
@@ -100,8 +101,8 @@ class Frame:
     T_world_ego: Float64[np.ndarray, "4 4"]
     velocity_ego_mps: Float[np.ndarray, "3"]
     acceleration_ego_mps2: Float[np.ndarray, "3"]
-    images: dict[str, UInt8[np.ndarray, "_ _ 3"]]
-    """RGB by camera name. A camera may be missing."""
+    images: Mapping[str, UInt8[np.ndarray, "_ _ 3"] | bytes]
+    """RGB by camera name, or the bytes of a JPEG, which are kept. A camera may be missing."""
     sweep: LidarSweep | None
     """Unbatched, in the ego frame at `t_us`, with the misses."""
     boxes: Boxes | None
@@ -263,20 +264,21 @@ class LogWriter:
             ),
         )
 
-    def _images(self, frame: Frame) -> Iterator[Camera]:
+    def _images(self, frame: Frame) -> Iterator[BaseModality]:
         for name, image in frame.images.items():
-            yield self._camera(frame, self._declared(name, image), image)
+            size_hw = image_size(image) if isinstance(image, bytes) else image.shape[:2]
+            yield self._camera(frame, self._declared(name, size_hw), image)
 
     def _label_images(self, frame: Frame) -> Iterator[Camera]:
         for name, depth_m in frame.depth_m.items():
-            depth = depth_metadata(self._declared(name, depth_m))
+            depth = depth_metadata(self._declared(name, depth_m.shape))
             yield self._camera(frame, depth, depth.encode_depth(depth_m))
         for name, label in frame.semantic.items():
-            yield self._camera(frame, semantic_metadata(self._declared(name, label)), label)
+            yield self._camera(frame, semantic_metadata(self._declared(name, label.shape)), label)
         for name, track_id in frame.instance.items():
-            yield self._camera(frame, instance_metadata(self._declared(name, track_id)), track_id)
+            yield self._camera(frame, instance_metadata(self._declared(name, track_id.shape)), track_id)
 
-    def _declared(self, name: str, image: np.ndarray) -> PinholeCameraMetadata:
+    def _declared(self, name: str, size_hw: tuple[int, ...]) -> PinholeCameraMetadata:
         """Return the metadata of an image's camera.
 
         Raises:
@@ -285,14 +287,19 @@ class LogWriter:
         if name not in self._cameras:
             raise InputError(f"{self.folder}: image of camera {name!r}, which was not declared")
         spec, metadata = self._cameras[name]
-        if image.shape[:2] != tuple(spec.size_hw):
-            raise InputError(f"{self.folder}: image of {name} is {image.shape[:2]}, not {spec.size_hw}")
+        if size_hw != tuple(spec.size_hw):
+            raise InputError(f"{self.folder}: image of {name} is {size_hw}, not {spec.size_hw}")
         return metadata
 
-    def _camera(self, frame: Frame, metadata: BaseCameraMetadata, image: np.ndarray) -> Camera:
+    def _camera(
+        self, frame: Frame, metadata: BaseCameraMetadata, image: np.ndarray | bytes
+    ) -> Camera | ParsedCamera:
         spec, _ = self._cameras[metadata.camera_name]
         t_us, T_world_ego = frame.exposed.get(spec.name, (frame.t_us, frame.T_world_ego))
-        return Camera(metadata, image, _pose(T_world_ego @ spec.T_ego_cam), Timestamp.from_us(t_us))
+        T_world_cam, exposed = _pose(T_world_ego @ spec.T_ego_cam), Timestamp.from_us(t_us)
+        if isinstance(image, bytes):
+            return ParsedCamera(metadata, exposed, T_world_cam, byte_string=image)
+        return Camera(metadata, image, T_world_cam, exposed)
 
     def _sweep(self, frame: Frame, sweep: LidarSweep) -> list[BaseModality]:
         t_us, kept = frame.t_us, sweep.valid & sweep.returned

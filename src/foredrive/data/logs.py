@@ -108,6 +108,8 @@ class Log:
     t_us: Int64[np.ndarray, "F"]
     """Time of each frame: that of its ego pose."""
     T_world_ego: Float64[np.ndarray, "F 4 4"]
+    drive_t_us: Int64[np.ndarray, "E"]
+    """Times of all ego poses, of which those of the frames are a part."""
     speed_mps: Float64[np.ndarray, "F"]
     """Ego speed: as logged, else from the previous pose. NaN at a first frame without a logged speed."""
     period_s: float
@@ -128,7 +130,7 @@ class Log:
         self.t_us, self.T_world_ego = ego_t_us[ego_rows], T_world_ego[ego_rows]
         # Times in nanoseconds may share a microsecond; interpolation needs increasing ones
         distinct = np.diff(ego_t_us, prepend=ego_t_us[0] - 1) > 0
-        self._drive_t_us, self._drive_T = ego_t_us[distinct], T_world_ego[distinct]
+        self.drive_t_us, self._drive_T = ego_t_us[distinct], T_world_ego[distinct]
         self.period_s = float(np.median(np.diff(self.t_us))) * 1e-6 if len(self.t_us) > 1 else 0.0
         self.speed_mps = _speed(speed_mps[ego_rows], self.t_us, self.T_world_ego)
 
@@ -197,7 +199,7 @@ class Log:
         self, point_ego: Float[np.ndarray, "3"], t_us: Float64[np.ndarray, "N"]
     ) -> Float64[np.ndarray, "N 3"]:
         """Return world positions of a vehicle-fixed point, with constant velocity beyond the log."""
-        times_us = self._drive_t_us.astype(np.float64)
+        times_us = self.drive_t_us.astype(np.float64)
         xyz = self._drive_T[:, :3, :3] @ point_ego + self._drive_T[:, :3, 3]
         if len(times_us) > 1:
             # One more point at either end, at the velocity of the first and the last step
@@ -216,13 +218,13 @@ class Log:
         after the log.
         """
         valid = self.knows_pose_at(t_us)
-        if len(self._drive_t_us) < 2 or len(t_us) == 0:
+        if len(self.drive_t_us) < 2 or len(t_us) == 0:
             return np.repeat(self._drive_T[:1], len(t_us), axis=0), valid
-        return interpolated_poses(self._drive_t_us, self._drive_T, t_us), valid
+        return interpolated_poses(self.drive_t_us, self._drive_T, t_us), valid
 
     def knows_pose_at(self, t_us: Float64[np.ndarray, "*n"]) -> Bool[np.ndarray, "*n"]:
         """Return whether the log has close poses before and after each time."""
-        times_us = self._drive_t_us
+        times_us = self.drive_t_us
         if len(times_us) < 2:
             return np.zeros(t_us.shape, dtype=bool)
         after = np.searchsorted(times_us, t_us).clip(1, len(times_us) - 1)

@@ -20,7 +20,7 @@ from py123d.geometry import PoseSE3
 from foredrive.data.camera_streams import CameraSpec
 from foredrive.data.category_names import category_named
 from foredrive.data.ego_path import interpolated_poses
-from foredrive.data.images import read_rgb
+from foredrive.data.images import read_rgb, whole_jpeg
 from foredrive.data.log_paths import LogPath
 from foredrive.data.log_writer import Frame, LogWriter
 from foredrive.errors import InputError
@@ -86,9 +86,9 @@ def write_log(
     T_world_ego: Num,
     *,
     cameras: Sequence[CameraSpec] = (),
-    images: Mapping[str, Sequence[Path | str | Num | None]] | None = None,
+    images: Mapping[str, Sequence[Path | str | bytes | Num | None]] | None = None,
     image_t_s: Mapping[str, Num] | None = None,
-    sweeps: Sequence[Points | None] | None = None,
+    sweeps: Sequence[Points | LidarSweep | None] | None = None,
     lidar_position_m: tuple[float, float, float] = (0.0, 0.0, 1.8),
     boxes: Sequence[Sequence[Box] | None] | None = None,
     vehicle: Vehicle = Vehicle(),
@@ -101,7 +101,7 @@ def write_log(
     All sequences have one entry for each of T frames, and None where a frame lacks it. They are read one
     entry at a time, so a sequence may load its entries when they are read, which limits the memory.
     Velocities and accelerations are differences to the previous frame, so that they contain nothing of later
-    frames. Images are stored as JPEG.
+    frames. Images are stored as JPEG; those that are JPEGs are kept as they are.
 
     Args:
         out: 123D data root; the log is out/logs/SPLIT/NAME.
@@ -109,10 +109,11 @@ def write_log(
         t_s: [T] time of each frame, increasing.
         T_world_ego: [T, 4, 4] pose of the vehicle at these times.
         cameras: their calibration, at most 11.
-        images: by camera: image files, or uint8 RGB arrays [H, W, 3].
+        images: by camera: image files, their bytes, or uint8 RGB arrays [H, W, 3].
         image_t_s: by camera: time at which the middle row of each image was exposed. Default: that of the
             frame. Poses between frames are interpolated.
-        sweeps: points of the lidar. Beams that did not return are unknown.
+        sweeps: points of the lidar, whose beams that did not return are unknown; or whole sweeps, unbatched,
+            in the ego frame at the frame's time, where they are known if there are any.
         lidar_position_m: of the lidar, in the ego frame.
         boxes: labels at each frame. None where a frame is not annotated, empty where nothing is there.
         vehicle: size of the recording vehicle.
@@ -156,8 +157,7 @@ def write_log(
                 sweep=None if points is None else _sweep(points, drive, frame, lidar_position_m, where),
                 boxes=None if labels is None else _boxes(labels, where),
                 exposed={camera: times[frame] for camera, times in exposed.items()},
-                # The beams that did not return are unknown
-                misses_known=False,
+                misses_known=isinstance(points, LidarSweep) and not bool(points.returned.all()),
             )
             writer.write(sensed)
             tick()
@@ -274,21 +274,33 @@ def _metadata(vehicle: Vehicle) -> EgoStateSE3Metadata:
     )
 
 
-def _rgb(image: Path | str | Num, where: str) -> RGB:
-    """Return an image, read from its file if it is one."""
+def _rgb(image: Path | str | bytes | Num, where: str) -> RGB | bytes:
+    """Return an image, read from its file if it is one. A JPEG stays as it is."""
     if isinstance(image, np.ndarray):
         if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3:
             raise InputError(
                 f"{where}: an image must be uint8 [H, W, 3], not {image.dtype} {list(image.shape)}"
             )
         return image
-    return read_rgb(image)
+    jpeg = whole_jpeg(image)
+    return read_rgb(image) if jpeg is None else jpeg
 
 
 def _sweep(
-    points: Points, drive: _Drive, frame: int, position_m: tuple[float, float, float], where: str
+    points: Points | LidarSweep,
+    drive: _Drive,
+    frame: int,
+    position_m: tuple[float, float, float],
+    where: str,
 ) -> LidarSweep:
-    """Return a sweep of returns in the ego frame at the frame's time."""
+    """Return a sweep of returns in the ego frame at the frame's time; a whole sweep is kept."""
+    if isinstance(points, LidarSweep):
+        parts = (points.origin_ego, points.dir_ego, points.range_m, points.dt_s)
+        if not all(bool(part.isfinite().all()) for part in parts):
+            raise InputError(f"{where}: a beam is not finite")
+        if not bool(((points.intensity >= 0) & (points.intensity <= 1)).all()):
+            raise InputError(f"{where}: intensity must be between 0 and 1")
+        return points
     xyz = np.asarray(points.xyz_m, np.float64)
     count = len(xyz)
     columns = {

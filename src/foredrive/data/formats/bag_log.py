@@ -25,7 +25,6 @@ from foredrive.data.formats.bag_messages import (
     time_unit,
 )
 from foredrive.data.formats.bag_topics import (
-    DEFAULT_PERIOD_S,
     BagTopics,
     CameraTopics,
     Mount,
@@ -33,7 +32,7 @@ from foredrive.data.formats.bag_topics import (
     topics_file,
 )
 from foredrive.data.formats.frame_tree import FrameTree
-from foredrive.data.formats.guard import PartSequence
+from foredrive.data.formats.guard import DEFAULT_PERIOD_S, PartSequence, nearest_parts
 from foredrive.data.formats.raw_log import RawLog
 from foredrive.data.images import check_size
 from foredrive.data.log_paths import LogPath
@@ -280,14 +279,8 @@ class _Stream(PartSequence):
             note(topic, "messages out of order, sorted by their stamps", place)
         order = np.argsort(stamps_us, kind="stable")
         numbers, stamps_us = numbers[order], stamps_us[order]
-        # Messages before and after each frame, and the nearer one of the two
-        after = np.searchsorted(stamps_us, times_us).clip(1, max(len(stamps_us) - 1, 1))
-        before = after - 1
-        after = after.clip(0, len(stamps_us) - 1)
-        nearest = np.where(times_us - stamps_us[before] <= stamps_us[after] - times_us, before, after)
-        period_us = float(np.median(np.diff(times_us))) if len(times_us) > 1 else 1e5
         # A message more than half a period away belongs to another frame
-        self._exists = np.abs(stamps_us[nearest] - times_us) <= 0.5 * period_us
+        nearest, self._exists = nearest_parts(stamps_us, times_us)
         self.t_us = np.where(self._exists, stamps_us[nearest], times_us)
         self._numbers = numbers[nearest]
         frames = np.flatnonzero(self._exists)

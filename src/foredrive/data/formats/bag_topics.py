@@ -31,6 +31,7 @@ from foredrive.data.formats.bag_messages import (
     time_unit,
 )
 from foredrive.data.formats.frame_tree import FrameTree
+from foredrive.data.formats.guard import DEFAULT_PERIOD_S
 from foredrive.data.notices import collecting
 from foredrive.errors import InputError
 from foredrive.files import atomic_path
@@ -40,8 +41,6 @@ T = TypeVar("T")
 _EGO_NAMES = ("base_link", "base_footprint", "ego", "ego_vehicle", "vehicle", "imu_link", "imu")
 _RANGE_IMAGES = 10
 """Images whose values are looked at for the range of a camera with 16 bits."""
-DEFAULT_PERIOD_S = 0.1
-"""Time between sweeps where there is one alone."""
 _WORLD_NAMES = ("map", "odom", "world", "global", "earth", "utm")
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, TypeVar, overload
 
 import numpy as np
-from PIL import Image
+from jaxtyping import Bool, Int64
 from py123d.common.io.lidar.path_lidar_io import load_point_cloud_data_from_path
 from py123d.datatypes import BoxDetectionsSE3, Camera, EgoStateSE3, Lidar, LogMetadata, MapMetadata
 from py123d.datatypes.modalities.base_modality import BaseModality
@@ -19,13 +19,15 @@ from py123d.parser.base_dataset_parser import ParsedCamera, ParsedLidar, ParsedR
 
 from foredrive.data.arrow_files import REFUSES_WRITING
 from foredrive.data.formats.point_files import NUSCENES, read_points
-from foredrive.data.images import read_rgb
+from foredrive.data.images import read_rgb, whole_jpeg
 from foredrive.data.notices import note
 from foredrive.errors import InputError
 
 T = TypeVar("T")
 
 _NAME = re.compile(r"[\w-][\w.+-]*")
+DEFAULT_PERIOD_S = 0.1
+"""Time between the frames of a log that has only one."""
 _READ_MODES = ("r", "rb", "rt", None)
 _MISTAKES = (TypeError, AttributeError, NameError, ImportError)
 """Errors of code. Decoders of images, messages, sweeps and pickles raise none of them for damaged bytes."""
@@ -143,6 +145,26 @@ class PartSequence(Sequence[Any]):
         self._read.check()
 
 
+def nearest_parts(
+    part_us: Int64[np.ndarray, "P"], frame_us: Int64[np.ndarray, "T"]
+) -> tuple[Int64[np.ndarray, "T"], Bool[np.ndarray, "T"]]:
+    """Return which part is nearest to each frame, and whether it belongs to it.
+
+    A part belongs to a frame that is at most half of the frames' usual period away.
+
+    Args:
+        part_us: times of at least one part, in order.
+        frame_us: times of the frames, in order.
+    """
+    # Parts before and after each frame, and the nearer one of the two
+    after = np.searchsorted(part_us, frame_us).clip(1, max(len(part_us) - 1, 1))
+    before = after - 1
+    after = after.clip(0, len(part_us) - 1)
+    nearest = np.where(frame_us - part_us[before] <= part_us[after] - frame_us, before, after)
+    period_us = float(np.median(np.diff(frame_us))) if len(frame_us) > 1 else 1e6 * DEFAULT_PERIOD_S
+    return nearest, np.abs(part_us[nearest] - frame_us) <= 0.5 * period_us
+
+
 class SensorFiles:
     """Loads the sensor files of a log's frames. A frame loses an image or a sweep that cannot be read."""
 
@@ -189,17 +211,14 @@ class SensorFiles:
 def _whole_image(parsed: ParsedCamera) -> BaseModality:
     """Return a camera whose JPEG is whole, or with its decoded image.
 
-    JPEGs go into the log as they are. Decoding them at an eighth of their size finds those that are cut.
+    JPEGs go into the log as they are.
     """
     if not parsed.has_file_path or parsed.exposure_factor is not None:
         return parsed
     file = Path(parsed._dataset_root) / parsed._relative_path
     if not parsed.has_jpeg_file_path:
         return Camera(parsed.metadata, read_rgb(file), parsed.camera_to_global_se3, parsed.timestamp)
-    # JPEG decoding at an eighth of the size is fast and finds cut files
-    with Image.open(file) as opened:
-        opened.draft("RGB", (opened.width // 8, opened.height // 8))
-        opened.load()
+    whole_jpeg(file)
     return parsed
 
 

@@ -22,7 +22,7 @@ from py123d.datatypes import LogMetadata
 from foredrive.data.camera_streams import CameraSpec
 from foredrive.data.ego_path import interpolated_poses
 from foredrive.data.formats.camera_split import PosedImage, RigCamera, split_into_cameras
-from foredrive.data.formats.guard import PartReader, PartSequence
+from foredrive.data.formats.guard import PartReader, PartSequence, nearest_parts
 from foredrive.data.formats.raw_log import RawLog, folders_with
 from foredrive.data.images import check_size, decoded, read_rgb
 from foredrive.data.log_paths import LogPath
@@ -167,9 +167,7 @@ def _beside(
     camera: RigCamera, t_us: Int64[np.ndarray, "T"]
 ) -> tuple[list[Path | None], Int64[np.ndarray, "T"]]:
     """Return the image of a camera beside each frame, and its time; that of the frame where there is none."""
-    # Nearest image of the camera to each frame
-    nearest = np.abs(camera.t_us[None] - t_us[:, None]).argmin(axis=1)
-    near = np.abs(camera.t_us[nearest] - t_us) <= _half_period_us(t_us)
+    nearest, near = nearest_parts(camera.t_us, t_us)
     files = [
         camera.files[k] if exists else None for k, exists in zip(nearest.tolist(), near.tolist(), strict=True)
     ]

@@ -32,7 +32,6 @@ NEEDS = {
     "nuscenes": "pip install scikit-learn && pip install --no-deps nuscenes-devkit==1.2.0 descartes",
     "nuplan": "pip install 'py123d[nuplan]' and nuplan-devkit from github.com/motional/nuplan-devkit",
     "tensorflow": "pip install tensorflow-cpu",
-    "ncore": "pip install nvidia-ncore",
 }
 """How to install what parsers need. nuscenes-devkit asks for NumPy 1, so --no-deps, but runs with NumPy 2."""
 
@@ -229,13 +228,6 @@ def physical_ai_av(source: Path) -> Iterator[RawLog]:
         module = _module("physical_ai_av.physical_ai_av_parser")
         splits = [f"physical-ai-av_{kind}" for kind in ("train", "val", "test")]
         yield from _of(module.PhysicalAIAVParser(splits, root), root)
-
-
-def ncore(source: Path) -> Iterator[RawLog]:
-    """Find the clips of NVIDIA's PhysicalAI-Autonomous-Vehicles-NCore."""
-    for root in folders_with(source, "clips/*/pai_*.json"):
-        module = _module("ncore.ncore_parser", "ncore")
-        yield from _of(module.NCoreParser(["ncore_train"], root), root)
 
 
 def nureasoning(source: Path) -> Iterator[RawLog]:
