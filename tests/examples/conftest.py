@@ -7,7 +7,8 @@ from pathlib import Path
 from types import ModuleType
 
 import pytest
-from navsim_records import AbstractAgent, AgentInput, SensorConfig, Trajectory, TrajectorySampling
+
+from foredrive.integrations.navsim.stand_ins import add_stand_ins
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 
@@ -29,16 +30,6 @@ def example(monkeypatch: pytest.MonkeyPatch) -> Callable[[str], ModuleType]:
 
 
 @pytest.fixture
-def navsim(monkeypatch: pytest.MonkeyPatch) -> None:
+def navsim() -> None:
     """Modules with the records of NAVSIM's interface."""
-    of = {
-        "navsim.agents.abstract_agent": (AbstractAgent,),
-        "navsim.common.dataclasses": (AgentInput, SensorConfig, Trajectory),
-        "nuplan.planning.simulation.trajectory.trajectory_sampling": (TrajectorySampling,),
-    }
-    for name, members in of.items():
-        parts = name.split(".")
-        for end in range(1, len(parts) + 1):
-            monkeypatch.setitem(sys.modules, ".".join(parts[:end]), ModuleType(".".join(parts[:end])))
-        for member in members:
-            setattr(sys.modules[name], member.__name__, member)
+    add_stand_ins()

@@ -9,8 +9,15 @@ import numpy as np
 import pytest
 import torch
 import yaml
-from navsim_records import AgentInput, Camera, Cameras, EgoStatus, SensorConfig, TrajectorySampling
 
+from foredrive.integrations.navsim.records import (
+    AgentInput,
+    Camera,
+    Cameras,
+    EgoStatus,
+    SensorConfig,
+    TrajectorySampling,
+)
 from foredrive.runs import Run, load_agent
 from foredrive.scene import Command, Trajectory
 

@@ -11,7 +11,7 @@ from foredrive.cli.drive_options import InputFaults, InReconstruction, InTowns, 
 from foredrive.cli.failures import listed_failures
 from foredrive.errors import InputError
 from foredrive.lazy import importing
-from foredrive.runs.drive.agents import agents_help
+from foredrive.runs.drive.agents import absolute_name, agents_help
 
 if TYPE_CHECKING:
     from foredrive.driving.drive_record import DriveRecord
@@ -47,7 +47,7 @@ def drive(
         from foredrive.runs.drive.suite import DriveSuite, drive_suite
 
     # Workers may run in other folders, so the folder of a run is named by its absolute path
-    name = str(Path(agent).absolute()) if Path(agent).is_dir() else agent
+    name = absolute_name(agent)
     source = reconstructed.source() or towns.source(name)
     rig = getattr(source, "rig", None)
     faults = inputs.faults(() if rig is None else tuple(rig.cameras))
@@ -57,7 +57,13 @@ def drive(
     workers = towns.workers or len(os.sched_getaffinity(0))
     with DrivesProgress(len(suite.jobs())) as progress:
         driven = drive_suite(
-            suite, out, workers, on_ray=towns.ray, tick=progress.tick, report=lambda _: _write_report(out)
+            suite,
+            out,
+            workers,
+            on_ray=towns.ray,
+            tick=progress.tick,
+            report=lambda _: _write_report(out),
+            tried=lambda text: print(f"{name} was {text}", flush=True),
         )
     check_driven(driven)
     _tell(driven)

@@ -107,7 +107,8 @@ class InTowns:
         conditions: clear, morning, overcast, dusk, night, rain, night_rain, fog or night_fog; any: drawn for
             each drive; by default a bright day.
         rig: Cameras of the vehicle: surround (six in all directions), driving (the same and a narrow one for
-            traffic lights), front_tele (two front cameras), or a YAML file of image_hw and cameras. By
+            traffic lights), front_tele (two front cameras), navsim (eight, of nuPlan's size), or a YAML file
+            of image_hw and cameras. By
             default that of the agent's training logs.
         other_rig: Drive with a rig that the agent was not trained with.
         raise_cameras: Height by which all cameras are higher than in the rig, m. Needs --other-rig.

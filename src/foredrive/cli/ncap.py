@@ -9,6 +9,7 @@ from foredrive.cli.arguments import OptionalPath, check_number, check_out_folder
 from foredrive.cli.drive import DrivesProgress, check_driven
 from foredrive.errors import InputError
 from foredrive.lazy import importing
+from foredrive.runs.drive.agents import absolute_name
 
 
 def ncap(
@@ -79,7 +80,7 @@ def ncap(
         from foredrive.view.ncap_tables import safety_table
         from foredrive.view.table import Table, print_table
 
-    name = str(Path(agent).absolute()) if Path(agent).is_dir() else agent
+    name = absolute_name(agent)
     source = SafetyTests(
         folders,
         str(scenarios.absolute()),

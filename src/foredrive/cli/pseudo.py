@@ -8,6 +8,7 @@ import tyro
 from foredrive.cli.arguments import check_number, check_out_folder, check_reconstruction
 from foredrive.errors import InputError
 from foredrive.lazy import importing
+from foredrive.runs.drive.agents import absolute_name
 
 
 def pseudo(
@@ -44,7 +45,7 @@ def pseudo(
         from foredrive.view.pseudo_table import pseudo_table
         from foredrive.view.table import print_table
 
-    name = str(Path(agent).absolute()) if Path(agent).is_dir() else agent
+    name = absolute_name(agent)
     summary = pseudo_simulate([str(folder.absolute()) for folder in reconstructed], name, out, every)
     print_table(pseudo_table(summary), Console())
     print(f"wrote {out / 'summary.json'}")

@@ -57,7 +57,8 @@ def record(
             For a number, seeds are chosen whose routes turn left, turn right and go straight equally often.
         rate: Frames per second.
         rig: Cameras of the vehicle: surround (six in all directions), driving (the same and a narrow one for
-            traffic lights), front_tele (two front cameras), or a YAML file of image_hw and cameras.
+            traffic lights), front_tele (two front cameras), navsim (eight, of nuPlan's size), or a YAML file
+            of image_hw and cameras.
         image_size: Size of the images (height, width), px; by default the rig's.
         vehicles: Number of vehicles on the road near the ego vehicle; from a range, drawn for each drive.
         people: Number of pedestrians, where the town has walkways; from a range, drawn for each drive.

@@ -104,7 +104,29 @@ FRONT_TELE = RigPlan(
 """A wide and a narrow front camera: what a small driver sees. From a stop line, the lamps beyond a junction
 are up to 20° aside, where the wide camera shows them in less than a pixel. The narrow one has 2 px at 40 m.
 """
-RIGS: Mapping[str, RigPlan] = {"surround": SURROUND, "driving": DRIVING, "front_tele": FRONT_TELE}
+NAVSIM = RigPlan(
+    (1080, 1920),
+    {
+        name: Mount((x_m, y_m, 1.6), yaw_deg, 64.0)
+        for name, x_m, y_m, yaw_deg in (
+            ("PCAM_F0", 1.70, 0.00, 0.0),
+            ("PCAM_L0", 1.52, 0.49, 55.0),
+            ("PCAM_R0", 1.52, -0.49, -55.0),
+            ("PCAM_L1", 1.03, 0.48, 110.0),
+            ("PCAM_R1", 1.03, -0.48, -110.0),
+            ("PCAM_L2", 0.30, 0.45, 140.0),
+            ("PCAM_R2", 0.30, -0.45, -140.0),
+            ("PCAM_B0", 0.03, 0.00, 180.0),
+        )
+    },
+)
+"""Eight cameras in all directions with the size and about the field of view of nuPlan's."""
+RIGS: Mapping[str, RigPlan] = {
+    "surround": SURROUND,
+    "driving": DRIVING,
+    "front_tele": FRONT_TELE,
+    "navsim": NAVSIM,
+}
 
 
 def find_rig(name: str) -> RigPlan:

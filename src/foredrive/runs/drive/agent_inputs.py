@@ -5,13 +5,14 @@ from dataclasses import dataclass
 
 from foredrive.driving.observation import FRAME_DT_S
 from foredrive.errors import InputError
+from foredrive.integrations.own_agents import needs_of
 from foredrive.integrations.remote.json_http import read_address
 from foredrive.methods.reconstruction.vehicle import LoggedVehicle
 from foredrive.runs.drive.agents import Sees, agent_folder, find_agent, is_remote
 from foredrive.runs.train.driver import is_driver, open_driver
 from foredrive.runs.train.rigs import TrainedRigs, check_rig, read_rigs
 from foredrive.runs.train.run import open_run
-from foredrive.sensors.rigs import SURROUND, RigPlan, rig_of_cameras
+from foredrive.sensors.rigs import DRIVING, NAVSIM, SURROUND, RigPlan, rig_of_cameras
 
 
 @dataclass(frozen=True)
@@ -56,6 +57,10 @@ def inputs_of(agent: str) -> AgentInputs:
     if kind.sensors == "remote":
         read_address(agent, kind.name.removesuffix("://"))
         return AgentInputs(cameras=True, lidar=False, past_frames=1)
+    if kind.sensors == "declared":
+        needs = needs_of(agent)
+        names = None if needs.cameras == "all" else needs.cameras
+        return AgentInputs(names != (), needs.lidar, needs.past_frames, names)
     if kind.sensors in ("none", "lidar"):
         return AgentInputs(cameras=False, lidar=kind.sensors == "lidar", past_frames=1)
     folder = agent_folder(agent, argument)
@@ -69,9 +74,30 @@ def inputs_of(agent: str) -> AgentInputs:
 
 
 def rig_of(agent: str) -> RigPlan:
-    """Return the rig that most of an agent's training logs have; the surround rig if the agent has none."""
+    """Return the rig that most of an agent's training logs have, or that it declares; else the surround rig.
+
+    Raises:
+        InputError: it declares a camera that no rig has.
+    """
+    if find_agent(agent)[0].sensors == "declared":
+        return _declared_rig(agent)
     rigs = _rigs_of(agent)
     return SURROUND if rigs is None else rigs.usual
+
+
+def _declared_rig(agent: str) -> RigPlan:
+    """Return the cameras of a town that an agent of a user's class declares, in the size that it declares."""
+    needs, usual = needs_of(agent), SURROUND
+    if needs.cameras not in ("all", ()):
+        pool = NAVSIM.cameras if agent.startswith("navsim:") else {**NAVSIM.cameras, **DRIVING.cameras}
+        by_name, chosen = {name.lower(): name for name in pool}, {}
+        for declared in needs.cameras:
+            if declared.lower() not in by_name:
+                raise InputError(f"{agent}: needs the camera {declared}; towns have {', '.join(pool)}")
+            name = by_name[declared.lower()]
+            chosen[name] = pool[name]
+        usual = RigPlan(SURROUND.image_hw, chosen)
+    return usual if needs.image_hw is None else usual.of_size(needs.image_hw)
 
 
 def chosen_cameras(agent: str, cameras: Sequence[str]) -> list[str]:
@@ -93,6 +119,8 @@ def own_rig(agent: str, vehicle: LoggedVehicle) -> RigPlan | None:
     Only an agent that requires cameras by name has cameras of its own.
     """
     required, rigs = inputs_of(agent).camera_names, _rigs_of(agent)
+    if find_agent(agent)[0].sensors == "declared":
+        return _declared_cameras(agent, vehicle)
     if required is None or rigs is None or len(required) != len(rigs.usual.cameras):
         return None
     logged, usual = rig_of_cameras(vehicle.rig), rigs.usual
@@ -102,6 +130,21 @@ def own_rig(agent: str, vehicle: LoggedVehicle) -> RigPlan | None:
     except InputError:  # a camera is missing, stands elsewhere or has another field of view
         return RigPlan(usual.image_hw, dict(zip(required, usual.cameras.values(), strict=True)))
     return None
+
+
+def _declared_cameras(agent: str, vehicle: LoggedVehicle) -> RigPlan | None:
+    """Return the cameras that an agent declares, where the log has cameras of its names; None if all fit."""
+    needs, logged = needs_of(agent), rig_of_cameras(vehicle.rig)
+    if needs.cameras in ("all", ()):
+        same = needs.image_hw in (None, logged.image_hw)
+        return None if same or needs.image_hw is None else logged.of_size(needs.image_hw)
+    places, mounts = _declared_rig(agent).cameras, {}
+    for name, usual in zip(needs.cameras, places.values(), strict=True):
+        try:
+            mounts[name] = logged.cameras[vehicle.rig.names[vehicle.camera(name)]]
+        except InputError:
+            mounts[name] = usual
+    return RigPlan(needs.image_hw or logged.image_hw, mounts)
 
 
 def check_rig_of(agent: str, rig: RigPlan) -> None:

@@ -164,6 +164,12 @@ def _build_grpc(setup: AgentSetup) -> "Agent":
     return GrpcDriver(read_address(setup.agent, "grpc"), setup.clock)
 
 
+def _build_own(setup: AgentSetup) -> "Agent":
+    from foredrive.integrations.own_agents import own_agent
+
+    return own_agent(setup.agent)
+
+
 def _check_http(agent: str) -> None:
     from foredrive.integrations.remote.json_http import read_address
     from foredrive.integrations.remote.planner_client import check_planner
@@ -192,9 +198,9 @@ class AgentKind:
     """Builds the agent of one drive."""
     argument: str = ""
     """Word for the argument in help."""
-    sensors: Literal["none", "lidar", "remote", "trained", "ego"] = "none"
-    """Sensors that it is shown: none, lidar, what another process asks for, the cameras of its run, or the
-    key frames of its run without images."""
+    sensors: Literal["none", "lidar", "remote", "trained", "ego", "declared"] = "none"
+    """Sensors that it is shown: none, lidar, what another process asks for, the cameras of its run, the key
+    frames of its run without images, or what its class declares."""
     of_driver: bool = False
     """Tells whether its run must be that of a driver."""
     of_log: bool = False
@@ -281,6 +287,21 @@ AGENTS: tuple[AgentKind, ...] = (
         ready=_check_grpc,
     ),
     AgentKind(
+        "python:",
+        "a class of your own: its act(clip) returns points x, y, 0.5 s apart, and its needs name cameras, "
+        "image_hw, lidar and past_frames; ?NAME=VALUE&… behind it are its arguments",
+        _build_own,
+        "FILE.py:CLASS",
+        "declared",
+    ),
+    AgentKind(
+        "navsim:",
+        "an agent of NAVSIM's interface, whose arguments follow it as above",
+        _build_own,
+        "MODULE:CLASS",
+        "declared",
+    ),
+    AgentKind(
         "",
         "the agent of a run folder; embedded or embedded:NAME comes with the package",
         _build_run,
@@ -306,6 +327,20 @@ def agents_help() -> str:
         + "; ".join(f"{kind.name}{kind.argument}: {kind.knows}" for kind in (AGENTS[-1], *AGENTS[:-1]))
         + "."
     )
+
+
+def absolute_name(agent: str) -> str:
+    """Return the name of an agent for processes in other folders: with absolute paths of its run or file."""
+    if find_agent(agent)[0].sensors == "declared":
+        from foredrive.integrations.own_agents import absolute
+
+        return absolute(agent)
+    return str(Path(agent).absolute()) if Path(agent).is_dir() else agent
+
+
+def is_foreign(agent: str) -> bool:
+    """Return whether an agent is of another program, so that it is tried before the first drive."""
+    return find_agent(agent)[0].sensors in ("remote", "declared")
 
 
 def check_without_log(agent: str) -> None:

@@ -31,7 +31,8 @@ from foredrive.engine.interrupts import start_fork_server
 from foredrive.engine.summary import write_summary
 from foredrive.errors import InputError
 from foredrive.files import atomic_path, together
-from foredrive.runs.drive.agents import check_ready
+from foredrive.runs.drive.agents import check_ready, is_foreign
+from foredrive.runs.drive.preflight import try_agent
 from foredrive.runs.drive.records import read_drive, read_suite, summarise, write_drive
 from foredrive.scene import Agent, Simulator
 
@@ -159,6 +160,7 @@ def drive_suite(
     on_ray: bool = False,
     tick: Callable[[DriveJob, DriveRecord | None], None] = lambda job, drive: None,
     report: Callable[[SuiteResult], object] = lambda driven: None,
+    tried: Callable[[str], object] = lambda text: None,
 ) -> SuiteResult:
     """Drive all jobs that have no record in the folder yet; write the summary when every job has one.
 
@@ -167,9 +169,11 @@ def drive_suite(
             `fan_out.fan_out`.
         tick: called after each drive with its record, or None if the drive broke.
         report: writes the report of a whole suite, which appears together with its summary.
+        tried: called with the result of the trial, in words, if the agent is of another program.
 
     Raises:
-        InputError: there is no such agent, it is in another process and not alive, or there are no drives;
+        InputError: there is no such agent, it is in another process and not alive, it fails in its trial, or
+            there are no drives;
             the folder holds another suite, or another process drives into it; a drive of a source with
             `in_turn` cannot be set up.
         OSError: the disk is full.
@@ -178,6 +182,11 @@ def drive_suite(
     threads = None if in_turn else max(1, torch.get_num_threads() // workers)
     work = functools.partial(drive_one, suite=suite, out=out, threads=threads)
     drives, broken = dict[DriveJob, DriveRecord](), dict[DriveJob, str]()
+    missing = [job for job in jobs if not _file(out, job).is_file()]
+    # Before the folder is there: an agent that fails leaves nothing
+    if missing and is_foreign(suite.agent):
+        check_ready(suite.agent)
+        tried(try_agent(suite, missing[0]).text(suite.period_s))
     with folder_of(suite, out).claimed():
         for job in jobs:
             if _file(out, job).is_file():
@@ -185,8 +194,6 @@ def drive_suite(
                 tick(job, drives[job])
         skipped = len(drives)
         todo = [job for job in jobs if job not in drives]
-        if todo:
-            check_ready(suite.agent)
         if not in_turn:
             start_fork_server(preload=type(suite.source).__module__)  # workers share the imported modules
         results = _in_turn(todo, work) if in_turn else fan_out(todo, work, workers, on_ray=on_ray)
