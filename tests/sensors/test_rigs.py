@@ -105,5 +105,5 @@ def test_a_wrong_file_is_one_line(text: str, message: str, tmp_path: Path) -> No
 
 
 def test_an_unknown_rig_names_the_known_ones() -> None:
-    with pytest.raises(InputError, match="no rig 'sidewinder': surround, driving, front_tele, navsim, or a YAML"):
+    with pytest.raises(InputError, match=r"no rig 'sidewinder': surround, .*, navsim, or"):
         find_rig("sidewinder")

@@ -11,6 +11,7 @@ from jaxtyping import Float64
 
 from foredrive.data.batches import stack_records
 from foredrive.debugging import profile_step
+from foredrive.driving.bench2drive import EfficiencyMeter
 from foredrive.driving.comfort import JERK_S, Comfort, comfort_of
 from foredrive.driving.controller import ControllerState, follow
 from foredrive.driving.dynamics import EGO, STEP_S
@@ -67,6 +68,8 @@ class Drive:
     """Error of the agent; empty if there was none."""
     plans: tuple[tuple[int, Float64[np.ndarray, "_ 2"]], ...] = ()
     """For each plan the step at which it was made, and its points in the ego frame then, m."""
+    efficiency_pct: float | None = None
+    """Bench2Drive's driving efficiency; None if the drive is too short to tell."""
 
 
 @runtime_checkable
@@ -136,6 +139,7 @@ def drive_route(
     states, events, nearest, act_s = [simulator.ego()], list[Event](), [_nearest_s(clip)], list[float]()
     plans = list[tuple[int, np.ndarray]]()
     pilot, ending, error = pilot or FollowingPilot(simulator, pace.latency_s), None, ""
+    efficiency = EfficiencyMeter()
     while ending is None:
         index = len(states) - 1
         profile_step()
@@ -157,6 +161,8 @@ def drive_route(
         if step.clip is not clip:
             clip = step.clip
             nearest.append(_nearest_s(clip))
+            completion = simulator.progress().completion
+            efficiency.see(float(clip.ego_speed_mps[clip.now]), clip.boxes[clip.now], completion)
             on_frame()
         # The first event that is an ending ends the drive
         ending = next((Ending(event.kind) for event in step.events if event.kind in set(Ending)), None)
@@ -167,7 +173,15 @@ def drive_route(
     )
     comfort = comfort_of(states) if len(states) * STEP_S > JERK_S + STEP_S else None
     return Drive(
-        score, tuple(states), tuple(events), tuple(nearest), tuple(act_s), comfort, error, tuple(plans)
+        score,
+        tuple(states),
+        tuple(events),
+        tuple(nearest),
+        tuple(act_s),
+        comfort,
+        error,
+        tuple(plans),
+        efficiency.result(score.completion),
     )
 
 

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64
 
+from foredrive.driving.bench2drive import smoothness_of
 from foredrive.driving.comfort import Comfort
 from foredrive.driving.drive import Drive
 from foredrive.driving.dynamics import STEP_S
@@ -58,6 +59,9 @@ class DriveRecord:
     """False if departures from the lanes cannot be detected."""
     trusted_share: float | None = None
     """Share of the key frames that the reconstruction trusts; None where it was not asked, and in towns."""
+    efficiency_pct: float | None = None
+    smoothness_pct: float | None = None
+    """Bench2Drive's driving efficiency and smoothness; None if the drive is too short to tell."""
 
     @property
     def scenario_events(self) -> tuple[Event, ...]:
@@ -102,4 +106,6 @@ def record_of(
         threat=threat,
         lanes_known=lanes_known,
         trusted_share=trusted_share,
+        efficiency_pct=drive.efficiency_pct,
+        smoothness_pct=smoothness_of(drive.states),
     )

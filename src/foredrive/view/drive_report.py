@@ -40,6 +40,7 @@ LEADERBOARDS = {
     "driving_score_1_0": "Driving score, leaderboard 1.0",
     "driving_score_2_1": "Driving score, leaderboard 2.1",
 }
+BENCH2DRIVE = {"success": "Success", "efficiency": "Efficiency", "smoothness": "Smoothness"}
 SCORES = {**LEADERBOARDS, "completion": "Route completion, %"}
 
 
@@ -83,6 +84,12 @@ def score_table(summary: Summary) -> Table:
         Row([f"ended: {words(ending)}", summary[f"endings.{ending}"]])
         for ending in Ending
         if ending is not Ending.COMPLETED and summary[f"endings.{ending}"]
+    ]
+    # Suites from before these metrics have none
+    scores += [
+        Row([f"{name} (Bench2Drive), %", number(summary[f"bench2drive.{key}_pct"], 1)])
+        for key, name in BENCH2DRIVE.items()
+        if f"bench2drive.{key}_pct" in summary
     ]
     rest = [
         Row(["Failed drives", summary["failed"]]),

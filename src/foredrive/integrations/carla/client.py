@@ -17,7 +17,8 @@ def import_carla() -> Any:
     try:
         return importlib.import_module("carla")
     except ImportError as error:
-        raise InputError(f"CARLA's client is missing: pip install 'foredrive[carla]' ({error})") from None
+        wanted = "pip install 'foredrive[carla]' for a server of 0.9.16, 'foredrive[carla-0915]' for 0.9.15"
+        raise InputError(f"CARLA's client is missing: {wanted} ({error})") from None
 
 
 def connect(host: str = "localhost", port: int = 2000, timeout_s: float = 10.0) -> Any:

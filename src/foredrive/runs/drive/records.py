@@ -9,6 +9,7 @@ from pathlib import Path
 
 from pydantic import TypeAdapter, ValidationError
 
+from foredrive.driving.bench2drive import Bench2DriveDrive, bench2drive_figures, succeeds
 from foredrive.driving.drive_record import DriveRecord
 from foredrive.driving.ncap.aggregation import TestedRun, aggregate
 from foredrive.driving.scores import score_suite
@@ -26,7 +27,7 @@ Figures = dict[str, float | int | str | None]
 def write_drive(path: Path, record: DriveRecord) -> None:
     """Write the record of a drive as JSON."""
     content = _RECORD.dump_python(record, mode="json")
-    for name in ("threat", "trusted_share"):
+    for name in ("threat", "trusted_share", "efficiency_pct", "smoothness_pct"):
         if content[name] is None:
             del content[name]
     write_json(path, content)
@@ -103,6 +104,18 @@ def summarise(drives: Sequence[DriveRecord]) -> Figures:
     trusted = [drive.trusted_share for drive in drives if drive.trusted_share is not None]
     if trusted:
         out["trusted_share"] = statistics.fmean(trusted)
+    figures = bench2drive_figures(
+        [
+            Bench2DriveDrive(
+                succeeds(drive.score),
+                drive.efficiency_pct,
+                drive.smoothness_pct,
+                frozenset(event.what for event in drive.scenario_events),
+            )
+            for drive in drives
+        ]
+    )
+    out |= {f"bench2drive.{name}": value for name, value in figures.items()}
     out["plan_ms"] = statistics.median(plan_ms) if plan_ms else None
     out["driven_s"] = sum(drive.score.duration_s for drive in drives)
     out["wall_s"] = sum(drive.wall_s for drive in drives)
