@@ -7,9 +7,14 @@ import pytest
 from html_pages import EVIL, assert_harmless
 
 from foredrive.cli.main import main
+from foredrive.driving.replay.threats import Threat
 from foredrive.engine.summary import read_summary
 from foredrive.errors import InputError
+from foredrive.runs.drive.baselines import same_drives
 from foredrive.runs.drive.compare import compare, figures_of, read_agent
+from foredrive.runs.drive.in_reconstruction import ReconstructedRoutes
+from foredrive.runs.drive.in_towns import TownRoutes
+from foredrive.runs.drive.suite import DriveSource, DriveSuite
 from foredrive.view.compare_report import means_table, routes_table
 
 Given = dict[tuple[str, int], tuple[float, list[str], str]]
@@ -66,6 +71,48 @@ SEEING: Given = {
     ("10", 0): (1.0, [], DONE),
     ("11", 0): (1.0, [], DONE),
 }
+
+
+def test_a_failed_drive_is_no_bad_drive(tmp_path: Path) -> None:
+    """The agent broke on route 2 and would be ranked last by it; the drive is left out and counted."""
+    breaks: Given = {**SEEING, ("2", 0): (0.0, [], "crashed"), ("12", 0): (0.1, [], "crashed")}
+    agents = [read_agent(str(suite(tmp_path / name, of))) for name, of in (("b", BLIND), ("s", breaks))]
+    compared = compare(agents, resamples=500)
+    assert [route for route, *_ in compared.keys] == ["1", "10"]
+    assert compared.differences["driving_score_1_0"]["s"].mean == pytest.approx((30 + 70) / 2)
+    figures = figures_of(compared)
+    assert (figures["b.failed"], figures["s.failed"]) == (0, 2)
+    assert (figures["s.rank"], figures["b.rank"]) == (1.0, 2.0)
+    assert compared.rated_routes == ("1", "2", "10", "11")
+    with pytest.raises(InputError, match=r"in common \(failed drives: all 1\)"):
+        compare([agents[0], read_agent(str(suite(tmp_path / "all", {("1", 0): (0.5, [], "crashed")})))])
+
+
+@pytest.mark.parametrize(
+    "source",
+    [
+        TownRoutes("town05-short", 2, 7, "night", vehicles=3, people=1, only=("4", "9"), scenarios=False),
+        ReconstructedRoutes("runs/a", (1.0, 2.5), (Threat.FRONTAL, Threat.SIDE), "edits.yaml", True),
+        ReconstructedRoutes("runs/a"),
+    ],
+)
+def test_baselines_have_the_same_drives(source: DriveSource, tmp_path: Path) -> None:
+    suite = DriveSuite("embedded", source, period_s=1.0, latency_s=0.2)
+    (tmp_path / "suite.json").write_text(json.dumps(suite.noted()))
+    baseline = same_drives(tmp_path, "stop")
+    assert baseline.source == source
+    assert (baseline.agent, baseline.sensors, baseline.period_s, baseline.latency_s) == (
+        "stop",
+        False,
+        1.0,
+        0.2,
+    )
+    (tmp_path / "suite.json").write_text(
+        json.dumps(suite.noted() | {"server": "localhost:2000", "run": None})
+    )
+    if isinstance(source, TownRoutes):
+        with pytest.raises(InputError, match="baselines drive in towns and reconstructed logs alone"):
+            same_drives(tmp_path, "stop")
 
 
 def test_differences_by_hand(tmp_path: Path) -> None:

@@ -12,21 +12,27 @@ from foredrive.driving.observation import FRAME_DT_S, HORIZON_STEPS
 from foredrive.driving.replay.logged_drive import LoggedDrive
 from foredrive.scene import Clip, Trajectory
 
+STANDS_MPS = 0.5
+"""A slower vehicle stands."""
+
 
 @dataclass(frozen=True)
 class StraightAgent:
-    """Agent that drives straight on at a constant speed. At speed 0 it stands still.
-
-    Drives begin at rest, so the constant-velocity baseline of open-loop evaluation would never move.
-    """
+    """Agent that drives straight on at a constant speed. At speed 0 it stands still."""
 
     speed_mps: float
+    keeps: bool = False
+    """If True, it keeps the speed that it has, and takes `speed_mps` only when it stands, as drives in towns
+    begin."""
 
     def act(self, observation: Clip) -> Trajectory:
-        """Return the same plan for every item of the batch."""
-        x = self.speed_mps * FRAME_DT_S * torch.arange(1, HORIZON_STEPS + 1)
-        xy = torch.stack([x, torch.zeros_like(x)], dim=-1)
-        return plan_of(xy.expand(len(observation.t_s), 1, -1, -1))
+        """Return a straight plan for every item of the batch."""
+        speed = torch.full((len(observation.t_s), 1), self.speed_mps)
+        if self.keeps:
+            now = observation.ego_speed_mps[:, observation.now, None].to(speed)
+            speed = torch.where(now > STANDS_MPS, now, speed)
+        x = speed * FRAME_DT_S * torch.arange(1, HORIZON_STEPS + 1)
+        return plan_of(torch.stack([x, torch.zeros_like(x)], dim=-1)[:, None])
 
 
 @dataclass(frozen=True, eq=False)

@@ -45,7 +45,7 @@ def means_table(comparison: Comparison) -> Table:
             cells.append(_difference(metric, comparison.differences[metric][agent.name], digits))
         rows.append(Row(cells))
     notes = [
-        f"{len(comparison.keys)} drives of {len(comparison.routes)} routes that all agents have. "
+        f"Drives that all agents have: {len(comparison.keys)}, on {len(comparison.routes)} routes. "
         f"Differences from {first.name} with 95 % intervals (paired bootstrap over routes); coloured where "
         "the interval leaves out 0."
     ]
@@ -57,6 +57,47 @@ def means_table(comparison: Comparison) -> Table:
             "same traffic."
         )
     return Table(columns, [Section(rows)], "Agents side by side", notes)
+
+
+def ranking_table(comparison: Comparison) -> Table:
+    """Return the agents in the order of their abilities."""
+    columns = [
+        Column("agent", align="left"),
+        Column("rank"),
+        Column("ability, logits", wraps=False),
+        Column("drives"),
+        Column("mean score", digits=1),
+        Column("failed"),
+    ]
+    rows = []
+    for agent, ability, rank in zip(
+        comparison.agents, comparison.ratings.ability, comparison.ratings.rank, strict=True
+    ):
+        scores = [drive.driving_score_1_0 for drive in agent.drives.values() if not drive.score.failed]
+        places = f"{rank.value:.3g} [{rank.low:.3g}, {rank.high:.3g}]"
+        logits = f"{ability.value:+.2f} [{ability.low:+.2f}, {ability.high:+.2f}]"
+        cells: list[Cell | str | float | None] = [agent.name, places, logits, len(scores)]
+        rows.append((-ability.value, [*cells, statistics.fmean(scores), agent.failed]))
+    rows.sort(key=lambda row: row[0])
+    notes = [
+        "By an item-response model of all drives of each agent: the logit of an expected score is the "
+        "ability minus the difficulty of the route. Intervals of 95 % over routes. Drives in which the agent "
+        "itself failed count for nothing."
+    ]
+    return Table(columns, [Section([Row(cells) for _, cells in rows])], "Ranking", notes)
+
+
+def difficulties_table(comparison: Comparison) -> Table:
+    """Return the routes, the hardest first."""
+    columns = [Column("route", align="left"), Column("difficulty, logits", wraps=False)]
+    hardest = sorted(
+        zip(comparison.rated_routes, comparison.ratings.difficulty, strict=True),
+        key=lambda row: -row[1].value,
+    )
+    rows: list[list[Cell | str | float | None]] = [
+        [route, f"{of.value:+.2f} [{of.low:+.2f}, {of.high:+.2f}]"] for route, of in hardest
+    ]
+    return simple_table(columns, rows, "Difficulty of the routes")
 
 
 def routes_table(comparison: Comparison, shown: int | None = None) -> Table:
@@ -99,6 +140,8 @@ def write_compare_report(path: Path, comparison: Comparison) -> None:
         "compare_report.html.j2",
         title=", ".join(agent.name for agent in comparison.agents),
         means=means_table(comparison),
+        ranking=ranking_table(comparison),
+        difficulties=difficulties_table(comparison),
         scatters=[_scatter(comparison, other) for other in range(1, len(comparison.agents))],
         routes=routes_table(comparison),
         drives=drives_table(comparison),

@@ -16,7 +16,10 @@ if TYPE_CHECKING:
     from foredrive.towns.driving.town import TownSimulator
 
 CRUISE_MPS = 5.0
-EXPERT, DISTURBED, IDM, STOP, CONSTANT_VELOCITY = "expert", "disturbed", "idm", "stop", "constant-velocity"
+EXPERT, DISTURBED, IDM = "expert", "disturbed", "idm"
+STOP, CONSTANT_VELOCITY, GO_STRAIGHT = "stop", "constant-velocity", "go-straight"
+BASELINES = (STOP, CONSTANT_VELOCITY, GO_STRAIGHT)
+"""The agents beside which every other should be seen."""
 REPLAY, CORRIDOR = "log", "lidar-corridor"
 NEEDS_TOWN = "the expert and idm read the state of an embedded town and can drive only there"
 
@@ -69,11 +72,11 @@ def _build_idm(setup: AgentSetup) -> "Agent":
     return IdmAgent(truth.path, truth.view)
 
 
-def _straight_on(speed_mps: float) -> Callable[[AgentSetup], "Agent"]:
+def _straight_on(speed_mps: float, *, keeps: bool = False) -> Callable[[AgentSetup], "Agent"]:
     def build(setup: AgentSetup) -> "Agent":
         from foredrive.driving.simple_agents import StraightAgent
 
-        return StraightAgent(speed_mps)
+        return StraightAgent(speed_mps, keeps)
 
     return build
 
@@ -218,6 +221,11 @@ AGENTS: tuple[AgentKind, ...] = (
     ),
     AgentKind(STOP, "never starts", _straight_on(0.0)),
     AgentKind(CONSTANT_VELOCITY, "straight on at 5 m/s", _straight_on(CRUISE_MPS)),
+    AgentKind(
+        GO_STRAIGHT,
+        "straight on at the speed that it has, from rest at 5 m/s",
+        _straight_on(CRUISE_MPS, keeps=True),
+    ),
     AgentKind(DISTURBED, "the expert under disturbances, for demonstrations", _build_disturbed),
     AgentKind(REPLAY, "in a reconstruction: repeats the logged drive", _build_of_log, of_log=True),
     AgentKind(

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from foredrive.driving.drive_record import DriveRecord
+from foredrive.driving.item_response import Ratings, rate
 from foredrive.driving.scores import Ending, InfractionKind
 from foredrive.engine.folder import DRIVES
 from foredrive.errors import InputError
@@ -43,6 +44,18 @@ class ComparedAgent:
     name: str
     folders: tuple[Path, ...]
     drives: Mapping[Key, DriveRecord]
+
+    @property
+    def failed(self) -> int:
+        """Return the number of drives in which the agent raised an error or gave no plan.
+
+        What failed says nothing about driving, so it is left out of all figures.
+        """
+        return sum(drive.score.failed for drive in self.drives.values())
+
+    def driven(self) -> set[Key]:
+        """Return the drives that did not fail."""
+        return {key for key, drive in self.drives.items() if not drive.score.failed}
 
     def values(self, metric: str, keys: Sequence[Key]) -> list[float]:
         """Return the values of a metric for some drives."""
@@ -79,6 +92,10 @@ class Comparison:
     """Those that separate the agents most come first."""
     unlike: tuple[str, ...]
     """Settings in which the folders differ, so that drives of a pair did not meet the same traffic."""
+    ratings: Ratings
+    """Abilities of the agents and difficulties of the routes, from all drives that did not fail."""
+    rated_routes: tuple[str, ...]
+    """The routes of the difficulties."""
 
 
 def values_of(drive: DriveRecord) -> dict[str, float]:
@@ -136,9 +153,11 @@ def compare(agents: Sequence[ComparedAgent], seed: int = 0, resamples: int = 10_
     names = [agent.name for agent in agents]
     if len(set(names)) < len(names):
         raise InputError(f"two agents have the same name ({', '.join(names)}): write NAME=FOLDER")
-    common = set.intersection(*(set(agent.drives) for agent in agents))
+    common = set.intersection(*(agent.driven() for agent in agents))
     if not common:
-        raise InputError("the folders have no route and repetition in common, so nothing can be compared")
+        failed = ", ".join(f"{agent.name} {agent.failed}" for agent in agents if agent.failed)
+        reason = f" (failed drives: {failed})" if failed else ""
+        raise InputError(f"the folders have no route and repetition in common{reason}: nothing to compare")
     keys = tuple(sorted(common, key=_order))
     routes = [route for route, *_ in keys]
     differences: dict[str, dict[str, BootstrapMean]] = {}
@@ -161,7 +180,23 @@ def compare(agents: Sequence[ComparedAgent], seed: int = 0, resamples: int = 10_
         differences,
         _rows(agents, keys),
         _unlike(agents),
+        *_rated(agents, seed),
     )
+
+
+def _rated(agents: Sequence[ComparedAgent], seed: int) -> tuple[Ratings, tuple[str, ...]]:
+    """Rate agents and routes by the driving score of leaderboard 1.0 in all drives that did not fail."""
+    rows = [
+        (number, key) for number, agent in enumerate(agents) for key in sorted(agent.driven(), key=_order)
+    ]
+    routes = list(dict.fromkeys(route for _, (route, *_) in sorted(rows, key=lambda row: _order(row[1]))))
+    ratings = rate(
+        np.array([agents[number].drives[key].driving_score_1_0 / 100 for number, key in rows]),
+        np.array([number for number, _ in rows]),
+        np.array([routes.index(route) for _, (route, *_) in rows]),
+        np.random.default_rng(seed),
+    )
+    return ratings, tuple(routes)
 
 
 def figures_of(comparison: Comparison) -> dict[str, float | int | str | None]:
@@ -177,6 +212,14 @@ def figures_of(comparison: Comparison) -> dict[str, float | int | str | None]:
     for agent in comparison.agents:
         for metric in METRICS:
             out[f"{agent.name}.{metric}"] = statistics.fmean(agent.values(metric, comparison.keys))
+    for number, agent in enumerate(comparison.agents):
+        out[f"{agent.name}.failed"] = agent.failed
+        for name, estimate in (
+            ("ability", comparison.ratings.ability[number]),
+            ("rank", comparison.ratings.rank[number]),
+        ):
+            for part, end in (("value", ""), ("low", ".low"), ("high", ".high")):
+                out[f"{agent.name}.{name}{end}"] = getattr(estimate, part)
     for metric, of_agents in comparison.differences.items():
         for name, metrics in of_agents.items():
             for part, value in dataclasses.asdict(metrics).items():
