@@ -23,6 +23,7 @@ from ncore.data.v4 import (
     CuboidsComponent,
     IntrinsicsComponent,
     LidarSensorComponent,
+    MasksComponent,
     PosesComponent,
     SequenceComponentGroupsReader,
     SequenceComponentGroupsWriter,
@@ -209,6 +210,7 @@ def write_foreign(folder: Path, store_type: str = "itar", *, poses: bool = True)
             intensity = np.where(np.isnan(returns), np.nan, 0.5).astype(np.float32)
             lidar.store_frame(direction, at_us, None, returns, intensity, span_us, {}, {})
     camera = register(CameraSensorComponent.Writer, "fish", "fish")
+    register(MasksComponent.Writer, "own").store_camera_masks("fish", {"ego": Image.new("L", (160, 120))})
     for shot in range(8):
         begin_us = START_US + shot * SWEEP_US // 2
         camera.store_frame(fisheye_image(begin_us), "png", np.array([begin_us, begin_us], np.uint64), {}, {})
@@ -280,7 +282,7 @@ def test_a_sequence_of_another_program(store_type: str, tmp_path: Path) -> None:
     assert torch.cos(heading - 0.3).tolist() == pytest.approx([1.0, 1.0], abs=1e-5)
     assert boxes.category.tolist() == [Category.CAR, Category.OTHER]
     told = "\n".join(read_notices(path.folder))
-    for fact in ("hovercraft", "opencv-fisheye", "several returns", "vehicle-bbox"):
+    for fact in ("hovercraft", "opencv-fisheye", "several returns", "vehicle-bbox", "masks"):
         assert fact in told
 
 

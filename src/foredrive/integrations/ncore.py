@@ -34,17 +34,8 @@ from upath import UPath
 
 from foredrive.data.boxes import frames_with_boxes, read_boxes
 from foredrive.data.cameras import CameraFrame, camera_mount, encoded_image, pinhole_cameras, read_camera
-from foredrive.data.formats.ncore import (
-    ANNOTATED,
-    FRAME_TIMES,
-    FREE_RANGE,
-    OF_FOREDRIVE,
-    RIG,
-    VEHICLE,
-    VELOCITY,
-    WHEELBASE,
-    WORLD,
-)
+from foredrive.data.formats.ncore import ANNOTATED, OF_FOREDRIVE, VEHICLE, VELOCITY, WHEELBASE
+from foredrive.data.formats.ncore_sensors import FRAME_TIMES, FREE_RANGE, RIG, WORLD
 from foredrive.data.lidar import frames_with_lidar, lidar_mounts, read_sweep
 from foredrive.data.logs import Log
 from foredrive.errors import InputError
