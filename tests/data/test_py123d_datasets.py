@@ -17,6 +17,7 @@ import raw_waymo
 from PIL import Image
 from plyfile import PlyData, PlyElement
 from py123d.datatypes import CameraID
+from py123d.parser.nureasoning.utils import nureasoning_schema as nureasoning
 from py123d.parser.truckdrive.truckdrive_constants import LABEL_MAPPING, MAPPED_CATEGORIES
 from scipy.spatial.transform import Rotation
 from test_raw_pandaset import Intruder
@@ -31,7 +32,7 @@ from foredrive.data.maps import read_map_patch
 from foredrive.data.notices import read_notices
 from foredrive.data.safe_pickle import PlainPickle
 from foredrive.errors import InputError
-from foredrive.scene import Attribute, Category, Visibility
+from foredrive.scene import Attribute, Category, MapKind, Visibility
 from foredrive.scene.boxes import UNKNOWN
 
 HAS_NUSCENES = importlib.util.find_spec("nuscenes") is not None
@@ -347,6 +348,115 @@ def test_waymo_motion(tmp_path: Path) -> None:
     boxes = read_boxes(log, 1)
     assert boxes is not None
     assert len(boxes.centre) == 1
+
+
+def write_nureasoning(folder: Path) -> Path:
+    """Three frames of a turning car with a camera, a sweep, a box and a lane, by nuReasoning's schema."""
+    clip = folder / "train" / "part_1" / "2025.01.01_drive_abc"
+    for name in ("cameras/CAM_M_F", "lidar", "ego_state", "annotations"):
+        (clip / name).mkdir(parents=True)
+    frames = []
+    for k in range(3):
+        t_us, yaw = 1_000_000 + 100_000 * k, 0.5 + 0.1 * k
+        x, y = 100.0 + k, 50.0 + 0.5 * k
+        turn = dict(zip(("qx", "qy", "qz", "qw"), Rotation.from_euler("z", yaw).as_quat(), strict=True))
+        pose = {"x": x, "y": y, "z": 2.35, "yaw": yaw} | {key: float(value) for key, value in turn.items()}
+        still = {"ax": 0.0, "ay": 0.0, "az": 0.0}
+        ego = nureasoning.EgoState(pose, {"vx": 9.0, "vy": 0.0, "vz": 0.0}, still)
+        car = nureasoning.ObjectAnnotation(
+            "t1", "vehicle.truck", {"x": 120.0, "y": 50.0, "z": 3.0, "yaw": 1.5},
+            {"vx": 0.0, "vy": 4.0, "vz": 0.0}, {"l": 6.0, "w": 2.5, "h": 3.0},
+        )  # fmt: skip
+        light = nureasoning.TrafficLightState(1, "red", lane_connector_id=7)
+        dump_as_published(clip / f"ego_state/{t_us}.pkl", ego)
+        dump_as_published(clip / f"annotations/{t_us}.pkl", nureasoning.Annotations([car], [light]))
+        Image.new("RGB", (64, 48), (200, 100, 50)).save(clip / f"cameras/CAM_M_F/CAM_M_F_{t_us}.jpg")
+        types = [(name, "<f4") for name in ("x", "y", "z", "intensity")] + [
+            ("lidar_info", "u1"),
+            ("ring", "u1"),
+        ]
+        points = np.array([(10, 2, -0.35, 51, 0, 3), (0, 0, 0, 5, 1, 4)], dtype=types)
+        sizes = "SIZE 4 4 4 4 1 1\nTYPE F F F F U U\nPOINTS 2\nDATA binary\n"
+        header = f"FIELDS {' '.join(name for name, _ in types)}\n{sizes}"
+        (clip / f"lidar/{t_us}.pcd").write_bytes(header.encode() + points.tobytes())
+        frames.append(
+            {
+                "timestamp_us": t_us,
+                "ego_state": f"ego_state/{t_us}.pkl",
+                "annotations": f"annotations/{t_us}.pkl",
+                "reasoning": "",
+                "sensors": {
+                    "cameras": {"front": f"cameras/CAM_M_F/CAM_M_F_{t_us}.jpg"},
+                    "lidar": {"point_cloud_path": f"lidar/{t_us}.pcd"},
+                },
+            }
+        )
+    lens = {
+        "intrinsic": [[60.0, 0, 32], [0, 60.0, 24], [0, 0, 1]],
+        "sensor2lidar_translation": [1.5, 0.1, 1.2],
+        "sensor2lidar_rotation": [[0, 0, 1], [-1, 0, 0], [0, -1, 0]],
+        "width": 64,
+        "height": 48,
+    }
+    size = {"length": 4.6, "width": 1.9, "height": 1.6, "vehicle_rear_length": 0.9}
+    metadata = {
+        "clip_location": "las vegas",
+        "ego_dimensions": size,
+        "camera_calibrations": {"CAM_M_F": lens},
+    }
+    (clip / "metadata.json").write_text(json.dumps(metadata | {"frames": frames}))
+    ring = [[90.0, 48, 0], [140, 48, 0], [140, 52, 0], [90, 52, 0], [90, 48, 0]]
+    lane = nureasoning.Lane(5, 0, ring, 1, 0, 13.9, [[90.0, 50, 0], [115, 50, 0], [140, 50, 0]])
+    dump_as_published(clip / "map.pkl", nureasoning.nuReasoningStaticMap(lanes=[lane]))
+    return clip
+
+
+def dump_as_published(file: Path, record: Any) -> None:
+    """Pickle a record as the published files name its class: of a module data_schema."""
+    data = pickle.dumps(record, protocol=2)
+    file.write_bytes(data.replace(nureasoning.__name__.encode(), b"data_schema"))
+
+
+def test_nureasoning(tmp_path: Path) -> None:
+    clip = write_nureasoning(tmp_path / "raw")
+    (path,) = convert(tmp_path / "raw", "nureasoning", tmp_path / "out")
+    assert path.name == f"nureasoning-mini_train/{clip.name}"
+    log = Log(path)
+    # The pose is that of the rear axle, 0.35 m above the ground
+    np.testing.assert_allclose(log.T_world_ego[:, :3, 3], [[100 + k, 50 + 0.5 * k, 2.0] for k in range(3)])
+    yaw = np.arctan2(log.T_world_ego[:, 1, 0], log.T_world_ego[:, 0, 0])
+    np.testing.assert_allclose(yaw, [0.5, 0.6, 0.7])
+    boxes = read_boxes(log, 1)
+    assert boxes is not None
+    world = log.T_world_ego[1] @ [*boxes.centre[0].tolist(), 1.0]
+    np.testing.assert_allclose(world[:3], [120, 50, 3.0], atol=1e-4)
+    assert float(boxes.yaw[0]) == pytest.approx(1.5 - 0.6, abs=1e-5)
+    assert boxes.category.tolist() == [Category.TRUCK]
+    assert boxes.velocity[0].tolist() == pytest.approx([4 * np.sin(0.6), 4 * np.cos(0.6)], abs=1e-4)
+    read = read_sweep(log, 1)
+    assert read is not None
+    # A point at the lidar itself is no return; the other lies on the ground
+    assert read[0].points_ego.tolist() == [pytest.approx([10.0, 2.0, 0.0], abs=1e-5)]
+    assert read[0].beam.tolist() == [3]
+    (camera,) = pinhole_cameras(log).values()
+    assert camera.camera_id == CameraID.PCAM_F0
+    shown = read_camera(log, 1, camera, (48, 64), with_image=True)
+    np.testing.assert_allclose(shown.T_ego_cam[:3, 3], [1.5, 0.1, 1.55], atol=1e-5)
+    np.testing.assert_allclose(shown.K[:, 2], [32, 24, 1])
+    patch = read_map_patch(log, 1)
+    (centre,) = patch.vertices[patch.kind == MapKind.LANE_CENTRE]
+    (seen,) = patch.valid[patch.kind == MapKind.LANE_CENTRE]
+    # A flat map lies at the height of the vehicle's ground
+    line = centre[seen].double().numpy() @ log.T_world_ego[1, :3, :3].T + log.T_world_ego[1, :3, 3]
+    np.testing.assert_allclose(line[:, 1:], [[50, 2.0]] * len(line), atol=1e-4)
+
+
+def test_nothing_of_nureasoning_is_unpickled(tmp_path: Path) -> None:
+    clip = write_nureasoning(tmp_path / "raw")
+    (clip / "map.pkl").write_bytes(pickle.dumps(Intruder(f"touch {tmp_path / 'touched'}")))
+    with pytest.raises(InputError, match="which plain data do not need"):
+        convert(tmp_path / "raw", "nureasoning", tmp_path / "out")
+    assert not (tmp_path / "touched").exists()
 
 
 TREES = {

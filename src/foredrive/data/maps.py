@@ -52,8 +52,10 @@ def read_map_patch(log: Log, frame: int) -> MapPatch:
             flat = not api.get_map_metadata().map_has_z
             T_ego_world = np.linalg.inv(T_world_ego)
             for kind, line in _lines(item for items in near.values() for item in items):
-                # A map without heights is taken as level: pitch and roll must not lift far lines
-                line = np.column_stack([line, np.full(len(line), T_world_ego[2, 3])]) if flat else line
+                # A map without heights is taken as level: pitch and roll must not lift far lines. Some of its
+                # lines have a third column all the same
+                if flat:
+                    line = np.column_stack([line[:, :2], np.full(len(line), T_world_ego[2, 3])])
                 line = line @ T_ego_world[:3, :3].T + T_ego_world[:3, 3]
                 if flat:
                     line[:, 2] = 0.0
