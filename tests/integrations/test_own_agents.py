@@ -138,6 +138,17 @@ def test_a_declaration_that_is_not_understood_is_refused(needs: str, reason: str
         needs_of(f"python:{file}:Planner")
 
 
+def test_arguments_behind_the_class(tmp_path: Path) -> None:
+    file = tmp_path / "takes.py"
+    file.write_text(
+        "class Planner:\n    def __init__(self, **given): self.given = given\n    def act(self, clip): ...\n"
+    )
+    query = "width=64&lr=1e-4&deep=true&checkpoint=runs/a.b:c&sizes=[1,2]&name=01"
+    given = own_agent(f"python:{file}:Planner?{query}").plan.__self__.given  # type: ignore[attr-defined]
+    plain = {"width": 64, "lr": 1e-4, "deep": True, "sizes": [1, 2]}
+    assert given == plain | {"checkpoint": "runs/a.b:c", "name": "01"}
+
+
 def test_one_instance_with_reset_serves_all_drives(tmp_path: Path) -> None:
     file = tmp_path / "slow_to_load.py"
     file.write_text(

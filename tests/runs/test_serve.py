@@ -64,18 +64,32 @@ def test_a_planner_over_http_drives_as_it_does_here(
 def test_an_agent_without_a_plan_is_a_counted_failure(
     answer: object, told: str, reconstructed: Path, scenarios: Path, tmp_path: Path
 ) -> None:
+    """In its trial it drives nothing; a planner that breaks later has a failed drive."""
+    resets, sound_resets = 0, 0
+
+    def reset(_: object) -> bool:
+        nonlocal resets
+        resets += 1
+        return True
+
     def infer(_: object) -> object:
+        if resets <= sound_resets:
+            return {"trajectory": [[0.5 * step, 0.0] for step in range(1, 7)]}
         if answer == "late":
             time.sleep(1.0)
         return answer
 
     answers: dict[tuple[str, str], Any] = {
         ("GET", "/alive"): lambda _: True,
-        ("POST", "/reset"): lambda _: True,
+        ("POST", "/reset"): reset,
         ("POST", "/infer"): infer,
     }
     with JsonServer(answers).in_background() as address:
         driven = suite(f"http://{address}?timeout=0.5", reconstructed, scenarios)
+        with pytest.raises(InputError, match=f"in the trial at 0 s: .*{told}"):
+            drive_suite(driven, tmp_path / "tried")
+        assert not (tmp_path / "tried").exists()
+        sound_resets = 2
         (drive,) = drive_suite(driven, tmp_path).drives.values()
     assert drive.threat is not None
     assert (drive.threat.outcome, drive.threat.score) == (Outcome.FAILED, None)

@@ -10,6 +10,7 @@ import functools
 import importlib
 import importlib.util
 import inspect
+import json
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -20,7 +21,6 @@ from urllib.parse import parse_qsl
 
 import numpy as np
 import torch
-import yaml
 from pydantic import TypeAdapter, ValidationError
 
 from foredrive.driving.observation import FRAME_DT_S, HORIZON_STEPS
@@ -172,13 +172,21 @@ def _made_by(agent: str) -> tuple[Callable[..., Any], dict[str, Any]]:
     kind = NAVSIM if agent.startswith(NAVSIM) else PYTHON
     place, name = _split(agent, kind)
     name, _, query = name.partition("?")
-    arguments = {key: yaml.safe_load(value) for key, value in parse_qsl(query, keep_blank_values=True)}
+    arguments = {key: _value(text) for key, text in parse_qsl(query, keep_blank_values=True)}
     module = _navsim_module(place) if kind == NAVSIM else _file_module(Path(place))
     make = getattr(module, name, None)
     if not callable(make):
         classes = [key for key, value in vars(module).items() if inspect.isclass(value)]
         raise InputError(f"{agent}: no class {name} in {place}; there are {', '.join(classes) or 'none'}")
     return make, arguments
+
+
+def _value(text: str) -> Any:
+    """Return a value as JSON writes it, such as 64, 1e-4 or true; anything else is a text."""
+    try:
+        return json.loads(text)
+    except ValueError:
+        return text
 
 
 def _split(agent: str, kind: str) -> tuple[str, str]:
