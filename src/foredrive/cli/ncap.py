@@ -104,6 +104,7 @@ def ncap(
             on_ray=ray,
             tick=progress.tick,
             report=lambda driven: write_drive_report(out, films, table(driven)),
+            tried=lambda text: print(f"{name} was {text}", flush=True),
         )
     check_driven(driven)
     print_table(table(driven), Console())

@@ -161,7 +161,7 @@ def shown_vehicle(run: str, agent: str) -> LoggedVehicle:
     if own is None:
         return vehicle
     _log.warning(
-        "%s: its cameras are not those that %s was trained with: the agent's own are rendered", run, agent
+        "%s: its cameras are not those of %s: the agent's own are rendered", run, agent
     )
     return vehicle.with_rig(camera_rig(None, 0.0, own))
 
