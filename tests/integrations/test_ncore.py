@@ -13,7 +13,9 @@ import zarr
 from miniature import write_log
 from ncore.data import (
     BBox3,
+    CameraModelParameters,
     CuboidTrackObservation,
+    FThetaCameraModelParameters,
     LabelSource,
     OpenCVFisheyeCameraModelParameters,
     ShutterType,
@@ -158,6 +160,17 @@ FISHEYE = OpenCVFisheyeCameraModelParameters(
     radial_coeffs=np.zeros(4, np.float32),
     max_angle=1.5,
 )
+FTHETA = FThetaCameraModelParameters(
+    resolution=FISHEYE.resolution,
+    shutter_type=ShutterType.GLOBAL,
+    external_distortion_parameters=None,
+    principal_point=np.array([79.5, 59.5], np.float32),  # pixel centres at whole numbers
+    reference_poly=FThetaCameraModelParameters.PolynomialType.ANGLE_TO_PIXELDIST,
+    pixeldist_to_angle_poly=np.array([0, 1 / 60, 0, 0, 0, 0], np.float32),
+    angle_to_pixeldist_poly=np.array([0, 60, 0, 0, 0, 0], np.float32),
+    max_angle=1.5,
+)
+"""The same lens in NVIDIA's own model."""
 LEFT, RIGHT = np.eye(4), np.eye(4)
 LEFT[:3, 3], RIGHT[:3, 3] = (1.0, 0.8, 1.8), (1.0, -0.8, 1.8)
 RIGHT[:3, :3] = [[0, 1, 0], [-1, 0, 0], [0, 0, 1]]
@@ -173,7 +186,9 @@ def rays(mounted: np.ndarray, at_us: np.ndarray) -> tuple[np.ndarray, np.ndarray
     return (xyz / distance[:, None]).astype(np.float32), distance.astype(np.float32)
 
 
-def write_foreign(folder: Path, store_type: str = "itar", *, poses: bool = True) -> Path:
+def write_foreign(
+    folder: Path, store_type: str = "itar", lens: CameraModelParameters = FISHEYE, *, poses: bool = True
+) -> Path:
     """A sequence as another program writes it.
 
     Two lidars at 10 Hz with two returns, one of them turned; a fisheye at 20 Hz; a box in a lidar's frame.
@@ -195,7 +210,7 @@ def write_foreign(folder: Path, store_type: str = "itar", *, poses: bool = True)
             ("fish", CAMERA.T_ego_cam.astype(np.float64)),
         ):
             graph.store_static_pose(name, "rig", mounted)
-    register(IntrinsicsComponent.Writer, "own").store_camera_intrinsics("fish", FISHEYE)
+    register(IntrinsicsComponent.Writer, "own").store_camera_intrinsics("fish", lens)
     for name, mounted in (("left", LEFT), ("right", RIGHT)):
         lidar = register(LidarSensorComponent.Writer, name, name)
         for sweep in range(4):
@@ -243,9 +258,9 @@ def fisheye_image(t_us: int) -> bytes:
     return out.getvalue()
 
 
-@pytest.mark.parametrize("store_type", ["itar", "directory"])
-def test_a_sequence_of_another_program(store_type: str, tmp_path: Path) -> None:
-    (path,) = convert(write_foreign(tmp_path / "raw", store_type), "ncore", tmp_path / "out")
+@pytest.mark.parametrize(("store_type", "lens"), [("itar", FISHEYE), ("directory", FTHETA)])
+def test_a_sequence_of_another_program(store_type: str, lens: CameraModelParameters, tmp_path: Path) -> None:
+    (path,) = convert(write_foreign(tmp_path / "raw", store_type, lens), "ncore", tmp_path / "out")
     assert path.folder.name == "drive-1"
     log = Log(path)
     # The frames are at the ends of the sweeps
@@ -282,7 +297,7 @@ def test_a_sequence_of_another_program(store_type: str, tmp_path: Path) -> None:
     assert torch.cos(heading - 0.3).tolist() == pytest.approx([1.0, 1.0], abs=1e-5)
     assert boxes.category.tolist() == [Category.CAR, Category.OTHER]
     told = "\n".join(read_notices(path.folder))
-    for fact in ("hovercraft", "opencv-fisheye", "several returns", "vehicle-bbox", "masks"):
+    for fact in ("hovercraft", lens.type(), "several returns", "vehicle-bbox", "masks"):
         assert fact in told
 
 
