@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from PIL import Image
 
 from foredrive.data import ClipConfig, ClipDataset, LogPath, find_one_log
-from foredrive.data.truth.store import TaskTruthConfig
+from foredrive.data.clip_config import TaskTruthConfig
 from foredrive.geometry.boxes import box_corners
 from foredrive.scene import Boxes, Example, VoxelSpec
 from foredrive.scene.agent_futures import AgentFutures

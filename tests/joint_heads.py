@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 import torch
 
-from foredrive.data.truth.store import TaskTruthConfig
+from foredrive.data.clip_config import TaskTruthConfig
 from foredrive.methods.recipe import Recipe
 from foredrive.runs.recipes.task_heads import TaskHeadsRecipe, town_heads, with_joint_heads
 from foredrive.scene import Example

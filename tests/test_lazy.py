@@ -69,3 +69,31 @@ def _homes(imported: str) -> dict[str, str]:
     code = f"{imported}; import json; print(json.dumps({{n: getattr(p, n).__module__ for n in p.__all__}}))"
     found: dict[str, str] = json.loads(_run(code))
     return found
+
+
+MODELS = """
+import importlib, pkgutil, sys
+for name in sys.argv[1].split(","):
+    sys.modules[name] = None  # not installed
+imported = 0
+for root in ("ops", "methods", "geometry", "scene", "sensors", "sets", "tasks.heads"):
+    package = importlib.import_module(f"foredrive.{root}")
+    for module in pkgutil.walk_packages(package.__path__, f"foredrive.{root}."):
+        try:
+            importlib.import_module(module.name)
+        except ModuleNotFoundError as error:
+            assert error.name == "triton", f"{module.name}: {error}"
+        imported += 1
+for losses in ("detection.losses", "maps.losses", "occupancy.losses", "planning.losses"):
+    importlib.import_module(f"foredrive.tasks.{losses}")
+print(imported)
+"""
+
+
+def test_models_ops_and_losses_need_neither_123d_nor_its_tables() -> None:
+    absent = "py123d,pyarrow,pandas,geopandas,lancedb,viser,shapely,trimesh,embreex,lightning_fabric,ray"
+    done = subprocess.run(
+        [sys.executable, "-W", "error", "-c", MODELS, absent], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert int(done.stdout) > 150

@@ -30,13 +30,13 @@ def defer_imports(package: str, homes: Mapping[str, tuple[str, ...]]) -> None:
     """Make a library's package import its names from its modules on first use.
 
     The package's own `__init__`, which would import all modules, is not run. If the package is already
-    imported, nothing changes.
+    imported, or the library is not installed, nothing changes.
 
     Args:
         package: full name of the package.
         homes: as for `on_demand`. It must contain all names that `__init__` offers.
     """
-    if package in sys.modules:
+    if package in sys.modules or importlib.util.find_spec(package.partition(".")[0]) is None:
         return
     spec = importlib.util.find_spec(package)
     assert spec is not None, f"{package} is not installed"
@@ -49,12 +49,14 @@ def defer_imports(package: str, homes: Mapping[str, tuple[str, ...]]) -> None:
 def defer_package(package: str) -> None:
     """Make `import package` cheap: its `__init__` runs when the first attribute or module of it is used.
 
-    If the package is already imported, nothing changes. `from package import name` uses it at once.
+    If the package is already imported, or not installed, nothing changes. `from package import name` uses it
+    at once.
     """
     if package in sys.modules:
         return
     spec = importlib.util.find_spec(package)
-    assert spec is not None, f"{package} is not installed"
+    if spec is None:
+        return
     assert spec.loader is not None
     loader = spec.loader
     module = importlib.util.module_from_spec(spec)

@@ -12,11 +12,12 @@ from flat_street import street
 from py123d.datatypes import TrafficLightStatus
 
 from foredrive.data import LogPath, find_logs
+from foredrive.data.clip_config import TaskTruthConfig
 from foredrive.data.log_writer import LogWriter
 from foredrive.data.logs import Log
 from foredrive.data.maps import write_map
 from foredrive.data.truth.affordances import read_affordances, read_stop_lines
-from foredrive.data.truth.store import TaskTruthConfig, TaskTruthStore
+from foredrive.data.truth.store import TaskTruthStore
 from foredrive.geometry.path_frame import along_path, path_headings
 from foredrive.scene import Boxes, Category, VoxelSpec
 from foredrive.scene.boxes import unlabelled

@@ -11,12 +11,12 @@ from py123d.datatypes import BaseMapObject, Lane, LaneType
 from py123d.geometry import Polyline3D
 
 from foredrive.data import LogPath, find_logs
+from foredrive.data.clip_config import UNIAD_RASTER
 from foredrive.data.formats.convert import convert
 from foredrive.data.log_writer import LogWriter
 from foredrive.data.logs import Log
 from foredrive.data.maps import write_map
 from foredrive.data.truth.map_elements import read_map_elements, read_map_raster
-from foredrive.data.truth.store import UNIAD_RASTER
 from foredrive.scene.map_elements import ElementKind, MapElements, RasterLayer
 
 PATCH = (60.0, 30.0)

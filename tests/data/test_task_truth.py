@@ -10,12 +10,12 @@ import torch
 from flat_street import street
 
 from foredrive.data import ClipConfig, ClipDataset, LogPath, collate, find_logs
+from foredrive.data.clip_config import TaskTruthConfig
 from foredrive.data.formats.convert import convert
 from foredrive.data.log_writer import LogWriter
 from foredrive.data.logs import Log
 from foredrive.data.maps import write_map
 from foredrive.data.modalities import FullOccupancy
-from foredrive.data.truth.store import TaskTruthConfig
 from foredrive.data.truth.tasks import tasks_of
 from foredrive.scene import VoxelSpec
 from foredrive.scene.record import Record

@@ -13,8 +13,8 @@ import pytest
 import torch
 
 from foredrive.cli.main import main
+from foredrive.data import ClipConfig, ClipDataset
 from foredrive.data.cameras import pinhole_cameras, read_camera
-from foredrive.data.clips import ClipConfig, ClipDataset
 from foredrive.data.lidar import read_sweep
 from foredrive.data.log_paths import LogPath, find_logs
 from foredrive.data.logs import Log

@@ -13,10 +13,10 @@ from flat_street import street
 from scipy.spatial.transform import Rotation
 
 from foredrive.data import ClipConfig, ClipDataset, collate, find_logs
+from foredrive.data.clip_config import TaskTruthConfig
 from foredrive.data.log_writer import LogWriter
 from foredrive.data.maps import write_map
 from foredrive.data.modalities import FullOccupancy
-from foredrive.data.truth.store import TaskTruthConfig
 from foredrive.scene import Attribute, Boxes, Category, Example, VoxelSpec
 from foredrive.scene.agents import Agents, MapLines
 from foredrive.scene.map_elements import ElementKind

@@ -6,10 +6,10 @@ import torch
 
 from foredrive.data import ClipConfig, ClipDataset, LogPath
 from foredrive.data.boxes import read_boxes
+from foredrive.data.clip_config import TaskTruthConfig
 from foredrive.data.logs import Log
 from foredrive.data.recorded import read_visibility
 from foredrive.data.recorded_labels import recorded_labels
-from foredrive.data.truth.store import TaskTruthConfig
 from foredrive.data.truth.tasks import tasks_of
 from foredrive.scene import Attribute, Category, Example
 from foredrive.scene.conditions import BackgroundTraffic

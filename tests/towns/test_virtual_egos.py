@@ -13,6 +13,7 @@ from miniature import miniature
 from foredrive.data import ClipConfig, ClipDataset
 from foredrive.data.boxes import read_boxes
 from foredrive.data.cameras import pinhole_cameras, read_camera
+from foredrive.data.clip_config import TaskTruthConfig
 from foredrive.data.commands import route_at
 from foredrive.data.labels import make_labels
 from foredrive.data.lidar import frames_with_lidar
@@ -20,7 +21,6 @@ from foredrive.data.log_paths import LogPath
 from foredrive.data.logs import Log
 from foredrive.data.recorded_labels import recorded_labels
 from foredrive.data.truth.affordances import read_affordances
-from foredrive.data.truth.store import TaskTruthConfig
 from foredrive.runs.build import build_agent
 from foredrive.runs.train.baselines import fit_baselines
 from foredrive.runs.train.kept_volumes import KeptVolumes

@@ -7,7 +7,8 @@ from foredrive.lazy import defer_imports, defer_package, on_demand
 if TYPE_CHECKING:
     from foredrive.data.batches import collate
     from foredrive.data.camera_streams import CameraSpec
-    from foredrive.data.clips import ClipConfig, ClipDataset
+    from foredrive.data.clip_config import ClipConfig
+    from foredrive.data.clips import ClipDataset
     from foredrive.data.log_paths import LogPath, find_all_logs, find_logs, find_one_log
     from foredrive.data.own_logs import Box, Points, Vehicle, write_log
 
@@ -31,7 +32,8 @@ __getattr__ = on_demand(
     {
         "batches": ("collate",),
         "camera_streams": ("CameraSpec",),
-        "clips": ("ClipConfig", "ClipDataset"),
+        "clip_config": ("ClipConfig",),
+        "clips": ("ClipDataset",),
         "log_paths": ("LogPath", "find_all_logs", "find_logs", "find_one_log"),
         "own_logs": ("Box", "Points", "Vehicle", "write_log"),
     },

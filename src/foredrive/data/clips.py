@@ -1,12 +1,9 @@
 """A torch dataset of clips from 123D logs, with voxel labels."""
 
-import dataclasses
 import functools
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 import torch
@@ -15,68 +12,20 @@ from torch.utils.data import Dataset
 
 from foredrive.data.assemble import assemble_clip
 from foredrive.data.cameras import find_camera, pinhole_cameras, told_cameras
+from foredrive.data.clip_config import ClipConfig
 from foredrive.data.commands import command_at, count_command_sources, route_ahead_at
 from foredrive.data.frame_store import FrameStore
-from foredrive.data.label_store import LabelStore, OccupancySource
+from foredrive.data.label_store import LabelStore
 from foredrive.data.lidar import frames_with_lidar, read_sweep
 from foredrive.data.log_paths import LogPath
 from foredrive.data.logs import Log
 from foredrive.data.maps import read_map_patch
 from foredrive.data.recorded import read_expert_plan
 from foredrive.data.recorded_labels import check_recorded_occupancy
-from foredrive.data.truth.store import TaskTruthConfig, TaskTruthStore
+from foredrive.data.truth.store import TaskTruthStore
 from foredrive.errors import InputError
-from foredrive.scene import Clip, Example, Trajectory, VoxelGrid, VoxelSpec
+from foredrive.scene import Clip, Example, Trajectory, VoxelGrid
 from foredrive.scene.task_truth import TaskTruth
-
-
-@dataclass(frozen=True)
-class ClipConfig:
-    """The frames of a clip and the data to read for them."""
-
-    past_frames: int
-    """Number of key frames before now."""
-    future_frames: int
-    """Number of key frames after now, the targets of training and evaluation."""
-    image_hw: tuple[int, int]
-    """Height and width of the resized images, px."""
-    voxels: VoxelSpec
-    """Grid of the voxel labels and of a world model's volume."""
-    frame_dt_s: float = 0.5
-    """Time between key frames, s."""
-    horizon_steps: int = 6
-    """Number of steps of the future trajectory and of plans."""
-    horizon_dt_s: float = 0.5
-    """Time between the steps of the future trajectory and of plans, s."""
-    cameras: tuple[str, ...] | None = None
-    """Camera names, the log's own or 123D's ("pcam_f0"), in this order; None selects all cameras."""
-    now_stride_s: float = 0.5
-    """Time between the nows of successive clips, s."""
-    future_images: bool = True
-    """Read the images of the key frames after now too. If False, they are masked."""
-    lidar: bool = False
-    """Read lidar sweeps into the clip."""
-    map: bool = False
-    """Read the patch of the road map around the vehicle at now."""
-    occupancy_source: OccupancySource = "lidar"
-    """Source of the voxel labels: "lidar" for beams of the frame's own sweep, "accumulated" for those of the
-    frames within 3 s too, or "recorded" for the exact occupancy and flow in recordings of towns, which
-    includes voxels that no sensor has observed. Evaluations use "lidar" in place of "accumulated"."""
-    future_source: Literal["driven", "expert"] = "driven"
-    """Source of the future trajectory: "driven" for the recorded path, or "expert" for the expert's plan in
-    DAgger demonstrations. Clips without such a plan use the driven path."""
-    tasks: TaskTruthConfig | None = None
-    """Ground truth of detection, mapping, motion and occupancy heads to read for each now; None: nothing."""
-    part_s: tuple[float, float] | None = None
-    """Part of each log, (start, end) in s since its start, end exclusive; None: all of it. Only clips with
-    now and all later frames inside it are used."""
-
-    @property
-    def judged(self) -> "ClipConfig":
-        """Return the clips of an evaluation: labels of neighbouring sweeps are for training alone."""
-        if self.occupancy_source != "accumulated":
-            return self
-        return dataclasses.replace(self, occupancy_source="lidar")
 
 
 class ClipDataset(Dataset[Example]):

@@ -2,7 +2,6 @@
 
 import dataclasses
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 import torch
@@ -11,6 +10,7 @@ from py123d.common.utils.msgpack_utils import msgpack_decode_with_numpy, msgpack
 
 from foredrive.data.beam_casting import FREE, OCCUPIED, UNKNOWN
 from foredrive.data.boxes import read_boxes
+from foredrive.data.clip_config import OccupancySource
 from foredrive.data.disk_cache import DiskCache
 from foredrive.data.labels import (
     Beams,
@@ -90,7 +90,6 @@ def _state_from(log: Log, neighbour: int, frame: int, spec: VoxelSpec) -> UInt8[
 LABEL_VERSION = 2
 """Version in every cache key. Increase it when the labels change."""
 
-OccupancySource = Literal["lidar", "accumulated", "recorded"]
 _MAKERS = {"lidar": make_labels, "accumulated": accumulated_labels, "recorded": recorded_labels}
 
 

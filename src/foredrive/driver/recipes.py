@@ -4,7 +4,7 @@ from dataclasses import dataclass, field, replace
 from typing import Literal
 
 from foredrive.data import ClipConfig
-from foredrive.data.truth.store import TaskTruthConfig
+from foredrive.data.clip_config import TaskTruthConfig
 from foredrive.driver.eyes import CameraEyesConfig
 from foredrive.driver.losses import SightWeights
 from foredrive.driver.planner_fit import PlanFit

@@ -8,7 +8,7 @@ import pytest
 import torch
 from recorded_street import near_truth, read_batch, record
 
-from foredrive.data.truth.store import TaskTruthConfig
+from foredrive.data.clip_config import TaskTruthConfig
 from foredrive.files import together
 from foredrive.scene import Example, VoxelSpec
 from foredrive.tasks.detection.metric import DetectionMetric

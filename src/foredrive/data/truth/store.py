@@ -2,7 +2,6 @@
 
 import dataclasses
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +11,7 @@ from py123d.common.utils.msgpack_utils import msgpack_decode_with_numpy, msgpack
 from py123d.datatypes import PinholeCameraMetadata
 from torch import Tensor
 
+from foredrive.data.clip_config import TaskTruthConfig
 from foredrive.data.disk_cache import DiskCache, map_fingerprint
 from foredrive.data.logs import Log
 from foredrive.data.modalities import expand_array, squeeze_array
@@ -21,8 +21,8 @@ from foredrive.data.truth.map_elements import read_map_elements, read_map_raster
 from foredrive.data.truth.rays import read_rays
 from foredrive.data.truth.semantic_labels import read_semantics
 from foredrive.scene import VoxelSpec
-from foredrive.scene.map_elements import InstanceRaster, MapElements, MapRaster, PlaneSpec
-from foredrive.scene.semantics import SemanticVoxels, Taxonomy
+from foredrive.scene.map_elements import InstanceRaster, MapElements, MapRaster
+from foredrive.scene.semantics import SemanticVoxels
 from foredrive.scene.task_truth import TaskTruth
 
 TRUTH_VERSION = 1
@@ -30,38 +30,6 @@ TRUTH_VERSION = 1
 
 NOT_CACHED = ("rays", "affordances")
 """Parts that are read anew each time."""
-UNIAD_RASTER = PlaneSpec((-51.2, -51.2), 0.512, (200, 200))
-UNIAD_INSTANCES = PlaneSpec((-50.0, -50.0), 0.5, (200, 200))
-"""UniAD's grids, but centred on the rear axle."""
-
-
-@dataclass(frozen=True)
-class TaskTruthConfig:
-    """The ground truth to read for the now of each clip. A part that is None is not read."""
-
-    future_steps: int = 12
-    """Number of steps of the agents' futures."""
-    future_dt_s: float = 0.5
-    """Time between the steps of the agents' futures, s."""
-    elements_lw_m: tuple[float, float] | None = (60.0, 30.0)
-    """Extent of the patch of map elements along x and along y, m: MapTR's by default, and (100, 50) is the
-    wide one."""
-    raster: PlaneSpec | None = UNIAD_RASTER
-    """Grid of the map's raster layers: UniAD's by default."""
-    line_px: int = 2
-    """Width of lines in the raster layers, cells."""
-    semantics: Taxonomy | None = "occ3d"
-    """Classes of the semantic voxels, on the grid of the clip's voxels."""
-    instances: PlaneSpec | None = UNIAD_INSTANCES
-    """Grid of the vehicles over time: UniAD's by default, but centred on the rear axle."""
-    instance_steps: int = 4
-    """Number of steps of `instances` after now."""
-    instance_dt_s: float = 0.5
-    """Time between the steps of `instances`, s."""
-    rays: bool = False
-    """Read the lidar's places and the velocities of voxels, which metrics of rays need."""
-    affordances: bool = False
-    """Read the next light, the lead vehicle, and the road users that occupy the path over time."""
 
 
 class TaskTruthStore:

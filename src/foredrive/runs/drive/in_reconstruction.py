@@ -160,9 +160,7 @@ def shown_vehicle(run: str, agent: str) -> LoggedVehicle:
     own = own_rig(agent, vehicle) if vehicle.rig.names else None
     if own is None:
         return vehicle
-    _log.warning(
-        "%s: its cameras are not those of %s: the agent's own are rendered", run, agent
-    )
+    _log.warning("%s: its cameras are not those of %s: the agent's own are rendered", run, agent)
     return vehicle.with_rig(camera_rig(None, 0.0, own))
 
 

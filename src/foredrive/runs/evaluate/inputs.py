@@ -11,7 +11,7 @@ from typing import Any
 import torch
 
 from foredrive.data import ClipDataset, LogPath, collate
-from foredrive.data.truth.store import TaskTruthConfig
+from foredrive.data.clip_config import TaskTruthConfig
 from foredrive.methods.planner.agent import PlanningAgent
 from foredrive.runs.evaluate.predict import AgentPredictor
 from foredrive.runs.open_clips import open_clips

@@ -5,7 +5,7 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, TypeVar, get_args
 
-from foredrive.data.truth.store import TaskTruthConfig
+from foredrive.data.clip_config import TaskTruthConfig
 from foredrive.engine.config import overridden, read_values, validated
 from foredrive.engine.loop import Schedule
 from foredrive.errors import InputError
