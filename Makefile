@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 STAMP := .venv/.installed
 
-.PHONY: install demo docs dist test quick test-slow test-oracles golden lint types format clean
+.PHONY: install demo docs dist test quick gpu test-slow test-oracles golden lint types format clean
 
 install: $(STAMP)
 
@@ -59,6 +59,12 @@ test: install lint
 # Units only, for the inner loop.
 quick: install
 	$(PYTEST) -m "not slow" $(QUICK)
+
+# Kernels against their references, then speeds, on a GPU: about 8 minutes. The figures go to benchmarks/results/gpu.json.
+gpu: install
+	@$(BIN)/python -c 'import sys, torch; sys.exit(0 if torch.cuda.is_available() else f"no GPU here that PyTorch {torch.__version__} can use: nothing was measured")'
+	$(BIN)/python -m pytest tests/ops
+	$(BIN)/python -m benchmarks.gpu
 
 # The studies that `make test` leaves out.
 test-slow: install

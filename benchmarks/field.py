@@ -3,11 +3,12 @@
 `grid` reads a hash grid of eight levels with two features each, from 32 to 8192 cells along a side, with at
 most 2^17 rows a level. A million points lie on rays in patches of 32 × 32 pixels, 32 samples on each ray.
 Arm `proposal` has six levels of one feature. `…_mpoints_per_s` are millions of points forward and backward
-per CPU second; with `to_points`, the gradient reaches the points too. Plain PyTorch reads 65,536 of them.
+per CPU second (on a GPU: per second); with `to_points`, the gradient reaches the points too. Plain PyTorch
+reads 65,536 of them.
 
 `scene` is the recipe `field_tiny` with 20 actors: whole steps of training (rays, losses, gradients, Adam), an
 image of 480 × 270, and a sweep of 64 × 1800 beams. Its images are noise and its sweeps show a hall of
-40 × 20 m. Freed memory is kept, as by the command line.
+40 × 20 m. On the CPU freed memory is kept, as by the command line.
 """
 
 import functools
@@ -19,7 +20,6 @@ import torch
 from torch import Tensor
 
 from benchmarks.common.measuring import in_a_process, measure
-from foredrive.cli.main import keep_freed_memory
 from foredrive.engine.bench import Benchmark
 from foredrive.geometry.se3 import exp_se3
 from foredrive.methods.neurad.recipes import tiny_field
@@ -98,14 +98,18 @@ def hall(count: int = 20) -> tuple[FieldScene, SensorViews]:
     return tiny_field().begin(views, tracks, 1, 200.0), views
 
 
-def measure_scene(seed: int) -> dict[str, float]:
+def measure_scene(device: str, _: int) -> dict[str, float]:
     """Return the speed of training, of an image and of a sweep."""
-    return in_a_process(__file__, "scene", "fast") | {"threads": float(torch.get_num_threads())}
+    return in_a_process(__file__, "scene", device, "fast") | {"threads": float(torch.get_num_threads())}
 
 
-def _measure_scene() -> dict[str, float]:
-    keep_freed_memory()
+def _measure_scene(device: str) -> dict[str, float]:
+    if device == "cpu":
+        from foredrive.cli.main import keep_freed_memory  # needs packages that a machine for GPUs may lack
+
+        keep_freed_memory()
     scene, views = hall()
+    scene = scene.to(device)
     training = tiny_field().training(scene, views)
     optimizer, rng = make_optimizer(training), torch.Generator().manual_seed(0)
     schedule = training.schedule
@@ -118,11 +122,12 @@ def _measure_scene() -> dict[str, float]:
 
     for _ in range(5):  # compiles; the proposals find the walls
         step()
-    took = measure(step, 15, "cpu")
+    took = measure(step, 15, device)
     with torch.no_grad():
-        image = measure(lambda: scene.camera(scene.graph, views.cameras[1]), 5, "cpu")
+        view = views.cameras[1].to(device)
+        image = measure(lambda: scene.camera(scene.graph, view), 5, device)
         points = scene.prepare_sweep(views.sweeps[1])
-        sweep = measure(lambda: scene.sweep(scene.graph, points, 0.1), 3, "cpu")
+        sweep = measure(lambda: scene.sweep(scene.graph, points, 0.1), 3, device)
     krays = (schedule.patches * schedule.patch**2 + schedule.beams) / 1000
     return {
         "train_krays_per_s": krays / took.wall_s,
@@ -134,34 +139,35 @@ def _measure_scene() -> dict[str, float]:
     }
 
 
-def _measure_here(arm: str, path: str) -> dict[str, float]:
+def _measure_here(arm: str, device: str, path: str) -> dict[str, float]:
     if arm == "scene":
-        return _measure_scene()
+        return _measure_scene(device)
     number, features, finest = GRIDS[arm]
     levels = grid_levels(number, 32, finest, 17)
-    table = 0.1 * torch.randn(levels[-1].first_row + levels[-1].rows, features)
+    table = 0.1 * torch.randn(levels[-1].first_row + levels[-1].rows, features, device=device)
     read: Callable[[Tensor, Tensor, tuple[Level, ...]], Tensor] = read_hash_grid
     count, runs = POINTS, RUNS
     if path == "reference":
         read, count, runs = read_hash_grid_reference, REFERENCE_POINTS, 2
-    points = points_on_rays(count)
+    points = points_on_rays(count).to(device)
     figures = {}
     for name, wanted in (("", [True, False]), ("to_points_", [True, True])):
         leaves = [x.clone().requires_grad_(w) for x, w in zip((table, points), wanted, strict=True)]
-        upstream = torch.ones(number * features, count)
+        upstream = torch.ones(number * features, count, device=device)
 
         def step(leaves: list[Tensor] = leaves, upstream: Tensor = upstream) -> None:
             out = read(leaves[0], leaves[1], levels)
             torch.autograd.grad(out, [x for x in leaves if x.requires_grad], upstream)
 
         step()  # compiles
-        figures[f"{name}mpoints_per_s"] = count / 1e6 / measure(step, runs, "cpu").cpu_s
+        took = measure(step, runs, device)
+        figures[f"{name}mpoints_per_s"] = count / 1e6 / (took.cpu_s if device == "cpu" else took.wall_s)
     return figures
 
 
-def measure_grid(arm: str, _: int) -> dict[str, float]:
+def measure_grid(arm: str, device: str, _: int) -> dict[str, float]:
     """Return the speed of the kernel and of plain PyTorch."""
-    fast, slow = (in_a_process(__file__, arm, path) for path in ("fast", "reference"))
+    fast, slow = (in_a_process(__file__, arm, device, path) for path in ("fast", "reference"))
     figures = {f"{arm}_{name}": value for name, value in fast.items()}
     figures |= {f"{arm}_reference_{name}": value for name, value in slow.items()}
     return figures | {"threads": float(torch.get_num_threads())}
@@ -169,7 +175,8 @@ def measure_grid(arm: str, _: int) -> dict[str, float]:
 
 BENCHMARK = Benchmark(
     question="How fast are the parts of a neural field on a CPU?",
-    arms={arm: functools.partial(measure_grid, arm) for arm in GRIDS} | {"scene": measure_scene},
+    arms={arm: functools.partial(measure_grid, arm, "cpu") for arm in GRIDS}
+    | {"scene": functools.partial(measure_scene, "cpu")},
     seeds=(0,),
 )
 

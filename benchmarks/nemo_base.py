@@ -14,6 +14,7 @@ from contextlib import contextmanager
 from typing import Any
 
 import torch
+from lightning_fabric import Fabric
 from torch import Tensor
 from torch.utils.flop_counter import FlopCounterMode, sdpa_flop_count
 
@@ -23,13 +24,13 @@ from foredrive.engine.fabric import make_fabric
 from foredrive.geometry.se3 import matrix_from_yaw
 from foredrive.methods.blocks import lifting
 from foredrive.methods.nemo import rendering
+from foredrive.methods.nemo.recipes import nemo_base
 from foredrive.methods.recipe import Recipe
 from foredrive.ops import volume
 from foredrive.ops.attention3d import attend_volume_reference
 from foredrive.ops.lifting import lift_reference
 from foredrive.ops.volume import sample_volume_reference
 from foredrive.runs.build import build_agent, build_objective
-from foredrive.runs.recipes.known import find_recipe
 from foredrive.scene import Boxes, CameraRig, Clip, Example, LidarSweep, Trajectory, VoxelGrid, VoxelSpec
 from foredrive.scene.boxes import unlabelled
 
@@ -121,12 +122,16 @@ def _rig(frames: int, height: int, width: int) -> CameraRig:
 
 def recipe_at(voxel_m: float) -> Recipe:
     """Return nemo_base with voxels of this size and without the perceptual loss."""
-    recipe = find_recipe("nemo_base")
+    recipe = nemo_base()
     spec = recipe.clips.voxels
     z, y, x = (round(n * spec.voxel_m / voxel_m) for n in spec.shape_zyx)
     clips = dataclasses.replace(recipe.clips, voxels=VoxelSpec(spec.lower_m, voxel_m, (z, y, x)))
-    finetune = dataclasses.replace(recipe.finetune, perceptual=None)
-    return dataclasses.replace(recipe, clips=clips, finetune=finetune)
+    return without_perceptual_loss(dataclasses.replace(recipe, clips=clips))
+
+
+def without_perceptual_loss(recipe: Recipe) -> Recipe:
+    """Return a recipe whose second stage needs no weights of a perceptual loss."""
+    return dataclasses.replace(recipe, finetune=dataclasses.replace(recipe.finetune, perceptual=None))
 
 
 @contextmanager
@@ -154,10 +159,9 @@ REFERENCES: Mapping[str, Callable[..., Tensor]] = {
 class Bench:
     """An objective, its optimizer and an example, ready for training steps."""
 
-    def __init__(self, voxel_m: float) -> None:
+    def __init__(self, recipe: Recipe, fabric: Fabric | None = None) -> None:
         torch.manual_seed(0)
-        recipe = recipe_at(voxel_m)
-        self.fabric = make_fabric(recipe.precision)
+        self.fabric = fabric or make_fabric(recipe.precision)
         self.agent = build_agent(recipe, fetch=False)
         objective = build_objective(recipe, recipe.finetune, self.agent)
         optimizer = torch.optim.AdamW(objective.parameters(), lr=recipe.finetune.schedule.lr)
@@ -196,7 +200,7 @@ def forward_pass() -> dict[str, float]:
     """Measure one forward pass with losses, without gradients, at full size; count floating point
     operations.
     """
-    bench = Bench(FULL_M)
+    bench = Bench(recipe_at(FULL_M))
     bench.agent.requires_grad_(False)
     kernel_flops = {"lift": 0, "attend_volume": 0, "sample_volume": 0}
 
@@ -235,7 +239,7 @@ def forward_pass() -> dict[str, float]:
 
 def training_step(voxel_m: float, path: str) -> dict[str, float]:
     """Measure training steps by the kernels ("fast") or the plain references; {} if memory is too small."""
-    bench = Bench(voxel_m)
+    bench = Bench(recipe_at(voxel_m))
     forget_peak(DEVICE)
     try:
         with kernels_as(lambda name, op: op if path == "fast" else REFERENCES[name]):

@@ -69,32 +69,34 @@ def warp() -> Case:
 CASES: dict[str, Callable[[], Case]] = {case.__name__: case for case in (attention3d, rays, warp)}
 
 
-def measure(case: str, _: int) -> dict[str, float]:
+def measure(case: str, device: str, _: int) -> dict[str, float]:
     """Return the metrics of both paths and their ratios."""
-    fast, reference = (in_a_process(__file__, case, path) for path in ("fast", "reference"))
+    fast, reference = (in_a_process(__file__, case, device, path) for path in ("fast", "reference"))
     return {"threads": torch.get_num_threads()} | compare(fast, reference)
 
 
-def _measure_here(case: str, path: str) -> dict[str, float]:
+def _measure_here(case: str, device: str, path: str) -> dict[str, float]:
     torch.manual_seed(0)
     fast, reference, inputs = CASES[case]()
+    inputs = [x.to(device) for x in inputs]
     if path == "reference":
-        return measure_op(reference, inputs, RUNS, "cpu")
+        return measure_op(reference, inputs, RUNS, device)
     started = time.perf_counter()
-    _compile()
+    _compile(device)
     compile_s = time.perf_counter() - started
-    return measure_op(fast, inputs, RUNS, "cpu") | {"compile_s": compile_s}
+    return measure_op(fast, inputs, RUNS, device) | {"compile_s": compile_s}
 
 
-def _compile() -> None:
+def _compile(device: str) -> None:
     """Call the kernels on tiny inputs, so that they compile."""
-    values, points = torch.ones(1, 1, 1, 1, 1, requires_grad=True), torch.ones(1, 1, 1, 1, 3)
-    attend_volume(values, points, torch.ones(1, 1, 1, 1)).sum().backward()
+    values, points = (torch.ones(1, 1, 1, 1, size, device=device) for size in (1, 3))
+    weights = torch.ones(1, 1, 1, 1, device=device)
+    attend_volume(values.requires_grad_(), points, weights).sum().backward()
 
 
 BENCHMARK = Benchmark(
     question="How much faster and leaner are the CPU kernels than their plain PyTorch references?",
-    arms={case: functools.partial(measure, case) for case in CASES},
+    arms={case: functools.partial(measure, case, "cpu") for case in CASES},
     seeds=(0,),
 )
 
