@@ -4,6 +4,7 @@ import dataclasses
 import json
 import math
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -39,6 +40,16 @@ class Planner:
 def observed(seed: int = 3) -> Clip:
     """A batch of one clip of three key frames of a turning vehicle, with boxes that no agent may see."""
     return one_example(seed).clip.observed()
+
+
+@pytest.fixture(scope="module", autouse=True)
+def stand_ins_leave() -> Iterator[None]:
+    """Take the modules away that stand in for NAVSIM's, which other tests expect to be absent."""
+    before = set(sys.modules)
+    yield
+    for name in set(sys.modules) - before:
+        if name.partition(".")[0] in {"navsim", "nuplan", "pytorch_lightning"}:
+            del sys.modules[name]
 
 
 @pytest.fixture
