@@ -1,4 +1,4 @@
-"""What `make gpu` measures, on the CPU, with the packages that a machine for GPUs may lack taken away."""
+"""`make gpu` on the CPU, with the packages that a machine for GPUs may lack taken away."""
 
 import json
 import subprocess

@@ -105,7 +105,7 @@ def test_plans_are_arrays_tensors_or_trajectories(planner: str) -> None:
 
 def test_a_camera_that_is_not_there_is_named(planner: str, tmp_path: Path) -> None:
     (tmp_path / "short_planner.py").write_text(SHORT.replace('"right"', '"PCAM_F0", "PCAM_L2"'))
-    sys.modules.pop("short_planner", None)
+    sys.modules.pop("own_agent_short_planner", None)
     with pytest.raises(InputError, match=r"needs the camera PCAM_F0; there are left, right"):
         own_agent(f"{planner}?").act(observed())
 
@@ -169,7 +169,7 @@ def test_one_instance_with_reset_serves_all_drives(tmp_path: Path) -> None:
     )
     for _ in range(3):
         own_agent(f"python:{file}:Planner")
-    kind = sys.modules["slow_to_load"].Planner
+    kind = sys.modules["own_agent_slow_to_load"].Planner
     assert (kind.made, kind.resets) == (1, 3)
 
 

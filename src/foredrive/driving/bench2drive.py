@@ -135,7 +135,7 @@ def smooth_pieces(
 
 @dataclass(frozen=True)
 class Bench2DriveDrive:
-    """What the metrics take of one drive."""
+    """The parts of one drive that the metrics use."""
 
     success: bool
     efficiency_pct: float | None
@@ -151,8 +151,8 @@ def bench2drive_figures(drives: Sequence[Bench2DriveDrive]) -> dict[str, float |
     """
 
     def mean(values: Sequence[float | None]) -> float | None:
-        known = [value for value in values if value is not None and math.isfinite(value)]
-        return statistics.fmean(known) if known else None
+        defined = [value for value in values if value is not None and math.isfinite(value)]
+        return statistics.fmean(defined) if defined else None
 
     figures: dict[str, float | int | None] = {
         "success_pct": mean([100.0 * drive.success for drive in drives]),

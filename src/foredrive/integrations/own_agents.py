@@ -33,7 +33,7 @@ NAVSIM, PYTHON = "navsim:", "python:"
 
 @dataclass(frozen=True)
 class Needs:
-    """What an agent is shown. Its speed, the command and the points of the route are always told."""
+    """The sensors that an agent is given. Speed, command and points of the route are always there."""
 
     cameras: tuple[str, ...] | Literal["all"] = ()
     """123D's names of the cameras, such as PCAM_F0, in the order in which it gets them."""
@@ -203,13 +203,14 @@ def _file_module(file: Path) -> ModuleType:
     """Import a file. Modules beside it can be imported, as in a script."""
     if not file.is_file():
         raise InputError(f"{file}: no such file")
-    spec = importlib.util.spec_from_file_location(file.stem, file)
+    # Under a name of its own: a file may be called as a module that is imported, such as queue.py
+    spec = importlib.util.spec_from_file_location(f"own_agent_{file.stem}", file)
     if spec is None or spec.loader is None:
         raise InputError(f"{file}: this is no Python file")
     if str(file.parent) not in sys.path:
         sys.path.append(str(file.parent))
     module = importlib.util.module_from_spec(spec)
-    sys.modules[file.stem] = module  # dataclasses look their module up
+    sys.modules[spec.name] = module  # dataclasses look their module up
     try:
         spec.loader.exec_module(module)
     except Exception as error:  # any error of the user's own code

@@ -55,16 +55,17 @@ def input_of(agent: Any, clip: Clip) -> Any:
     """
     records, config = sys.modules[RECORDS], vars(agent.get_sensor_config())
     command = np.zeros(len(COMMANDS) + 1, dtype=int)
-    known = bool(clip.command_valid)
-    command[COMMANDS.index(Command(int(clip.command))) if known else -1] = 1
+    place = COMMANDS.index(Command(int(clip.command))) if clip.command_valid else -1
+    command[place] = 1
     T_now = torch.linalg.inv(clip.T_world_ego[clip.now]) @ clip.T_world_ego
     yaw, speed = torch.atan2(T_now[:, 1, 0], T_now[:, 0, 0]), clip.ego_speed_mps.double()
     statuses, cameras, lidars = [], [], []
     for frame in range(len(clip.t_s)):
-        before = max(frame - 1, 0)
-        dt_s = max(float(clip.t_s[frame] - clip.t_s[before]), 1e-6)
-        turn_rate = float(yaw[frame] - yaw[before]) / dt_s
-        gain = float(speed[frame] - speed[before]) / dt_s
+        # Rates since the frame before; the first frame has those of the second
+        after = max(frame, 1)
+        dt_s = float(clip.t_s[after] - clip.t_s[after - 1])
+        turn_rate = float(yaw[after] - yaw[after - 1]) / dt_s
+        gain = float(speed[after] - speed[after - 1]) / dt_s
         pose = [*T_now[frame, :2, 3].tolist(), float(yaw[frame])]
         statuses.append(
             records.EgoStatus(

@@ -35,7 +35,7 @@ _MEMBERS = {
     ),
     "navsim.agents.abstract_agent": (records.AbstractAgent,),
 }
-"""What each module has, those first that others import."""
+"""Members of each module; modules that others import come first."""
 
 
 def add_stand_ins() -> list[str]:

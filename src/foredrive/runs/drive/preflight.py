@@ -12,6 +12,7 @@ import torch
 from foredrive.data.batches import stack_records
 from foredrive.driving.drive import FollowingPilot
 from foredrive.driving.dynamics import STEP_S
+from foredrive.driving.observation import FRAME_DT_S
 from foredrive.driving.plans import waypoints_of
 from foredrive.errors import InputError
 from foredrive.runs.drive.agent_inputs import AgentInputs, inputs_of
@@ -26,7 +27,7 @@ TRIED_S = 2.0
 
 @dataclass
 class Trial:
-    """What a trial has seen."""
+    """The sensors, plans and times of a trial."""
 
     shown: str = "nothing"
     """The sensors of the last observation, in words."""
@@ -94,8 +95,8 @@ def _check_inputs(clip: Clip, inputs: AgentInputs, where: str) -> None:
     if inputs.lidar and not bool(clip.sweep_valid[clip.now]):
         raise InputError(f"{where}: it needs the lidar, and gets no sweep")
     steps_s = clip.t_s[1:] - clip.t_s[:-1]
-    if len(steps_s) and not torch.allclose(steps_s, torch.tensor(0.5), atol=1e-3):
-        raise InputError(f"{where}: key frames are {steps_s.tolist()} s apart, not 0.5 s")
+    if len(steps_s) and not torch.allclose(steps_s, torch.tensor(FRAME_DT_S), atol=1e-3):
+        raise InputError(f"{where}: key frames are {steps_s.tolist()} s apart, not {FRAME_DT_S} s")
 
 
 def _shown(clip: Clip) -> str:
