@@ -47,6 +47,8 @@ def rate(
 ) -> Ratings:
     """Fit the model to the drives of A agents on R routes.
 
+    With one route there is nothing to draw from, and the intervals of abilities and ranks are NaN.
+
     Args:
         scores: of each drive, 0 to 1.
         agent: number of its agent, of 0 to A - 1.
@@ -56,8 +58,8 @@ def rate(
     agents, routes = int(agent.max()) + 1, int(route.max()) + 1
     values, hessian = _fit(scores, agent, route, np.ones(routes), agents)
     ability, difficulty = values[:agents], values[agents:]
-    drawn, ranks = np.empty((RESAMPLES, agents)), np.empty((RESAMPLES, agents))
-    for k in range(RESAMPLES):
+    drawn, ranks = np.full((2, RESAMPLES, agents), np.nan)
+    for k in range(RESAMPLES if routes > 1 else 0):
         times = np.bincount(rng.integers(0, routes, routes), minlength=routes).astype(np.float64)
         drawn[k] = _fit(scores, agent, route, times, agents)[0][:agents]
         ranks[k] = _ranks(drawn[k])

@@ -74,8 +74,10 @@ def ranking_table(comparison: Comparison) -> Table:
         comparison.agents, comparison.ratings.ability, comparison.ratings.rank, strict=True
     ):
         scores = [drive.driving_score_1_0 for drive in agent.drives.values() if not drive.score.failed]
-        places = f"{rank.value:.3g} [{rank.low:.3g}, {rank.high:.3g}]"
-        logits = f"{ability.value:+.2f} [{ability.low:+.2f}, {ability.high:+.2f}]"
+        places, logits = f"{rank.value:.3g}", f"{ability.value:+.2f}"
+        if not np.isnan(rank.low):  # NaN with one route alone
+            places += f" [{rank.low:.3g}, {rank.high:.3g}]"
+            logits += f" [{ability.low:+.2f}, {ability.high:+.2f}]"
         cells: list[Cell | str | float | None] = [agent.name, places, logits, len(scores)]
         rows.append((-ability.value, [*cells, statistics.fmean(scores), agent.failed]))
     rows.sort(key=lambda row: row[0])
