@@ -55,6 +55,18 @@ def test_finished_logs_are_kept_and_damaged_ones_are_not(raw: Path, tmp_path: Pa
     assert not any(one.kept for one in convert_all(raw, "pandaset", out, 1, overwrite=True))
 
 
+def test_a_second_log_of_one_name_is_refused_and_not_taken_for_the_first(tmp_path: Path) -> None:
+    """Two sequences whose names differ only in a sign that logs cannot have."""
+    raw, out = tmp_path / "raw", tmp_path / "out"
+    raw.mkdir()
+    for name in ("drive 1", "drive-1"):
+        (raw / f"{name}.ncore4.zarr.itar").write_bytes(b"")
+    outcomes = list(convert_all(raw, "ncore", out, 1))
+    assert [one.name for one in outcomes] == ["ncore_train/drive-1"] * 2
+    clash = f"ncore_train/drive-1: a second log of this name, in {raw}; the first is in {raw}"
+    assert [one.failure == clash for one in outcomes] == [True, False]  # the other one is damaged
+
+
 def test_two_conversions_into_one_data_root_share_the_logs(raw: Path, tmp_path: Path) -> None:
     """The second begins when the first has converted one log, and the first goes on when it has ended."""
     out, logs = tmp_path / "out", tmp_path / "out" / "logs" / "pandaset_train"

@@ -62,11 +62,17 @@ def convert_all(
         InputError: the data set is unknown, or there is no log of it.
         OSError: the disk is full, so that no other log could be written.
     """
-    todo, paths = [], dict[int, LogPath]()
+    todo, paths, sources = [], dict[int, LogPath](), dict[Path, Path]()
     for raw in find_raw_logs(source, dataset, topics):
         with reading_raw(raw.source):
             path = log_path(raw.log.get_log_metadata(), out)
         remove_abandoned(path.folder.parent)  # Also where no log has to be converted
+        # A second log of one name would take the first for its own, and be lost
+        if path.folder in sources:
+            clash = f"a second log of this name, in {raw.source}; the first is in {sources[path.folder]}"
+            yield Conversion(path.name, None, f"{path.name}: {clash}")
+            continue
+        sources[path.folder] = raw.source
         if not overwrite and _is_whole(path.folder):
             yield Conversion(path.name, path, kept=True)
         else:
