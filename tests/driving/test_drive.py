@@ -6,7 +6,9 @@ import math
 import numpy as np
 import pytest
 import torch
+from small_drives import one_example
 
+from foredrive.data.batches import stack_records
 from foredrive.driving.drive import Drive, PlanningTiming, drive_route
 from foredrive.driving.dynamics import STEP_S
 from foredrive.driving.scores import Ending
@@ -36,6 +38,19 @@ def scenario() -> TownScenario:
 @pytest.fixture(scope="module")
 def simulator() -> TownSimulator:
     return TownSimulator()
+
+
+def test_going_straight_keeps_a_speed_and_raises_one_below_its_own() -> None:
+    """A batch of two: one at walking speed, which is no speed to keep, and one that is faster."""
+    clips = stack_records([one_example(seed).clip.observed()[0] for seed in (1, 2)])
+    speed_mps = clips.ego_speed_mps.clone()
+    speed_mps[:, -1] = torch.tensor([1.5, 12.0])
+    clips = dataclasses.replace(clips, ego_speed_mps=speed_mps)
+    points = torch.arange(1, 7) * 0.5
+    keeping, constant = (StraightAgent(5.0, keeps).act(clips).xy[:, 0] for keeps in (True, False))
+    torch.testing.assert_close(keeping[..., 0], torch.stack([5.0 * points, 12.0 * points]))
+    torch.testing.assert_close(constant[..., 0], torch.stack([5.0 * points, 5.0 * points]))
+    assert not keeping[..., 1].any()
 
 
 class Failing:

@@ -12,9 +12,6 @@ from foredrive.driving.observation import FRAME_DT_S, HORIZON_STEPS
 from foredrive.driving.replay.logged_drive import LoggedDrive
 from foredrive.scene import Clip, Trajectory
 
-STANDS_MPS = 0.5
-"""A slower vehicle stands."""
-
 
 @dataclass(frozen=True)
 class StraightAgent:
@@ -22,15 +19,14 @@ class StraightAgent:
 
     speed_mps: float
     keeps: bool = False
-    """If True, it keeps the speed that it has, and takes `speed_mps` only when it stands, as drives in towns
-    begin."""
+    """If True, it keeps the speed that it has where that is more. Drives in towns begin at rest."""
 
     def act(self, observation: Clip) -> Trajectory:
         """Return a straight plan for every item of the batch."""
         speed = torch.full((len(observation.t_s), 1), self.speed_mps)
         if self.keeps:
             now = observation.ego_speed_mps[:, observation.now, None].to(speed)
-            speed = torch.where(now > STANDS_MPS, now, speed)
+            speed = torch.maximum(now, speed)
         x = speed * FRAME_DT_S * torch.arange(1, HORIZON_STEPS + 1)
         return plan_of(torch.stack([x, torch.zeros_like(x)], dim=-1)[:, None])
 

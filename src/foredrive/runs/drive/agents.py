@@ -223,7 +223,7 @@ AGENTS: tuple[AgentKind, ...] = (
     AgentKind(CONSTANT_VELOCITY, "straight on at 5 m/s", _straight_on(CRUISE_MPS)),
     AgentKind(
         GO_STRAIGHT,
-        "straight on at the speed that it has, from rest at 5 m/s",
+        "straight on at the speed that it has, at least 5 m/s",
         _straight_on(CRUISE_MPS, keeps=True),
     ),
     AgentKind(DISTURBED, "the expert under disturbances, for demonstrations", _build_disturbed),
