@@ -7,9 +7,10 @@ import functools
 import math
 import os
 import signal
+import sys
 import threading
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -197,6 +198,19 @@ def synthetic_example(
 def make_example() -> Callable[..., Example]:
     """See `synthetic_example`."""
     return synthetic_example
+
+
+@pytest.fixture
+def navsim() -> Iterator[None]:
+    """Modules with the records of NAVSIM's interface; other tests expect theirs to be absent."""
+    from foredrive.integrations.navsim.stand_ins import add_stand_ins
+
+    before = set(sys.modules)
+    add_stand_ins()
+    yield
+    for name in set(sys.modules) - before:
+        if name.partition(".")[0] in {"navsim", "nuplan", "pytorch_lightning"}:
+            del sys.modules[name]
 
 
 @pytest.fixture(scope="session")

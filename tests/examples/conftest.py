@@ -8,8 +8,6 @@ from types import ModuleType
 
 import pytest
 
-from foredrive.integrations.navsim.stand_ins import add_stand_ins
-
 EXAMPLES = Path(__file__).parents[2] / "examples"
 
 
@@ -27,9 +25,3 @@ def example(monkeypatch: pytest.MonkeyPatch) -> Callable[[str], ModuleType]:
         return module
 
     return load
-
-
-@pytest.fixture
-def navsim() -> None:
-    """Modules with the records of NAVSIM's interface."""
-    add_stand_ins()

@@ -4,7 +4,6 @@ import dataclasses
 import json
 import math
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -18,11 +17,12 @@ from foredrive.cli.main import main
 from foredrive.errors import InputError
 from foredrive.integrations.navsim import records
 from foredrive.integrations.navsim.agent import IMAGE_HW, input_of, plan_by_navsim
-from foredrive.integrations.navsim.stand_ins import add_stand_ins
 from foredrive.integrations.own_agents import Needs, absolute, needs_of, own_agent
 from foredrive.runs.drive.agent_inputs import inputs_of, rig_of
 from foredrive.runs.drive.agents import absolute_name
 from foredrive.scene import Clip, LidarSweep, Trajectory
+
+pytestmark = pytest.mark.usefixtures("navsim")
 
 SHORT = """
 class Planner:
@@ -40,16 +40,6 @@ class Planner:
 def observed(seed: int = 3) -> Clip:
     """A batch of one clip of three key frames of a turning vehicle, with boxes that no agent may see."""
     return one_example(seed).clip.observed()
-
-
-@pytest.fixture(scope="module", autouse=True)
-def stand_ins_leave() -> Iterator[None]:
-    """Take the modules away that stand in for NAVSIM's, which other tests expect to be absent."""
-    before = set(sys.modules)
-    yield
-    for name in set(sys.modules) - before:
-        if name.partition(".")[0] in {"navsim", "nuplan", "pytorch_lightning"}:
-            del sys.modules[name]
 
 
 @pytest.fixture
@@ -258,7 +248,6 @@ def navsim_clip() -> Clip:
 
 
 def test_a_clip_becomes_navsims_input() -> None:
-    add_stand_ins()
     agent, clip = Stitching(), navsim_clip()
     given = input_of(agent, clip)
     poses = np.stack([status.ego_pose for status in given.ego_statuses])
@@ -289,7 +278,6 @@ def test_a_clip_becomes_navsims_input() -> None:
 
 
 def test_navsims_poses_become_points_of_half_seconds() -> None:
-    add_stand_ins()
     t_s = 0.5 * np.arange(1, 7)
     points = plan_by_navsim(Stitching(), navsim_clip())
     np.testing.assert_allclose(points, np.stack([t_s**2, -t_s], axis=1), atol=1e-5)
