@@ -16,6 +16,7 @@ from PIL import Image
 from test_task_pictures import agents
 
 from foredrive.cli.main import main
+from foredrive.bounded_server import REQUEST_S
 from foredrive.data import CameraSpec, LogPath, Points
 from foredrive.data import write_log as write_recorded
 from foredrive.runs import Run, train_run
@@ -118,7 +119,8 @@ def test_the_page_is_served_beside_two_hundred_bad_clients(
         began_s = time.monotonic()
         with urllib.request.urlopen(viewer.url, timeout=20) as page:
             assert page.status == 200
-        assert time.monotonic() - began_s < 1.0
+        # A server that waits for one of them waits REQUEST_S
+        assert time.monotonic() - began_s < REQUEST_S / 2
         with contextlib.suppress(ConnectionResetError):
             assert clients[0].recv(1) == b""
     with socket.create_connection(("localhost", viewer.server.get_port()), 20) as mad:
