@@ -2,7 +2,8 @@
 
 `make gpu` first runs tests/ops, which hold the Triton kernels and gsplat to their plain PyTorch references,
 values and gradients. The arms here time them, at the sizes and beside the references of `lifting`, `ops`,
-`field` and `splats`. `gaussians` needs gsplat. `nemo_base` is a training step of the paper's size.
+`field` and `splats`. `gaussians` needs gsplat and `field` needs SciPy; without them these arms are left
+out, and this is said. `nemo_base` is a training step of the paper's size.
 `export` compares a torch.export program of a small NeMo with the agent, both on the GPU. `ddp` compares a
 training step in a group of one process with a step without a group.
 
@@ -15,6 +16,7 @@ import sys
 import warnings
 from collections.abc import Callable, Mapping
 from functools import partial
+from importlib.util import find_spec
 
 import torch
 from lightning_fabric import Fabric
@@ -101,6 +103,9 @@ ARMS: dict[str, Measurement] = {
     **{name: partial(measure_program, name) for name in PROGRAMS},
 }
 
+NEEDS = {"gaussians": "gsplat", "field": "scipy"}
+"""Packages of arms that the other arms do not need."""
+
 
 def on_a_gpu(measurement: Measurement) -> Measurement:
     """Return a measurement that is refused on a machine without a GPU."""
@@ -125,4 +130,9 @@ if __name__ == "__main__":
     elif not torch.cuda.is_available():
         sys.exit(NO_GPU)
     else:
-        print(f"wrote {run_benchmark('gpu', BENCHMARK, CHECKOUT / 'benchmarks' / 'results')}")
+        absent = {arm: package for arm, package in NEEDS.items() if find_spec(package) is None}
+        for arm, package in absent.items():
+            print(f"{arm} is not measured: pip install {package}")
+        arms = [arm for arm in ARMS if arm not in absent]
+        results = CHECKOUT / "benchmarks" / "results"
+        print(f"wrote {run_benchmark('gpu', BENCHMARK, results, arms=arms)}")

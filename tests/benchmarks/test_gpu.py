@@ -9,7 +9,7 @@ import torch
 
 from benchmarks.common.measuring import CHECKOUT
 
-ABSENT = ("py123d", "pyarrow", "pandas", "cv2", "shapely", "trimesh", "embreex", "geopandas", "tyro")
+ABSENT = ("py123d", "pyarrow", "pandas", "cv2", "shapely", "trimesh", "embreex", "geopandas", "tyro", "scipy")
 PROGRAM = """
 import json, sys
 sys.modules.update(dict.fromkeys(sys.argv[2].split(",")))

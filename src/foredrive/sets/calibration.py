@@ -9,7 +9,6 @@ import numpy as np
 import torch
 from jaxtyping import Float, Shaped
 from numpy import ndarray
-from scipy.optimize import isotonic_regression
 
 from foredrive.errors import InputError
 from foredrive.sets.boxes import BoxDensity, LabelledBoxes
@@ -35,6 +34,8 @@ def fit_existence(probability: Float[ndarray, "n"], happened: Shaped[ndarray, "n
     `happened` may hold probabilities, such as 1 - `AssociationSum.absent`. The fitted values keep a distance
     of half an observation from 0 and 1, so that no likelihood becomes zero.
     """
+    from scipy.optimize import isotonic_regression  # not on every machine with a GPU
+
     if len(probability) == 0:
         raise InputError("calibration of existence needs detections")
     order = np.argsort(probability, kind="stable")

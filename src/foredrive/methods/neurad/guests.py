@@ -10,7 +10,6 @@ from typing import NamedTuple
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float, Int
-from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
 from foredrive.methods.neurad.content import FieldContent, FieldParts
@@ -256,6 +255,8 @@ def _together(seen: SeenAlongRays, ray: Int[Tensor, "Q"], curves: list[_Curve]) 
 
 def _filled(feature: Float[Tensor, "H W D"], share: Float[Tensor, "H W"]) -> Float[Tensor, "H W D"]:
     """Give rays that see nothing of a guest the feature of the nearest ray that does: a CNN sees both."""
+    from scipy.ndimage import distance_transform_edt  # not on every machine with a GPU
+
     nowhere = (share <= _LEAST_SHARE).cpu().numpy()
     rows, columns = distance_transform_edt(nowhere, return_distances=False, return_indices=True)
     device = feature.device

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
-from scipy.spatial import cKDTree
 from torch import Tensor
 
 from foredrive.geometry.projection import pixels_to_rays, project
@@ -103,6 +102,8 @@ def points_along_pixels(
         far_m: range of points that look upwards with no beam near, uniform in 1/m.
         generator: random choice of pixels.
     """
+    from scipy.spatial import cKDTree  # not on every machine with a GPU
+
     parts = [empty_points()]
     moments_s = torch.tensor([sweep.t_s for sweep in sweeps])
     # Every image gets nearly the same number of pixels; the shares add up to `count`
@@ -197,6 +198,8 @@ def subsample(points: SeedPoints, most: int, generator: torch.Generator) -> Seed
 
 def colour_from_neighbours(points: SeedPoints) -> SeedPoints:
     """Give unseen points the median colour of their nearest seen neighbours, if there are any."""
+    from scipy.spatial import cKDTree  # not on every machine with a GPU
+
     if bool(points.seen.all()) or not bool(points.seen.any()):
         return points
     near = cKDTree(points.xyz_m[points.seen].numpy()).query(
@@ -210,6 +213,8 @@ def colour_from_neighbours(points: SeedPoints) -> SeedPoints:
 
 def neighbour_distance_m(xyz_m: Float[Tensor, "N 3"]) -> Float[Tensor, "N"]:
     """Return the mean distance of each point to its nearest neighbours; 0.1 m for a few points."""
+    from scipy.spatial import cKDTree  # not on every machine with a GPU
+
     if len(xyz_m) <= _NEIGHBOURS:
         return torch.full((len(xyz_m),), 0.1)
     points = xyz_m.numpy()

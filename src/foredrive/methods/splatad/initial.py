@@ -8,7 +8,6 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float
-from scipy.spatial import cKDTree
 from torch import Tensor
 
 from foredrive.geometry.quaternions import quaternion_from_matrix
@@ -260,6 +259,8 @@ def _gaussians(
 
 def _patches(points: SeedPoints, size: InitialGaussians, generator: torch.Generator) -> Gaussians:
     """Build Gaussians with the covariance axes of their neighbours: flat where the neighbours are flat."""
+    from scipy.spatial import cKDTree  # not on every machine with a GPU
+
     gaussians = _gaussians(points, size, size.opacity, generator, by_neighbours=size.random_rotations)
     if len(points.xyz_m) <= _PATCH or size.random_rotations:
         return gaussians

@@ -10,7 +10,6 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
-from scipy.spatial import cKDTree
 from torch import Tensor
 
 from foredrive.geometry.projection import project
@@ -72,6 +71,8 @@ def extrapolated_ground(
         T_scene_ego: poses of the ego vehicle, whose frame is on the ground.
         step_m: spacing of the added Gaussians.
     """
+    from scipy.spatial import cKDTree  # not on every machine with a GPU
+
     ground = _ground(standing, T_scene_ego)
     xyz = ground.mean_m.double().cpu().numpy()
     level = _levels(xyz)
@@ -133,6 +134,8 @@ def _seen(
 
 def _ground(standing: Gaussians, T_scene_ego: Float[Tensor, "K 4 4"]) -> Gaussians:
     """Return the Gaussians that show the ground near the path, at about the height of the wheels."""
+    from scipy.spatial import cKDTree  # not on every machine with a GPU
+
     mean_m = standing.mean_m
     way = cKDTree(T_scene_ego[:, :2, 3].double().cpu().numpy())
     # Nearest pose of the path to each Gaussian, over the ground

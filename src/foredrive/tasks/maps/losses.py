@@ -6,7 +6,6 @@ from typing import NamedTuple
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float, Int
-from scipy.optimize import linear_sum_assignment
 from torch import Tensor
 
 
@@ -104,6 +103,8 @@ def _best_matching(
 
     The cost of a kind is the focal loss of the kind less that of its absence, as in Deformable DETR.
     """
+    from scipy.optimize import linear_sum_assignment  # not on every machine with a GPU
+
     # Cost of claiming a kind less the cost of denying it, for every element and kind
     yes, no = (sigmoid_focal_loss(logits, torch.full_like(logits, value)) for value in (1.0, 0.0))
     # Distance to a true element in its best order

@@ -6,8 +6,6 @@ import numba
 import numpy as np
 from jaxtyping import Int
 from numpy import ndarray
-from scipy.optimize import linear_sum_assignment
-from scipy.spatial.distance import cdist
 
 from foredrive.tasks.detection.matching import descending
 from foredrive.tasks.frames import rows_by_frame
@@ -61,6 +59,9 @@ def match_by_distance(predicted: PredictedAgents, true: TrueAgents, *, within_m:
 
     -1: none. Scores and classes do not matter.
     """
+    from scipy.optimize import linear_sum_assignment  # not on every machine with a GPU
+    from scipy.spatial.distance import cdist  # not on every machine with a GPU
+
     partner = np.full(len(predicted.frame), -1)
     rows, columns = rows_by_frame(predicted.frame), rows_by_frame(true.frame)
     for frame, row in rows.items():
