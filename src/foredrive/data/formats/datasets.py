@@ -52,7 +52,10 @@ DATASETS: dict[str, RawDataset] = {
     ),
     "griffin": RawDataset("py123d_datasets.griffin", "griffin-release/vehicle-side"),
     "truckdrive": RawDataset("py123d_datasets.truckdrive", "calibrations/calib_tf_tree_full.json"),
-    "physical-ai-av": RawDataset("py123d_datasets.physical_ai_av", "clip_index.parquet"),
+    "physical-ai-av": RawDataset(
+        "py123d_datasets.physical_ai_av",
+        "clip_index.parquet beside unpacked labels/egomotion and lidar/lidar_top_360fov",
+    ),
     "ncore": RawDataset("ncore.find_ncore", "*.ncore4*.zarr.itar or .zarr", "NCore v4"),
     "nureasoning": RawDataset("py123d_datasets.nureasoning", "train/*/*/metadata.json"),
     "nerfstudio": RawDataset("nerfstudio.find_nerfstudio", "transforms.json", "folders with transforms.json"),

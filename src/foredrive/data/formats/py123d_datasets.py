@@ -8,7 +8,7 @@ import importlib
 import importlib.util
 import json
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -192,14 +192,14 @@ def truckdrive(source: Path) -> Iterator[RawLog]:
         module = _module("truckdrive.truckdrive_parser")
         scenes = [folder.name for folder in folders if folder.parent == root]
         for raw in _of(module.TruckDriveDatasetParser(root, scenes), root):
-            yield RawLog(raw.source, _WithoutMotion(raw.log), raw.map)
+            yield RawLog(raw.source, _Changed(raw.log, _without_motion), raw.map)
 
 
-class _WithoutMotion(BaseLogParser):
-    """A parser of TruckDrive that leaves speeds out. py123d's writes 0 m/s for the vehicle and all boxes."""
+class _Changed(BaseLogParser):
+    """A parser whose modalities are changed, or left out where `change` returns None."""
 
-    def __init__(self, parser: Any) -> None:
-        self._parser = parser
+    def __init__(self, parser: Any, change: Callable[[BaseModality], BaseModality | None]) -> None:
+        self._parser, self._change = parser, change
 
     def get_log_metadata(self) -> LogMetadata:
         """Return the log's metadata."""
@@ -208,10 +208,12 @@ class _WithoutMotion(BaseLogParser):
     def iter_modalities_sync(self) -> Iterator[ModalitiesSync]:
         """Yield the frames."""
         for sync in self._parser.iter_modalities_sync():
-            yield ModalitiesSync(sync.timestamp, [_without_motion(modality) for modality in sync.modalities])
+            changed = [self._change(modality) for modality in sync.modalities]
+            yield ModalitiesSync(sync.timestamp, [modality for modality in changed if modality is not None])
 
 
 def _without_motion(modality: BaseModality) -> BaseModality:
+    """Leave speeds out. py123d's parser of TruckDrive writes 0 m/s for the vehicle and all boxes."""
     if isinstance(modality, EgoStateSE3):
         return EgoStateSE3.from_imu(modality.imu_se3, modality.metadata, modality.timestamp, None)
     if isinstance(modality, BoxDetectionsSE3):
@@ -223,11 +225,22 @@ def _without_motion(modality: BaseModality) -> BaseModality:
 
 
 def physical_ai_av(source: Path) -> Iterator[RawLog]:
-    """Find the downloaded clips of NVIDIA's PhysicalAI-Autonomous-Vehicles."""
+    """Find the downloaded clips of NVIDIA's PhysicalAI-Autonomous-Vehicles, with or without labels."""
     for root in folders_with(source, "clip_index.parquet"):
         module = _module("physical_ai_av.physical_ai_av_parser")
         splits = [f"physical-ai-av_{kind}" for kind in ("train", "val", "test")]
-        yield from _of(module.PhysicalAIAVParser(splits, root), root)
+        for raw in _of(module.PhysicalAIAVParser(splits, root), root):
+            clip = raw.log.get_log_metadata().log_name
+            ego = root / "labels" / "egomotion" / f"{clip}.egomotion.parquet"
+            lidar = root / "lidar" / "lidar_top_360fov" / f"{clip}.lidar_top_360fov.parquet"
+            boxes = root / "labels" / "obstacle.offline" / f"{clip}.obstacle.offline.parquet"
+            # py123d gives all clips of a chunk whose calibration is there, and frames without labels no boxes
+            if ego.is_file() and lidar.is_file():
+                yield raw if boxes.is_file() else RawLog(root, _Changed(raw.log, _without_boxes))
+
+
+def _without_boxes(modality: BaseModality) -> BaseModality | None:
+    return None if isinstance(modality, BoxDetectionsSE3) else modality
 
 
 def nureasoning(source: Path) -> Iterator[RawLog]:
