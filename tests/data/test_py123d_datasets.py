@@ -4,6 +4,7 @@ import importlib.util
 import io
 import json
 import pickle
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -32,6 +33,7 @@ from foredrive.data.maps import read_map_patch
 from foredrive.data.notices import read_notices
 from foredrive.data.safe_pickle import PlainPickle
 from foredrive.errors import InputError
+from foredrive.runs.convert import convert_all
 from foredrive.scene import Attribute, Category, MapKind, Visibility
 from foredrive.scene.boxes import UNKNOWN
 
@@ -457,6 +459,27 @@ def test_nothing_of_nureasoning_is_unpickled(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="which plain data do not need"):
         convert(tmp_path / "raw", "nureasoning", tmp_path / "out")
     assert not (tmp_path / "touched").exists()
+
+
+def test_nothing_is_unpickled_in_workers_either(tmp_path: Path) -> None:
+    """Workers are new processes, in which py123d's modules are as py123d has them."""
+    clip = write_nureasoning(tmp_path / "raw")
+    shutil.copytree(clip, clip.with_name("whole"))
+    (clip / "map.pkl").write_bytes(pickle.dumps(Intruder(f"touch {tmp_path / 'touched'}")))
+    done = {
+        one.name: one.failure for one in convert_all(tmp_path / "raw", "nureasoning", tmp_path / "out", 2)
+    }
+    assert done.pop("nureasoning-mini_train/whole") is None
+    (failure,) = done.values()
+    assert "which plain data do not need" in str(failure)
+    assert not (tmp_path / "touched").exists()
+
+
+def test_workers_convert_truckdrive_whose_modules_are_mended(tmp_path: Path) -> None:
+    write_truckdrive(tmp_path / "raw")
+    shutil.copytree(tmp_path / "raw" / "scene_900_1", tmp_path / "raw" / "scene_900_2")
+    done = list(convert_all(tmp_path / "raw", "truckdrive", tmp_path / "out", 2))
+    assert [one.failure for one in done] == [None, None]
 
 
 TREES = {

@@ -2,8 +2,11 @@
 
 py123d's parsers find the logs below a root by the published folders of each data set. Pickles in these data
 sets are read by an allow-list (`safe_pickle`), which takes the place of `pickle` in the parsers' modules.
+
+Modules are changed by functions `_…_parser`, which every process calls that gets a log (`RawLog.prepare`).
 """
 
+import dataclasses
 import importlib
 import importlib.util
 import json
@@ -55,10 +58,9 @@ def _nuscenes(source: Path, name: str) -> Iterator[RawLog]:
     for version, splits in versions.items():
         # nuScenes' own versions, by py123d's parser
         for root in folders_with(source, f"{version}/scene.json"):
-            module = _module("nuscenes.nuscenes_parser", "nuscenes")
-            _leave_unknown_speed_out(module)
+            module = _nuscenes_parser()
             maps = root if (root / "maps" / "expansion").is_dir() else None
-            yield from _of(module.NuScenesParser(splits, root, maps), root / version)
+            yield from _of(module.NuScenesParser(splits, root, maps), root / version, _nuscenes_parser)
     # Other versions, by the parser of tables
     for root in folders_with(source, "v[0-9]*-*/scene.json"):
         for tables in sorted(root.glob("v[0-9]*-*")):
@@ -80,13 +82,14 @@ def _own_scenes(tables: Path, *, sweeps: bool) -> Iterator[RawLog]:
         yield RawLog(tables.parent, NuScenesTablesParser(tables, split, token, sweeps=sweeps))
 
 
-def _leave_unknown_speed_out(parser: Any) -> None:
-    """Make py123d's parser of nuScenes leave speeds out where there is no CAN bus; it writes 0 m/s there."""
+def _nuscenes_parser() -> Any:
+    """Return py123d's parser, made to leave speeds out without a CAN bus; it writes 0 m/s there."""
+    parser = _module("nuscenes.nuscenes_parser", "nuscenes")
     extraction = _module("nuscenes.utils.nuscenes_extraction", "nuscenes")
     real_bus, find = parser.NuScenesCanBus, extraction._find_dynamic_state_from_can_bus
     # The replacement is made once
     if real_bus is _can_bus:
-        return
+        return parser
 
     def speed(bus: Any, scene: str, t_us: int) -> Any:
         try:
@@ -97,6 +100,7 @@ def _leave_unknown_speed_out(parser: Any) -> None:
 
     extraction._find_dynamic_state_from_can_bus = speed
     parser.NuScenesCanBus = _can_bus
+    return parser
 
 
 def _can_bus(dataroot: str) -> Any:
@@ -113,24 +117,33 @@ def nuplan(source: Path) -> Iterator[RawLog]:
         "test": ["nuplan_test"],
     }.items():
         for root in folders_with(source, f"nuplan-v1.1/splits/{kind}"):
-            module = _module("nuplan.nuplan_parser", "nuplan")
-            # Every module that unpickles gets the restricted reader
-            unpickling = [importlib.import_module(f"nuplan.database.{name}") for name in _NUPLAN_UNPICKLES]
-            for reader in (module, *unpickling):
-                reader.pickle = PlainPickle(_NUPLAN_LISTS)
             sensors = root / "nuplan-v1.1" / "sensor_blobs"
-            yield from _of(module.NuplanParser(splits, root, root / "maps", sensors), root)
+            parser = _nuplan_parser().NuplanParser(splits, root, root / "maps", sensors)
+            yield from _of(parser, root, _nuplan_parser)
+
+
+def _nuplan_parser() -> Any:
+    """Return py123d's parser; every module that unpickles has the restricted reader."""
+    module = _module("nuplan.nuplan_parser", "nuplan")
+    unpickling = [importlib.import_module(f"nuplan.database.{name}") for name in _NUPLAN_UNPICKLES]
+    for reader in (module, *unpickling):
+        reader.pickle = PlainPickle(_NUPLAN_LISTS)
+    return module
 
 
 def kitti360(source: Path) -> Iterator[RawLog]:
     """Find KITTI-360's drives. Their boxes are filtered anew: no precomputed pickle is read."""
     for root in folders_with(source, "calibration/calib_cam_to_pose.txt"):
-        module = _module("kitti360.kitti360_parser")
-        module.pickle = PlainPickle()
         drives = [folder.name for folder in sorted((root / "data_2d_raw").glob("*_sync"))]
-        parser = module.Kitti360Parser(["kitti360_train"], root, root, 80.0, drives, [], [])
-        for raw in _of(parser, root):
-            yield RawLog(raw.source, _WithOwnCache(raw.log), raw.map)
+        parser = _kitti360_parser().Kitti360Parser(["kitti360_train"], root, root, 80.0, drives, [], [])
+        for raw in _of(parser, root, _kitti360_parser):
+            yield dataclasses.replace(raw, log=_WithOwnCache(raw.log))
+
+
+def _kitti360_parser() -> Any:
+    module = _module("kitti360.kitti360_parser")
+    module.pickle = PlainPickle()
+    return module
 
 
 class _WithOwnCache(BaseLogParser):
@@ -186,13 +199,17 @@ def truckdrive(source: Path) -> Iterator[RawLog]:
     """Find TruckDrive's scenes. Those of its test split have no poses and are left out."""
     folders = folders_with(source, "calibrations/calib_tf_tree_full.json")
     for root in dict.fromkeys(folder.parent for folder in folders):
-        constants = _module("truckdrive.truckdrive_constants")
-        if not hasattr(constants, "DEFAULT_VEHICLE_HEIGHT_M"):
-            constants.DEFAULT_VEHICLE_HEIGHT_M = 4.0  # py123d 0.7.0 has this line at the end of a comment
-        module = _module("truckdrive.truckdrive_parser")
         scenes = [folder.name for folder in folders if folder.parent == root]
-        for raw in _of(module.TruckDriveDatasetParser(root, scenes), root):
-            yield RawLog(raw.source, _Changed(raw.log, _without_motion), raw.map)
+        parser = _truckdrive_parser().TruckDriveDatasetParser(root, scenes)
+        for raw in _of(parser, root, _truckdrive_parser):
+            yield dataclasses.replace(raw, log=_Changed(raw.log, _without_motion))
+
+
+def _truckdrive_parser() -> Any:
+    constants = _module("truckdrive.truckdrive_constants")
+    if not hasattr(constants, "DEFAULT_VEHICLE_HEIGHT_M"):
+        constants.DEFAULT_VEHICLE_HEIGHT_M = 4.0  # py123d 0.7.0 has this line at the end of a comment
+    return _module("truckdrive.truckdrive_parser")
 
 
 class _Changed(BaseLogParser):
@@ -246,12 +263,14 @@ def _without_boxes(modality: BaseModality) -> BaseModality | None:
 def nureasoning(source: Path) -> Iterator[RawLog]:
     """Find the clips of nuReasoning (mini)."""
     for root in folders_with(source, "train/*/*/metadata.json"):
-        module, maps = (
-            _module("nureasoning.nureasoning_parser"),
-            _module("nureasoning.nureasoning_map_parser"),
-        )
-        module.load_schema_pickle = maps.load_schema_pickle = _load_nureasoning
-        yield from _of(module.NureasoningParser(["nureasoning-mini_train"], root), root)
+        parser = _nureasoning_parser().NureasoningParser(["nureasoning-mini_train"], root)
+        yield from _of(parser, root, _nureasoning_parser)
+
+
+def _nureasoning_parser() -> Any:
+    module, maps = _module("nureasoning.nureasoning_parser"), _module("nureasoning.nureasoning_map_parser")
+    module.load_schema_pickle = maps.load_schema_pickle = _load_nureasoning
+    return module
 
 
 def _load_nureasoning(file: Path) -> Any:
@@ -269,7 +288,9 @@ def _module(name: str, needs: str = "") -> Any:
     return importlib.import_module(f"py123d.parser.{name}")
 
 
-def _of(parser: BaseDatasetParser, source: Path) -> Iterator[RawLog]:
+def _of(
+    parser: BaseDatasetParser, source: Path, prepare: Callable[[], object] | None = None
+) -> Iterator[RawLog]:
     """Yield the logs of a parser, each with its map."""
     # Maps by log, or by location where they are shared
     maps = {_map_key(one.get_map_metadata()): one for one in parser.get_map_parsers()}
@@ -278,7 +299,7 @@ def _of(parser: BaseDatasetParser, source: Path) -> Iterator[RawLog]:
         entry = maps.get((metadata.split, metadata.log_name)) or maps.get(
             (metadata.dataset, metadata.location)
         )
-        yield RawLog(source, log, entry)
+        yield RawLog(source, log, entry, prepare)
 
 
 def _map_key(metadata: MapMetadata) -> tuple[str | None, str | None]:

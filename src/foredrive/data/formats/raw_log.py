@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 from py123d.datatypes import LogMetadata
 from py123d.parser.base_dataset_parser import BaseLogParser, BaseMapParser
@@ -31,6 +31,32 @@ class RawLog:
     log: BaseLogParser | OwnLog
     map: BaseMapParser | None = None
     """Parser of the map, which may be shared by many logs."""
+    prepare: Callable[[], object] | None = None
+    """Changes modules of the parser. It runs again in each process that gets the log, before their import."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        # Parts are unpickled in this order
+        return _prepared_log, (_Preparation(self.prepare), self.source, self.log, self.map)
+
+
+class _Preparation:
+    """A function that is called where this is unpickled."""
+
+    def __init__(self, prepare: Callable[[], object] | None) -> None:
+        self.prepare = prepare
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _called, (self.prepare,)
+
+
+def _called(prepare: Callable[[], object] | None) -> _Preparation:
+    if prepare is not None:
+        prepare()
+    return _Preparation(prepare)
+
+
+def _prepared_log(preparation: _Preparation, source: Path, log: Any, map_parser: Any) -> RawLog:
+    return RawLog(source, log, map_parser, preparation.prepare)
 
 
 def folders_with(source: Path, pattern: str) -> list[Path]:
