@@ -25,14 +25,19 @@ SCENARIO_S = 8.0
 ON_ITS_WAY = ("light_accuracy_40m", "red_missed_40m", "conflict_recall", "conflict_false", "conflicts")
 
 
-def egos(seeds: Sequence[int], folder: Path, workers: int) -> list[LogPath]:
+def egos(seeds: Sequence[int], folder: Path, workers: int, conditions: Sequence[str] = ()) -> list[LogPath]:
     """Return the virtual egos of the training towns, by seed and then by town; record those that are missing.
+
+    Args:
+        conditions: names of `CONDITIONS`, of which one is drawn for each ego; by default a bright day.
 
     Raises:
         InputError: some failed: all arms must have the same data.
     """
     return _recorded(
-        [EgosPlan(town, seed, EGOS, ()) for seed in seeds for town in TRAINING_TOWNS], folder, workers
+        [EgosPlan(town, seed, EGOS, tuple(conditions)) for seed in seeds for town in TRAINING_TOWNS],
+        folder,
+        workers,
     )
 
 

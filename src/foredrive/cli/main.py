@@ -28,6 +28,7 @@ from foredrive.cli.export_ncore import export_ncore
 from foredrive.cli.export_nuscenes import export_nuscenes
 from foredrive.cli.fetch import fetch_av2
 from foredrive.cli.imagine import imagine
+from foredrive.cli.improve import improve
 from foredrive.cli.models import models
 from foredrive.cli.ncap import ncap
 from foredrive.cli.pseudo import pseudo
@@ -82,6 +83,7 @@ VERBS: dict[str, Callable[..., Any]] = {
     "evaluate": evaluate,
     "drive": drive,
     "compare": compare,
+    "improve": improve,
     "ncap": ncap,
     "pseudo": pseudo,
     "serve": serve,

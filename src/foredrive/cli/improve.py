@@ -1,0 +1,107 @@
+"""`foredrive improve`."""
+
+import dataclasses
+import os
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from foredrive.cli.arguments import Settings, SomePaths, check_number, check_out_folder, check_run
+from foredrive.cli.drive_options import InTowns
+from foredrive.cli.progress import job_progress
+from foredrive.data.log_paths import find_all_logs
+from foredrive.errors import InputError
+from foredrive.lazy import importing
+
+TRAINING = InTowns(routes="training-short")
+ROUND = ("see.epochs=2", "see.lr=1e-3")
+"""Settings of a round's training: it continues from weights that have been trained."""
+
+
+def improve(
+    run: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")],
+    pool: SomePaths,
+    out: Path,
+    towns: tyro.conf.OmitArgPrefixes[InTowns] = TRAINING,
+    logs: SomePaths = (),
+    judge: Annotated[str | None, tyro.conf.arg(metavar="SET|FILE.xml")] = None,
+    rounds: int = 3,
+    budget: int = 500,
+    strategy: Annotated[str, tyro.conf.arg(metavar="NAME")] = "failures-diversity",
+    keep_best: bool = False,
+    set: Settings = ROUND,
+) -> None:
+    """Improve a driver by the data that its failures ask for, in rounds.
+
+    A round drives the routes, takes the seconds before each failure as examples, chooses moments of the pool
+    that resemble them, trains on these and the run's own logs from the run's weights, and drives again. Each
+    round is a folder; an interrupted loop goes on, and --rounds may grow.
+
+    Args:
+        run: Folder of a driver's run, or embedded.
+        pool: 123D logs, splits or data roots to choose from. Labels are read of the chosen moments alone.
+        out: Folder of the loop: a folder for each round, summary.json and report.html.
+        logs: Logs that every round trains on too; by default those that the run was trained on.
+        judge: Held-out routes, a set or a file, that judge the rounds; by default the routes of --routes.
+            Towns of held-out routes may not be in the pool.
+        rounds: Number of rounds.
+        budget: Moments that are chosen in a round.
+        strategy: How: random; uncertainty, where the driver is least sure of what it sees; diversity,
+            k-centre over the embeddings; failures, those nearest to the failures, which take turns;
+            failures-diversity, k-centre among three times as many of these; anew, from drives on the failed
+            routes in other traffic, in place of the pool.
+        keep_best: Drop a round that is judged worse than the one before it; the next one starts from the
+            better run.
+        set: Entries of the run's recipe to replace in the rounds' training.
+    """
+    check_out_folder(out)
+    towns.check()
+    if towns.carla is not None:
+        raise InputError("the loop drives in the embedded towns: leave out --carla")
+    check_number("--rounds", rounds, low=1)
+    check_number("--budget", budget, low=1)
+    folder = check_run(run).absolute()
+    pool_logs, own = find_all_logs(pool), find_all_logs(logs) if logs else None
+
+    with importing():
+        from rich.console import Console
+
+        from foredrive.runs.drive.in_towns import TownRoutes
+        from foredrive.runs.improve.choosing import STRATEGIES
+        from foredrive.runs.improve.loop import Improvement
+        from foredrive.runs.improve.loop import improve as run_loop
+        from foredrive.runs.train.driver import open_driver
+        from foredrive.view.improve_report import REPORT, rounds_table, write_improve_report
+        from foredrive.view.table import print_table
+
+    if strategy not in STRATEGIES:
+        raise InputError(f"no strategy {strategy!r}; there are {', '.join(STRATEGIES)}")
+    routes = towns.source(str(folder))
+    assert isinstance(routes, TownRoutes)
+    improvement = Improvement(
+        folder,
+        pool_logs,
+        open_driver(folder).logs if own is None else own,
+        routes,
+        None if judge is None else dataclasses.replace(routes, routes=judge, only=()),
+        strategy,
+        budget,
+        tuple(set),
+        keep_best,
+        towns.seed,
+    )
+    result = run_loop(
+        improvement,
+        out,
+        rounds,
+        towns.workers or len(os.sched_getaffinity(0)),
+        say=lambda text: print(text, flush=True),
+        progress=job_progress,
+        report=lambda result: write_improve_report(out, result),
+    )
+    print_table(rounds_table(result), Console())
+    if result.ended:
+        print(f"ended: {result.ended}")
+    print(f"best: {result.best.run}")
+    print(f"report: {out / REPORT}")

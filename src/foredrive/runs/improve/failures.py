@@ -1,0 +1,86 @@
+"""Failures of drives: what went wrong, and the seconds before it as a part of the drive's log."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from foredrive.data.log_paths import LogPath
+from foredrive.driving.drive_record import DriveRecord
+from foredrive.driving.scores import Ending
+from foredrive.engine.folder import DRIVES
+from foredrive.runs.drive.records import read_drive
+
+BEFORE_S = 3.0
+"""Time before a failure whose key frames are examples of it, s."""
+APART_S = 3.0
+"""What happens within this time after a failure, s, belongs to it."""
+STANDING_MPS = 0.1
+
+
+@dataclass(frozen=True)
+class Failure:
+    """One failure of a drive."""
+
+    drive: str
+    """Stem of the drive's files."""
+    route: str
+    kind: str
+    """An `InfractionKind` or an `Ending`."""
+    what: str
+    """Object that was hit, or line that was crossed."""
+    t_s: float
+    """Time since the beginning of the drive, s; where the vehicle stopped for good, that of the stop."""
+    xy_world: tuple[float, float]
+    log: LogPath
+    """The drive's log, and as its only part the seconds before the failure."""
+
+    @property
+    def name(self) -> str:
+        """Return the failure in words."""
+        return f"{self.kind.replace('_', ' ')} at {self.t_s:.1f} s of {self.drive}"
+
+
+def failures_of(suite: Path) -> list[Failure]:
+    """Return the failures of all drives in a folder, by drive and time.
+
+    Drives in which the agent itself failed (an error, no plan) are left out: they say nothing about driving.
+    """
+    drives = {path.stem: read_drive(path) for path in sorted((suite / DRIVES).glob("*.json"))}
+    return [
+        failure
+        for name, drive in drives.items()
+        if not drive.score.failed
+        for failure in _of_drive(suite, name, drive)
+    ]
+
+
+def logs_before(failures: Sequence[Failure]) -> list[LogPath]:
+    """Return the logs of failures, each with the seconds before all its failures as parts."""
+    parts: dict[LogPath, list[tuple[float, float]]] = {}
+    for failure in failures:
+        whole = LogPath(failure.log.folder, failure.log.maps_dir)
+        parts.setdefault(whole, []).extend(failure.log.parts_s)
+    return [LogPath(log.folder, log.maps_dir, tuple(of_log)) for log, of_log in parts.items()]
+
+
+def _of_drive(suite: Path, name: str, drive: DriveRecord) -> list[Failure]:
+    score = drive.score
+    events = [(entry.t_s, str(entry.kind), entry.what, entry.xy_world) for entry in score.infractions]
+    if score.ending is not Ending.COMPLETED:
+        stop = _last_moving(drive)
+        events.append((drive.track.t_s[stop], str(score.ending), "", drive.track.xy[stop]))
+    failures: list[Failure] = []
+    for t_s, kind, what, xy in sorted(events):
+        if failures and t_s - failures[-1].t_s < APART_S:
+            continue
+        part = (max(0.0, t_s - BEFORE_S), t_s)
+        log = LogPath(suite / drive.log, suite / "maps", (part,))
+        if part[1] > 0:
+            failures.append(Failure(name, score.route, kind, what, t_s, xy, log))
+    return failures
+
+
+def _last_moving(drive: DriveRecord) -> int:
+    """Return the last state of the track in which the vehicle moved; the first if it never did."""
+    moving = [k for k, speed in enumerate(drive.track.speed_mps) if speed > STANDING_MPS]
+    return moving[-1] if moving else 0

@@ -1,0 +1,184 @@
+"""The report on rounds of the loop: scores, failures, what was chosen for them, films before and after."""
+
+from pathlib import Path
+from typing import NamedTuple
+from urllib.parse import quote
+
+import numpy as np
+
+from foredrive.data.log_paths import LogPath
+from foredrive.engine.folder import SUMMARY, held_for_results
+from foredrive.engine.provenance import collect_provenance
+from foredrive.engine.summary import write_summary
+from foredrive.runs.drive.compare import values_of
+from foredrive.runs.improve.loop import LoopResult, Round
+from foredrive.tasks.bootstrap import BootstrapMean, bootstrap_mean
+from foredrive.view.drive_video import write_drive_video
+from foredrive.view.hit_picture import hit_name, hit_picture
+from foredrive.view.html import Picture, picture, write_page
+from foredrive.view.table import Column, Row, Section, Table, number
+
+REPORT, VIDEOS = "report.html", "videos"
+FILMS, FAILURES_SHOWN = 3, 12
+COLUMNS = {
+    "completion": "completion, %",
+    "red_lights": "red lights",
+    "collisions": "collisions",
+    "stop_signs": "stop signs",
+}
+"""Values of drives beside the score; counts are per drive."""
+
+
+class AnsweredFailure(NamedTuple):
+    """A failure and the chosen moments that resemble it most."""
+
+    caption: str
+    moment: Picture
+    chosen: list[Picture]
+
+
+class Films(NamedTuple):
+    """The drives of one route in two rounds."""
+
+    caption: str
+    before: str
+    after: str
+
+
+class ShownRound(NamedTuple):
+    """What the page shows of a round."""
+
+    title: str
+    failures: str
+    answers: list[AnsweredFailure]
+    films: list[Films]
+
+
+def rounds_table(result: LoopResult) -> Table:
+    """Return the drives that judge each round, with differences from those of the run at the beginning."""
+    columns = [
+        Column("round", align="left"),
+        Column("moments"),
+        Column("driving score", digits=1),
+        Column("difference", wraps=False),
+        *[Column(title, digits=2) for title in COLUMNS.values()],
+        Column("", align="left"),
+    ]
+    rows = []
+    for of_number in result.rounds:
+        figures = _means(of_number)
+        change = "" if not of_number.number else _change(difference(result.rounds[0], of_number))
+        taken = "" if of_number.kept else "dropped"
+        first = "begin" if not of_number.number else str(of_number.number)
+        values = [figures[name] for name in COLUMNS]
+        rows.append(Row([first, len(of_number.hits) or None, of_number.score, change, *values, taken]))
+    drives = len(result.rounds[0].judged)
+    notes = [
+        f"{drives} drives; counts are per drive. Differences from the beginning with 95 % intervals (paired "
+        "bootstrap over routes)."
+    ]
+    return Table(columns, [Section(rows)], "Rounds", notes)
+
+
+def difference(first: Round, other: Round) -> BootstrapMean:
+    """Return the mean difference of the driving scores of two rounds, over their common drives."""
+    names = [name for name in first.judged if name in other.judged]
+    gains = [other.judged[name].driving_score_1_0 - first.judged[name].driving_score_1_0 for name in names]
+    routes = [first.judged[name].score.route for name in names]
+    return bootstrap_mean(np.array(gains), routes, np.random.default_rng(0))
+
+
+def write_improve_report(out: Path, result: LoopResult) -> None:
+    """Write summary.json and the page of a loop into its folder, and the films that the page shows."""
+    rounds = [_show(out, result, number) for number in range(1, len(result.rounds))]
+    with held_for_results(out):
+        write_summary(out / SUMMARY, figures_of(result) | collect_provenance())
+        write_page(
+            out / REPORT,
+            "improve_report.html.j2",
+            title=f"{result.rounds[0].run.name}, improved",
+            rounds=rounds,
+            table=rounds_table(result),
+            ended=result.ended,
+        )
+
+
+def figures_of(result: LoopResult) -> dict[str, float | int | str | None]:
+    """Return the figures of all rounds as flat dotted keys."""
+    out: dict[str, float | int | str | None] = {"rounds": len(result.rounds) - 1, "best": result.best.number}
+    for of_number in result.rounds:
+        prefix = f"round_{of_number.number}"
+        out |= {f"{prefix}.{name}": value for name, value in _means(of_number).items()}
+        out |= {
+            f"{prefix}.drives": len(of_number.judged),
+            f"{prefix}.moments": len(of_number.hits),
+            f"{prefix}.failures": len(of_number.failures),
+            f"{prefix}.kept": int(of_number.kept),
+        }
+    return out
+
+
+def _means(of_number: Round) -> dict[str, float]:
+    values = [values_of(drive) for drive in of_number.judged.values()]
+    return {name: float(np.mean([row[name] for row in values])) for name in values[0]}
+
+
+def _change(gain: BootstrapMean) -> str:
+    text = f"{gain.mean:+.1f}"
+    return text if np.isnan(gain.low) else f"{text} [{gain.low:+.1f}, {gain.high:+.1f}]"
+
+
+def _show(out: Path, result: LoopResult, place: int) -> ShownRound:
+    of_number = result.rounds[place]
+    before = [earlier for earlier in result.rounds[:place] if earlier.kept][-1]
+    kinds = [failure.kind.replace("_", " ") for failure in of_number.failures]
+    counts = ", ".join(f"{kinds.count(kind)} {kind}" for kind in dict.fromkeys(kinds))
+    moved = "" if of_number.kept else ", dropped"
+    return ShownRound(
+        f"Round {of_number.number}: {number(before.score, 1)} to {number(of_number.score, 1)}{moved}",
+        f"{len(kinds)} failures ({counts}); {len(of_number.hits)} moments chosen.",
+        _answers(of_number),
+        _films(out, before, of_number),
+    )
+
+
+def _answers(of_number: Round) -> list[AnsweredFailure]:
+    # Evenly over all, so that each kind of failure has a chance
+    count = len(of_number.answers)
+    shown = np.linspace(0, count - 1, min(count, FAILURES_SHOWN)).round().astype(int).tolist()
+    return [
+        AnsweredFailure(
+            answer.failure.name + (f": {answer.failure.what}" if answer.failure.what else ""),
+            picture(hit_picture(answer.moment), hit_name(answer.moment)),
+            [picture(hit_picture(hit), hit_name(hit)) for hit in answer.hits],
+        )
+        for answer in (of_number.answers[place] for place in shown)
+    ]
+
+
+def _films(out: Path, before: Round, after: Round) -> list[Films]:
+    """Write films of the judged drives that changed most."""
+    common = [name for name in before.judged if name in after.judged]
+
+    def gain(name: str) -> float:
+        return after.judged[name].driving_score_1_0 - before.judged[name].driving_score_1_0
+
+    changed = sorted((name for name in common if gain(name)), key=lambda name: -abs(gain(name)))[:FILMS]
+    return [
+        Films(
+            f"{name}: {number(before.judged[name].driving_score_1_0, 1)} to "
+            f"{number(after.judged[name].driving_score_1_0, 1)}",
+            *[_film(out, of_number, name) for of_number in (before, after)],
+        )
+        for name in changed
+    ]
+
+
+def _film(out: Path, of_number: Round, name: str) -> str:
+    """Return the address of a drive's film, relative to the page; write the film if it is missing."""
+    assert of_number.suite is not None
+    suite, drive = of_number.suite, of_number.judged[name]
+    film = suite / VIDEOS / f"{name}.webp"
+    if not film.is_file():
+        write_drive_video(film, LogPath(suite / drive.log, suite / "maps"), drive)
+    return quote(str(film.relative_to(out)))
