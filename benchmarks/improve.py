@@ -108,7 +108,7 @@ def _loop(strategy: str, seed: int) -> Loop:
         own.parent.mkdir(parents=True, exist_ok=True)
         if not own.is_symlink():
             own.symlink_to(common.absolute(), target_is_directory=True)
-    return Loop(improvement, out, CORES, print)
+    return Loop(improvement, out, CORES, say=print)
 
 
 def _round(strategy: str, seed: int) -> tuple[Loop, Round]:

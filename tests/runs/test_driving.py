@@ -46,21 +46,6 @@ VOXELS = VoxelSpec(lower_m=(-8.0, -8.0, -1.0), voxel_m=2.0, shape_zyx=(2, 8, 8))
 HOSTILE = 'x"><svg onload=alert(1)>'
 
 
-@pytest.fixture(scope="module")
-def routes(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two short routes of Town02 in CARLA's form, along one lane; CARLA's y points to the right."""
-    graph = build_lane_graph(load_town_map("Town02"))
-    lane = int(np.argmax(np.where(graph.contested, 0.0, graph.length_m)))
-    text = ""
-    for name, first_m in (("a", 20.0), ("b", 60.0)):
-        ends = graph.position(np.full(2, lane), np.array([first_m, first_m + 14.0]))
-        points = "".join(f'<waypoint x="{x}" y="{-y}" z="{z}"/>' for x, y, z in ends)
-        text += f'<route id="{name}" town="Town02">{points}</route>'
-    path = tmp_path_factory.mktemp("routes") / "two.xml"
-    path.write_text(f"<routes>{text}</routes>")
-    return path
-
-
 def test_what_a_route_file_asks_for_and_is_not_here_is_told(
     routes: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:

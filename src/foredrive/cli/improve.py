@@ -96,6 +96,7 @@ def improve(
         out,
         rounds,
         towns.workers or len(os.sched_getaffinity(0)),
+        on_ray=towns.ray,
         say=lambda text: print(text, flush=True),
         progress=job_progress,
         report=lambda result: write_improve_report(out, result),

@@ -21,6 +21,8 @@ from foredrive.view.bev import start_path_map
 from foredrive.view.html import style_axes
 
 MARGIN_M, MIN_HALF_WIDTH_M = 25.0, 45.0
+PLACES_M = 60.0
+"""Margin of lanes around places, m."""
 MAX_SHOWN_MPS = 14.0
 SPEED_MAP, DARKEST = "plasma", -0.35
 """Lower end of the speed colours, as a part of `MAX_SHOWN_MPS`. It keeps a standing vehicle away from the
@@ -73,6 +75,31 @@ def draw_drive_path(drive: DriveRecord) -> Figure:
     x, y = centre[0] - 0.92 * half, centre[1] - 0.92 * half
     ax.plot([x, x + scale_m], [y, y], color=palette.INK, linewidth=1.5)
     ax.text(x, y + 0.02 * half, f"{scale_m:.0f} m", color=palette.INK, fontsize=8, va="bottom")
+    return figure
+
+
+def letter_of(kind: str) -> str:
+    """Return the letter of an `InfractionKind`, or the first one of another word."""
+    return LETTERS[InfractionKind(kind)] if kind in set(InfractionKind) else kind[0]
+
+
+def draw_places(town: str, places: Sequence[tuple[Sequence[float], str]]) -> Figure:
+    """Draw places in a town, each with the kind of its event: letters as in the maps of drives.
+
+    Args:
+        places: position in the world, and the kind, see `letter_of`.
+    """
+    figure = Figure(figsize=(4.6, 4.6))
+    ax = figure.add_axes((0.0, 0.0, 1.0, 1.0))
+    lanes = np.concatenate([lane.centreline_xyz[:, :2] for lane in load_town_map(town).lanes])
+    xy = np.array([place for place, _ in places])
+    inside = (lanes > xy.min(0) - PLACES_M).all(1) & (lanes < xy.max(0) + PLACES_M).all(1)
+    centre, half = start_path_map(ax, np.concatenate([xy, lanes[inside]]), MARGIN_M, MIN_HALF_WIDTH_M)
+    ax.add_patch(Rectangle((0, 0), 1, 1, transform=ax.transAxes, facecolor=palette.PANEL, zorder=0))
+    _draw_lanes(ax, town, centre, half)
+    style = _style("circle", palette.PLAN) | {"fontsize": 13}  # the page shows several maps in a row
+    for place, kind in places:
+        ax.text(place[0], place[1], letter_of(kind), zorder=6, va="center_baseline", **style)
     return figure
 
 

@@ -23,11 +23,19 @@ REACH_M = 40.0
 """Half width of the lidar's picture, m."""
 
 
-def hit_picture(hit: Hit) -> UInt8[np.ndarray, "H W 3"]:
+def hit_picture(hit: Hit, *, lidar: bool = True) -> UInt8[np.ndarray, "H W 3"]:
     """Draw camera and lidar side by side, in the same size for every hit. A missing sensor is left dark.
 
     A whole scene shows its front camera. For any other view, a mark at the lidar's edge shows its direction.
+
+    Args:
+        lidar: False leaves the lidar's picture out.
     """
+    drawn = _drawn(hit)
+    return drawn if lidar else drawn[:, :WIDTH_PX]
+
+
+def _drawn(hit: Hit) -> UInt8[np.ndarray, "H W 3"]:
     canvas = Image.new("RGB", (WIDTH_PX + GAP_PX + HEIGHT_PX, HEIGHT_PX), palette.GROUND)
     canvas.paste(palette.PANEL, (0, 0, WIDTH_PX, HEIGHT_PX))
     canvas.paste(palette.PANEL, (WIDTH_PX + GAP_PX, 0, canvas.width, HEIGHT_PX))

@@ -1,22 +1,27 @@
 """The report on rounds of the loop: scores, failures, what was chosen for them, films before and after."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 from urllib.parse import quote
 
 import numpy as np
+from markupsafe import Markup
 
 from foredrive.data.log_paths import LogPath
 from foredrive.engine.folder import SUMMARY, held_for_results
 from foredrive.engine.provenance import collect_provenance
 from foredrive.engine.summary import write_summary
 from foredrive.runs.drive.compare import values_of
+from foredrive.runs.improve.failures import Failure
 from foredrive.runs.improve.loop import LoopResult, Round
+from foredrive.search.find import Hit
 from foredrive.tasks.bootstrap import BootstrapMean, bootstrap_mean
+from foredrive.view.drive_plots import draw_places, letter_of
 from foredrive.view.drive_video import write_drive_video
-from foredrive.view.hit_picture import hit_name, hit_picture
-from foredrive.view.html import Picture, picture, write_page
-from foredrive.view.table import Column, Row, Section, Table, number
+from foredrive.view.hit_picture import content_text, hit_name, hit_picture
+from foredrive.view.html import Picture, inline_svg, picture, write_page
+from foredrive.view.table import Column, Row, Section, Table, number, words
 
 REPORT, VIDEOS = "report.html", "videos"
 FILMS, FAILURES_SHOWN = 3, 12
@@ -50,6 +55,10 @@ class ShownRound(NamedTuple):
 
     title: str
     failures: str
+    places: list[tuple[str, Markup]]
+    """Maps of the towns, with the failures."""
+    letters: str
+    """The letters of the maps, in words."""
     answers: list[AnsweredFailure]
     films: list[Films]
 
@@ -131,15 +140,33 @@ def _change(gain: BootstrapMean) -> str:
 def _show(out: Path, result: LoopResult, place: int) -> ShownRound:
     of_number = result.rounds[place]
     before = [earlier for earlier in result.rounds[:place] if earlier.kept][-1]
-    kinds = [failure.kind.replace("_", " ") for failure in of_number.failures]
-    counts = ", ".join(f"{kinds.count(kind)} {kind}" for kind in dict.fromkeys(kinds))
+    kinds = [failure.kind for failure in of_number.failures]
+    counts = ", ".join(f"{kinds.count(kind)} {words(kind)}" for kind in dict.fromkeys(kinds))
     moved = "" if of_number.kept else ", dropped"
     return ShownRound(
         f"Round {of_number.number}: {number(before.score, 1)} to {number(of_number.score, 1)}{moved}",
         f"{len(kinds)} failures ({counts}); {len(of_number.hits)} moments chosen.",
+        _maps(of_number.failures),
+        ", ".join(f"{letter_of(kind)} {words(kind)}" for kind in dict.fromkeys(kinds)),
         _answers(of_number),
         _films(out, before, of_number),
     )
+
+
+def _maps(failures: Sequence[Failure]) -> list[tuple[str, Markup]]:
+    towns = sorted({failure.town for failure in failures if failure.town is not None})
+    return [
+        (
+            town,
+            inline_svg(
+                draw_places(
+                    town,
+                    [(failure.xy_world, failure.kind) for failure in failures if failure.town == town],
+                )
+            ),
+        )
+        for town in towns
+    ]
 
 
 def _answers(of_number: Round) -> list[AnsweredFailure]:
@@ -149,11 +176,16 @@ def _answers(of_number: Round) -> list[AnsweredFailure]:
     return [
         AnsweredFailure(
             answer.failure.name + (f": {answer.failure.what}" if answer.failure.what else ""),
-            picture(hit_picture(answer.moment), hit_name(answer.moment)),
-            [picture(hit_picture(hit), hit_name(hit)) for hit in answer.hits],
+            _picture(answer.moment),
+            [_picture(hit) for hit in answer.hits],
         )
         for answer in (of_number.answers[place] for place in shown)
     ]
+
+
+def _picture(hit: Hit) -> Picture:
+    name = hit_name(hit).rpartition("/")[0]
+    return picture(hit_picture(hit, lidar=False), f"{name}: {content_text(hit)}")
 
 
 def _films(out: Path, before: Round, after: Round) -> list[Films]:

@@ -31,6 +31,8 @@ class Failure:
     t_s: float
     """Time since the beginning of the drive, s; where the vehicle stopped for good, that of the stop."""
     xy_world: tuple[float, float]
+    town: str | None
+    """None without a map."""
     log: LogPath
     """The drive's log, and as its only part the seconds before the failure."""
 
@@ -68,15 +70,16 @@ def _of_drive(suite: Path, name: str, drive: DriveRecord) -> list[Failure]:
     events = [(entry.t_s, str(entry.kind), entry.what, entry.xy_world) for entry in score.infractions]
     if score.ending is not Ending.COMPLETED:
         stop = _last_moving(drive)
-        events.append((drive.track.t_s[stop], str(score.ending), "", drive.track.xy[stop]))
+        # Who never moved has failed by the time that is looked back on
+        stop_s = max(drive.track.t_s[stop], min(BEFORE_S, score.duration_s))
+        events.append((stop_s, str(score.ending), "", drive.track.xy[stop]))
     failures: list[Failure] = []
     for t_s, kind, what, xy in sorted(events):
         if failures and t_s - failures[-1].t_s < APART_S:
             continue
         part = (max(0.0, t_s - BEFORE_S), t_s)
         log = LogPath(suite / drive.log, suite / "maps", (part,))
-        if part[1] > 0:
-            failures.append(Failure(name, score.route, kind, what, t_s, xy, log))
+        failures.append(Failure(name, score.route, kind, what, t_s, xy, drive.town, log))
     return failures
 
 

@@ -96,13 +96,19 @@ class Improvement:
         """Check what can be checked before the first drive.
 
         Raises:
-            InputError: the run is no driver or not trained, there is no such route, or a log of the pool is
-                among those of the training.
+            InputError: the run is no driver or not trained, there is no such route, a log of its training
+                is missing, or one of the pool is among them.
         """
         open_driver(self.start).weights  # noqa: B018 - raises where training has not finished
         self.recipe()
         for source in filter(None, (self.routes, self.held_out)):
             source.jobs(str(self.start))
+        for log in self.logs:
+            if not log.folder.is_dir():
+                raise InputError(
+                    f"{log.folder}: a log that the run was trained on is not here; --logs names others, on "
+                    "which every round trains beside the chosen moments"
+                )
         trained = {log.name for log in self.logs}
         if common := [log.name for log in self.pool if log.name in trained]:
             raise InputError(
@@ -165,6 +171,7 @@ def improve(
     rounds: int,
     workers: int = 1,
     *,
+    on_ray: bool = False,
     say: Callable[[str], object] = lambda text: None,
     progress: Progress = lambda what, count: nullcontext(lambda: None),
     report: Callable[[LoopResult], object] = lambda result: None,
@@ -172,7 +179,7 @@ def improve(
     """Run the rounds; continue where an earlier call stopped. A later call may ask for more of them.
 
     Args:
-        workers: number of drives, and of parts of logs to embed, at a time.
+        workers: number of drives, and of parts of logs to embed, at a time; on Ray as for `fan_out.fan_out`.
         say: called with a line about each step.
         progress: shows how far a step is.
         report: writes the report, after each round.
@@ -183,7 +190,7 @@ def improve(
     """
     improvement.check()
     with _folder(improvement, out).claimed():
-        loop = Loop(improvement, out, workers, say, progress)
+        loop = Loop(improvement, out, workers, on_ray=on_ray, say=say, progress=progress)
         result = LoopResult([loop.judged(loop.begin)])
         report(result)
         for number in range(1, rounds + 1):
@@ -238,7 +245,7 @@ class Loop:
 
     Args:
         out: folder of the loop.
-        workers, say, progress: as of `improve`.
+        workers, on_ray, say, progress: as of `improve`.
 
     Raises:
         InputError: the pool is empty, or has logs of towns that have to stay unseen.
@@ -252,10 +259,12 @@ class Loop:
         improvement: Improvement,
         out: Path,
         workers: int = 1,
+        *,
+        on_ray: bool = False,
         say: Callable[[str], object] = lambda text: None,
         progress: Progress = lambda what, count: nullcontext(lambda: None),
     ) -> None:
-        self.of, self.out, self.workers = improvement, out, workers
+        self.of, self.out, self.workers, self.on_ray = improvement, out, workers, on_ray
         self.say, self.progress = say, progress
         self.recipe = improvement.recipe()
         self.pool = open_clips(self.of.pool, self.recipe.clips, self.out / "cache")
@@ -322,7 +331,9 @@ class Loop:
 
     def _index(self, logs: Sequence[LogPath], uri: Path, what: str) -> None:
         with _fraction(self.progress, what) as tick:
-            done = index_logs(logs, str(uri), "embedded", STRIDE_S, self.workers, tick=tick)
+            done = index_logs(
+                logs, str(uri), "embedded", STRIDE_S, self.workers, on_ray=self.on_ray, tick=tick
+            )
         if done.failed:
             name, why = next(iter(done.failed.items()))
             raise InputError(f"{len(done.failed)} logs cannot be indexed: {name}: {why}")
@@ -330,7 +341,7 @@ class Loop:
     def _drive(self, run: Path, source: TownRoutes, out: Path) -> dict[str, DriveRecord]:
         suite = DriveSuite(str(run.absolute()), source, sensors=False, lidar=False)
         with self.progress(f"driving {source.routes}", len(suite.jobs())) as tick:
-            driven = drive_suite(suite, out, self.workers, tick=lambda *_: tick())
+            driven = drive_suite(suite, out, self.workers, on_ray=self.on_ray, tick=lambda *_: tick())
         if driven.broken:
             job, why = next(iter(driven.broken.items()))
             raise InputError(f"{len(driven.broken)} drives failed, such as {job.name}: {why}")
