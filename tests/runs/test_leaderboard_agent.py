@@ -44,6 +44,19 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+OWN = """
+class Planner:
+    needs = {"cameras": ["PCAM_F0"], "image_hw": [48, 80], "lidar": True, "past_frames": 1}
+
+    def act(self, clip):
+        assert clip.images.shape[-2:] == (48, 80) and len(clip.rig.names) == 1
+        # A wall 30 m ahead of the lidar: the plan ends well before it
+        points = clip.sweeps[clip.now].points_ego[clip.sweeps.valid[clip.now]]
+        assert 28 < float(points[:, 0].median()) < 32
+        return [[2.0 * k, 0.0] for k in range(1, 7)]
+"""
+
+
 @pytest.fixture
 def loaded(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     """The file, loaded by its path where the leaderboard's code is there."""
@@ -77,7 +90,6 @@ def test_bench2drive_gets_controls_and_what_it_measures_by(
         "GPS": (1, np.zeros(3)),
         "IMU": (1, np.array([0, 0, 9.8, 0, 0, 0, 1.57])),
         "SPEED": (1, {"speed": 0.0}),
-        "LIDAR": (1, np.array([[30.0, 0.0, 1.0, 0.5]], dtype=np.float32)),
     }
     assert data.keys() == {sensor["id"] for sensor in agent.sensors()}
     controls = [agent.run_step(data, 0.05 * k) for k in range(12)]
@@ -87,6 +99,29 @@ def test_bench2drive_gets_controls_and_what_it_measures_by(
     written = json.loads((tmp_path / "Route2_rep0_Town02" / "metric_info.json").read_text())
     assert len(written) == 12
     assert written["0"] == {"location": [1.0, 2.0, 3.0]}
+
+
+def test_a_planner_of_ones_own_drives_there(loaded: ModuleType, tmp_path: Path) -> None:
+    carla = pytest.importorskip("carla")
+    (tmp_path / "own.py").write_text(OWN)
+    agent = loaded.ForedriveAgent("localhost", 2000, False)
+    straight = SimpleNamespace(name="LANEFOLLOW")
+    places = [carla.Transform(carla.Location(x, 0, 0)) for x in (0.0, 40.0)]
+    by_satellite = [({"lat": 0.0, "lon": x / 111_319.49, "z": 0.0}, straight) for x in (0.0, 40.0)]
+    agent.set_global_plan(by_satellite, [(place, straight) for place in places])
+    agent.setup(f"python:{tmp_path / 'own.py'}:Planner")
+    (camera,) = [sensor for sensor in agent.sensors() if "width" in sensor]
+    assert (camera["height"], camera["width"]) == (48, 80)
+    wall = np.array([[30.0, y, 1.0, 0.5] for y in (-1.0, 0.0, 1.0)], dtype=np.float32)
+    data = {
+        camera["id"]: (1, np.zeros((48, 80, 4), dtype=np.uint8)),
+        "GPS": (1, np.zeros(3)),
+        "IMU": (1, np.array([0, 0, 9.8, 0, 0, 0, 1.57])),
+        "SPEED": (1, {"speed": 0.0}),
+        "LIDAR": (1, wall),
+    }
+    controls = [agent.run_step(data, 0.05 * k) for k in range(30)]
+    assert controls[-1].throttle > 0
 
 
 def test_the_route_may_be_appended_to_the_run(tmp_path: Path) -> None:

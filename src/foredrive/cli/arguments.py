@@ -11,6 +11,9 @@ from foredrive.errors import InputError
 from foredrive.runs.shipped import run_folder
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from foredrive.data.log_paths import LogPath
     from foredrive.sensors.rigs import RigPlan
 
 OptionalPath = Annotated[Path | None, tyro.conf.arg(metavar="PATH")]
@@ -95,6 +98,23 @@ def check_out_folder(folder: Path | None) -> None:
     """Check that --out can be a folder. Raise `InputError` if it is a file."""
     if folder is not None and folder.exists() and not folder.is_dir():
         raise InputError(f"--out {folder}: this is a file; a folder is needed")
+
+
+def whole_logs(verb: str, logs: "Sequence[Path]") -> "tuple[LogPath, ...]":
+    """Return the logs that a verb exports.
+
+    Raises:
+        InputError: there are none, or a list of clips has parts of some.
+    """
+    from foredrive.data.log_paths import find_all_logs
+
+    if not logs:
+        raise InputError(f"{verb} needs a log, or a data root with logs")
+    log_paths = find_all_logs(logs)
+    parts = [log.name for log in log_paths if log.parts_s]
+    if parts:
+        raise InputError(f"whole logs are exported, not parts of them as of {parts[0]} in a list of clips")
+    return log_paths
 
 
 def check_run(run: Path) -> Path:

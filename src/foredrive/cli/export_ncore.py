@@ -6,7 +6,7 @@ from typing import Annotated
 
 import tyro
 
-from foredrive.cli.arguments import check_out_folder
+from foredrive.cli.arguments import check_out_folder, whole_logs
 from foredrive.cli.failures import listed_failures
 from foredrive.cli.progress import frame_progress
 from foredrive.errors import InputError
@@ -29,17 +29,10 @@ def export_ncore(
         out: Folder; a log becomes OUT/SPLIT/NAME/NAME.json and the stores beside it.
         overwrite: Export logs again that were exported before.
     """
-    from foredrive.data.log_paths import find_all_logs
-
     if importlib.util.find_spec("ncore") is None:
         raise InputError("NCore needs the package nvidia-ncore: pip install 'foredrive[ncore]'")
     check_out_folder(out)
-    if not logs:
-        raise InputError("export ncore needs a log, or a data root with logs")
-    log_paths = find_all_logs(logs)
-    parts = [log.name for log in log_paths if log.parts_s]
-    if parts:
-        raise InputError(f"whole logs are exported, not parts of them as of {parts[0]} in a list of clips")
+    log_paths = whole_logs("export ncore", logs)
 
     with importing():
         from foredrive.data.logs import Log

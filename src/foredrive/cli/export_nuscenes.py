@@ -6,7 +6,7 @@ from typing import Annotated
 
 import tyro
 
-from foredrive.cli.arguments import check_number, check_out_folder
+from foredrive.cli.arguments import check_number, check_out_folder, whole_logs
 from foredrive.cli.failures import listed_failures
 from foredrive.cli.progress import frame_progress
 from foredrive.errors import InputError
@@ -37,17 +37,10 @@ def export_nuscenes(
         workers: Number of logs exported at a time; 0: one for each core.
         overwrite: Export logs again that were exported before.
     """
-    from foredrive.data.log_paths import find_all_logs
-
     check_number("--rate", rate, above=0)
     check_number("--workers", workers, low=0)
     check_out_folder(out)
-    if not logs:
-        raise InputError("export nuscenes needs a log, or a data root with logs")
-    log_paths = find_all_logs(logs)
-    parts = [log.name for log in log_paths if log.parts_s]
-    if parts:
-        raise InputError(f"whole logs are exported, not parts of them as of {parts[0]} in a list of clips")
+    log_paths = whole_logs("export nuscenes", logs)
 
     with importing():
         from foredrive.integrations.nuscenes.dataset import NuScenesFolder

@@ -377,7 +377,12 @@ class Loop:
             hits = choose(self.of.strategy, request)
         if hits:
             clips = [
-                ListedClip(hit.row.folder, hit.row.maps_dir, hit.row.t_s - CLIP_S, hit.row.t_s + CLIP_S)
+                ListedClip(
+                    hit.row.folder.absolute(),
+                    hit.row.maps_dir.absolute(),
+                    hit.row.t_s - CLIP_S,
+                    hit.row.t_s + CLIP_S,
+                )
                 for hit in hits
             ]
             notes = [{"log": hit.row.log, "t_s": hit.row.t_s, "score": hit.score} for hit in hits]
