@@ -72,7 +72,7 @@ def test_every_results_file_has_a_page_and_a_row() -> None:
         ("claims.md", "sets.md#speed", "sets.md#speed"),
         ("claims.md", "../benchmarks/results/ops.json", "benchmarks/ops.md"),
         ("claims.md", "../src/foredrive/scene/clip.py", "source/src/foredrive/scene/clip.py.md"),
-        ("how-to/train.md", "../../README.md#results", "../readme.md#results"),
+        ("how-to/train.md", "../../README.md#limitations", "../readme.md#limitations"),
         ("how-to/index.md", "../../benchmarks/results", "../benchmarks/index.md"),
         ("readme.md", "docs/claims.md", "claims.md"),
         ("readme.md", "docs/hero.png", "hero.png"),

@@ -49,11 +49,12 @@ def write_drive_video(path: Path, log: LogPath, drive: DriveRecord) -> None:
         drive: record of the drive.
     """
     opened = Log(log)
-    frames = (_frame(opened, index, drive) for index in range(len(opened)))
+    frames = (draw_drive_frame(opened, index, drive) for index in range(len(opened)))
     write_video(path, frames, FRAME_DT_S / SPEEDUP)
 
 
-def _frame(log: Log, index: int, drive: DriveRecord) -> Image.Image:
+def draw_drive_frame(log: Log, index: int, drive: DriveRecord) -> Image.Image:
+    """Draw one key frame of a drive."""
     above = draw_from_above(
         drive.town,
         np.array(drive.route_xy),
