@@ -33,7 +33,8 @@ def score(
             files. For map: JSON of MapTR, or of StreamMapNet's family. For occupancy: a folder of npz files
             as Occ3D or OpenOcc define them.
         truth: The ground truth in the same format; for COCO its instances. For detection and tracking also a
-            folder of nuScenes' tables (v1.0-*). For all tasks but sets also a folder of 123D logs.
+            folder of nuScenes' tables (v1.0-*). For nuScenes' results and all tasks also a folder of 123D
+            logs.
         task: sets: detections as a random finite set. The others are scored under all published protocols of
             the task, see docs/tasks.md.
         poses: For occupancy: nuscenes_infos_val.pkl or Occ3D's annotations.json. They give the scored

@@ -6,9 +6,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from tasks.files_of_detections import box, write_coco_truth, write_list, write_nuscenes
 
+from foredrive.data.boxes import read_boxes
+from foredrive.data.log_paths import LogPath
+from foredrive.data.logs import Log
 from foredrive.errors import InputError
+from foredrive.scene import Category
 from foredrive.tasks.detection.files import read_detections
 
 
@@ -47,6 +52,37 @@ def test_nuscenes_boxes_around_the_ego_vehicle(tmp_path: Path) -> None:
     assert frame.visibility is not None
     assert frame.visibility.tolist() == [7.0]
     assert len(empty.detected.log_existence) == len(empty.objects.label) == 0
+
+
+def test_the_truth_may_be_logs(log: LogPath, tmp_path: Path) -> None:
+    """Frames have the names of clips, so that their scores go into an index of search."""
+    opened = Log(log)
+    frames = {f"{log.name}@{opened.t_us[k]}": k for k in (3, 12)}
+    results = {name: [box(*opened.T_world_ego[k, :2, 3], detection_score=0.5)] for name, k in frames.items()}
+    read = read_detections(write_nuscenes(tmp_path / "found.json", results), log.folder)
+    assert [frame.name for frame in read.frames] == list(frames)
+    for frame, k in zip(read.frames, frames.values(), strict=True):
+        boxes = read_boxes(opened, k)
+        assert boxes is not None
+        boxes = boxes[boxes.valid]
+        assert frame.sequence == log.name
+        # Turned into the axes of the world, about the ego vehicle, which is where the detection is
+        R_world_ego = torch.from_numpy(opened.T_world_ego[k, :3, :3])
+        torch.testing.assert_close(frame.objects.state[:, :3], boxes.centre.double() @ R_world_ego.T)
+        torch.testing.assert_close(frame.objects.state[:, 3:], boxes.size_lwh.double().log())
+        ahead = torch.stack([boxes.yaw.cos(), boxes.yaw.sin(), torch.zeros_like(boxes.yaw)], -1).double()
+        turned = ahead @ R_world_ego.T
+        assert frame.objects.yaw is not None
+        torch.testing.assert_close(frame.objects.yaw.cos(), turned[:, 0], atol=1e-3, rtol=0)
+        assert [read.classes[n] for n in frame.objects.label.tolist()] == [
+            Category(kind).name.lower() for kind in boxes.category.tolist()
+        ]
+        assert abs(frame.detected.boxes.mean[0, :2]).max() < 1e-6
+    unlike = write_nuscenes(tmp_path / "other.json", {f"{log.name}@1": []})
+    with pytest.raises(InputError, match="none of its 1 frames is in"):
+        read_detections(unlike, log.folder)
+    with pytest.raises(InputError, match="a truth of logs needs an object of boxes by sample"):
+        read_detections(write_list(tmp_path / "coco.json", []), log.folder)
 
 
 def test_files_as_the_devkit_serialises_boxes(tmp_path: Path) -> None:

@@ -18,8 +18,11 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
+from foredrive.data.boxes import read_boxes
 from foredrive.errors import InputError
 from foredrive.files import atomic_path
+from foredrive.scene import Category
+from foredrive.scene.boxes import UNKNOWN
 from foredrive.sets import Family
 from foredrive.tasks.detection.frames import (
     STD_OF_SIDE,
@@ -38,9 +41,12 @@ from foredrive.tasks.detection.frames import (
     tell_left_out,
 )
 from foredrive.tasks.detection.kitti_labels import read_kitti
-from foredrive.tasks.detection.nuscenes_results import read_nuscenes
+from foredrive.tasks.detection.nuscenes_results import boxes_by_frame, read_nuscenes
+from foredrive.tasks.detection.protocols import CLASSES
 from foredrive.tasks.detection.score import FrameScore
+from foredrive.tasks.evaluation.frames_of_results import log_frames
 from foredrive.tasks.evaluation.plain_files import read_plain
+from foredrive.tasks.tracking.in_world import ego_yaw, places_in_world
 
 Record = Mapping[str, Any]
 
@@ -209,13 +215,20 @@ def _named(content: Mapping[str, Any], key: str, path: Path) -> list[Any]:
 def read_detections(results: Path, truth: Path, family: Family = "gaussian") -> DetectionSet:
     """Read detections and truth: two folders of KITTI's text, or JSON of nuScenes or COCO.
 
-    `family` is that of the box densities.
+    The truth of nuScenes' results may be a folder of 123D logs, whose frames are named LOG@T_US. `family` is
+    that of the box densities.
 
     Raises:
         InputError: a file cannot be read. The message names it.
     """
     if results.is_dir() and truth.is_dir():
         read = read_kitti(results, truth, family)
+    elif truth.is_dir():
+        predicted = read_plain(results)
+        if not isinstance(predicted, dict):
+            raise InputError(f"{results}: a truth of logs needs an object of boxes by sample (nuScenes)")
+        true = boxes_of_logs(truth, boxes_by_frame(results, predicted), results)
+        read = read_nuscenes(predicted, true, results, truth, family)
     else:
         predicted, true = read_plain(results), read_plain(truth)
         if not isinstance(true, dict):
@@ -233,6 +246,50 @@ def read_detections(results: Path, truth: Path, family: Family = "gaussian") -> 
     if not read.classes:
         raise InputError(f"neither {results} nor {truth} holds any box")
     return read
+
+
+def boxes_of_logs(folder: Path, listed: Iterable[str], path: Path) -> dict[str, list[Record]]:
+    """Return the true boxes of logs in nuScenes' format, in the logs' world frames.
+
+    Args:
+        folder: with logs, as `find_logs` takes it.
+        listed: names of frames, LOG@T_US.
+        path: of the results, for messages.
+
+    Raises:
+        InputError: a frame is not in the logs, or not annotated.
+    """
+    frames: dict[str, list[Record]] = {}
+    for named in log_frames(folder, dict.fromkeys(listed), path):
+        boxes = read_boxes(named.log, named.frame)
+        if boxes is None:
+            raise InputError(f"{path}: frame {named.name} is not annotated in {named.log.path.folder}")
+        kept, T_world_ego = boxes[boxes.valid], named.log.T_world_ego[named.frame]
+        centre = places_in_world(kept.centre.double().numpy(), T_world_ego)
+        half_yaw = 0.5 * (kept.yaw.double().numpy() + ego_yaw(T_world_ego))
+        columns = zip(
+            (Category(kind).name.lower() for kind in kept.category.tolist()),
+            centre.tolist(),
+            (centre - T_world_ego[:3, 3]).tolist(),
+            kept.size_lwh.double().numpy()[:, [1, 0, 2]].tolist(),
+            np.stack([np.cos(half_yaw), 0 * half_yaw, 0 * half_yaw, np.sin(half_yaw)], -1).tolist(),
+            kept.num_points.tolist(),
+            strict=True,
+        )
+        frames[named.name] = [
+            {
+                "detection_name": name,
+                "translation": translation,
+                "ego_translation": from_ego,
+                "size": size,
+                "rotation": rotation,
+                "scene_token": named.log.path.name,
+            }
+            | ({} if points == UNKNOWN else {"num_pts": points})
+            for name, translation, from_ego, size, rotation, points in columns
+            if name in CLASSES
+        ]
+    return frames
 
 
 def write_frame_scores(path: Path, scores: Iterable[FrameScore]) -> None:
