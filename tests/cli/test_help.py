@@ -29,6 +29,13 @@ def test_help_explains_every_flag(verb: str, capsys: pytest.CaptureFixture[str])
         assert " ".join(sentence) in " ".join(said.replace("│", " ").split())
 
 
+def test_the_program_alone_prints_its_help(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main([])
+    assert ended.value.code == 0
+    assert "The learning loop of autonomous driving" in capsys.readouterr().out
+
+
 def test_help_has_no_line_breaks_of_the_source() -> None:
     """The parser joins the lines of a paragraph, but not before a dash, and not those of an argument."""
     documented = """Do it.

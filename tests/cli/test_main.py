@@ -151,7 +151,7 @@ def test_a_missing_file_is_a_mistake_unless_a_verb_says_otherwise(run: Callable)
         run(lambda: Path("/nowhere/at/all").read_text())
 
 
-@pytest.mark.parametrize("args", [["vew"], ["view"], ["train", "nemo_tiny"], []])
+@pytest.mark.parametrize("args", [["vew"], ["view"], ["train", "nemo_tiny"]])
 def test_what_the_command_line_gets_wrong_ends_in_2(
     args: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:

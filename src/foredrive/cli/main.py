@@ -144,9 +144,9 @@ def main(args: Sequence[str] | None = None) -> int:
 
     Bad input and full disks print one line on stderr and return 2; Ctrl-C prints one line and returns 130.
     Any other error is an error of the program, and its traceback is shown. Errors of the command line itself
-    end in SystemExit(2), `--help` ends in SystemExit(0).
+    end in SystemExit(2), `--help` and nothing at all end in SystemExit(0).
     """
-    args = sys.argv[1:] if args is None else list(args)
+    args = (sys.argv[1:] if args is None else list(args)) or ["--help"]
     if args == ["--version"]:
         print(f"foredrive {foredrive.__version__}")
         return 0
