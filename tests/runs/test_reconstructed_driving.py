@@ -1,6 +1,7 @@
 """Drives in a small log that was reconstructed, with cameras and lidar: kept, recorded, and looked at."""
 
 import dataclasses
+import shutil
 from pathlib import Path
 
 import pytest
@@ -12,10 +13,12 @@ from foredrive.cli.main import main
 from foredrive.data import ClipConfig, ClipDataset, LogPath, find_logs
 from foredrive.data.drives import read_drive as read_log
 from foredrive.driving.replay.threats import Threat
+from foredrive.engine.config import save_recipe
 from foredrive.engine.summary import read_summary
 from foredrive.errors import InputError
 from foredrive.methods.reconstruction.renderer import ReconstructedRenderer
 from foredrive.runs import Run, evaluate_run
+from foredrive.runs.drive.agent_inputs import chosen_cameras
 from foredrive.runs.drive.in_reconstruction import REPLAY, ReconstructedRoutes, shown_vehicle
 from foredrive.runs.drive.suite import DriveSuite, drive_suite
 from foredrive.runs.reconstruction.reconstruction_run import open_reconstruction
@@ -100,6 +103,28 @@ def test_an_agent_that_requires_other_cameras_is_shown_its_own(
     (drive,) = drive_suite(suite, tmp_path).drives.values()
     assert drive.error == ""
     assert drive.score.duration_s > 1
+
+
+def test_an_agent_may_require_cameras_by_the_other_of_their_names(
+    reconstructed: Path, trained: Run, tmp_path: Path
+) -> None:
+    """The log calls its cameras "ahead" and "left", and the recipe asks for PCAM_L0."""
+    shutil.copytree(trained.folder, tmp_path / "run")
+    clips = dataclasses.replace(trained.recipe.clips, cameras=("PCAM_L0",))
+    save_recipe(dataclasses.replace(trained.recipe, clips=clips), tmp_path / "run" / "config.yaml")
+    vehicle = shown_vehicle(str(reconstructed), str(tmp_path / "run"))
+    assert vehicle.rig.names == ("ahead", "left")
+    assert chosen_cameras(str(tmp_path / "run"), vehicle) == [1]
+    assert chosen_cameras(str(trained.folder), vehicle) == [0, 1]
+    suite = DriveSuite(str(tmp_path / "run"), ReconstructedRoutes(str(reconstructed)))
+    (drive,) = drive_suite(suite, tmp_path / "drives").drives.values()
+    assert drive.error == ""
+    clips = dataclasses.replace(clips, cameras=("PCAM_B0",))
+    save_recipe(dataclasses.replace(trained.recipe, clips=clips), tmp_path / "run" / "config.yaml")
+    with pytest.raises(
+        InputError, match=r"no reconstructed camera 'PCAM_B0'; there are: ahead \(pcam_f0\), "
+    ):
+        chosen_cameras(str(tmp_path / "run"), vehicle)
 
 
 def test_other_cameras_take_what_was_learned_of_the_most_similar_ones(reconstructed: Path) -> None:

@@ -14,7 +14,7 @@ from foredrive.errors import InputError
 from foredrive.runs import Run
 from foredrive.runs.evaluate.real_to_sim_gap import RealToSimComparison, measure_gap, rendered_images
 from foredrive.runs.reconstruction.reconstruct import read_reconstruction_data, reconstruct
-from foredrive.runs.reconstruction.reconstruction_run import camera_indices, open_reconstruction
+from foredrive.runs.reconstruction.reconstruction_run import open_reconstruction
 from foredrive.scene import Clip, Trajectory
 from foredrive.tasks.evaluation.predictor import Prediction
 
@@ -95,9 +95,3 @@ def test_the_verb_shows_a_table(
 ) -> None:
     assert main(["evaluate", str(trained.folder), "--in", str(reconstructed), "--out", str(tmp_path)]) == 0
     assert "agreement of both" in capsys.readouterr().out
-
-
-def test_a_camera_that_was_not_reconstructed_is_named() -> None:
-    assert camera_indices(("a", "b"), ("b", "a")) == [1, 0]
-    with pytest.raises(InputError, match="not reconstructed: c; available: a, b"):
-        camera_indices(("a", "b"), ("a", "c"))

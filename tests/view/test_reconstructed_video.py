@@ -149,7 +149,7 @@ def test_captions_say_what_was_changed() -> None:
         (["--remove", "3"], "no actor 3; there are: 7, 11"),
         (["--insert", "{run}:7"], "written RUN:ACTOR@WAY"),
         (["--insert", "{tmp}:7@11"], "{tmp}: not a reconstruction folder"),
-        (["--cameras", "behind"], "no camera 'behind'; there are: ahead"),
+        (["--cameras", "behind"], "no reconstructed camera 'behind'; there are: ahead (pcam_f0)"),
         (["--start", "7"], "7 s is not in the log, which lasts from 0 s to 0.4 s"),
         (["--start", "0.2", "--seconds", "1"], "1.2 s is not in the log"),
         (["--rate-hz", "-5"], "--rate-hz must be a number above 0, got -5"),

@@ -42,7 +42,8 @@ def render(
             --remove.
         edits: File of edits, applied before those of the other flags.
         save_edits: Write all edits to this file, so that --edits can apply them again.
-        cameras: Show only these cameras, in this order; by default all reconstructed cameras.
+        cameras: Show only these cameras, in this order, by their own names or 123D's, such as pcam_f0; by
+            default all reconstructed cameras.
         lidar: Mount this lidar in place of the log's lidar; by default the log's own, if its beam pattern is
             known.
         colour: Quantity that colours the lidar's points.

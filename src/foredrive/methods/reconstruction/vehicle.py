@@ -103,10 +103,12 @@ class LoggedVehicle(Record):
             InputError: there is no camera of this name. The message lists those that exist.
         """
         others = self.other_names or ((),) * len(self.rig.names)
-        for index, names in enumerate(zip(self.rig.names, others, strict=True)):
-            if name.lower() in (alias.lower() for alias in (names[0], *names[1])):
+        cameras = [dict.fromkeys((own, *names)) for own, names in zip(self.rig.names, others, strict=True)]
+        for index, names in enumerate(cameras):
+            if name.lower() in (alias.lower() for alias in names):
                 return index
-        raise InputError(f"no camera {name!r}; there are: {', '.join(self.rig.names) or 'none'}")
+        texts = [own if not names else f"{own} ({', '.join(names)})" for own, *names in cameras]
+        raise InputError(f"no reconstructed camera {name!r}; there are: {', '.join(texts) or 'none'}")
 
 
 def read_vehicle(

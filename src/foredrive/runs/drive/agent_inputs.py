@@ -1,6 +1,6 @@
 """The inputs that agents require: sensors, key frames, the cameras of their training."""
 
-from collections.abc import Sequence
+import contextlib
 from dataclasses import dataclass
 
 from foredrive.driving.observation import FRAME_DT_S
@@ -100,17 +100,21 @@ def _declared_rig(agent: str) -> RigPlan:
     return usual if needs.image_hw is None else usual.of_size(needs.image_hw)
 
 
-def chosen_cameras(agent: str, cameras: Sequence[str]) -> list[str]:
-    """Return the cameras that an agent is shown, in lower case: those that it requires, or else all.
+def chosen_cameras(agent: str, vehicle: LoggedVehicle) -> list[int]:
+    """Return the cameras of a vehicle that an agent is shown: those that it requires, or else all.
 
     Of a rig that has more than all cameras of the agent's training, these are chosen.
+
+    Raises:
+        InputError: the vehicle lacks a camera that the agent requires.
     """
-    names = [camera.lower() for camera in cameras]
     if (required := inputs_of(agent).camera_names) is not None:
-        return [camera.lower() for camera in required]
+        return [vehicle.camera(name) for name in required]
     rigs = _rigs_of(agent)
-    usual = set(names) if rigs is None else {camera.lower() for camera in rigs.usual.cameras}
-    return [name for name in names if name in usual] if usual <= set(names) else names
+    with contextlib.suppress(InputError):
+        if rigs is not None:
+            return sorted(vehicle.camera(name) for name in rigs.usual.cameras)
+    return list(range(len(vehicle.rig.names)))
 
 
 def own_rig(agent: str, vehicle: LoggedVehicle) -> RigPlan | None:

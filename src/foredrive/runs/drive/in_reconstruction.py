@@ -32,7 +32,6 @@ from foredrive.runs.drive.agents import CORRIDOR, EXPERT, REPLAY, Sees, is_remot
 from foredrive.runs.drive.suite import DriveJob, DriveSetup, DriveSuite
 from foredrive.runs.reconstruction.reconstruction_run import (
     OpenedReconstruction,
-    camera_indices,
     edited_scene,
     open_reconstruction,
     open_run_log,
@@ -252,6 +251,7 @@ def _agent_in(name: str, simulator: ReconstructedSimulator, sees: Sees | None) -
     if name == CORRIDOR:
         return CorridorAgent(simulator.drive)
     agent = make_agent(name, lambda: simulator.state.t_s, sees=sees)
-    cameras = [camera.lower() for camera in simulator.renderer.rig.names]
-    wanted = chosen_cameras(name, cameras)
-    return _SelectedCameras(agent, camera_indices(cameras, wanted)) if wanted != cameras else agent
+    assert isinstance(simulator.renderer, ReconstructedRenderer)
+    vehicle = simulator.renderer.vehicle
+    cameras = chosen_cameras(name, vehicle)
+    return agent if cameras == list(range(len(vehicle.rig.names))) else _SelectedCameras(agent, cameras)

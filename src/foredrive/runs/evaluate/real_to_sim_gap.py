@@ -8,7 +8,6 @@ import torch
 from torch import Tensor
 
 from foredrive.data import collate
-from foredrive.data.cameras import find_camera, pinhole_cameras
 from foredrive.data.logs import Log
 from foredrive.data.resizing import shrink_images
 from foredrive.engine.provenance import collect_provenance
@@ -19,7 +18,7 @@ from foredrive.methods.reconstruction.views import CameraView
 from foredrive.runs.evaluate.predict import AgentPredictor
 from foredrive.runs.open_clips import open_clips
 from foredrive.runs.reconstruction.reconstruct import read_reconstruction_data
-from foredrive.runs.reconstruction.reconstruction_run import camera_indices, open_reconstruction, open_run_log
+from foredrive.runs.reconstruction.reconstruction_run import open_reconstruction, open_run_log
 from foredrive.runs.train.run import Run, load_agent
 from foredrive.scene import Clip, Example, VoxelGrid
 from foredrive.tasks.evaluation.metric import Figures
@@ -69,8 +68,8 @@ def measure_gap(
     )
     dataset = open_clips([log], config, reconstructed / "cache")
     opened = Log(log)
-    names = (_own_names(opened, names) for names in (data.vehicle.rig.names, dataset.camera_names))
-    cameras, t_us, every = camera_indices(*names), opened.t_us, recipe.hold_out_every
+    cameras = [data.vehicle.camera(name) for name in dataset.camera_names]
+    t_us, every = opened.t_us, recipe.hold_out_every
     held_us = set(t_us[every - 1 :: every].tolist()) if every else set()
     moments = [k for k in range(len(dataset)) if dataset.now_us(k) in held_us]
     if not moments:
@@ -118,15 +117,6 @@ def rendered_images(
                 raise InputError(f"no view of {clip.rig.names[place]} at {at_s:.3f} s of the log")
             images[frame, place] = scene.camera(graph, view.to(scene.device)).rgb_8bit
     return dataclasses.replace(clip, images=images)
-
-
-def _own_names(log: Log, names: Sequence[str]) -> list[str]:
-    """Return the log's own camera names for names that may be those of 123D."""
-    by_name = pinhole_cameras(log)
-    cameras = [find_camera(by_name, name) for name in names]
-    return [
-        name if camera is None else camera.camera_name for name, camera in zip(names, cameras, strict=True)
-    ]
 
 
 class RealToSimComparison:

@@ -1,7 +1,6 @@
 """Open finished reconstructions without their logs."""
 
 import json
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -63,16 +62,3 @@ def open_run_log(folder: Path) -> tuple[ReconstructionRecipe[Any], LogPath]:
     if not path.folder.is_dir():
         raise InputError(f"{folder}: its log no longer exists: {path.folder}")
     return load_reconstruction_recipe(folder / CONFIG), path
-
-
-def camera_indices(names: Sequence[str], wanted: Sequence[str]) -> list[int]:
-    """Return the index of the reconstructed camera for each camera that an agent requires.
-
-    Raises:
-        InputError: some cameras were not reconstructed; the error names them.
-    """
-    if missing := [name for name in wanted if name not in names]:
-        raise InputError(
-            f"cameras not reconstructed: {', '.join(missing)}; available: {', '.join(names) or 'none'}"
-        )
-    return [names.index(name) for name in wanted]
