@@ -50,8 +50,9 @@ def test_all_or_nothing_stays_finite_and_equals_share_a_rank() -> None:
     assert [one.value for one in ratings.rank] == [1, 4, 2.5, 2.5]
 
 
-def test_one_route_has_no_intervals_over_routes() -> None:
-    ratings = rated(np.array([[0.9], [0.2]]))
+@pytest.mark.parametrize("routes", [1, 9])
+def test_few_routes_have_no_intervals_over_routes(routes: int) -> None:
+    ratings = rated(np.array([[0.9] * routes, [0.2] * routes]))
     assert [one.value for one in ratings.rank] == [1, 2]
     assert np.isnan([end for one in (*ratings.ability, *ratings.rank) for end in (one.low, one.high)]).all()
     assert np.isfinite([ratings.difficulty[0].low, ratings.difficulty[0].high]).all()

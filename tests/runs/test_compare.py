@@ -3,6 +3,7 @@
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 from html_pages import EVIL, assert_harmless
 
@@ -15,7 +16,7 @@ from foredrive.runs.drive.compare import compare, figures_of, read_agent
 from foredrive.runs.drive.in_reconstruction import ReconstructedRoutes
 from foredrive.runs.drive.in_towns import TownRoutes
 from foredrive.runs.drive.suite import DriveSource, DriveSuite
-from foredrive.view.compare_report import means_table, routes_table
+from foredrive.view.compare_report import means_table, ranking_table, routes_table
 
 Given = dict[tuple[str, int], tuple[float, list[str], str]]
 """By route and repetition: completion, kinds of infractions, ending."""
@@ -123,7 +124,7 @@ def test_differences_by_hand(tmp_path: Path) -> None:
     assert found.left_out == 2
     score = found.differences["driving_score_1_0"]["s"]
     assert score.mean == pytest.approx((30 + 0 + 70) / 3)
-    assert 0 <= score.low < score.mean < score.high <= 70
+    assert np.isnan([score.low, score.high]).all()  # of three routes
     assert found.differences["red_lights"]["s"].mean == pytest.approx(-1 / 3)
     assert found.differences["collisions"]["s"].mean == pytest.approx(-1 / 3)
     assert found.differences["speed_mps"]["s"].mean == pytest.approx((5 - 2.5) / 3)
@@ -133,6 +134,29 @@ def test_differences_by_hand(tmp_path: Path) -> None:
     assert found.unlike == ()
     assert "s" in str(means_table(found).columns)
     assert len(routes_table(found, 2).sections[0].rows) == 2
+
+
+@pytest.mark.parametrize("routes", [9, 10])
+def test_fewer_than_ten_routes_have_no_intervals(routes: int, tmp_path: Path) -> None:
+    """One agent drives the whole of every route, the other half of every second one."""
+    whole: Given = {(str(k), 0): (1.0, [], DONE) for k in range(routes)}
+    half: Given = {(str(k), 0): (0.5 + 0.5 * (k % 2), [], "blocked") for k in range(routes)}
+    compared = compare([read_agent(str(suite(tmp_path / n, d))) for n, d in (("h", half), ("w", whole))])
+    figures, score = figures_of(compared), compared.differences["completion"]["w"]
+    means, ranking = means_table(compared), ranking_table(compared)
+    cells = [str(cell) for table in (means, ranking) for row in table.sections[0].rows for cell in row.cells]
+    notes = [" ".join(table.notes) for table in (means, ranking)]
+    if routes < 10:
+        assert np.isnan([score.low, score.high]).all()
+        assert figures["w.completion.difference.low"] is None
+        assert figures["w.ability.low"] is figures["w.rank.high"] is None
+        assert not any("[" in cell for cell in cells)
+        assert all("fewer than 10 routes there are no intervals" in note for note in notes)
+    else:
+        assert 0 < score.low < score.mean < score.high <= 50
+        assert figures["w.ability.low"] < figures["w.ability"]
+        assert any("[" in cell for cell in cells)
+        assert all("Intervals of 95 %" in note for note in notes)
 
 
 def test_repetitions_of_a_route_are_drawn_together(tmp_path: Path) -> None:

@@ -225,7 +225,10 @@ def test_a_round_learns_moments_of_the_pool_and_is_judged(
     assert summary["round_1.moments"] == 4
     page = (out / "report.html").read_text()
     assert f"{len(first.failures)} failures" in page
-    assert len(rounds_table(result).sections[0].rows) == 2
+    table = rounds_table(result)
+    assert len(table.sections[0].rows) == 2
+    assert table.sections[0].rows[1].cells[3] == f"{gain:+.1f}"  # two routes have no interval
+    assert "fewer than 10 routes" in table.notes[0]
 
 
 def test_a_loop_goes_on_and_has_other_moments_in_the_next_round(

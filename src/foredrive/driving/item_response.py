@@ -11,6 +11,8 @@ import numpy as np
 from jaxtyping import Float64, Int64
 from scipy.special import expit
 
+from foredrive.tasks.bootstrap import LEAST_ROUTES
+
 PRIOR_SPREAD = 10.0
 """Standard deviation of abilities and difficulties before any drive, in logits."""
 RESAMPLES, LEVEL = 500, 0.95
@@ -47,7 +49,7 @@ def rate(
 ) -> Ratings:
     """Fit the model to the drives of A agents on R routes.
 
-    With one route there is nothing to draw from, and the intervals of abilities and ranks are NaN.
+    With fewer than `LEAST_ROUTES` routes the intervals of abilities and ranks are NaN.
 
     Args:
         scores: of each drive, 0 to 1.
@@ -59,7 +61,7 @@ def rate(
     values, hessian = _fit(scores, agent, route, np.ones(routes), agents)
     ability, difficulty = values[:agents], values[agents:]
     drawn, ranks = np.full((2, RESAMPLES, agents), np.nan)
-    for k in range(RESAMPLES if routes > 1 else 0):
+    for k in range(RESAMPLES if routes >= LEAST_ROUTES else 0):
         times = np.bincount(rng.integers(0, routes, routes), minlength=routes).astype(np.float64)
         drawn[k] = _fit(scores, agent, route, times, agents)[0][:agents]
         ranks[k] = _ranks(drawn[k])

@@ -9,6 +9,14 @@ from numpy import ndarray
 
 from foredrive.errors import InputError
 
+LEAST_ROUTES = 10
+"""Routes of closed-loop drives below which there is no interval over them.
+
+Percentile intervals of few values are too narrow: of 5 normal values those of 95 % hold the true mean in
+82 % of cases, of 10 in 90 %, of 32 in 93 %; of values that are mostly 0 in 68 %, 84 % and 92 %.
+"""
+NO_INTERVAL = f"Of fewer than {LEAST_ROUTES} routes there are no intervals: they would be too narrow."
+
 
 @dataclass(frozen=True)
 class BootstrapMean:
@@ -31,12 +39,13 @@ def bootstrap_mean(
     *,
     level: float = 0.95,
     resamples: int = 2000,
+    least: int = 2,
 ) -> BootstrapMean:
     """Return the percentile interval of the mean over frames, by drawing whole sequences with replacement.
 
     The p-value of paired differences tests whether two detectors differ, by a randomisation test (Fisher
     1935): resampled means would call any two sequences that agree significant. With one sequence there is
-    nothing to draw from, and interval and p-value are NaN.
+    nothing to draw from, and interval and p-value are NaN. With fewer than `least` sequences the interval is.
 
     Raises:
         InputError: without values, or if any is not finite.
@@ -59,4 +68,6 @@ def bootstrap_mean(
     as_large = by_chance >= (1 - 1e-9) * abs(total.sum())
     # The observed signs are one of the draws, hence + 1
     p_value = float((as_large.sum() + 1) / (resamples + 1))
+    if len(total) < least:
+        low = high = np.nan
     return BootstrapMean(mean, float(low), float(high), p_value)

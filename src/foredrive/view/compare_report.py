@@ -9,7 +9,7 @@ from markupsafe import Markup
 from matplotlib.figure import Figure
 
 from foredrive.runs.drive.compare import METRICS, Comparison
-from foredrive.tasks.bootstrap import BootstrapMean
+from foredrive.tasks.bootstrap import LEAST_ROUTES, NO_INTERVAL, BootstrapMean
 from foredrive.view.html import INK_MARK, inline_svg, style_axes, write_page
 from foredrive.view.table import MISSING, Cell, Column, Row, Section, Table, number, simple_table
 
@@ -44,10 +44,14 @@ def means_table(comparison: Comparison) -> Table:
             cells.append(number(mean, digits))
             cells.append(_difference(metric, comparison.differences[metric][agent.name], digits))
         rows.append(Row(cells))
+    intervals = (
+        NO_INTERVAL
+        if len(comparison.routes) < LEAST_ROUTES
+        else "Intervals of 95 % (paired bootstrap over routes); coloured where the interval leaves out 0."
+    )
     notes = [
         f"Drives that all agents have: {len(comparison.keys)}, on {len(comparison.routes)} routes. "
-        f"Differences from {first.name} with 95 % intervals (paired bootstrap over routes); coloured where "
-        "the interval leaves out 0."
+        f"Differences from {first.name}. {intervals}"
     ]
     if comparison.left_out:
         notes.append(f"{comparison.left_out} drives are left out: not all agents have them.")
@@ -75,16 +79,17 @@ def ranking_table(comparison: Comparison) -> Table:
     ):
         scores = [drive.driving_score_1_0 for drive in agent.drives.values() if not drive.score.failed]
         places, logits = f"{rank.value:.3g}", f"{ability.value:+.2f}"
-        if not np.isnan(rank.low):  # NaN with one route alone
+        if not np.isnan(rank.low):  # NaN with few routes
             places += f" [{rank.low:.3g}, {rank.high:.3g}]"
             logits += f" [{ability.low:+.2f}, {ability.high:+.2f}]"
         cells: list[Cell | str | float | None] = [agent.name, places, logits, len(scores)]
         rows.append((-ability.value, [*cells, statistics.fmean(scores), agent.failed]))
     rows.sort(key=lambda row: row[0])
+    few = len(comparison.rated_routes) < LEAST_ROUTES
     notes = [
         "By an item-response model of all drives of each agent: the logit of an expected score is the "
-        "ability minus the difficulty of the route. Intervals of 95 % over routes. Drives in which the agent "
-        "itself failed count for nothing."
+        "ability minus the difficulty of the route. Drives in which the agent itself failed count for "
+        "nothing. " + (NO_INTERVAL if few else "Intervals of 95 % over routes.")
     ]
     return Table(columns, [Section([Row(cells) for _, cells in rows])], "Ranking", notes)
 

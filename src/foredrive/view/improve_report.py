@@ -16,7 +16,7 @@ from foredrive.runs.drive.compare import values_of
 from foredrive.runs.improve.failures import Failure
 from foredrive.runs.improve.loop import LoopResult, Round
 from foredrive.search.find import Hit
-from foredrive.tasks.bootstrap import BootstrapMean, bootstrap_mean
+from foredrive.tasks.bootstrap import LEAST_ROUTES, NO_INTERVAL, BootstrapMean, bootstrap_mean
 from foredrive.view.drive_plots import draw_places, letter_of
 from foredrive.view.drive_video import write_drive_video
 from foredrive.view.hit_picture import content_text, hit_name, hit_picture
@@ -82,10 +82,9 @@ def rounds_table(result: LoopResult) -> Table:
         values = [figures[name] for name in COLUMNS]
         rows.append(Row([first, len(of_number.hits) or None, of_number.score, change, *values, taken]))
     drives = len(result.rounds[0].judged)
-    notes = [
-        f"{drives} drives; counts are per drive. Differences from the beginning with 95 % intervals (paired "
-        "bootstrap over routes)."
-    ]
+    routes = len({drive.score.route for drive in result.rounds[0].judged.values()})
+    intervals = "Intervals of 95 % (paired bootstrap over routes)." if routes >= LEAST_ROUTES else NO_INTERVAL
+    notes = [f"{drives} drives; counts are per drive. Differences are from the beginning. {intervals}"]
     return Table(columns, [Section(rows)], "Rounds", notes)
 
 
@@ -94,7 +93,7 @@ def difference(first: Round, other: Round) -> BootstrapMean:
     names = [name for name in first.judged if name in other.judged]
     gains = [other.judged[name].driving_score_1_0 - first.judged[name].driving_score_1_0 for name in names]
     routes = [first.judged[name].score.route for name in names]
-    return bootstrap_mean(np.array(gains), routes, np.random.default_rng(0))
+    return bootstrap_mean(np.array(gains), routes, np.random.default_rng(0), least=LEAST_ROUTES)
 
 
 def write_improve_report(out: Path, result: LoopResult) -> None:

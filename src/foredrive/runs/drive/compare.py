@@ -14,7 +14,7 @@ from foredrive.driving.scores import Ending, InfractionKind
 from foredrive.engine.folder import DRIVES
 from foredrive.errors import InputError
 from foredrive.runs.drive.records import read_drive, read_suite
-from foredrive.tasks.bootstrap import BootstrapMean, bootstrap_mean
+from foredrive.tasks.bootstrap import LEAST_ROUTES, BootstrapMean, bootstrap_mean
 
 COLLISIONS = (
     InfractionKind.COLLISION_PEDESTRIAN,
@@ -138,7 +138,8 @@ def read_agent(given: str) -> ComparedAgent:
 def compare(agents: Sequence[ComparedAgent], seed: int = 0, resamples: int = 10_000) -> Comparison:
     """Compare agents with the first one, on the drives that all have.
 
-    Intervals are those of a bootstrap over routes: repetitions of one route resemble each other.
+    Intervals are those of a bootstrap over routes: repetitions of one route resemble each other. There are
+    none of fewer than `LEAST_ROUTES` routes.
 
     Args:
         agents: at least two, of different names.
@@ -169,6 +170,7 @@ def compare(agents: Sequence[ComparedAgent], seed: int = 0, resamples: int = 10_
                 routes,
                 np.random.default_rng(seed),
                 resamples=resamples,
+                least=LEAST_ROUTES,
             )
             for agent in agents[1:]
         }
@@ -219,12 +221,16 @@ def figures_of(comparison: Comparison) -> dict[str, float | int | str | None]:
             ("rank", comparison.ratings.rank[number]),
         ):
             for part, end in (("value", ""), ("low", ".low"), ("high", ".high")):
-                out[f"{agent.name}.{name}{end}"] = getattr(estimate, part)
+                out[f"{agent.name}.{name}{end}"] = _finite(getattr(estimate, part))
     for metric, of_agents in comparison.differences.items():
         for name, metrics in of_agents.items():
             for part, value in dataclasses.asdict(metrics).items():
-                out[f"{name}.{metric}.difference.{part}"] = None if np.isnan(value) else value
+                out[f"{name}.{metric}.difference.{part}"] = _finite(value)
     return out
+
+
+def _finite(value: float) -> float | None:
+    return None if np.isnan(value) else value
 
 
 def _rows(agents: Sequence[ComparedAgent], keys: Sequence[Key]) -> tuple[RouteRow, ...]:
