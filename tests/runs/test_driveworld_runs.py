@@ -7,7 +7,7 @@ from pathlib import Path
 import av
 import pytest
 import torch
-from miniature import STEPS, miniature, miniature_driveworld
+from miniature import STEPS, miniature, miniature_driveworld, write_log
 from safetensors.torch import load_file
 from transformers import BertConfig, BertModel, BertTokenizerFast
 
@@ -138,6 +138,21 @@ def test_futures_are_drawn_alike_each_time_and_filmed(run: Run, log: LogPath, tm
         assert len(list(film.decode(video=0))) == frames == 2 * 5
     with pytest.raises(InputError, match="at least one moment"):
         next(imagine_run(run, log, seconds=0.1, samples=1, moments=1))
+
+
+@pytest.mark.parametrize(("frames", "steps"), [(11, 1), (21, 3), (5, 0)])
+def test_a_short_log_shortens_the_future_unless_a_length_is_asked_for(
+    run: Run, tmp_path: Path, frames: int, steps: int
+) -> None:
+    """At 10 Hz, with 0.5 s before now: 1.0 s, 2.0 s and 0.4 s of a log."""
+    short = write_log(tmp_path, frames=frames)
+    if steps:
+        (moment,) = imagine_run(run, short, samples=1, moments=1)
+        assert moment.futures.shape[1] == 1 + steps
+        assert moment.example.clip.image_valid.all()
+    can = f"at most --seconds {0.5 * steps:g}" if steps else "too short for any future"
+    with pytest.raises(InputError, match=f"model sees 0.5 s before now: {can}"):
+        next(imagine_run(run, short, seconds=4.0, samples=1, moments=1))
 
 
 def test_nemo_imagines_one_future_as_far_as_it_can_and_renders_it(

@@ -27,7 +27,8 @@ def imagine(
         run: Folder of a trained run.
         log: Folder of a 123D log, or of a split or data root with exactly one log in it.
         out: The video: .mp4, or .webp, which browsers play as a picture.
-        seconds: Length of each future, s; by default as far as the model imagines, at most 4 s.
+        seconds: Length of each future, s; by default as far as the model imagines and the log goes on, at
+            most 4 s.
         samples: Number of futures drawn from a stochastic model; a deterministic model gives one.
         moments: Number of times of the log from which the model imagines.
     """

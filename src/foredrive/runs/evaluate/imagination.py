@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from foredrive.data import LogPath, collate
+from foredrive.data.logs import Log
 from foredrive.errors import InputError
 from foredrive.methods.blocks.training_rays import thinned_rays
 from foredrive.runs.open_clips import open_clips
@@ -39,7 +40,8 @@ def imagine_run(
     """Imagine futures from times spread evenly over a log.
 
     Args:
-        seconds: length of a future, s; None: as far as the model imagines, at most `MAX_DEFAULT_S`.
+        seconds: length of a future, s; None: as far as the model imagines and the log goes on, at most
+            `MAX_DEFAULT_S`.
         samples: number of futures from a stochastic world model; the seed is fixed, so they are the same in
             every call.
         moments: number of times; fewer if the log is too short for as many.
@@ -52,13 +54,23 @@ def imagine_run(
     clips = run.recipe.clips
     world = load_agent(run).world_model
     steps = round((MAX_DEFAULT_S if seconds is None else seconds) / clips.frame_dt_s)
-    if seconds is None and world.max_steps is not None:
-        steps = min(steps, world.max_steps)
+    # The longest future in which the log shows what the model is to be compared with
+    recorded = Log(log)
+    length_s = (recorded.t_us[-1] - recorded.t_us[0]) * 1e-6
+    most = int((length_s + 0.5 * recorded.period_s) / clips.frame_dt_s) - clips.past_frames
+    if seconds is None:
+        steps = min(steps, max(most, 1), *([] if world.max_steps is None else [world.max_steps]))
     if min(steps, samples, moments) < 1:
         raise InputError(f"at least one moment, one sample and one step of {clips.frame_dt_s:g} s are needed")
     if seconds is not None and world.max_steps is not None and steps > world.max_steps:
         max_s = world.max_steps * clips.frame_dt_s
         raise InputError(f"{run.folder}: the model imagines at most {max_s:g} s, not {seconds:g} s")
+    if steps > most:
+        past_s = clips.past_frames * clips.frame_dt_s
+        can = f"at most --seconds {most * clips.frame_dt_s:g}" if most > 0 else "too short for any future"
+        raise InputError(
+            f"{log.folder}: {length_s:.1f} s long, of which the model sees {past_s:g} s before now: {can}"
+        )
     config = dataclasses.replace(clips.judged, future_frames=steps, future_images=True)
     dataset = open_clips([log], config, run.cache_dir)
     generator = torch.Generator().manual_seed(SEED)
