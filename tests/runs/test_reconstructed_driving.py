@@ -168,8 +168,12 @@ def test_the_verb_drives_against_a_threat(
         str(reconstructed),
         "--no-sensors",
     ]
-    assert main([*command, "--start", "3", "--threat", "side"]) == 2
-    assert "the log ends at 6.6 s, too early for an impact at 7.0 s" in capsys.readouterr().err
+    late = "from 3 s: the log ends at 6.6 s, too early for an impact at 7.0 s"
+    for starts, why in ((["0.7", "3"], late), (["0.7", "6.6"], "a drive can begin at 0.5 to 6.6 s")):
+        threat = ["--threat", "side"] if why == late else []
+        assert main([*command, "--start", *starts, *threat]) == 2
+        assert why in capsys.readouterr().err.splitlines()[-1]
+        assert not (tmp_path / "suite").exists()  # the first start is not driven either
     assert main([*command, "--start", "0.7"]) == 0
     assert (tmp_path / "suite" / "report.html").is_file()
     assert main(["drive", "--agent", "stop", "--out", str(tmp_path / "other"), "--start", "1"]) == 2

@@ -49,6 +49,18 @@ class LoggedDrive:
         """Return the last time of the log, s."""
         return float(self.vehicle.t_s[-1])
 
+    def check_start(self, start_s: float, before_s: float) -> None:
+        """Check that the log covers a time before a start, and the start itself.
+
+        Raises:
+            InputError: it does not.
+        """
+        first_s = self.first_s + before_s
+        if not first_s - 1e-6 <= start_s < self.end_s:
+            raise InputError(
+                f"a drive can begin at {first_s:.1f} to {self.end_s:.1f} s of this log, not at {start_s:g} s"
+            )
+
     def pose_at(self, t_s: float) -> Float64[np.ndarray, "4 4"]:
         """Return `T_world_ego` at a time. Before and after the log the motion is extrapolated."""
         T_scene_ego = self.vehicle.at(t_s).shifted(self.T_ego_shifted).T_scene_ego.double()

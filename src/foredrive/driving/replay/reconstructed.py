@@ -105,13 +105,7 @@ class ReconstructedSimulator:
         Raises:
             InputError: the log does not cover the past frames before the start and some distance after it.
         """
-        before_s = scenario.past_frames * FRAME_DT_S
-        first_s = self.drive.first_s + before_s
-        if not first_s - 1e-6 <= scenario.start_s < self.drive.end_s:
-            raise InputError(
-                f"a drive can begin at {first_s:.1f} to {self.drive.end_s:.1f} s of this log, "
-                f"not at {scenario.start_s:g} s"
-            )
+        self.drive.check_start(scenario.start_s, scenario.past_frames * FRAME_DT_S)
         self._scenario = scenario
         self._route = RouteLine(self.drive.route_from(scenario.start_s))
         self._way_m = self.way_m(scenario)

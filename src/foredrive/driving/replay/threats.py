@@ -48,14 +48,20 @@ def send_threat(threat: Threat, graph: SceneGraph, drive: LoggedDrive, start_s: 
     at_s = start_s + AFTER_S
     # The log must go on beyond the impact, and move at that time
     if at_s > drive.end_s:
-        raise InputError(f"the log ends at {drive.end_s:.1f} s, too early for an impact at {at_s:.1f} s")
+        raise InputError(
+            f"from {start_s:g} s: the log ends at {drive.end_s:.1f} s, too early for an impact at "
+            f"{at_s:.1f} s"
+        )
     if (left_m := drive.way_left_m(at_s)) < ARRIVED_M:
         raise InputError(
-            f"the log drives on for {left_m:.1f} m after an impact at {at_s:.1f} s, "
-            f"and {ARRIVED_M:.0f} m are needed: the log is too short"
+            f"from {start_s:g} s: the log drives on for {left_m:.1f} m after an impact at {at_s:.1f} s, and "
+            f"{ARRIVED_M:.0f} m are needed: the log is too short"
         )
     if drive.state_at(at_s).speed_mps < MIN_MPS:
-        raise InputError(f"the vehicle of the log hardly moves at {at_s:.1f} s, so no impact would follow")
+        raise InputError(
+            f"from {start_s:g} s: the vehicle of the log hardly moves at {at_s:.1f} s, so no impact would "
+            "follow"
+        )
     row, tracks = _most_observed_car(graph), graph.tracks
     length_m, _, height_m = tracks.size_lwh[row].tolist()
     bumper_m = EGO.axle_to_centre_m + 0.5 * EGO.length_m

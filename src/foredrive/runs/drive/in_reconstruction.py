@@ -70,10 +70,16 @@ class ReconstructedRoutes:
         return {**fields, "routes": self.run}
 
     def jobs(self, agent: str) -> Sequence[DriveJob]:
-        """Return one drive for each start and threat."""
-        past_frames = past_frames_of(agent)
-        _edits_of(self.edits)
-        return [job for job, _, _ in self._plan(past_frames)]
+        """Return one drive for each start and threat, all of which can begin."""
+        past_frames, opened = past_frames_of(agent), opened_reconstruction(self.run)
+        edited = edited_scene(opened.scene, _edits_of(self.edits))
+        drive, plan = LoggedDrive(opened.vehicle, edited.T_ego_shifted.cpu()), self._plan(past_frames)
+        for _, start_s, threat in plan:
+            drive.check_start(start_s, past_frames * FRAME_DT_S)
+            drive.route_from(start_s)
+            if threat is not None:
+                send_threat(threat, edited.graph, drive, start_s)
+        return [job for job, _, _ in plan]
 
     def _plan(self, past_frames: int) -> list[tuple[DriveJob, float, Threat | None]]:
         first_s = float(opened_reconstruction(self.run).vehicle.t_s[0]) + past_frames * FRAME_DT_S
