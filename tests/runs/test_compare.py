@@ -11,10 +11,12 @@ from foredrive.cli.main import main
 from foredrive.driving.replay.threats import Threat
 from foredrive.engine.summary import read_summary
 from foredrive.errors import InputError
+from foredrive.runs.drive.agents import absolute_name
 from foredrive.runs.drive.baselines import same_drives
-from foredrive.runs.drive.compare import compare, figures_of, read_agent
+from foredrive.runs.drive.compare import compare, figures_of, read_agent, read_agents
 from foredrive.runs.drive.in_reconstruction import ReconstructedRoutes
 from foredrive.runs.drive.in_towns import TownRoutes
+from foredrive.runs.drive.records import suite_title
 from foredrive.runs.drive.suite import DriveSource, DriveSuite
 from foredrive.view.compare_report import means_table, ranking_table, routes_table
 
@@ -168,6 +170,42 @@ def test_repetitions_of_a_route_are_drawn_together(tmp_path: Path) -> None:
     assert found.differences["completion"]["b"].low != found.differences["completion"]["b"].low
 
 
+@pytest.mark.parametrize(
+    ("folders", "names"),
+    [
+        (["runs/blind/short", "runs/seeing/short"], ["blind", "seeing"]),
+        (["runs/blind", "runs/seeing"], ["blind", "seeing"]),
+        (["a/x/short", "b/x/short", "b/x/long"], ["a/x/short", "b/x/short", "long"]),
+        (["a/short", "b/short", "other"], ["a/short", "b/short", "other"]),
+        (["a/short", "mine=b/short", "b/long"], ["short", "mine", "long"]),
+        (["a/short", "a/short/more"], ["short", "more"]),
+        (["a/short,b/short", "c/short,d/short"], ["a", "c"]),
+    ],
+)
+def test_agents_are_named_by_what_tells_their_folders_apart(
+    folders: list[str], names: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for folder in {part for given in folders for part in given.rpartition("=")[2].split(",")}:
+        suite(Path(folder), SEEING)
+    agents = read_agents(folders)
+    assert [agent.name for agent in agents] == names
+    assert [agent.name for agent in compare(agents, resamples=10).agents] == names
+
+
+def test_titles_have_the_agent_as_it_was_given(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    for given, title in (
+        (absolute_name("expert"), "expert"),
+        ("idm:runs/driver", "idm:runs/driver"),
+        (str(tmp_path / "runs" / "driver"), "runs/driver"),
+        (f"python:{tmp_path}/own.py:Planner", "python:own.py:Planner"),
+        ("/elsewhere/runs/driver", "driver"),
+    ):
+        (tmp_path / "suite.json").write_text(json.dumps({"agent": given, "routes": "/x/short.xml"}))
+        assert suite_title(tmp_path) == f"{title} on short"
+
+
 def test_suites_of_several_seeds_are_one_agent(tmp_path: Path) -> None:
     folders = [suite(tmp_path / f"{n}{k}", d) for n, d in (("b", BLIND), ("s", SEEING)) for k in (0, 1)]
     blind = read_agent(f"blind={folders[0]},{folders[1]}")
@@ -199,8 +237,9 @@ def test_what_cannot_be_compared_is_one_line(tmp_path: Path) -> None:
     one = read_agent(str(suite(tmp_path / "one", BLIND)))
     with pytest.raises(InputError, match="at least two folders"):
         compare([one])
-    with pytest.raises(InputError, match="the same name"):
-        compare([one, one])
+    for same in ([one, one], read_agents([str(tmp_path / "one")] * 2)):
+        with pytest.raises(InputError, match="the same name"):
+            compare(same)
     with pytest.raises(InputError, match="no drives to compare"):
         read_agent(str(tmp_path))
     other = read_agent(str(suite(tmp_path / "far", {("99", 0): (1.0, [], DONE)})))

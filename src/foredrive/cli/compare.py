@@ -25,7 +25,8 @@ def compare(
     that separate the agents most are listed first.
 
     Args:
-        runs: Folders of `foredrive drive`; the first is the one that the others are compared with. Folders
+        runs: Folders of `foredrive drive`; the first is the one that the others are compared with. Without
+            NAME= an agent is called by the part of its path that tells it from the others. Folders
             joined by commas count as one agent, such as those of several training seeds.
         out: Folder for summary.json and report.html.
         shown: Number of routes to print.
@@ -41,7 +42,7 @@ def compare(
         from foredrive.engine.provenance import collect_provenance
         from foredrive.engine.summary import write_summary
         from foredrive.runs.drive.compare import compare as compare_agents
-        from foredrive.runs.drive.compare import figures_of, read_agent
+        from foredrive.runs.drive.compare import figures_of, read_agents
         from foredrive.view.compare_report import (
             REPORT,
             means_table,
@@ -51,9 +52,9 @@ def compare(
         )
         from foredrive.view.table import print_table
 
-    agents = [read_agent(given) for given in runs]
+    agents = read_agents(runs)
     if baselines:
-        agents += [read_agent(given) for given in _drive_baselines(agents[0].folders[0], out)]
+        agents += read_agents(_drive_baselines(agents[0].folders[0], out))
     comparison = compare_agents(agents)
     with held_for_results(out):
         write_summary(out / SUMMARY, figures_of(comparison) | collect_provenance())

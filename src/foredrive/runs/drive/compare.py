@@ -1,6 +1,7 @@
 """Comparison of agents over the same routes: paired differences, and the routes that separate them."""
 
 import dataclasses
+import os
 import statistics
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -110,6 +111,28 @@ def values_of(drive: DriveRecord) -> dict[str, float]:
         "stop_signs": float(kinds.count(InfractionKind.STOP_SIGN)),
         "speed_mps": drive.score.driven_m / max(drive.score.duration_s, 1e-9),
     }
+
+
+def read_agents(given: Sequence[str]) -> list[ComparedAgent]:
+    """Read the drives of agents, each as `read_agent` does.
+
+    An agent without a name is called by its folder, with as many folders above it as tell it from the others:
+    a and b of runs/a/short and runs/b/short.
+
+    Raises:
+        InputError: as `read_agent`.
+    """
+    agents = [read_agent(one) for one in given]
+    unnamed = [number for number, one in enumerate(given) if "=" not in one]
+    paths = [Path(os.path.abspath(agents[number].folders[0])).parts for number in unnamed]
+    while len(paths) > 1 and len({path[-1:] for path in paths}) == 1 and min(map(len, paths)) > 1:
+        paths = [path[:-1] for path in paths]  # the end that all share names none
+    for number, path in zip(unnamed, paths, strict=True):
+        count = next(
+            (n for n in range(1, len(path)) if [other[-n:] for other in paths].count(path[-n:]) == 1), 1
+        )
+        agents[number] = dataclasses.replace(agents[number], name="/".join(path[-count:]))
+    return agents
 
 
 def read_agent(given: str) -> ComparedAgent:

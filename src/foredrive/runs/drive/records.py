@@ -65,13 +65,18 @@ def read_suite(folder: Path) -> dict[str, object]:
 
 
 def suite_title(folder: Path) -> str:
-    """Return the title of a suite: the agent and the routes.
+    """Return the title of a suite: the agent as it was given, and the routes.
+
+    The paths of a suite are absolute. Those in the current folder are shown relative to it, and of others the
+    last part.
 
     Raises:
         InputError: as `read_suite`.
     """
     suite = read_suite(folder)
-    return f"{Path(str(suite['agent'])).name} on {Path(str(suite['routes'])).stem}"
+    agent = str(suite["agent"]).replace(f"{Path.cwd()}/", "")
+    name = Path(agent).name if Path(agent).is_absolute() else agent
+    return f"{name} on {Path(str(suite['routes'])).stem}"
 
 
 def summarise(drives: Sequence[DriveRecord]) -> Figures:
