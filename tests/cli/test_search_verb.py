@@ -55,6 +55,12 @@ def test_lidar_and_images_are_compared(tmp_path: Path, capsys: pytest.CaptureFix
     assert 0 <= shares["views.recall_at_1.image_to_lidar"]["value"] <= 1
     assert "frames: recall at 5" in capsys.readouterr().out
     assert main(shlex.split(f"search evaluate --index {index} --moments -1")) == 2
+    capsys.readouterr()
+    for asked in ("'a car'", "--like flat@0.5s"):
+        assert main(shlex.split(f"search {asked} --index {index} --gap 0.4")) == 0
+        assert "the towers never saw data of flat: they learned from town\n" in capsys.readouterr().out
+    assert main(shlex.split(f"search --where 'ego_speed >= 0' --index {index}")) == 0
+    assert "never saw" not in capsys.readouterr().out  # nothing is compared
 
 
 def test_a_folder_that_cannot_be_written_is_one_line(root: Path, capsys: pytest.CaptureFixture[str]) -> None:

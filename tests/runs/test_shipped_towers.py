@@ -77,6 +77,23 @@ def test_searching_works_with_nothing_else(
 
 
 @pytest.mark.slow
+def test_nothing_resembles_what_they_do_not_know(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    log = record_plan(DrivePlan("Town05", 77, "clear", 20, 10, 8.0, 2.0), tmp_path, SURROUND)
+    index = str(tmp_path / "index")
+    assert main(["search", "index", str(log.folder), "--index", index, "--workers", "1"]) == 0
+    opened = FrameIndex(index)
+    for modality in ("image", "lidar", "joint"):
+        for text, unlike in (("a bus at a junction", False), ("an elephant", True), ("a beach", True)):
+            assert ask(opened, Query(text=text, modality=modality)).unlike is unlike
+    capsys.readouterr()
+    assert main(["search", "snow", "--index", index, "--top", "3", "--gap", "1"]) == 0
+    said = capsys.readouterr().out
+    assert "nothing in the index resembles the text" in said
+    assert "3 moments, no hits, among" in said
+    assert "never saw" not in said
+
+
+@pytest.mark.slow
 def test_they_say_whether_it_is_night(drives: dict[str, LogPath]) -> None:
     towers = find_towers(EMBEDDED)
     decoder = load_captions(SHIPPED / CAPTIONS, towers)

@@ -207,6 +207,13 @@ def test_names_from_outside_run_nothing_on_a_contact_sheet(tmp_path: Path) -> No
     assert_harmless((tmp_path / "hits.html").read_text(), times=4 + 6)
 
 
+@pytest.mark.parametrize("unlike", [False, True])
+def test_moments_that_are_no_hits_are_called_so(unlike: bool, tmp_path: Path) -> None:
+    hit = Hit(index_row(folder="nowhere", maps_dir=""), 0.5, {})
+    write_search_sheet(tmp_path / "hits.html", Query(text="snow"), [hit], unlike)
+    assert ("no hits: the nearest moments" in (tmp_path / "hits.html").read_text()) is unlike
+
+
 def test_a_query_with_dollars_is_no_formula(tmp_path: Path) -> None:
     hit = Hit(index_row(folder="$\\frac$", maps_dir=""), 0.5, {"$\\x$": 1.0})
     write_search_sheet(tmp_path / "hits.png", Query(text="5 $ or $\\frac$"), [hit])

@@ -52,7 +52,7 @@ def search(
     asked = as_query(query, condition, ranking) if saved is None and untag is None else None
 
     with importing():
-        from foredrive.runs.search.searching import ask
+        from foredrive.runs.search.searching import answer_notes, ask
         from foredrive.search.index import FrameIndex
         from foredrive.search.saved import remove_tag
 
@@ -65,7 +65,7 @@ def search(
         asked = _saved(index, saved)
     assert asked is not None
     result = ask(opened, asked, towers, ensemble=not query.plain)
-    _print_found(opened, result)
+    _print_found(opened, result, answer_notes(opened, asked, towers, result))
     hits.do(index, asked, result)
 
 
@@ -103,7 +103,7 @@ def _saved(index: str, name: str) -> "Query":
     return Query.from_json(saved[name])
 
 
-def _print_found(index: "FrameIndex", result: "Found") -> None:
+def _print_found(index: "FrameIndex", result: "Found", notes: list[str]) -> None:
     from rich.console import Console
 
     from foredrive.view.search_sheet import hits_table
@@ -114,5 +114,8 @@ def _print_found(index: "FrameIndex", result: "Found") -> None:
         print(f"nothing found among {rows} rows of {index.uri}")
         return
     print_table(hits_table(result.hits), Console())
+    for note in notes:
+        print(note)
     how = "all compared" if result.exact else f"{result.compared} compared, the others are less similar"
-    print(f"{len(result.hits)} hits among {rows} rows of {index.uri}; {how}")
+    what = "moments, no hits," if result.unlike else "hits"
+    print(f"{len(result.hits)} {what} among {rows} rows of {index.uri}; {how}")

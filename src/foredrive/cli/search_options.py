@@ -134,7 +134,7 @@ class HitOptions:
             write_clip_list(self.clips, listed_clips(result.hits, self.before, self.after))
             print(f"wrote {self.clips}: foredrive train RECIPE --logs {self.clips}")
         if self.out is not None:
-            write_search_sheet(self.out, query, result.hits)
+            write_search_sheet(self.out, query, result.hits, result.unlike)
             print(f"wrote {self.out}")
 
 

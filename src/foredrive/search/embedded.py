@@ -25,6 +25,8 @@ from foredrive.search.towers import Towers, weights_digest
 
 CARD, IMAGE, LIDAR = "towers.json", "image.safetensors", "lidar.safetensors"
 TEXT_MEAN = "text_mean"
+SENTENCE = "sentence-"
+"""Beginning of the fingerprints of towers whose image tower was trained here."""
 SHIPPED = Path(__file__).parent / "shipped"
 """Folder of the towers that come with the package."""
 AT_ONCE = 8
@@ -46,6 +48,12 @@ class TowerCard:
     trained: dict[str, object]
     """Training data, duration and quality, for people to read."""
 
+    @property
+    def datasets(self) -> frozenset[str]:
+        """Return the data sets of the training logs, as splits name them; empty if the card has no logs."""
+        logs = self.trained.get("logs")
+        return frozenset(map(dataset_of, map(str, logs))) if isinstance(logs, list) else frozenset()
+
 
 class SentenceTowers:
     """An image tower trained with a frozen sentence encoder. See `Towers`.
@@ -62,7 +70,7 @@ class SentenceTowers:
         self.name, self.tower, self.text_mean = name, tower.eval(), text_mean
         self.size, self.text = size, text
         self.dim, self.image_side_px = len(text_mean), size.side_px
-        self.fingerprint = f"sentence-{weights_digest({TEXT_MEAN: text_mean, **tower.state_dict()})}"
+        self.fingerprint = f"{SENTENCE}{weights_digest({TEXT_MEAN: text_mean, **tower.state_dict()})}"
 
     @torch.no_grad()
     def embed_images(self, images: UInt8[Tensor, "n 3 H W"]) -> Float[Tensor, "n D"]:
@@ -111,6 +119,11 @@ class LidarTowers:
         return self.base.embed_text(texts)
 
 
+def dataset_of(log: str) -> str:
+    """Return the data set of a log's name: town of town_train/Town01_seed3."""
+    return log.partition("/")[0].rpartition("_")[0]
+
+
 def save_towers(
     folder: Path,
     card: TowerCard,
@@ -139,7 +152,7 @@ def load_towers(folder: Path) -> Towers:
         InputError: there are no towers, they are damaged, or the base model has other weights or looks at
             another crop than in training.
     """
-    card = _read_card(folder)
+    card = read_card(folder)
     base = _load_base(folder, card)
     if card.lidar is None:
         return base
@@ -160,13 +173,18 @@ def load_image_tower(folder: Path) -> ImageTower:
     Raises:
         InputError: there are no towers, they are damaged, or the image tower is that of another model.
     """
-    card = _read_card(folder)
+    card = read_card(folder)
     if card.image is None:
         raise InputError(f"{folder}: the image tower is that of {card.text}")
     return _load_image_tower(folder, card.image, card.dim)[0]
 
 
-def _read_card(folder: Path) -> TowerCard:
+def read_card(folder: Path) -> TowerCard:
+    """Read the description of towers.
+
+    Raises:
+        InputError: there is none, or it is damaged.
+    """
     try:
         return TypeAdapter(TowerCard).validate_json((folder / CARD).read_bytes())
     except (OSError, ValidationError) as error:

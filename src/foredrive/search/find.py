@@ -92,6 +92,9 @@ class Found:
     """Number of rows that were compared exactly."""
     exact: bool
     """Whether all rows that satisfy the conditions were compared."""
+    unlike: bool = False
+    """Whether the index shows no more of the query's text than of unrelated texts, so that these are no hits
+    but the nearest moments."""
 
 
 def find(index: FrameIndex, query: Query, target: Target | None, *, exact_up_to: int = EXACT_UP_TO) -> Found:

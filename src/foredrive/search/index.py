@@ -24,6 +24,7 @@ PARTITION_ROWS, GROWN = 4096, 2
 PROBES, REFINEMENT = 32, 3
 """Number of partitions searched, and the factor of additional rows compared exactly. The factor is needed
 because partitions store vectors with 8 bits."""
+SAMPLE_BLOCKS = 16
 FRAMES, PARTS = "frames", "parts"
 _REMEMBERED = b"foredrive"
 _PART_SCHEMA = pa.schema(
@@ -187,6 +188,17 @@ class FrameIndex:
         query = self._frames.search().select(list(columns)).limit(None)
         with understanding(where):
             return (query if where is None else query.where(where)).to_arrow()
+
+    def sample(self, columns: Sequence[str], count: int) -> pa.Table:
+        """Return about `count` rows, from places that are spread evenly over the table."""
+        rows = self.count()
+        if rows <= count:
+            return self.select(None, columns)
+        block = -(-count // SAMPLE_BLOCKS)
+        query = self._frames.search().select(list(columns)).limit(block)
+        with naming(self.uri):
+            starts = np.linspace(0, rows - block, SAMPLE_BLOCKS).astype(int).tolist()
+            return pa.concat_tables([query.offset(start).to_arrow() for start in starts])
 
     def nearest(
         self, vector: Float[np.ndarray, "D"], to: str, where: str | None, columns: Sequence[str], limit: int

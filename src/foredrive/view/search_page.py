@@ -11,7 +11,7 @@ from PIL import Image
 
 from foredrive.errors import InputError
 from foredrive.json_server import Answer, JsonServer, Raw, validated
-from foredrive.runs.search.searching import ask, listed_clips
+from foredrive.runs.search.searching import answer_notes, ask, listed_clips
 from foredrive.search.find import Hit
 from foredrive.search.index import FrameIndex
 from foredrive.search.projection import project_scenes
@@ -174,8 +174,11 @@ class SearchPage:
         query = query_of(asked)
         with self._one_at_a_time:
             result = ask(self._index, query, self._towers)
+            notes = answer_notes(self._index, query, self._towers, result)
         how = "all compared" if result.exact else f"{result.compared} compared"
-        return ShownHits([*map(ShownHit.of, result.hits)], f"{len(result.hits)} hits, {how}")
+        what = "moments, no hits" if result.unlike else "hits"
+        message = "; ".join([f"{len(result.hits)} {what}, {how}", *notes])
+        return ShownHits([*map(ShownHit.of, result.hits)], message)
 
     def _map(self) -> SceneMap:
         plane = project_scenes(self._index)

@@ -25,27 +25,30 @@ MARGIN_PX, HEAD_PX, TEXT_PX = 16, 54, 62
 CELL_PX = WIDTH_PX + GAP_PX + HEIGHT_PX
 LINE_PX = 17
 MAX_ON_PICTURE = 60
+UNLIKE = "   no hits: the nearest moments"
 SENSORS: dict[Modality, str] = {"image": "images", "lidar": "lidar", "joint": "images and lidar"}
 
 
-def write_search_sheet(path: Path, query: Query, hits: Sequence[Hit]) -> None:
+def write_search_sheet(path: Path, query: Query, hits: Sequence[Hit], unlike: bool = False) -> None:
     """Write the hits in their order, three per row.
 
     Args:
         path: ends in .png (a picture of the first 60) or .html (all hits, in one file that loads no other).
+        unlike: whether the hits are only the nearest moments, see `Found.unlike`; the title says so.
 
     Raises:
         InputError: the path has another suffix.
     """
     check_sheet(path)
+    title = query_line(query) + (UNLIKE if unlike else "")
     if path.suffix == ".png":
-        _write_picture(path, query, hits[:MAX_ON_PICTURE])
+        _write_picture(path, title, hits[:MAX_ON_PICTURE])
         return
     shown = [
         (picture(hit_picture(hit), f"{number}   {hit_name(hit)}"), score_text(hit), _told(hit))
         for number, hit in enumerate(hits, 1)
     ]
-    write_page(path, "search_sheet.html.j2", title=query_line(query), hits=shown)
+    write_page(path, "search_sheet.html.j2", title=title, hits=shown)
 
 
 def check_sheet(path: Path) -> None:
@@ -73,11 +76,11 @@ def query_line(query: Query) -> str:
     return "   ".join(asked)
 
 
-def _write_picture(path: Path, query: Query, hits: Sequence[Hit]) -> None:
+def _write_picture(path: Path, title: str, hits: Sequence[Hit]) -> None:
     rows = -(-len(hits) // COLUMNS)
     width = MARGIN_PX + min(len(hits), COLUMNS) * (CELL_PX + MARGIN_PX)
     sheet = Sheet(width, HEAD_PX + rows * (HEIGHT_PX + TEXT_PX))
-    sheet.head(MARGIN_PX, HEAD_PX, query_line(query), 15.0)
+    sheet.head(MARGIN_PX, HEAD_PX, title, 15.0)
     for number, hit in enumerate(hits):
         x = MARGIN_PX + number % COLUMNS * (CELL_PX + MARGIN_PX)
         y = HEAD_PX + number // COLUMNS * (HEIGHT_PX + TEXT_PX)

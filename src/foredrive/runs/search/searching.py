@@ -1,13 +1,16 @@
 """Query an index with the towers that made it."""
 
+import dataclasses
 from collections.abc import Sequence
 
 from foredrive.data.clip_list import ListedClip, clip_list
-from foredrive.runs.search.towers import find_towers
+from foredrive.runs.search.towers import find_towers, unseen_text
+from foredrive.search.embedded import SENTENCE
 from foredrive.search.find import Found, Hit, find
 from foredrive.search.index import FrameIndex
 from foredrive.search.query import Query
-from foredrive.search.target import Target, example_target, text_target
+from foredrive.search.resemblance import resembles
+from foredrive.search.target import example_target, text_target
 
 
 def ask(index: FrameIndex, query: Query, towers: str | None = None, *, ensemble: bool = True) -> Found:
@@ -20,17 +23,33 @@ def ask(index: FrameIndex, query: Query, towers: str | None = None, *, ensemble:
     Raises:
         InputError: the towers are not those of the index; the query cannot be answered.
     """
-    return find(index, query, _target(index, query, towers, ensemble))
-
-
-def _target(index: FrameIndex, query: Query, towers: str | None, ensemble: bool) -> Target | None:
     if not query.compares:
-        return None
+        return find(index, query, None)
     chosen = find_towers(towers or index.settings.towers)
     index.check_towers(chosen.name, chosen.fingerprint)
     if query.example is not None:
-        return example_target(index, query.example, chosen)
-    return text_target(query, chosen, ensemble=ensemble)
+        return find(index, query, example_target(index, query.example, chosen))
+    target = text_target(query, chosen, ensemble=ensemble)
+    result = find(index, query, target)
+    asked = target.lidar if query.modality == "lidar" else target.image
+    # With towers of other programs it was not measured whether this tells anything
+    if asked is None or not chosen.fingerprint.startswith(SENTENCE):
+        return result
+    return dataclasses.replace(result, unlike=resembles(index, asked, chosen) is False)
+
+
+def answer_notes(index: FrameIndex, query: Query, towers: str | None, result: Found) -> list[str]:
+    """Return lines that say why the hits of a query may be none."""
+    notes = []
+    if query.compares and result.hits:
+        name, logs = towers or index.settings.towers, [hit.row.log for hit in result.hits]
+        notes += [text] if (text := unseen_text(name, query.modality != "image", logs)) else []
+    if result.unlike:
+        notes.append(
+            "nothing in the index resembles the text: unrelated texts resemble it as much. These are the "
+            "nearest moments, not hits"
+        )
+    return notes
 
 
 def listed_clips(hits: Sequence[Hit], before_s: float, after_s: float) -> dict[str, object]:
