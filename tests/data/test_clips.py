@@ -38,6 +38,7 @@ def test_key_frames_are_spaced_and_fit_into_the_log(flat_root: Path) -> None:
     assert nows == [1_000_000, 1_700_000, 2_400_000, 3_100_000, 3_800_000]  # of 5 s
     torch.testing.assert_close(clips[1].clip.t_s, torch.tensor([-1.0, -0.5, 0.0, 0.5, 1.0]))
     assert clips[1].clip.now == 2
+    assert clips.left_out == {"past": 1, "future": 1, "gap": 0, "unseen": 0}  # 0.3 s and 4.5 s
     with pytest.raises(IndexError):
         clips[5]
 
@@ -49,6 +50,18 @@ def test_a_frame_missing_from_the_log_drops_the_clips_that_need_it(flat_log: Pat
     clips = ClipDataset([path], config(past_frames=0, future_frames=1, frame_dt_s=1.0), None)
     nows = {(int(clips[i].key[0].split("@")[1]) - world.START_US) // 100_000 for i in range(len(clips))}
     assert nows == {0, 5, 15, 25, 30, 35, 40}  # 10 would need 20 or a frame at most 50 ms from it
+    assert clips.left_out == {"past": 0, "future": 2, "gap": 2, "unseen": 0}  # 4.5 and 5.0 s; 1.0 and 2.0 s
+
+
+def test_times_without_image_and_sweep_are_left_out_and_counted(flat_log: Path, tmp_path: Path) -> None:
+    path = copy_of(flat_log, tmp_path)
+    gone = lambda rows: [None if i < 16 else r for i, r in enumerate(rows)]  # noqa: E731
+    rewrite_column(path.folder / "sync.arrow", "camera.pcam_f0", gone)
+    seen = {"cameras": ("ahead",), "past_frames": 0, "future_frames": 1}
+    clips = ClipDataset([path], config(**seen), None)
+    assert clips.left_out == {"past": 0, "future": 1, "gap": 0, "unseen": 4}  # 0 to 1.5 s
+    assert len(clips) == 6
+    assert ClipDataset([path], config(**seen, lidar=True), None).left_out["unseen"] == 0
 
 
 def test_points_inside_a_box_project_onto_its_colour(flat_root: Path) -> None:

@@ -57,6 +57,9 @@ def test_the_summary_says_what_it_promises(result: EvaluationResult, folder: Pat
         assert f"planning.{protocol}.l2_avg_m" in summary
     assert summary["items"] == CLIPS
     assert summary["failed"] == 0
+    assert (summary["clips.past_s"], summary["clips.future_s"], summary["clips.stride_s"]) == (0.5, 3.0, 0.5)
+    reasons = ("past", "future", "gap", "unseen")
+    assert [summary[f"clips.left_out.{reason}"] for reason in reasons] == [1, 6, 0, 0]  # 11 times in 5 s
     assert result.failures == ()
     assert summary["command_source"] == "driven_future"  # the log has no route
     assert summary["command_source.driven_future"] == CLIPS

@@ -56,8 +56,16 @@ def panel(example: Example) -> ExamplePrediction:
 
 def summary() -> dict[str, float | int | str | None]:
     figures: dict[str, float | int | str | None] = {
+        "items": 8,
         "failed": 2,
         "planning.stand_still.failed": 0,
+        "clips.stride_s": 0.5,
+        "clips.past_s": 1.0,
+        "clips.future_s": 3.0,
+        "clips.left_out.past": 2,
+        "clips.left_out.future": 6,
+        "clips.left_out.gap": 0,
+        "clips.left_out.unseen": 1,
         "command_source": "mixed",
         "command_source.route": 5,
         "command_source.driven_future": 3,
@@ -174,6 +182,8 @@ def test_names_from_outside_run_nothing(report: RunReport, panel: ExamplePredict
 
 def test_failures_and_leaking_commands_are_said_first_and_loudly(html: str) -> None:
     start = html[: html.index("Main metrics")]
+    left_out = "2 without 1.0 s before them, 6 without 3.0 s after them, 1 without image and sweep"
+    assert f"Judged: 8 clips, one every 0.50 s; times left out: {left_out}." in start
     assert "<strong>Failed clips of this model: 2.</strong>" in start
     assert "<strong>Commands from the driven future, which leaks" in start
     assert "stand still" not in start  # no failures, nothing to say

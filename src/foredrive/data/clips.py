@@ -1,6 +1,7 @@
 """A torch dataset of clips from 123D logs, with voxel labels."""
 
 import functools
+import math
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
@@ -61,7 +62,9 @@ class ClipDataset(Dataset[Example]):
         if config.occupancy_source == "recorded":
             for log in self.logs:
                 check_recorded_occupancy(log)
-        frames = [self._sensed_now(number, _clip_frames(log, config)) for number, log in enumerate(self.logs)]
+        whole = [_clip_frames(log, config) for log in self.logs]
+        self._whole = [len(of_log) for of_log in whole]
+        frames = [self._sensed_now(number, of_log) for number, of_log in enumerate(whole)]
         self._clip_frames = np.concatenate(frames)
         # For each clip the number of its log
         self._clip_logs = np.repeat(np.arange(len(self.logs)), [len(of_log) for of_log in frames])
@@ -86,6 +89,34 @@ class ClipDataset(Dataset[Example]):
                 count_command_sources(log, of_log, self.config.horizon_steps, self.config.horizon_dt_s)
             )
         return dict(counts)
+
+    @functools.cached_property
+    def left_out(self) -> dict[str, int]:
+        """Number of times of the logs, `now_stride_s` apart, that are no clip's now, by reason.
+
+        "past", "future": the log begins or ends too near; "gap": a frame is missing; "unseen": there is
+        neither an image nor a sweep. Times outside of selected parts do not count.
+        """
+        counts = dict.fromkeys(("past", "future", "gap", "unseen"), 0)
+        past_us, future_us = (
+            frames * self.config.frame_dt_s * 1e6
+            for frames in (self.config.past_frames, self.config.future_frames)
+        )
+        for number, log in enumerate(self.logs):
+            if log.path.parts_s or self.config.part_s is not None:
+                continue
+            stride_us = 1e6 * max(self.config.now_stride_s, log.period_s)  # a frame is one now
+            slack_us, length_us = 0.5e6 * log.period_s, float(log.t_us[-1] - log.t_us[0])
+            # The times on the grid of `_clip_frames`, which begins where there is enough of a past
+            last = math.floor((length_us + slack_us - past_us) / stride_us)
+            with_future = math.floor((length_us + slack_us - past_us - future_us) / stride_us)
+            before = math.floor((past_us + slack_us) / stride_us)
+            whole, seen = self._whole[number], int((self._clip_logs == number).sum())
+            counts["past"] += before
+            counts["future"] += last - with_future
+            counts["gap"] += max(with_future + 1 - whole, 0)
+            counts["unseen"] += whole - seen
+        return counts
 
     def _sensed_now(self, number: int, clips: Int64[np.ndarray, "N T"]) -> Int64[np.ndarray, "_ T"]:
         """Return the clips whose now has an image or a sweep, if the log has images of the chosen cameras.

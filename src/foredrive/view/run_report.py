@@ -16,6 +16,7 @@ from foredrive.view.html import MetricTile, Provenance, write_page
 from foredrive.view.loss_curves import Losses, draw_loss_curves
 from foredrive.view.summary_tables import (
     AGENT_TITLES,
+    clips_text,
     flow_table,
     full_table,
     image_table,
@@ -122,8 +123,9 @@ def _notes(run: Run, logs: Sequence[LogPath], failures: Sequence[Failure], losse
 
 
 def _alerts(report: RunReport) -> list[Alert]:
-    """Return lines about failed clips, the sources of the commands, and the notes."""
-    alerts = []
+    """Return lines about judged and failed clips, the sources of the commands, and the notes."""
+    judged = clips_text(report.summary)
+    alerts = [] if judged is None else [Alert(f"Judged: {judged}.")]
     for key, count in report.summary.items():
         if key == "failed" or (key.endswith(".failed") and count):
             method = "this model" if key == "failed" else words(key.split(".")[-2])

@@ -62,12 +62,29 @@ def print_summary(summary: Summary, console: Console, model: str) -> None:
         if table := make(summary):
             print_table(table, console)
     console.print(
-        f"{model}: {number(summary.get('items'))} clips, {number(summary.get('failed'))} failed; "
+        f"{model}: {clips_text(summary) or number(summary.get('items')) + ' clips'}; "
+        f"{number(summary.get('failed'))} failed; "
         f"commands from: {summary.get('command_source', 'none')}; "
         f"peak memory {number(summary.get('peak_rss_gib'), 2)} GiB, {number(summary.get('wall_s'), 0)} s",
         markup=False,
         highlight=False,
     )
+
+
+def clips_text(summary: Summary) -> str | None:
+    """Return how many clips were judged, and why other times were not; None if a summary does not say."""
+    if "clips.past_s" not in summary:
+        return None
+    reasons = {
+        "past": f"without {number(summary['clips.past_s'], 1)} s before them",
+        "future": f"without {number(summary['clips.future_s'], 1)} s after them",
+        "gap": "with missing frames",
+        "unseen": "without image and sweep",
+    }
+    counts = {text: summary.get(f"clips.left_out.{reason}") for reason, text in reasons.items()}
+    left_out = ", ".join(f"{number(count)} {text}" for text, count in counts.items() if count)
+    every = number(summary["clips.stride_s"], 2)
+    return f"{number(summary.get('items'))} clips, one every {every} s; times left out: {left_out or 'none'}"
 
 
 def time_title(name: str) -> str:

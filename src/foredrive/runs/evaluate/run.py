@@ -34,6 +34,7 @@ from foredrive.runs.train.baselines import run_baselines
 from foredrive.runs.train.run import Run, load_agent, open_run
 from foredrive.runs.train.tasks import load_heads
 from foredrive.scene import Example, Trajectory
+from foredrive.tasks.evaluation.metric import Figures
 from foredrive.tasks.evaluation.predictor import Part, Prediction
 from foredrive.tasks.evaluation.results_files import ResultsFiles
 from foredrive.tasks.evaluation.run import (
@@ -204,8 +205,20 @@ def evaluate_run(
             on_prediction=(lambda prediction, truth: None) if files is None else files.add,
         )
     origin = {"recipe": run.recipe.name, "run": str(run.folder)}
-    write_summary(out / SUMMARY, result.summary | collect_provenance() | run.conditions | origin)
-    return result
+    figures = result.summary | _clip_figures(dataset)
+    write_summary(out / SUMMARY, figures | collect_provenance() | run.conditions | origin)
+    return dataclasses.replace(result, summary=figures)
+
+
+def _clip_figures(dataset: ClipDataset) -> Figures:
+    """Return what a clip has to have around its now, and how many times of the logs have not."""
+    config = dataset.config
+    return {
+        "clips.stride_s": config.now_stride_s,
+        "clips.past_s": config.past_frames * config.frame_dt_s,
+        "clips.future_s": config.future_frames * config.frame_dt_s,
+        **{f"clips.left_out.{reason}": count for reason, count in dataset.left_out.items()},
+    }
 
 
 @torch.no_grad()
