@@ -235,13 +235,13 @@ def test_a_loop_goes_on_and_has_other_moments_in_the_next_round(
     asked: Improvement, once: tuple[Path, LoopResult]
 ) -> None:
     out, result = once
-    made = {
-        path: path.stat().st_mtime_ns for path in out.rglob("*") if path.suffix in (".safetensors", ".json")
-    }
-    lines: list[str] = []
-    longer = improve(asked, out, 2, say=lines.append)
-    kept = [path for path in files if path.name == "model.safetensors" or path.match("drives/drives/*.json")]
-    assert len(kept) == 5  # eyes and driver of the round, two drives of it, two of the beginning … and more
+    files = [path for path in out.rglob("*") if path.suffix in (".safetensors", ".json")]
+    made = {path: path.stat().st_mtime_ns for path in files}
+    longer = improve(asked, out, 2)
+    kept = [
+        path for path in files if path.match("run/*/model.safetensors") or path.match("drives/drives/*.json")
+    ]
+    assert len(kept) == 6  # eyes and driver of the round, two drives of it, and two of the beginning
     assert [path.stat().st_mtime_ns for path in kept] == [made[path] for path in kept]
     assert [hit.row.key for hit in longer.rounds[1].hits] == [hit.row.key for hit in result.rounds[1].hits]
     keys = [{hit.row.key for hit in of_number.hits} for of_number in longer.rounds]

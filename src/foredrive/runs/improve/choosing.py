@@ -66,6 +66,8 @@ class Request:
 
 def choose(strategy: str, request: Request) -> list[Hit]:
     """Return at most `budget` moments of the pool, in the order of choice. Scores are the strategy's own."""
+    if not len(request.pool):
+        return []
     order, score = _ORDERS[strategy](request)
     rows = request.pool.rows
     return [Hit(rows[n], float(score[n]), {strategy: float(score[n])}) for n in order]
