@@ -375,18 +375,19 @@ class Loop:
             moments = _without(self.moments, used)
             request = Request(moments, failures, before, uncertainty, self.of.budget, rng)
             hits = choose(self.of.strategy, request)
-        if hits:
-            clips = [
-                ListedClip(
-                    hit.row.folder.absolute(),
-                    hit.row.maps_dir.absolute(),
-                    hit.row.t_s - CLIP_S,
-                    hit.row.t_s + CLIP_S,
-                )
-                for hit in hits
-            ]
-            notes = [{"log": hit.row.log, "t_s": hit.row.t_s, "score": hit.score} for hit in hits]
-            write_clip_list(folder / MOMENTS, clip_list(clips, notes))
+        if not hits:
+            return [], []
+        clips = [
+            ListedClip(
+                hit.row.folder.absolute(),
+                hit.row.maps_dir.absolute(),
+                hit.row.t_s - CLIP_S,
+                hit.row.t_s + CLIP_S,
+            )
+            for hit in hits
+        ]
+        notes = [{"log": hit.row.log, "t_s": hit.row.t_s, "score": hit.score} for hit in hits]
+        write_clip_list(folder / MOMENTS, clip_list(clips, notes))
         return hits, _answers(failures, before, moments, hits)
 
     def _made_anew(
@@ -437,14 +438,14 @@ def _answers(
 ) -> list[Answer]:
     """Return what was chosen for each failure, as far as the last moment before it has an embedding."""
     of_key = {row.key: vector for row, vector in zip(moments.rows, moments.vectors, strict=True)}
-    vectors = np.array([of_key[hit.row.key] for hit in hits]).reshape(len(hits), -1)
+    vectors = np.stack([of_key[hit.row.key] for hit in hits])
     answers = []
     for failure in failures:
         mine = before_failure(before, failure)
         if not mine:
             continue
         last = max(mine, key=lambda n: before.rows[n].t_s)
-        likeness = vectors @ before.vectors[last] if hits else np.zeros(0)
+        likeness = vectors @ before.vectors[last]
         nearest = [hits[n] for n in np.argsort(-likeness, kind="stable")[:SHOWN]]
         answers.append(Answer(failure, Hit(before.rows[last], 0.0, {}), nearest))
     return answers
