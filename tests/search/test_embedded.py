@@ -21,6 +21,7 @@ from foredrive.search.embedded import (
     IMAGE,
     LIDAR,
     TowerCard,
+    dataset_of,
     load_towers,
     save_towers,
 )
@@ -133,3 +134,8 @@ def test_what_is_damaged_is_named(text_folder: Path, tmp_path: Path) -> None:
     (folder / CARD).write_text("{}")
     with pytest.raises(InputError, match="does not describe towers"):
         load_towers(folder)
+
+
+def test_logs_of_one_kind_of_recording_are_of_one_data_set() -> None:
+    logs = ("town_train/Town01_seed3", "town-egos_test/Town05_seed0_ego0001", "nuscenes-mini_val/scene-0103")
+    assert [dataset_of(log) for log in logs] == ["town", "town", "nuscenes"]

@@ -120,8 +120,8 @@ class LidarTowers:
 
 
 def dataset_of(log: str) -> str:
-    """Return the data set of a log's name: town of town_train/Town01_seed3."""
-    return log.partition("/")[0].rpartition("_")[0]
+    """Return the data set of a log's name: town of town_train/Town01_seed3, and of town-egos_train/…."""
+    return log.partition("/")[0].rpartition("_")[0].partition("-")[0]
 
 
 def save_towers(
