@@ -60,7 +60,7 @@ class ProgramServer:
         self._group: int | None = None
         process = subprocess.Popen(
             [sys.executable, "-W", "error", "-c", SERVER.format(prelude=prelude)],
-            bufsize=0,  # so that `select` sees every line that is not read yet
+            bufsize=0,  # so that `poll` sees every line that is not read yet
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             env=os.environ | {"PYTHONPATH": path} | ({"TMPDIR": str(temporary)} if temporary else {}),
@@ -81,7 +81,7 @@ class ProgramServer:
 
     def is_running(self) -> bool:
         """Return whether the program that was started last has not ended yet."""
-        return not select.select([self._stdout], [], [], 0)[0]
+        return not self._heard(0)
 
     def finish(self, patience_s: float) -> tuple[int, str]:
         """Wait for the program to end; return its exit code and what it printed on stderr."""
@@ -100,5 +100,12 @@ class ProgramServer:
             self.finish(self._start_s)
 
     def _read(self, patience_s: float) -> int:
-        assert select.select([self._stdout], [], [], patience_s)[0], "nothing was heard of it"
+        assert self._heard(patience_s), "nothing was heard of it"
         return int(self._stdout.readline())
+
+    def _heard(self, patience_s: float) -> bool:
+        """Return whether the server says something within some time."""
+        # Not select(), which takes no descriptor above 1023: a process of tests may have as many open
+        poll = select.poll()
+        poll.register(self._stdout, select.POLLIN | select.POLLHUP)
+        return bool(poll.poll(1000 * patience_s))
