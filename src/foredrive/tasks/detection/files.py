@@ -18,7 +18,6 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from foredrive.data.boxes import read_boxes
 from foredrive.errors import InputError
 from foredrive.files import atomic_path
 from foredrive.scene import Category
@@ -44,7 +43,7 @@ from foredrive.tasks.detection.kitti_labels import read_kitti
 from foredrive.tasks.detection.nuscenes_results import boxes_by_frame, read_nuscenes
 from foredrive.tasks.detection.protocols import CLASSES
 from foredrive.tasks.detection.score import FrameScore
-from foredrive.tasks.evaluation.frames_of_results import log_frames
+from foredrive.tasks.evaluation.frames_of_results import annotated_frames
 from foredrive.tasks.evaluation.plain_files import read_plain
 from foredrive.tasks.tracking.in_world import ego_yaw, places_in_world
 
@@ -260,10 +259,7 @@ def boxes_of_logs(folder: Path, listed: Iterable[str], path: Path) -> dict[str, 
         InputError: a frame is not in the logs, or not annotated.
     """
     frames: dict[str, list[Record]] = {}
-    for named in log_frames(folder, dict.fromkeys(listed), path):
-        boxes = read_boxes(named.log, named.frame)
-        if boxes is None:
-            raise InputError(f"{path}: frame {named.name} is not annotated in {named.log.path.folder}")
+    for named, boxes in annotated_frames(folder, dict.fromkeys(listed), path):
         kept, T_world_ego = boxes[boxes.valid], named.log.T_world_ego[named.frame]
         centre = places_in_world(kept.centre.double().numpy(), T_world_ego)
         half_yaw = 0.5 * (kept.yaw.double().numpy() + ego_yaw(T_world_ego))

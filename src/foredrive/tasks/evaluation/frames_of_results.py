@@ -4,9 +4,11 @@ from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from foredrive.data.boxes import read_boxes
 from foredrive.data.log_paths import find_logs
 from foredrive.data.logs import Log
 from foredrive.errors import InputError
+from foredrive.scene import Boxes
 
 
 @dataclass(frozen=True)
@@ -45,6 +47,19 @@ def log_frames(folder: Path, wanted: Collection[str], path: Path) -> Iterator[Lo
                 frames.append(name)
                 yield LogFrame(name, log, frame, drive)
     check_known_frames(path, wanted, folder, frames)
+
+
+def annotated_frames(folder: Path, wanted: Collection[str], path: Path) -> Iterator[tuple[LogFrame, Boxes]]:
+    """Yield the wanted frames of logs with their boxes, in the ego frame; arguments as for `log_frames`.
+
+    Raises:
+        InputError: as `log_frames`; a frame is not annotated.
+    """
+    for named in log_frames(folder, wanted, path):
+        boxes = read_boxes(named.log, named.frame)
+        if boxes is None:
+            raise InputError(f"{path}: frame {named.name} is not annotated in {named.log.path.folder}")
+        yield named, boxes
 
 
 def check_known_frames(

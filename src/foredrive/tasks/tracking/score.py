@@ -6,9 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from foredrive.data.boxes import read_boxes
 from foredrive.engine.summary import Figures
-from foredrive.errors import InputError
 from foredrive.tasks.detection.nuscenes_results import boxes_by_frame
 from foredrive.tasks.detection.protocols import (
     DETECTION_PROTOCOLS,
@@ -16,7 +14,7 @@ from foredrive.tasks.detection.protocols import (
     DetectionFigures,
     evaluate_detections,
 )
-from foredrive.tasks.evaluation.frames_of_results import log_frames
+from foredrive.tasks.evaluation.frames_of_results import annotated_frames
 from foredrive.tasks.tracking.in_world import box_rows, stacked
 from foredrive.tasks.tracking.nuscenes_json import (
     ObjectTask,
@@ -47,10 +45,7 @@ def read_log_truth(folder: Path, listed: Iterable[str], path: Path, classes: Seq
     names: list[str] = []
     # Frames of the log have the log's world frame, so places of one drive are comparable
     rows, ego, scene, time_us = [], [], [], []
-    for named in log_frames(folder, wanted, path):
-        boxes = read_boxes(named.log, named.frame)
-        if boxes is None:
-            raise InputError(f"{path}: frame {named.name} is not annotated in {named.log.path.folder}")
+    for named, boxes in annotated_frames(folder, wanted, path):
         T_world_ego = named.log.T_world_ego[named.frame]
         rows.append(box_rows(boxes, T_world_ego, len(names), classes))
         names.append(named.name)
