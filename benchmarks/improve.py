@@ -1,4 +1,4 @@
-"""What chooses the better data: `foredrive bench improve`, a round of `foredrive improve` by each strategy.
+"""Compare what chooses data: `foredrive bench improve`, a round of `foredrive improve` by each strategy.
 
 A driver is trained on few virtual egos of the training towns (one seed, three epochs). It drives training
 routes in all weathers; then each strategy chooses as many moments of a pool of four other seeds, or makes
@@ -22,6 +22,7 @@ from benchmarks.common.driver_study import (
     TRAINING_TOWNS,
     egos,
     recipe_of,
+    recorded,
     sight_figures,
     trained,
 )
@@ -30,9 +31,10 @@ from foredrive.driver.recipes import DriverRecipe
 from foredrive.engine.bench import Benchmark, study_identity
 from foredrive.runs.drive.compare import values_of
 from foredrive.runs.drive.in_towns import TownRoutes
-from foredrive.runs.drive.recording import EgosPlan, record_egos
+from foredrive.runs.drive.recording import EgosPlan
 from foredrive.runs.improve.choosing import STRATEGIES
-from foredrive.runs.improve.loop import INDEX, Improvement, Loop, Round
+from foredrive.runs.improve.loop import INDEX, Loop
+from foredrive.runs.improve.records import Improvement, Round
 from foredrive.runs.train.driver import open_driver
 from foredrive.scene.conditions import ANY_CONDITIONS, CONDITIONS
 from foredrive.sensors.rigs import FRONT_TELE
@@ -74,8 +76,7 @@ def _base() -> list[LogPath]:
 
 def _held() -> list[LogPath]:
     plans = [EgosPlan(town, seed, HELD_EGOS, tuple(CONDITIONS)) for town in TEST_TOWNS for seed in HELD_SEEDS]
-    logs, _ = record_egos(plans, WORK / "held", FRONT_TELE, CORES)
-    return logs
+    return recorded(plans, WORK / "held", CORES)
 
 
 def _loop(strategy: str, seed: int) -> Loop:

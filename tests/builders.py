@@ -1,8 +1,9 @@
-"""What tests of several folders build: logs that are reconstructed in seconds."""
+"""What tests of several folders build: logs that are reconstructed in seconds, and short routes."""
 
 import dataclasses
 from pathlib import Path
 
+import numpy as np
 import synthetic_log
 
 from foredrive.data import find_logs
@@ -13,6 +14,8 @@ from foredrive.methods.splatad.scene_config import GaussianSceneConfig
 from foredrive.methods.splatad.training import GaussianSchedule
 from foredrive.runs.recipes.reconstruction import ReconstructionRecipe
 from foredrive.runs.reconstruction.reconstruct import Reconstruction, reconstruct
+from foredrive.towns.map.town_map import load_town_map
+from foredrive.towns.traffic.lane_graph import build_lane_graph
 
 SMALLEST = ReconstructionRecipe(
     name="smallest",
@@ -41,3 +44,16 @@ def reconstructed_log(
     """A made-up log that is reconstructed, in `run` beside the log."""
     (log,) = find_logs(synthetic_log.write(folder, frames=frames))
     return reconstruct(recipe, log, folder / "run")
+
+
+def routes_along(path: Path, town: str) -> Path:
+    """Write two routes of 14 m in CARLA's form, along one lane; CARLA's y points to the right."""
+    graph = build_lane_graph(load_town_map(town))
+    lane = int(np.argmax(np.where(graph.contested, 0.0, graph.length_m)))
+    text = ""
+    for name, first_m in (("a", 20.0), ("b", 60.0)):
+        ends = graph.position(np.full(2, lane), np.array([first_m, first_m + 14.0]))
+        points = "".join(f'<waypoint x="{x}" y="{-y}" z="{z}"/>' for x, y, z in ends)
+        text += f'<route id="{name}" town="{town}">{points}</route>'
+    path.write_text(f"<routes>{text}</routes>")
+    return path

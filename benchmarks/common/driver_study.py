@@ -34,7 +34,7 @@ def egos(seeds: Sequence[int], folder: Path, workers: int, conditions: Sequence[
     Raises:
         InputError: some failed: all arms must have the same data.
     """
-    return _recorded(
+    return recorded(
         [EgosPlan(town, seed, EGOS, tuple(conditions)) for seed in seeds for town in TRAINING_TOWNS],
         folder,
         workers,
@@ -43,10 +43,15 @@ def egos(seeds: Sequence[int], folder: Path, workers: int, conditions: Sequence[
 
 def test_egos(folder: Path, workers: int) -> list[LogPath]:
     """Return the virtual egos of the held-out town."""
-    return _recorded([EgosPlan(town, 0, TEST_EGOS, ()) for town in TEST_TOWNS], folder, workers)
+    return recorded([EgosPlan(town, 0, TEST_EGOS, ()) for town in TEST_TOWNS], folder, workers)
 
 
-def _recorded(plans: list[EgosPlan], folder: Path, workers: int) -> list[LogPath]:
+def recorded(plans: list[EgosPlan], folder: Path, workers: int) -> list[LogPath]:
+    """Return virtual egos, by seed and then by town; record those that are missing.
+
+    Raises:
+        InputError: some failed.
+    """
     logs, failed = record_egos(plans, folder, FRONT_TELE, workers)
     if failed:
         raise InputError(f"{len(failed)} recordings failed: {next(iter(failed.values()))}")

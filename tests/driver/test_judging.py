@@ -8,7 +8,8 @@ import pytest
 import torch
 from path_truth import sight_of, truth
 
-from foredrive.driver.judging import THRESHOLDS, Moment, _figures, _moment
+from foredrive.driver.judging import THRESHOLDS, Moment, _figures, _moment, uncertainty
+from foredrive.scene.affordances import TIMES, PathEstimate
 from foredrive.scene.traffic_light import LightState
 
 PLAIN = Moment(
@@ -107,3 +108,16 @@ def test_who_is_met_beyond_a_red_light_is_no_conflict(light: LightState, met: bo
     nothing = sight_of(1).estimate()[0]
     moment = _moment(seen, nothing, 6.0, visible=True)
     assert (moment.conflict, moment.crossing) == (met, met)
+
+
+def test_the_uncertainty_of_an_estimate_by_hand() -> None:
+    """Two clips: sure of all, and of nothing but that half of the cells are free."""
+    light = torch.tensor([[1.0, 0.0, 0.0, 0.0], [0.25, 0.25, 0.25, 0.25]])
+    occupied = torch.zeros(2, TIMES, 24)
+    occupied[0, :, 3] = 1.0
+    occupied[1, :, :12] = 0.5
+    unsure = uncertainty(PathEstimate(light, torch.zeros(2), occupied))
+    # A uniform light is 1, and half of the cells at a half are 0.5
+    torch.testing.assert_close(unsure, torch.tensor([0.0, 1.5]), atol=1e-4, rtol=0)
+    skewed = uncertainty(PathEstimate(torch.tensor([[0.5, 0.5, 0.0, 0.0]]), torch.zeros(1), occupied[:1]))
+    torch.testing.assert_close(skewed, torch.tensor([0.5]), atol=1e-4, rtol=0)

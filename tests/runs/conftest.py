@@ -36,19 +36,7 @@ def scenarios(reconstructed: Path) -> Path:
 
 @pytest.fixture(scope="session")
 def routes(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two short routes of Town02 in CARLA's form, along one lane; CARLA's y points to the right."""
-    import numpy as np
+    """Two short routes of Town02."""
+    from builders import routes_along
 
-    from foredrive.towns.map.town_map import load_town_map
-    from foredrive.towns.traffic.lane_graph import build_lane_graph
-
-    graph = build_lane_graph(load_town_map("Town02"))
-    lane = int(np.argmax(np.where(graph.contested, 0.0, graph.length_m)))
-    text = ""
-    for name, first_m in (("a", 20.0), ("b", 60.0)):
-        ends = graph.position(np.full(2, lane), np.array([first_m, first_m + 14.0]))
-        points = "".join(f'<waypoint x="{x}" y="{-y}" z="{z}"/>' for x, y, z in ends)
-        text += f'<route id="{name}" town="Town02">{points}</route>'
-    path = tmp_path_factory.mktemp("routes") / "two.xml"
-    path.write_text(f"<routes>{text}</routes>")
-    return path
+    return routes_along(tmp_path_factory.mktemp("routes") / "two.xml", "Town02")

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from builders import routes_along
 from jaxtyping import Float
 from numpy import ndarray
 
@@ -21,8 +22,9 @@ from foredrive.errors import InputError
 from foredrive.runs.drive.in_towns import TownRoutes
 from foredrive.runs.drive.records import write_drive
 from foredrive.runs.improve.choosing import STRATEGIES, Moments, Request, choose
-from foredrive.runs.improve.failures import Failure, failures_of, logs_before
-from foredrive.runs.improve.loop import MOMENTS, RUN, Improvement, LoopResult, improve
+from foredrive.runs.improve.failures import Failure, counted, failures_of, logs_before
+from foredrive.runs.improve.loop import MOMENTS, RUN, Loop
+from foredrive.runs.improve.records import Improvement, LoopResult, Round
 from foredrive.runs.train.driver import open_driver, train_driver
 from foredrive.search.rows import IndexRow
 from foredrive.sensors.rigs import FRONT_TELE, camera_rig
@@ -82,6 +84,7 @@ def test_failures_are_events_and_stops_with_the_seconds_before_them(tmp_path: Pa
         ("b", "blocked", 9.75),
     ]
     assert [f.log.parts_s for f in failures] == [((0.0, 2.0),), ((9.0, 12.0),), ((6.75, 9.75),)]
+    assert counted(failures) == "3 failures (2 red light, 1 blocked)"
     first, second = logs_before(failures)
     assert first.folder == tmp_path / "logs/town_train/route1_rep0"
     assert first.parts_s == ((0.0, 2.0), (9.0, 12.0))
@@ -197,7 +200,7 @@ def asked(
 def once(asked: Improvement, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, LoopResult]:
     """The folder and the result of one round."""
     out = tmp_path_factory.mktemp("loop") / "out"
-    return out, improve(asked, out, 1, report=lambda result: write_improve_report(out, result))
+    return out, Loop(asked, out).run(1, lambda result: write_improve_report(out, result))
 
 
 def test_a_round_learns_moments_of_the_pool_and_is_judged(
@@ -237,7 +240,7 @@ def test_a_loop_goes_on_and_has_other_moments_in_the_next_round(
     out, result = once
     files = [path for path in out.rglob("*") if path.suffix in (".safetensors", ".json")]
     made = {path: path.stat().st_mtime_ns for path in files}
-    longer = improve(asked, out, 2)
+    longer = Loop(asked, out).run(2)
     kept = [
         path for path in files if path.match("run/*/model.safetensors") or path.match("drives/drives/*.json")
     ]
@@ -249,30 +252,48 @@ def test_a_loop_goes_on_and_has_other_moments_in_the_next_round(
     second = open_driver(longer.rounds[2].run)
     assert sum(len(log.parts_s) for log in second.logs) == len(keys[1]) + len(keys[2])
     with pytest.raises(InputError, match="another loop"):
-        improve(dataclasses.replace(asked, budget=5), out, 1)
+        Loop(dataclasses.replace(asked, budget=5), out).run(1)
     # The pool has fewer moments than two more rounds would need
-    ended = improve(asked, out, 9)
+    ended = Loop(asked, out).run(9)
     assert ended.ended == "the pool is used up"
 
 
-def test_a_worse_round_is_dropped(asked: Improvement, once: tuple[Path, LoopResult], tmp_path: Path) -> None:
-    """Of two rounds, one is not better than the other, whatever they are."""
-    result = improve(dataclasses.replace(asked, keep_best=True, seed=1), tmp_path / "out", 2)
-    best = result.rounds[0]
-    for of_number in result.rounds[1:]:
-        assert of_number.kept == (of_number.score >= best.score)
-        assert open_driver(of_number.run).start == best.run
-        best = of_number if of_number.kept else best
-    assert result.best is best
+def judged(number: int, *infractions: Infraction) -> Round:
+    return Round(number, Path(), Path(str(number)), judged={"a": drive_of(Ending.COMPLETED, *infractions)})
+
+
+def test_a_worse_round_is_dropped_and_the_next_compared_with_the_best() -> None:
+    begin, worse, better = judged(0, hit(2.0)), judged(1, hit(2.0), hit(9.0)), judged(2)
+    for keep_best, kept, after_worse in ((True, [True, False, True], "0"), (False, [True] * 3, "1")):
+        result = LoopResult([begin]).followed_by(worse, keep_best=keep_best)
+        assert result.best.run == Path(after_worse)
+        # 49 of two red lights, 70 of one: this round is worse than the beginning, not than the dropped one
+        same = result.followed_by(judged(2, hit(2.0), hit(6.0)), keep_best=True)
+        assert same.rounds[-1].kept is not keep_best
+        result = result.followed_by(better, keep_best=keep_best)
+        assert [of_number.kept for of_number in result.rounds] == kept
+        assert result.best.run == Path("2")
+
+
+def test_held_out_routes_judge_a_round(asked: Improvement, tmp_path: Path) -> None:
+    held = dataclasses.replace(asked.routes, routes=str(routes_along(tmp_path / "held.xml", "Town01")))
+    loop = Loop(dataclasses.replace(asked, held_out=held, budget=2), tmp_path / "out")
+    begin, first = loop.run(1).rounds
+    assert set(first.judged) == {"routea_rep0", "routeb_rep0"}
+    assert {drive.town for drive in (*begin.judged.values(), *first.judged.values())} == {"Town01"}
+    # Failures are of the other routes
+    assert {failure.town for failure in first.failures} == {"Town02"}
+    assert not (first.folder / DRIVES).exists()  # no round follows
 
 
 @pytest.mark.parametrize("strategy", [name for name in STRATEGIES if name in ("uncertainty", "anew")])
 def test_strategies_that_look_with_the_driver(asked: Improvement, strategy: str, tmp_path: Path) -> None:
-    result = improve(dataclasses.replace(asked, strategy=strategy), tmp_path / "out", 1)
+    result = Loop(dataclasses.replace(asked, strategy=strategy), tmp_path / "out").run(1)
     first = result.rounds[1]
     assert len(first.hits) == 4
     folders = {hit.row.folder for hit in first.hits}
     if strategy == "anew":
+        assert [hit.score for hit in first.hits] == sorted((hit.score for hit in first.hits), reverse=True)
         new = first.folder / "anew"
         assert all(folder.is_relative_to(new) for folder in folders)
         assert json.loads((new / "suite.json").read_text())["seed"] != asked.routes.seed
@@ -287,13 +308,13 @@ def test_pools_that_spoil_the_judgement_are_refused(
 ) -> None:
     mixed = dataclasses.replace(asked, pool=(*asked.pool, egos[3][0]))
     with pytest.raises(InputError, match="the pool has 1 logs that the run was trained on, such as"):
-        improve(mixed, tmp_path / "out", 1)
+        Loop(mixed, tmp_path / "out").run(1)
     judged = dataclasses.replace(asked, held_out=asked.routes)
     with pytest.raises(InputError, match="recorded in Town02, where the routes that judge"):
-        improve(judged, tmp_path / "out", 1)
+        Loop(judged, tmp_path / "out").run(1)
     gone = dataclasses.replace(asked, logs=(LogPath(tmp_path / "gone", tmp_path),))
     with pytest.raises(InputError, match="gone: a log that the run was trained on is not here; --logs"):
-        improve(gone, tmp_path / "out", 1)
+        Loop(gone, tmp_path / "out").run(1)
     pool = str(egos[4][0].folder)
     arguments = ["improve", str(asked.start), "--pool", pool, "--out", str(tmp_path / "out")]
     assert main([*arguments, "--strategy", "luck"]) == 2

@@ -69,8 +69,8 @@ def improve(
 
         from foredrive.runs.drive.in_towns import TownRoutes
         from foredrive.runs.improve.choosing import STRATEGIES
-        from foredrive.runs.improve.loop import Improvement
-        from foredrive.runs.improve.loop import improve as run_loop
+        from foredrive.runs.improve.loop import Loop
+        from foredrive.runs.improve.records import Improvement
         from foredrive.runs.train.driver import open_driver
         from foredrive.view.improve_report import REPORT, rounds_table, write_improve_report
         from foredrive.view.table import print_table
@@ -91,16 +91,15 @@ def improve(
         keep_best,
         towns.seed,
     )
-    result = run_loop(
+    loop = Loop(
         improvement,
         out,
-        rounds,
         towns.workers or len(os.sched_getaffinity(0)),
         on_ray=towns.ray,
         say=lambda text: print(text, flush=True),
         progress=job_progress,
-        report=lambda result: write_improve_report(out, result),
     )
+    result = loop.run(rounds, lambda result: write_improve_report(out, result))
     print_table(rounds_table(result), Console())
     if result.ended:
         print(f"ended: {result.ended}")

@@ -110,14 +110,10 @@ def missed_by(
     return torch.tensor([moment.missed for moment in _moments(driver, clips, tick)])
 
 
-@torch.no_grad()
 def uncertainty_of(
     driver: Driver, clips: PackedClips, tick: Callable[[], None] = lambda: None
 ) -> Float[Tensor, "N"]:
-    """Return how unsure a driver is of what it sees, from 0 to 2; the truth is not looked at.
-
-    It is the entropy of the light's state plus the mean entropy of the occupancy over the cells and times of
-    the path, each relative to its maximum.
+    """Return how unsure a driver is of what it sees, see `uncertainty`; the truth is not looked at.
 
     Args:
         driver: in evaluation mode.
@@ -127,13 +123,20 @@ def uncertainty_of(
     of_batches = []
     for start in range(0, len(clips), BATCH):
         batch = join([clips[index] for index in range(start, min(start + BATCH, len(clips)))])
-        estimate = driver.see(batch.clip).estimate()
-        light, p = estimate.light.clamp(min=1e-6), estimate.occupied.clamp(1e-6, 1 - 1e-6)
-        of_light = -(light * light.log()).sum(-1) / math.log(light.shape[-1])
-        of_path = -(p * p.log() + (1 - p) * (1 - p).log()) / math.log(2)
-        of_batches.append(of_light + of_path.flatten(1).mean(1))
+        of_batches.append(uncertainty(driver.see(batch.clip).estimate()))
         tick()
     return torch.cat(of_batches)
+
+
+def uncertainty(estimate: PathEstimate) -> Float[Tensor, "b"]:
+    """Return the entropy of the light's state plus the mean entropy of the path's cells over all times.
+
+    Each is relative to its maximum, so the sum is from 0 to 2.
+    """
+    light, p = estimate.light.clamp(min=1e-6), estimate.occupied.clamp(1e-6, 1 - 1e-6)
+    of_light = -(light * light.log()).sum(-1) / math.log(light.shape[-1])
+    of_path = -(p * p.log() + (1 - p) * (1 - p).log()) / math.log(2)
+    return of_light + of_path.flatten(1).mean(1)
 
 
 def _moments(driver: Driver, clips: PackedClips, tick: Callable[[], None]) -> Iterator[Moment]:

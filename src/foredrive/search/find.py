@@ -93,8 +93,8 @@ class Found:
     exact: bool
     """Whether all rows that satisfy the conditions were compared."""
     unlike: bool = False
-    """Whether the index shows no more of the query's text than of unrelated texts, so that these are no hits
-    but the nearest moments."""
+    """True if the index shows no more of the query's text than of unrelated texts: the hits are then only the
+    nearest moments."""
 
 
 def find(index: FrameIndex, query: Query, target: Target | None, *, exact_up_to: int = EXACT_UP_TO) -> Found:

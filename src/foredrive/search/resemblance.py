@@ -1,4 +1,4 @@
-"""Whether a text is about anything that an index shows."""
+"""Judge whether a text is about anything that an index shows."""
 
 import functools
 

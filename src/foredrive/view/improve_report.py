@@ -13,8 +13,8 @@ from foredrive.engine.folder import SUMMARY, held_for_results
 from foredrive.engine.provenance import collect_provenance
 from foredrive.engine.summary import write_summary
 from foredrive.runs.drive.compare import values_of
-from foredrive.runs.improve.failures import Failure
-from foredrive.runs.improve.loop import LoopResult, Round
+from foredrive.runs.improve.failures import Failure, counted
+from foredrive.runs.improve.records import LoopResult, Round
 from foredrive.search.find import Hit
 from foredrive.tasks.bootstrap import LEAST_ROUTES, NO_INTERVAL, BootstrapMean, bootstrap_mean
 from foredrive.view.drive_plots import draw_places, letter_of
@@ -140,11 +140,10 @@ def _show(out: Path, result: LoopResult, place: int) -> ShownRound:
     of_number = result.rounds[place]
     before = [earlier for earlier in result.rounds[:place] if earlier.kept][-1]
     kinds = [failure.kind for failure in of_number.failures]
-    counts = ", ".join(f"{kinds.count(kind)} {words(kind)}" for kind in dict.fromkeys(kinds))
     moved = "" if of_number.kept else ", dropped"
     return ShownRound(
         f"Round {of_number.number}: {number(before.score, 1)} to {number(of_number.score, 1)}{moved}",
-        f"{len(kinds)} failures ({counts}); {len(of_number.hits)} moments chosen.",
+        f"{counted(of_number.failures)}; {len(of_number.hits)} moments chosen.",
         _maps(of_number.failures),
         ", ".join(f"{letter_of(kind)} {words(kind)}" for kind in dict.fromkeys(kinds)),
         _answers(of_number),

@@ -52,7 +52,7 @@ class Moments:
 
 @dataclass(frozen=True)
 class Request:
-    """What a strategy chooses from, and by."""
+    """The arguments of a strategy."""
 
     pool: Moments
     failures: Sequence[Failure]

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from foredrive.data.log_paths import LogPath
 from foredrive.driving.drive_record import DriveRecord
+from foredrive.driving.observation import FRAME_DT_S
 from foredrive.driving.scores import Ending
 from foredrive.engine.folder import DRIVES
 from foredrive.runs.drive.records import read_drive
@@ -13,7 +14,7 @@ from foredrive.runs.drive.records import read_drive
 BEFORE_S = 3.0
 """Time before a failure whose key frames are examples of it, s."""
 APART_S = 3.0
-"""What happens within this time after a failure, s, belongs to it."""
+"""Time after a failure within which other events belong to it, s."""
 STANDING_MPS = 0.1
 
 
@@ -56,6 +57,13 @@ def failures_of(suite: Path) -> list[Failure]:
     ]
 
 
+def counted(failures: Sequence[Failure]) -> str:
+    """Return the number of failures, in all and by kind."""
+    kinds = [failure.kind.replace("_", " ") for failure in failures]
+    of_kinds = ", ".join(f"{kinds.count(kind)} {kind}" for kind in dict.fromkeys(kinds))
+    return f"{len(failures)} failures ({of_kinds})"
+
+
 def logs_before(failures: Sequence[Failure]) -> list[LogPath]:
     """Return the logs of failures, each with the seconds before all its failures as parts."""
     parts: dict[LogPath, list[tuple[float, float]]] = {}
@@ -77,7 +85,8 @@ def _of_drive(suite: Path, name: str, drive: DriveRecord) -> list[Failure]:
     for t_s, kind, what, xy in sorted(events):
         if failures and t_s - failures[-1].t_s < APART_S:
             continue
-        part = (max(0.0, t_s - BEFORE_S), t_s)
+        # At least the first key frame of the drive
+        part = (max(0.0, t_s - BEFORE_S), max(t_s, FRAME_DT_S))
         log = LogPath(suite / drive.log, suite / "maps", (part,))
         failures.append(Failure(name, score.route, kind, what, t_s, xy, drive.town, log))
     return failures

@@ -8,12 +8,11 @@ index of the moments before the failures), `run`, `drives` on the searched route
 
 import contextlib
 import dataclasses
+import functools
 import json
 import math
-import statistics
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -26,16 +25,16 @@ from foredrive.driver.packed import PackedClips, batches
 from foredrive.driver.recipes import DriverRecipe
 from foredrive.driving.drive_record import DriveRecord
 from foredrive.driving.route_sets import load_route_set
-from foredrive.engine.folder import CONFIG, DRIVES, RunFolder
+from foredrive.engine.folder import DRIVES, RunFolder
 from foredrive.engine.interrupts import start_fork_server
 from foredrive.errors import InputError
 from foredrive.files import atomic_path
 from foredrive.runs.drive.in_towns import TownRoutes
 from foredrive.runs.drive.suite import DriveSuite, drive_suite
 from foredrive.runs.improve.choosing import ANEW, Moments, Request, before_failure, choose
-from foredrive.runs.improve.failures import Failure, failures_of, logs_before
+from foredrive.runs.improve.failures import Failure, counted, failures_of, logs_before
+from foredrive.runs.improve.records import Answer, Improvement, LoopResult, Round
 from foredrive.runs.open_clips import open_clips
-from foredrive.runs.recipes.known import find_recipe
 from foredrive.runs.search.indexing import index_logs
 from foredrive.runs.train.driver import load_driver, open_driver, train_driver
 from foredrive.search.find import Hit
@@ -59,153 +58,6 @@ CLIP_S = 0.01
 """Half the length of the part of a log that holds one key frame, s."""
 Progress = Callable[[str, int], AbstractContextManager[Callable[[], None]]]
 """Shows an activity and its number of parts; the function is called after each part."""
-
-
-@dataclass(frozen=True)
-class Improvement:
-    """The request: a driver, where it drives, and a pool to learn from."""
-
-    start: Path
-    """Folder of the driver's run that the loop begins with."""
-    pool: tuple[LogPath, ...]
-    logs: tuple[LogPath, ...]
-    """Logs that every round trains on beside the chosen moments, as a rule those of the run."""
-    routes: TownRoutes
-    """Where failures are looked for, and without `held_out` also what a round is judged by."""
-    held_out: TownRoutes | None = None
-    """Routes that judge a round and are never searched for failures."""
-    strategy: str = "failures-diversity"
-    budget: int = 500
-    """Moments of each round."""
-    settings: tuple[str, ...] = ()
-    """Entries of the run's recipe to replace, KEY.KEY=VALUE."""
-    keep_best: bool = False
-    """Whether a round that is judged worse than the one before it is dropped."""
-    seed: int = 0
-
-    def recipe(self) -> DriverRecipe:
-        """Return the recipe of the rounds.
-
-        Raises:
-            InputError: a setting does not fit it.
-        """
-        recipe = find_recipe(str(self.start / CONFIG), self.settings, DriverRecipe)
-        return dataclasses.replace(recipe, see=dataclasses.replace(recipe.see, seed=self.seed))
-
-    def check(self) -> None:
-        """Check what can be checked before the first drive.
-
-        Raises:
-            InputError: the run is no driver or not trained, there is no such route, a log of its training
-                is missing, or one of the pool is among them.
-        """
-        open_driver(self.start).weights  # noqa: B018 - raises where training has not finished
-        self.recipe()
-        for source in filter(None, (self.routes, self.held_out)):
-            source.jobs(str(self.start))
-        for log in self.logs:
-            if not log.folder.is_dir():
-                raise InputError(
-                    f"{log.folder}: a log that the run was trained on is not here; --logs names others, on "
-                    "which every round trains beside the chosen moments"
-                )
-        trained = {log.name for log in self.logs}
-        if common := [log.name for log in self.pool if log.name in trained]:
-            raise InputError(
-                f"the pool has {len(common)} logs that the run was trained on, such as {common[0]}: "
-                "leave them out"
-            )
-
-
-@dataclass(frozen=True)
-class Answer:
-    """A failure, the last moment before it, and the chosen moments that resemble it most."""
-
-    failure: Failure
-    moment: Hit
-    hits: Sequence[Hit]
-
-
-@dataclass(frozen=True)
-class Round:
-    """One round, or the run that the loop begins with (number 0)."""
-
-    number: int
-    folder: Path
-    run: Path
-    failures: Sequence[Failure] = ()
-    """The failures that this round looked for moments of."""
-    hits: Sequence[Hit] = ()
-    """The chosen moments, in the order of choice."""
-    answers: Sequence[Answer] = ()
-    """What was chosen for each failure."""
-    judged: Mapping[str, DriveRecord] = field(default_factory=dict)
-    """The drives that judge the round, by name."""
-    suite: Path | None = None
-    """Folder of these drives."""
-    kept: bool = True
-    """False if the round was dropped, because it was judged worse."""
-
-    @property
-    def score(self) -> float:
-        """Return the mean driving score of the drives that judge the round."""
-        return statistics.fmean(drive.driving_score_1_0 for drive in self.judged.values())
-
-
-@dataclass(frozen=True)
-class LoopResult:
-    """The rounds, and why the loop ended before the last one that was asked for."""
-
-    rounds: list[Round]
-    ended: str = ""
-
-    @property
-    def best(self) -> Round:
-        """Return the round whose run is the result."""
-        return [of_number for of_number in self.rounds if of_number.kept][-1]
-
-
-def improve(
-    improvement: Improvement,
-    out: Path,
-    rounds: int,
-    workers: int = 1,
-    *,
-    on_ray: bool = False,
-    say: Callable[[str], object] = lambda text: None,
-    progress: Progress = lambda what, count: nullcontext(lambda: None),
-    report: Callable[[LoopResult], object] = lambda result: None,
-) -> LoopResult:
-    """Run the rounds; continue where an earlier call stopped. A later call may ask for more of them.
-
-    Args:
-        workers: number of drives, and of parts of logs to embed, at a time; on Ray as for `fan_out.fan_out`.
-        say: called with a line about each step.
-        progress: shows how far a step is.
-        report: writes the report, after each round.
-
-    Raises:
-        InputError: as `Improvement.check`; the folder holds another loop; a drive could not be simulated.
-        OSError: the disk is full.
-    """
-    improvement.check()
-    with _folder(improvement, out).claimed():
-        loop = Loop(improvement, out, workers, on_ray=on_ray, say=say, progress=progress)
-        result = LoopResult([loop.judged(loop.begin)])
-        report(result)
-        for number in range(1, rounds + 1):
-            best = result.best
-            learned = loop.learned(number, result.rounds)
-            if isinstance(learned, str):
-                say(f"round {number}: {learned}")
-                return LoopResult(result.rounds, learned)
-            judged = loop.judged(learned)
-            if improvement.keep_best and judged.score < best.score:
-                judged = dataclasses.replace(judged, kept=False)
-                say(f"round {number}: dropped, {judged.score:.1f} after {best.score:.1f}")
-            result = LoopResult([*result.rounds, judged])
-            report(result)
-        return result
 
 
 def _folder(improvement: Improvement, out: Path) -> RunFolder:
@@ -241,14 +93,13 @@ def _noted(improvement: Improvement) -> object:
 
 
 class Loop:
-    """The steps of the rounds. Opening one indexes the pool.
+    """The rounds of an improvement in a folder.
 
     Args:
         out: folder of the loop.
-        workers, on_ray, say, progress: as of `improve`.
-
-    Raises:
-        InputError: the pool is empty, or has logs of towns that have to stay unseen.
+        workers: number of drives, and of parts of logs to embed, at a time; on Ray as for `fan_out.fan_out`.
+        say: called with a line about each step.
+        progress: shows how far a step is.
     """
 
     begin: Round
@@ -266,17 +117,62 @@ class Loop:
     ) -> None:
         self.of, self.out, self.workers, self.on_ray = improvement, out, workers, on_ray
         self.say, self.progress = say, progress
-        self.recipe = improvement.recipe()
-        self.pool = open_clips(self.of.pool, self.recipe.clips, self.out / "cache")
-        self._check_places(self.pool)
-        start_fork_server(preload=TownRoutes.__module__)
-        self._index(self.of.pool, self.out / INDEX, "indexing the pool")
+        self.begin = Round(0, out / "round_0", improvement.start)
+
+    def run(self, rounds: int, report: Callable[[LoopResult], object] = lambda result: None) -> LoopResult:
+        """Run the rounds; continue where an earlier call stopped. A later call may ask for more of them.
+
+        Args:
+            rounds: their number.
+            report: writes the report, after each round.
+
+        Raises:
+            InputError: as `Improvement.check`; the pool is empty, or has logs of towns that have to stay
+                unseen; the folder holds another loop; a drive could not be simulated, or the driver raised an
+                error in one.
+            OSError: the disk is full.
+        """
+        self.of.check()
+        with _folder(self.of, self.out).claimed():
+            start_fork_server(preload=TownRoutes.__module__)
+            self.say(f"pool: {len(self.moments)} moments of {len(self.of.pool)} logs")
+            if not self.of.logs:
+                self.say("the run comes without its logs: rounds train on the chosen moments alone (--logs)")
+            result = LoopResult([self.judged(self.begin)])
+            report(result)
+            for number in range(1, rounds + 1):
+                learned = self.learned(number, result.rounds)
+                if isinstance(learned, str):
+                    self.say(f"round {number}: {learned}")
+                    return LoopResult(result.rounds, learned)
+                before = result.best.score
+                result = result.followed_by(self.judged(learned), keep_best=self.of.keep_best)
+                if not result.rounds[-1].kept:
+                    self.say(f"round {number}: dropped, {result.rounds[-1].score:.1f} after {before:.1f}")
+                report(result)
+            return result
+
+    @functools.cached_property
+    def recipe(self) -> DriverRecipe:
+        """Return the recipe of the rounds."""
+        return self.of.recipe()
+
+    @functools.cached_property
+    def pool(self) -> ClipDataset:
+        """Return the clips of the pool."""
+        pool = open_clips(self.of.pool, self.recipe.clips, self.out / "cache")
+        self._check_places(pool)
+        return pool
+
+    @functools.cached_property
+    def moments(self) -> Moments:
+        """Return the moments of the pool with their embeddings; the first access indexes the pool."""
         keys = {self.pool.key(number) for number in range(len(self.pool))}
-        self.moments = Moments.of(FrameIndex(str(self.out / INDEX)), keys)
-        if not len(self.moments):
+        self._index(self.of.pool, self.out / INDEX, "indexing the pool")
+        moments = Moments.of(FrameIndex(str(self.out / INDEX)), keys)
+        if not len(moments):
             raise InputError("the pool is empty: none of its moments has images and a key frame before it")
-        say(f"pool: {len(self.moments)} moments of {len(self.of.pool)} logs")
-        self.begin = Round(0, self.out / "round_0", self.of.start)
+        return moments
 
     def learned(self, number: int, rounds: Sequence[Round]) -> Round | str:
         """Return a round that is trained and not judged yet; or why there is none.
@@ -291,7 +187,7 @@ class Loop:
         failures = failures_of(best.folder / DRIVES)
         if not failures:
             return f"no failures left in {len(drives)} drives"
-        self.say(f"round {number}: {_counted(failures)} in {len(drives)} drives")
+        self.say(f"round {number}: {counted(failures)} in {len(drives)} drives")
         used = {hit.row.key for of_number in rounds for hit in of_number.hits}
         hits, answers = self._chosen(number, best, failures, drives, used)
         if not hits:
@@ -345,6 +241,10 @@ class Loop:
         if driven.broken:
             job, why = next(iter(driven.broken.items()))
             raise InputError(f"{len(driven.broken)} drives failed, such as {job.name}: {why}")
+        # A driver that raises an error has no failures to learn from, and its score says nothing
+        for job, drive in driven.drives.items():
+            if drive.score.failed:
+                raise InputError(f"{run}: the driver failed in {out / DRIVES / job.name}.json: {drive.error}")
         return {job.name: drive for job, drive in driven.drives.items()}
 
     def _chosen(
@@ -463,13 +363,6 @@ def _merged(logs: Sequence[LogPath]) -> list[LogPath]:
     for log in logs:
         parts.setdefault((log.folder, log.maps_dir), []).extend(log.parts_s)
     return [LogPath(*place, tuple(sorted(of_log))) for place, of_log in parts.items()]
-
-
-def _counted(failures: Sequence[Failure]) -> str:
-    """Return the number of failures, in all and by kind."""
-    kinds = [failure.kind.replace("_", " ") for failure in failures]
-    of_kinds = ", ".join(f"{kinds.count(kind)} {kind}" for kind in dict.fromkeys(kinds))
-    return f"{len(failures)} failures ({of_kinds})"
 
 
 @contextlib.contextmanager
