@@ -133,6 +133,7 @@ class Loop:
             OSError: the disk is full.
         """
         self.of.check()
+        self._check_places()  # before the folder is there
         with _folder(self.of, self.out).claimed():
             start_fork_server(preload=TownRoutes.__module__)
             self.say(f"pool: {len(self.moments)} moments of {len(self.of.pool)} logs")
@@ -160,9 +161,7 @@ class Loop:
     @functools.cached_property
     def pool(self) -> ClipDataset:
         """Return the clips of the pool."""
-        pool = open_clips(self.of.pool, self.recipe.clips, self.out / "cache")
-        self._check_places(pool)
-        return pool
+        return open_clips(self.of.pool, self.recipe.clips, self.out / "cache")
 
     @functools.cached_property
     def moments(self) -> Moments:
@@ -209,7 +208,7 @@ class Loop:
         self.say(f"round {of_number.number}: driving score {judged.score:.1f} in {len(drives)} drives")
         return judged
 
-    def _check_places(self, pool: ClipDataset) -> None:
+    def _check_places(self) -> None:
         """Refuse a pool with logs of the towns that judge the rounds and have to stay unseen."""
         unseen = {
             route.town
@@ -218,7 +217,7 @@ class Loop:
             for route in load_route_set(source.routes)
             if source is self.of.held_out or route.town in TEST_TOWNS
         }
-        for log in pool.logs:
+        for log in self.pool.logs:
             if log.metadata.location in unseen:
                 raise InputError(
                     f"{log.path.name}: recorded in {log.metadata.location}, where the routes that judge "
