@@ -143,7 +143,7 @@ def boxes_message(t_us: int, boxes: Boxes, colours: list[RGB]) -> SceneUpdate:
     return _update(t_us, entities)
 
 
-def lines_message(t_us: int, lines: list[tuple[Float64[np.ndarray, "V 3"], RGB]], name: str) -> SceneUpdate:
+def lines_message(t_us: int, lines: list[tuple[Float64[np.ndarray, "_ 3"], RGB]], name: str) -> SceneUpdate:
     """Return polylines in the world frame that stay; another message of the name replaces them."""
     strips = [
         LinePrimitive(
