@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import TypeGuard
 
 from api_pages import api_pages
-from benchmark_pages import benchmark_pages
+from benchmark_pages import arms_of_today, benchmark_pages
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.exceptions import PluginError
 from mkdocs.structure.files import File, Files
@@ -22,7 +22,8 @@ LOADED = re.compile(r"<(?:script|img|iframe|link)\b[^>]*\b(?:src|href)=.?https?:
 def on_files(files: Files, *, config: MkDocsConfig) -> Files:
     """Add the generated pages: API, benchmarks, verbs, files of the repository that pages link to."""
     pages: dict[str, str | bytes] = {uri: (ROOT / name).read_text() for name, uri in MOUNTED.items()}
-    pages |= api_pages(ROOT / "src" / "foredrive") | benchmark_pages(ROOT / "benchmarks" / "results")
+    pages |= api_pages(ROOT / "src" / "foredrive")
+    pages |= benchmark_pages(ROOT / "benchmarks" / "results", arms_of_today(ROOT))
     pages["how-to/verbs.md"] = verb_page(ROOT)
     pages |= tutorial_pages(ROOT / "docs" / "tutorials", ROOT)
     written = [file.content_string for file in files.documentation_pages()]
