@@ -117,7 +117,7 @@ def test_a_long_page_begins_with_what_decides_and_folds_the_rest() -> None:
     many = {f"uniad.part_{i}.x": entry(float(i)) for i in range(30)}
     page = benchmark_page(content({"one": few | many, "two": few | many}, name))
     short, _, rest = page.partition("## All figures")
-    assert "## In short\n\n| | Score | Collision rate | Progress | Score progress |\n" in short
+    assert "## In short\n\n| | `one` | `two` |\n|---|--:|--:|\n| Score | 1 | 1 |\n" in short
     assert '??? abstract "UniAD"\n\n    | | `one` | `two` |\n' in rest
     assert "    | **Part 7** | | |\n    | X | 7 | 7 |\n" in rest
 

@@ -216,12 +216,14 @@ def figure_table(
 
 
 def arm_table(figures: Mapping[str, Mapping[str, Any]], arms: Sequence[str], names: Sequence[str]) -> str:
-    """Return the table of some figures: a row for each arm, a column for each figure with its whole name."""
+    """Return the table of some figures by their whole names: a row for each arm, or figure if more."""
     every = {name for arm in arms for name in figures[arm]}
-    heads = [_whole_name(name, every) for name in names]
-    head = f"| | {' | '.join(heads)} |\n|---|{'--:|' * len(names)}"
-    rows = [f"| `{arm}` | {' | '.join(cell(figures[arm], name) for name in names)} |" for arm in arms]
-    return "\n".join([head, *rows])
+    heads, codes = [_whole_name(name, every) for name in names], [f"`{arm}`" for arm in arms]
+    cells = [[cell(figures[arm], name) for name in names] for arm in arms]
+    if len(arms) < len(names):
+        heads, codes, cells = codes, heads, [list(row) for row in zip(*cells, strict=True)]
+    rows = [f"| {code} | {' | '.join(row)} |" for code, row in zip(codes, cells, strict=True)]
+    return "\n".join([f"| | {' | '.join(heads)} |", f"|---|{'--:|' * len(heads)}", *rows])
 
 
 def cell(figures: Mapping[str, Mapping[str, float]], name: str) -> str:
