@@ -55,6 +55,18 @@ def test_the_vehicle_and_its_motion(tmp_path: Path) -> None:
     np.testing.assert_allclose(log.speed_mps, 8.0, rtol=1e-3)  # a chord is shorter than its arc
 
 
+def test_cameras_keep_123d_names_in_any_case_and_others_go_by_direction(tmp_path: Path) -> None:
+    names = ("ftcam_tele_f0", "PCAM_F0", "front")
+    cameras = [dataclasses.replace(CAMERA, name=name) for name in names]
+    images = {name: [np.zeros((*SIZE_HW, 3), np.uint8)] * len(TIMES_S) for name in names}
+    log = write(tmp_path, cameras=cameras, images=images)
+    ids = {name: camera.camera_id.name for name, camera in pinhole_cameras(log).items()}
+    assert ids == {"ftcam_tele_f0": "FTCAM_TELE_F0", "PCAM_F0": "PCAM_F0", "front": "PCAM_STEREO_L"}
+    twice = [dataclasses.replace(CAMERA, name=name) for name in ("pcam_f0", "PCAM_F0")]
+    with pytest.raises(InputError, match="names are not unique"):
+        write(tmp_path / "twice", cameras=twice)
+
+
 def test_images_of_files_and_arrays_at_times_of_their_own(tmp_path: Path) -> None:
     image = np.full((*SIZE_HW, 3), (200, 100, 50), np.uint8)
     Image.fromarray(image).save(tmp_path / "front.png")

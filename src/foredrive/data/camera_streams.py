@@ -84,7 +84,7 @@ def camera_metadata(spec: CameraSpec, camera_id: CameraID) -> RollingCameraMetad
 
 
 def camera_ids(cameras: list[CameraSpec]) -> list[tuple[CameraSpec, CameraID]]:
-    """Assign a 123D id to each camera: that of its name if it has one, else one by its viewing direction.
+    """Assign a 123D id to each camera: that of its name in any case, else one by its viewing direction.
 
     The ids by direction are front, back, and left and right, numbered from front to back.
     """
@@ -94,8 +94,11 @@ def camera_ids(cameras: list[CameraSpec]) -> list[tuple[CameraSpec, CameraID]]:
         raise InputError(f"camera names are not unique: {[c.name for c in cameras]}")
     by_name = CameraID.__members__
     # Cameras with a name of 123D keep that id; the others share what is left
-    taken = {by_name[camera.name]: camera for camera in cameras if camera.name in by_name}
-    unnamed = [camera for camera in cameras if camera.name not in by_name]
+    named = [camera for camera in cameras if camera.name.upper() in by_name]
+    taken = {by_name[camera.name.upper()]: camera for camera in named}
+    if len(taken) < len(named):
+        raise InputError(f"camera names are not unique: {[c.name for c in named]}")
+    unnamed = [camera for camera in cameras if camera.name.upper() not in by_name]
     left_over = []
     # From front to back, so that side cameras are numbered in this order
     for camera in sorted(unnamed, key=lambda c: abs(azimuth[c.name])):
