@@ -10,12 +10,17 @@ from small_drives import one_example
 
 from foredrive.data.batches import stack_records
 from foredrive.driving.drive import Drive, PlanningTiming, drive_route
+from foredrive.driving.drive_record import record_of
 from foredrive.driving.dynamics import STEP_S
+from foredrive.driving.faults import NO_FAULTS
+from foredrive.driving.faulty_agent import FaultyAgent
 from foredrive.driving.scores import Ending
 from foredrive.driving.simple_agents import StraightAgent
 from foredrive.errors import InputError
 from foredrive.scene import Clip, Trajectory
+from foredrive.scene.affordances import CELLS, TIMES, PathEstimate
 from foredrive.scene.conditions import BackgroundTraffic
+from foredrive.scene.traffic_light import LightState
 from foredrive.towns.driving.town import TownScenario, TownSimulator
 from foredrive.towns.driving.town_expert import TownExpert
 from foredrive.towns.map.town_map import load_town_map
@@ -95,6 +100,39 @@ def test_a_plan_takes_effect_after_its_latency(simulator: TownSimulator, scenari
         assert drive.score.ending is Ending.TIMEOUT
         assert len(drive.act_s) == 3
     assert moves[0.6] - moves[0.0] == round(0.6 / STEP_S)
+
+
+class Telling:
+    """Drives straight on, and sees a green light 12 m ahead and somebody in the third cell."""
+
+    def __init__(self) -> None:
+        self.sight: PathEstimate | None = None
+
+    def act(self, observation: Clip) -> Trajectory:
+        occupied = torch.zeros(1, TIMES, CELLS)
+        occupied[0, 0, 2], occupied[0, 1, 5] = 0.9, 1.0  # the second one only later
+        light = torch.tensor([[0.1, 0.1, 0.1, 0.7]])
+        self.sight = PathEstimate(light, torch.full((1,), 12.0), occupied)
+        return StraightAgent(4.0).act(observation)
+
+
+def test_a_record_keeps_plans_in_the_world_and_what_was_seen(
+    simulator: TownSimulator, scenario: TownScenario
+) -> None:
+    brief = dataclasses.replace(scenario, limit_s=1.4)
+    faulty = FaultyAgent(Telling(), NO_FAULTS, 0.5, "d")
+    for agent, tells in ((Telling(), True), (faulty, True), (StraightAgent(4.0), False)):
+        drive = drive_route(simulator, brief, agent, route="r")
+        record = record_of(drive, scenario.route_xyz, 45.0, town="Town02", log="logs/d", wall_s=1.0)
+        assert [plan.t_s for plan in record.plans] == [0.0, 0.5, 1.0]
+        for plan in record.plans:
+            state = drive.states[round(plan.t_s / STEP_S)]
+            ahead = np.array([math.cos(state.yaw_rad), math.sin(state.yaw_rad)])
+            wanted = np.array([state.x_m, state.y_m]) + np.outer([0.0, 2.0, 4.0], ahead)
+            np.testing.assert_allclose(plan.xy[:3], wanted, atol=0.006)
+            assert (plan.light, plan.light_m) == ((LightState.GREEN, 12.0) if tells else (None, 0.0))
+            assert np.flatnonzero(plan.occupied).tolist() == ([2] if tells else [])
+        assert abs(drive.states[0].yaw_rad) > 0.1  # the world's axes are not the vehicle's
 
 
 def test_who_plans_less_often_is_asked_less_often(simulator: TownSimulator, scenario: TownScenario) -> None:

@@ -224,11 +224,13 @@ class SightDriver:
 
     def __init__(self, driver: Driver, perceive: Callable[[Clip], PathEstimate] | None = None) -> None:
         self._planner, self._perceive = driver.planner, perceive or Perception(driver)
+        self.sight: PathEstimate | None = None
+        """What the last plan was made from."""
 
     @torch.no_grad()
     def act(self, observation: Clip) -> Trajectory:
         """Return the plan for an observation of a batch of one. Without a route it goes straight on."""
-        view = self._perceive(observation)
+        view = self.sight = self._perceive(observation)
         path = given_path(observation)
         speed = ego_speeds(observation)[:, observation.now]
         # The best speed profile on the route, then points along it

@@ -4,7 +4,7 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float64
@@ -21,6 +21,8 @@ from foredrive.driving.scores import Ending, RouteScore, infraction_of
 from foredrive.driving.time_to_collision import MovingBoxes, time_to_collision_s
 from foredrive.errors import InputError
 from foredrive.scene import Agent, BicycleState, Clip, Event, Simulator, Step, Trajectory
+from foredrive.scene.affordances import PathEstimate
+from foredrive.scene.protocols import SeesPath
 
 
 @dataclass(frozen=True)
@@ -49,6 +51,17 @@ class PlanningTiming:
         return round(self.period_s / STEP_S)
 
 
+class DrivePlan(NamedTuple):
+    """A plan of a drive."""
+
+    step: int
+    """The step at which it was made."""
+    xy: Float64[np.ndarray, "_ 2"]
+    """Its points in the ego frame then, m."""
+    sight: PathEstimate | None
+    """What the agent saw of its path then; None if it does not say so."""
+
+
 @dataclass(frozen=True, eq=False)
 class Drive:
     """Result of one drive."""
@@ -66,8 +79,7 @@ class Drive:
     """None if the drive is too short to tell."""
     error: str = ""
     """Error of the agent; empty if there was none."""
-    plans: tuple[tuple[int, Float64[np.ndarray, "_ 2"]], ...] = ()
-    """For each plan the step at which it was made, and its points in the ego frame then, m."""
+    plans: tuple[DrivePlan, ...] = ()
     efficiency_pct: float | None = None
     """Bench2Drive's driving efficiency; None if the drive is too short to tell."""
 
@@ -137,7 +149,7 @@ def drive_route(
     on_frame()
     # Time to collision at the first key frame; then at each later one
     states, events, nearest, act_s = [simulator.ego()], list[Event](), [_nearest_s(clip)], list[float]()
-    plans = list[tuple[int, np.ndarray]]()
+    plans = list[DrivePlan]()
     pilot, ending, error = pilot or FollowingPilot(simulator, pace.latency_s), None, ""
     efficiency = EfficiencyMeter()
     while ending is None:
@@ -149,7 +161,8 @@ def drive_route(
             try:
                 plan = agent.act(stack_records([clip]))
                 pilot.expect(plan, states[-1], index * STEP_S)
-                plans.append((index, waypoints_of(plan)))
+                sight = agent.sight if isinstance(agent, SeesPath) else None
+                plans.append(DrivePlan(index, waypoints_of(plan), sight))
             except Exception as problem:  # any error of an agent ends the drive, but the route still counts
                 ending, error = Ending.CRASHED, f"{type(problem).__name__}: {problem}"
                 break

@@ -7,11 +7,12 @@ from jaxtyping import Float64
 
 from foredrive.driving.bench2drive import smoothness_of
 from foredrive.driving.comfort import Comfort
-from foredrive.driving.drive import Drive
+from foredrive.driving.drive import Drive, DrivePlan
 from foredrive.driving.dynamics import STEP_S
 from foredrive.driving.ncap.outcome import SafetyResult
 from foredrive.driving.scores import RouteScore
-from foredrive.scene import Event
+from foredrive.scene import BicycleState, Event
+from foredrive.scene.traffic_light import LightState
 
 TRACK_EVERY = 5
 """One in this many states of a drive is kept: four per second."""
@@ -27,6 +28,22 @@ class DrivenTrack:
     xy: tuple[Point, ...]
     yaw_rad: tuple[float, ...]
     speed_mps: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class PlanRecord:
+    """A plan, and what the agent saw of its path."""
+
+    t_s: float
+    xy: tuple[Point, ...]
+    """Its points, from the place of the vehicle on."""
+    light: LightState | None = None
+    """The most probable state of the next light; None if the agent does not tell."""
+    light_m: float = 0.0
+    """Distance of its stop line along the route from the front bumper, m."""
+    occupied: tuple[float, ...] = ()
+    """Probability that a road user is now in each cell of the path, of `affordances.CELL_M`, from the bumper
+    on."""
 
 
 @dataclass(frozen=True)
@@ -59,6 +76,8 @@ class DriveRecord:
     """False if departures from the lanes cannot be detected."""
     trusted_share: float | None = None
     """Share of the key frames that the reconstruction trusts; None where it was not asked, and in towns."""
+    plans: tuple[PlanRecord, ...] = ()
+    """Plans in the order of time; none in records of another program."""
     efficiency_pct: float | None = None
     smoothness_pct: float | None = None
     """Bench2Drive's driving efficiency and smoothness; None if the drive is too short to tell."""
@@ -106,6 +125,23 @@ def record_of(
         threat=threat,
         lanes_known=lanes_known,
         trusted_share=trusted_share,
+        plans=tuple(_plan_record(made, drive.states[made.step]) for made in drive.plans),
         efficiency_pct=drive.efficiency_pct,
         smoothness_pct=smoothness_of(drive.states),
+    )
+
+
+def _plan_record(made: DrivePlan, state: BicycleState) -> PlanRecord:
+    # From the ego frame at the time of the plan to the world
+    cos, sin = np.cos(state.yaw_rad), np.sin(state.yaw_rad)
+    points = np.vstack([np.zeros(2), made.xy]) @ np.array([[cos, sin], [-sin, cos]]) + [state.x_m, state.y_m]
+    t_s, xy = round(STEP_S * made.step, 2), tuple((x, y) for x, y in points.round(2).tolist())
+    if made.sight is None:
+        return PlanRecord(t_s, xy)
+    return PlanRecord(
+        t_s,
+        xy,
+        LightState(int(made.sight.light[0].argmax())),
+        round(float(made.sight.light_m[0]), 2),
+        tuple(round(p, 2) for p in made.sight.occupied[0, 0].tolist()),
     )

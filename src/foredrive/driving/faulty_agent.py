@@ -9,6 +9,8 @@ from torch import Tensor
 
 from foredrive.driving.faults import CameraFault, Faults
 from foredrive.scene import Agent, Clip, Trajectory
+from foredrive.scene.affordances import PathEstimate
+from foredrive.scene.protocols import SeesPath
 
 TOLERANCE_S = 1e-6
 
@@ -31,6 +33,11 @@ class FaultyAgent:
         self._kept: dict[str, Tensor] = {}
         self._shown: dict[tuple[str, int], Tensor] = {}
         """Images by camera and key frame of the drive, of the clip before, as they were shown."""
+
+    @property
+    def sight(self) -> PathEstimate | None:
+        """Return what the agent saw of its path, if it says so."""
+        return self._agent.sight if isinstance(self._agent, SeesPath) else None
 
     def act(self, observation: Clip) -> Trajectory:
         """Return the agent's plan for the observation with its faults."""

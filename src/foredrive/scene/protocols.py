@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Float, Float64, UInt8
 from torch import Tensor
 
+from foredrive.scene.affordances import PathEstimate
 from foredrive.scene.clip import Clip
 from foredrive.scene.frames import Frames
 from foredrive.scene.record import Record
@@ -168,6 +169,16 @@ class Agent(Protocol):
 
     def act(self, observation: Clip) -> Trajectory:
         """Return the plan from now on, in the ego frame at now."""
+        ...
+
+
+@runtime_checkable
+class SeesPath(Protocol):
+    """An `Agent` that says what it saw of its path; films of drives show it."""
+
+    @property
+    def sight(self) -> PathEstimate | None:
+        """Return what its last plan was made from, a batch of one; None before the first plan."""
         ...
 
 

@@ -1,5 +1,6 @@
 """The report on a suite of closed-loop drives: scores, and path, speed and video of each drive."""
 
+import functools
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,10 +17,10 @@ from foredrive.engine.folder import DRIVES, SUMMARY
 from foredrive.engine.summary import Summary, read_summary
 from foredrive.errors import InputError
 from foredrive.files import latest
-from foredrive.runs.drive.records import read_drive, suite_title
+from foredrive.runs.drive.records import read_drive, read_suite, suite_title
 from foredrive.towns.scenarios.scenario import ScenarioKind
 from foredrive.view.drive_plots import LETTERS, draw_drive_path, draw_timeline
-from foredrive.view.drive_video import write_drive_video
+from foredrive.view.drive_video import Lanes, write_drive_video
 from foredrive.view.html import MetricTile, Provenance, inline_svg, write_page
 from foredrive.view.summary_tables import full_table
 from foredrive.view.table import (
@@ -122,7 +123,7 @@ def write_drive_report(out: Path, shown: int | None = None, safety: Table | None
     for name in worst_first:
         drive, video = drives[name], out / VIDEOS / f"{name}.webp"
         if not video.is_file():
-            write_drive_video(video, LogPath(out / drive.log, out / "maps"), drive)
+            write_drive_video(video, LogPath(out / drive.log, out / "maps"), drive, _lanes_of(out))
     summary = read_summary(out / SUMMARY)
     write_page(
         out / REPORT,
@@ -302,3 +303,12 @@ def _order(path: Path) -> tuple[list[int], str]:
     """Return a sort key that compares the numbers in a name as numbers."""
     parts = path.stem.replace("route", "").split("_rep")
     return [int(part) if part.isdigit() else 0 for part in parts], path.stem
+
+
+@functools.lru_cache(maxsize=1)
+def _lanes_of(out: Path) -> Lanes:
+    """Return the lanes of the log in whose reconstruction the suite drove; none in towns or without a map."""
+    from foredrive.runs.drive.in_reconstruction import lane_outlines_of  # imports renderers
+
+    run = read_suite(out).get("run")
+    return (lane_outlines_of(Path(run)) or []) if isinstance(run, str) else []

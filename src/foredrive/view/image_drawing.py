@@ -96,15 +96,20 @@ def draw_points_on_image(
 
 
 def draw_boxes_on_image(
-    image: UInt8[np.ndarray, "H W 3"], boxes: Boxes, camera: Camera, width_px: float = 1.6
+    image: UInt8[np.ndarray, "H W 3"],
+    boxes: Boxes,
+    camera: Camera,
+    width_px: float = 1.6,
+    colour: str | None = None,
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """Draw boxes as wire frames coloured by category; the front face is crossed.
+    """Draw boxes as wire frames; the front face is crossed.
 
     Args:
         image: RGB of the camera's size.
         boxes: without leading dimensions, in the ego frame.
         camera: the camera that took the image.
         width_px: width of the lines.
+        colour: colour of all lines; by default that of each category.
     """
     kept = boxes[boxes.valid]
     corners_ego = box_corners(kept.centre, kept.size_lwh, kept.yaw)
@@ -112,7 +117,7 @@ def draw_boxes_on_image(
     far_first = corners[..., 2].mean(-1).argsort(descending=True).tolist()
     lines = []
     for index in far_first:
-        rgb = rgb255(box_colour(int(kept.category[index])))
+        rgb = rgb255(colour or box_colour(int(kept.category[index])))
         for pairs, width in ((EDGES, width_px), (FRONT_CROSS, 0.6 * width_px)):
             segments = corners[index][torch.tensor(pairs)]  # [S, 2, 3]
             lines += [(line, rgb, width) for line in _projected_lines(segments, camera)]

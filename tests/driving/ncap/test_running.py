@@ -8,7 +8,7 @@ import pytest
 import shapely
 import torch
 
-from foredrive.driving.drive import drive_route
+from foredrive.driving.drive import DrivePlan, drive_route
 from foredrive.driving.ncap.drawing import draw_run
 from foredrive.driving.ncap.hd import hd_score_of
 from foredrive.driving.ncap.outcome import Outcome, SafetyResult, first_collision, judge
@@ -311,7 +311,9 @@ def test_all_vehicles_count_in_the_hd_score(category: Category, nc: float) -> No
     run = set_up_run(here, FRONTAL, 0, OURS, sensors=False, past_frames=0)
     drive = drive_route(run.simulator, run.scenario, StraightAgent(SPEED_MPS), route="r", pilot=run.pilot)
     ahead_m = np.linspace(0.0, 1.0, 7)[1:, None] * np.array([[1.0, 0.0]])
-    both = dataclasses.replace(drive, plans=((0, 20.0 * ahead_m), (0, 32.0 * ahead_m)))
+    both = dataclasses.replace(
+        drive, plans=(DrivePlan(0, 20.0 * ahead_m, None), DrivePlan(0, 32.0 * ahead_m, None))
+    )
     street = shapely.Polygon([at(*corner)[:2] for corner in ((-20, -9), (150, -9), (150, 9), (-20, 9))])
     found = hd_score_of(both, here.graph.tracks, here.vehicle.T_world_scene, run.scenario.start_s, street)
     assert found is not None
@@ -326,7 +328,7 @@ def test_a_plan_that_stops_in_a_curve_keeps_its_heading() -> None:
     ways, turns = np.array([2.0, 1.2, 0.4, 0.0, 0.0, 0.0]), np.array([0.15, 0.35, 0.55, 0.0, 0.0, 0.0])
     points = np.cumsum(ways[:, None] * np.stack([np.cos(turns), np.sin(turns)], axis=1), axis=0)
     street = shapely.Polygon([at(*corner)[:2] for corner in ((-20, -9), (150, -9), (150, 9), (-20, 9))])
-    curved = dataclasses.replace(drive, plans=((0, points),))
+    curved = dataclasses.replace(drive, plans=(DrivePlan(0, points, None),))
     tracks, T = run.simulator.tracks, here.vehicle.T_world_scene
     found = hd_score_of(curved, tracks, T, run.scenario.start_s, street)
     assert found is not None

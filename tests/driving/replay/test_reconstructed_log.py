@@ -15,7 +15,14 @@ from foredrive.driving.observation import no_images
 from foredrive.driving.replay.logged_drive import LoggedDrive
 from foredrive.driving.replay.logged_lanes import LoggedLanes
 from foredrive.driving.replay.reconstructed import STRUCK, ReconstructedScenario, ReconstructedSimulator
-from foredrive.driving.replay.threats import AFTER_S, Threat, reference_mps, send_threat
+from foredrive.driving.replay.threats import (
+    AFTER_S,
+    AS_PLANNED,
+    Threat,
+    Variation,
+    reference_mps,
+    send_threat,
+)
 from foredrive.driving.scores import Ending
 from foredrive.driving.simple_agents import ReplayAgent, StraightAgent
 from foredrive.errors import InputError
@@ -222,6 +229,21 @@ def test_a_threat_hits_who_goes_on_as_the_log_did(threat: Threat) -> None:
     reference = reference_mps(threat, drive, 1.0)
     assert first.severity == pytest.approx(reference, rel=0.05)
     assert threat_score(first.severity, reference) < 0.3
+
+
+@pytest.mark.parametrize("threat", list(Threat))
+def test_a_variation_hits_earlier_faster_and_beside(threat: Threat) -> None:
+    graph, drive = scene_with(actor(-50.0, 0.0)), LoggedDrive(vehicle(), torch.eye(4))
+    varied = Variation(after_s=3.0, speed_mps=7.0, left_m=0.5)
+    planned, sent = (send_threat(threat, graph, drive, 1.0, of) for of in (AS_PLANNED, varied))
+    # A second earlier along the log, which drives straight on along x of the scene
+    moved_m = np.subtract(sent.at_m, planned.at_m)
+    assert moved_m == pytest.approx([-SPEED_MPS * 1.0, 0.5, 0.0], abs=1e-4)
+    assert np.hypot(*sent.velocity_mps[:2]) == pytest.approx(0.0 if threat is Threat.STATIONARY else 7.0)
+    simulator = begun(graph, (sent,))
+    first = driven(simulator, replay(simulator)).score.infractions[0]
+    assert first.t_s == pytest.approx(3.0, abs=0.3)
+    assert first.severity == pytest.approx(reference_mps(threat, drive, 1.0, varied), rel=0.05)
 
 
 def test_a_safety_test_ends_at_the_first_collision() -> None:

@@ -174,9 +174,7 @@ def hd_score_of(
         start_s: time of the log at which the drive began, s.
         drivable: area in which vehicles may drive, world frame.
     """
-    plans = [
-        _in_traffic(drive, index, points, tracks, T_world_scene, start_s) for index, points in drive.plans
-    ]
+    plans = [_in_traffic(drive, made.step, made.xy, tracks, T_world_scene, start_s) for made in drive.plans]
     if not plans:
         return None
     return hd_score(plans, drivable, (EGO.length_m, EGO.width_m), drive.score.completion)

@@ -66,6 +66,8 @@ class SafetyResult:
     """0 to 5. None for a drive that failed or was not trusted to its end: it is counted and never scored."""
     progress: float
     """Share of the way that was driven, 0 to 1."""
+    track: int | None = None
+    """Track of the vehicle that was sent; None where several were, or none."""
     hd_score: float | None = None
     """HUGSIM's HD-Score, 0 to 1. None without a map, and for a failed drive."""
 
@@ -94,7 +96,11 @@ def first_collision(drive: Drive) -> Event | None:
 
 
 def judge(
-    kind: Threat, drive: Drive, reference_mps: float, left_way_score: float = LEFT_WAY_SCORE
+    kind: Threat,
+    drive: Drive,
+    reference_mps: float,
+    left_way_score: float = LEFT_WAY_SCORE,
+    track: int | None = None,
 ) -> SafetyResult:
     """Score a drive by its first collision, or by its ending if there is none.
 
@@ -114,4 +120,5 @@ def judge(
         reference_mps=reference_mps,
         score=scores.get(outcome, threat_score(impact_mps, reference_mps)),
         progress=drive.score.completion,
+        track=track,
     )

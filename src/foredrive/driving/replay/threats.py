@@ -7,6 +7,7 @@ the log hits it a few seconds after the start. Positions and speeds are our own 
 
 import enum
 import math
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -24,6 +25,10 @@ AFTER_S = 4.0
 """Time after the start at which an ego vehicle that drives on as in the log is hit, s."""
 THREAT_MPS = 5.0
 """Speed of the other vehicle, m/s."""
+VARIED_AFTER_S, VARIED_SPEED, VARIED_BESIDE_M = (3.0, 5.0), (0.6, 1.6), 0.7
+"""Ranges from which variations are drawn: time of the impact, s, share of the speed, and largest distance
+beside the logged path, m.
+"""
 MIN_MPS = 2.0
 """If the log is slower than this at the time of impact, m/s, there is nothing to avoid."""
 
@@ -39,13 +44,39 @@ class Threat(enum.StrEnum):
     """A vehicle crosses from the right."""
 
 
-def send_threat(threat: Threat, graph: SceneGraph, drive: LoggedDrive, start_s: float) -> DriveStraight:
+class Variation(NamedTuple):
+    """A threat that is earlier or later, faster or slower, and beside the place where it is planned."""
+
+    after_s: float = AFTER_S
+    speed_mps: float = THREAT_MPS
+    left_m: float = 0.0
+
+    @classmethod
+    def drawn(cls, rng: np.random.Generator) -> "Variation":
+        """Draw a variation."""
+        return cls(
+            rng.uniform(*VARIED_AFTER_S),
+            THREAT_MPS * rng.uniform(*VARIED_SPEED),
+            rng.uniform(-VARIED_BESIDE_M, VARIED_BESIDE_M),
+        )
+
+
+AS_PLANNED = Variation()
+
+
+def send_threat(
+    threat: Threat,
+    graph: SceneGraph,
+    drive: LoggedDrive,
+    start_s: float,
+    variation: Variation = AS_PLANNED,
+) -> DriveStraight:
     """Return the edit that puts a vehicle of the scene in the way of a drive that begins at `start_s`.
 
     Raises:
         InputError: the scene has no car, or at the time of impact the log has ended or hardly moves.
     """
-    at_s = start_s + AFTER_S
+    at_s = start_s + variation.after_s
     # The log must go on beyond the impact, and move at that time
     if at_s > drive.end_s:
         raise InputError(
@@ -73,24 +104,26 @@ def send_threat(threat: Threat, graph: SceneGraph, drive: LoggedDrive, start_s: 
     }[threat]
     T_scene_ego = (inverse_se3(drive.vehicle.T_world_scene) @ torch.from_numpy(drive.pose_at(at_s))).numpy()
     way = T_scene_ego[:3, :3] @ [math.cos(heading_rad), math.sin(heading_rad), 0.0]
-    speed_mps = 0.0 if threat is Threat.STATIONARY else THREAT_MPS
+    speed_mps = 0.0 if threat is Threat.STATIONARY else variation.speed_mps
     return DriveStraight(
         actor=int(tracks.track_id[row]),
         copy=unused_id(graph),
-        at_m=_offset(T_scene_ego[:3, :3] @ [ahead_m, 0.0, 0.5 * height_m] + T_scene_ego[:3, 3]),
+        at_m=_offset(T_scene_ego[:3, :3] @ [ahead_m, variation.left_m, 0.5 * height_m] + T_scene_ego[:3, 3]),
         at_s=at_s,
         velocity_mps=_offset(speed_mps * way),
         yaw_rad=float(np.arctan2(way[1], way[0])),
     )
 
 
-def reference_mps(threat: Threat, drive: LoggedDrive, start_s: float) -> float:
+def reference_mps(
+    threat: Threat, drive: LoggedDrive, start_s: float, variation: Variation = AS_PLANNED
+) -> float:
     """Return the impact speed of an ego vehicle that drives on as in the log, m/s."""
-    speed = drive.state_at(start_s + AFTER_S).speed_mps
+    speed = drive.state_at(start_s + variation.after_s).speed_mps
     return {
         Threat.STATIONARY: speed,
-        Threat.FRONTAL: speed + THREAT_MPS,
-        Threat.SIDE: math.hypot(speed, THREAT_MPS),
+        Threat.FRONTAL: speed + variation.speed_mps,
+        Threat.SIDE: math.hypot(speed, variation.speed_mps),
     }[threat]
 
 

@@ -4,11 +4,14 @@ import contextlib
 import dataclasses
 import functools
 import logging
+import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import torch
+from jaxtyping import Float64
 
 from foredrive.data.logs import Log
 from foredrive.data.maps import read_lane_outlines
@@ -19,11 +22,11 @@ from foredrive.driving.replay.logged_drive import LoggedDrive
 from foredrive.driving.replay.logged_lanes import LoggedLanes
 from foredrive.driving.replay.reconstructed import ReconstructedScenario, ReconstructedSimulator
 from foredrive.driving.replay.replay_expert import ReplayedWorld, ReplayExpert
-from foredrive.driving.replay.threats import Threat, reference_mps, send_threat
+from foredrive.driving.replay.threats import AS_PLANNED, Threat, Variation, reference_mps, send_threat
 from foredrive.driving.route_progress import RouteLine
 from foredrive.driving.simple_agents import ReplayAgent
 from foredrive.errors import InputError
-from foredrive.methods.reconstruction.edits import Edit, load_edits
+from foredrive.methods.reconstruction.edits import DriveStraight, Edit, load_edits
 from foredrive.methods.reconstruction.renderer import ReconstructedRenderer
 from foredrive.methods.reconstruction.trust import Trust
 from foredrive.methods.reconstruction.vehicle import LoggedVehicle
@@ -58,36 +61,68 @@ class ReconstructedRoutes:
     """File of edits to the scene; None: no edits."""
     stay_trusted: bool = False
     """If True, a drive ends where the images are no longer trusted."""
+    variations: int = 0
+    """Number of drawn variations of each threat, in place of the threat itself; 0: none."""
+    seed: int = 0
+    """Seed of the variations."""
+    only: tuple[str, ...] = ()
+    """Names of the drives to vary; empty: all."""
 
     in_turn = True
     grows = ("starts_s", "threats")
 
     def noted(self) -> Mapping[str, object]:
-        """Return the fields, and the run as the routes. `stay_trusted` is left out if it is not set."""
+        """Return the fields, and the run as the routes. Those that few drives set are left out if not set."""
         fields = dataclasses.asdict(self)
-        if not self.stay_trusted:
-            del fields["stay_trusted"]
+        for name in ("stay_trusted", "variations", "seed", "only"):
+            if not fields[name]:
+                del fields[name]
         return {**fields, "routes": self.run}
 
     def jobs(self, agent: str) -> Sequence[DriveJob]:
-        """Return one drive for each start and threat, all of which can begin."""
+        """Return one drive for each start and threat, or for each variation of these.
+
+        All of them can begin. Variations that cannot are left out.
+        """
         past_frames, opened = past_frames_of(agent), opened_reconstruction(self.run)
         edited = edited_scene(opened.scene, _edits_of(self.edits))
         drive, plan = LoggedDrive(opened.vehicle, edited.T_ego_shifted.cpu()), self._plan(past_frames)
-        for _, start_s, threat in plan:
+        jobs = []
+        for job, start_s, threat, variation in plan:
             drive.check_start(start_s, past_frames * FRAME_DT_S)
             drive.route_from(start_s)
-            if threat is not None:
-                send_threat(threat, edited.graph, drive, start_s)
-        return [job for job, _, _ in plan]
+            try:
+                if threat is not None:
+                    send_threat(threat, edited.graph, drive, start_s, variation)
+            except InputError:
+                if not self.variations:
+                    raise
+            else:
+                jobs.append(job)
+        if not jobs:
+            raise InputError(f"{self.run}: none of the {len(plan)} variations can begin")
+        return jobs
 
-    def _plan(self, past_frames: int) -> list[tuple[DriveJob, float, Threat | None]]:
+    def anew(self, routes: Sequence[str], count: int, seed: int) -> "ReconstructedRoutes":
+        """Return `count` drawn variations of each of some drives, which end where images are not trusted."""
+        return dataclasses.replace(
+            self, stay_trusted=True, variations=count, seed=self.seed + seed, only=tuple(routes)
+        )
+
+    def _plan(self, past_frames: int) -> list[tuple[DriveJob, float, Threat | None, Variation]]:
         first_s = float(opened_reconstruction(self.run).vehicle.t_s[0]) + past_frames * FRAME_DT_S
         plan = []
         for start_s in self.starts_s or (first_s,):
             for threat in self.threats or (None,):
                 name = f"from{start_s:g}s" + ("" if threat is None else f"_{threat}")
-                plan.append((DriveJob(name, name), start_s, threat))
+                if self.only and name not in self.only:
+                    continue
+                if not self.variations:
+                    plan.append((DriveJob(name, name), start_s, threat, AS_PLANNED))
+                rng = np.random.default_rng((self.seed, zlib.crc32(name.encode())))
+                for number in range(self.variations):
+                    varied = f"{name}_{number}"
+                    plan.append((DriveJob(varied, varied), start_s, threat, Variation.drawn(rng)))
         return plan
 
     @contextlib.contextmanager
@@ -97,12 +132,15 @@ class ReconstructedRoutes:
         vehicle = shown_vehicle(self.run, suite.agent)
         suite.faults.check_cameras(vehicle.rig.names)
         past_frames = past_frames_of(suite.agent)
-        _, start_s, threat = next(planned for planned in self._plan(past_frames) if planned[0] == job)
+        _, start_s, threat, variation = next(
+            planned for planned in self._plan(past_frames) if planned[0] == job
+        )
         edited = edited_scene(opened.scene, edits)
         drive = LoggedDrive(opened.vehicle, edited.T_ego_shifted.cpu())
         graph = edited.graph
+        sent: DriveStraight | None = None
         if threat is not None:
-            sent = send_threat(threat, graph, drive, start_s)
+            sent = send_threat(threat, graph, drive, start_s, variation)
             graph = edited_scene(opened.scene, [*edits, sent]).graph
         sensors = renders_for(suite) or self.stay_trusted
         trust = opened_trust(self.run, self.stay_trusted) if sensors else None
@@ -130,7 +168,11 @@ class ReconstructedRoutes:
                 lanes_known=lanes is not None,
                 trusted_share=lambda: simulator.trusted_share,
                 judge=lambda driven: (
-                    None if threat is None else judge(threat, driven, reference_mps(threat, drive, start_s))
+                    None
+                    if threat is None or sent is None
+                    else judge(
+                        threat, driven, reference_mps(threat, drive, start_s, variation), track=sent.copy
+                    )
                 ),
             )
 
@@ -184,12 +226,17 @@ def past_frames_of(agent: str) -> int:
     return inputs_of(agent).past_frames
 
 
-def lanes_of(folder: Path) -> LoggedLanes | None:
+def lane_outlines_of(folder: Path) -> list[Float64[np.ndarray, "V 2"]] | None:
     """Read the lanes from the map of a run's log; return None if the log or its map is missing."""
     try:
-        outlines = read_lane_outlines(Log(open_run_log(folder)[1]))
+        return read_lane_outlines(Log(open_run_log(folder)[1]))
     except InputError:
         return None
+
+
+def lanes_of(folder: Path) -> LoggedLanes | None:
+    """Return the lanes of a run's log; None if the log or its map is missing."""
+    outlines = lane_outlines_of(folder)
     return None if outlines is None else LoggedLanes(outlines)
 
 

@@ -100,6 +100,7 @@ def reconstruct(
         InputError: `folder` holds a run of another recipe or log, or another process writes to it; the log
             cannot be read, has neither images nor sweeps, or needs more memory than is free.
     """
+    path = path.absolute()  # a run opens from any working directory
     claim = _folder_of(recipe, path, folder)
     claim.check()
     check_memory(recipe, path)
