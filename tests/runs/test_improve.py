@@ -15,16 +15,20 @@ from foredrive.data.clip_list import read_clip_list
 from foredrive.data.log_paths import LogPath
 from foredrive.driver.recipes import DriverRecipe, driver_small
 from foredrive.driving.drive_record import DrivenTrack, DriveRecord
+from foredrive.driving.ncap.outcome import Outcome, SafetyResult
+from foredrive.driving.replay.threats import Threat
 from foredrive.driving.scores import Ending, Infraction, InfractionKind, RouteScore
 from foredrive.engine.folder import DRIVES, SUMMARY
 from foredrive.engine.summary import read_summary
 from foredrive.errors import InputError
+from foredrive.runs.drive.in_reconstruction import ReconstructedRoutes
 from foredrive.runs.drive.in_towns import TownRoutes
-from foredrive.runs.drive.records import write_drive
+from foredrive.runs.drive.records import read_drive, write_drive
 from foredrive.runs.improve.choosing import STRATEGIES, Moments, Request, choose
 from foredrive.runs.improve.failures import Failure, counted, failures_of, logs_before
 from foredrive.runs.improve.loop import MOMENTS, RUN, Loop
-from foredrive.runs.improve.records import Improvement, LoopResult, Round
+from foredrive.runs.improve.records import Improvement, LoopResult, Round, score_of
+from foredrive.runs.reconstruction.reconstruction_run import open_run_log
 from foredrive.runs.train.driver import open_driver, train_driver
 from foredrive.search.rows import IndexRow
 from foredrive.sensors.rigs import FRONT_TELE, camera_rig
@@ -89,6 +93,23 @@ def test_failures_are_events_and_stops_with_the_seconds_before_them(tmp_path: Pa
     assert first.folder == tmp_path / "logs/town_train/route1_rep0"
     assert first.parts_s == ((0.0, 2.0), (9.0, 12.0))
     assert second.parts_s == ((6.75, 9.75),)
+
+
+def test_only_who_is_hit_or_leaves_the_way_fails_a_safety_test(tmp_path: Path) -> None:
+    collided = drive_of(Ending.COLLISION, hit(4.0, InfractionKind.COLLISION_VEHICLE), route="1")
+    drives = {
+        "hit": (collided, Outcome.COLLIDED, 1.5),
+        "left": (drive_of(Ending.DEVIATION, route="2"), Outcome.LEFT_WAY, 0.0),
+        "stood": (drive_of(Ending.TIMEOUT, route="3"), Outcome.STOPPED_SHORT, 5.0),
+        "untrusted": (drive_of(Ending.UNTRUSTED, route="4"), Outcome.UNTRUSTED, None),
+    }
+    for name, (drive, outcome, score) in drives.items():
+        threat = SafetyResult(Threat.SIDE, outcome, None, None, 9.0, score, 0.5)
+        write_drive(tmp_path / DRIVES / f"{name}.json", dataclasses.replace(drive, threat=threat))
+    failures = [(f.drive, f.kind, f.t_s) for f in failures_of(tmp_path)]
+    assert failures == [("hit", "collision_vehicle", 4.0), ("left", "deviation", 9.75)]
+    scores = {path.stem: score_of(read_drive(path)) for path in (tmp_path / DRIVES).glob("*.json")}
+    assert scores == {"hit": 30.0, "left": 0.0, "stood": 100.0, "untrusted": 100.0}
 
 
 def row(log: str, t_s: float) -> IndexRow:
@@ -200,7 +221,7 @@ def asked(
 def once(asked: Improvement, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, LoopResult]:
     """The folder and the result of one round."""
     out = tmp_path_factory.mktemp("loop") / "out"
-    return out, Loop(asked, out).run(1, lambda result: write_improve_report(out, result))
+    return out, Loop(asked, out).run(1, lambda result, state: write_improve_report(out, result, state))
 
 
 def test_a_round_learns_moments_of_the_pool_and_is_judged(
@@ -301,6 +322,48 @@ def test_strategies_that_look_with_the_driver(asked: Improvement, strategy: str,
         scores = [hit.score for hit in first.hits]
         assert scores == sorted(scores, reverse=True)
         assert 0 < scores[-1] <= scores[0] <= 2
+
+
+def test_failures_in_a_rebuilt_log_are_replayed_in_other_forms(
+    asked: Improvement, reconstructed: Path, tmp_path: Path
+) -> None:
+    source = ReconstructedRoutes(str(reconstructed), threats=tuple(Threat))
+    trial = dataclasses.replace(asked, routes=source, strategy="anew", budget=12)
+    states: list[str] = []
+    out = tmp_path / "out"
+
+    def report(result: LoopResult, state: str) -> None:
+        states.append(state)
+        write_improve_report(out, result, state)
+        assert ("http-equiv" in (out / "report.html").read_text()) == bool(state)
+        assert (out / SUMMARY).is_file() == (not state)
+
+    result = Loop(trial, out).run(1, report)
+    begin, first = result.rounds
+    assert states == [
+        "driving the routes for the first time",
+        "round 1: choosing moments, and training on them",
+        "round 1: driving the routes again",
+        "",
+    ]
+    # A driver that has learned nothing is hit
+    failed = {failure.route for failure in first.failures}
+    assert failed
+    assert failed <= {"from0.5s_stationary", "from0.5s_frontal", "from0.5s_side"}
+    new = sorted(path.stem for path in (first.folder / "anew" / DRIVES).glob("*.json"))
+    assert {name.rpartition("_")[0] for name in new} == failed
+    assert len(new) > len(failed)
+    assert 6 < len(first.hits) <= 12
+    assert {hit.row.log.rpartition("/")[2] for hit in first.hits} <= set(new)
+    assert "NeuroNCAP score" in (out / "report.html").read_text()
+    assert 0.0 <= begin.score <= 100.0
+    again = source.anew(["from0.5s_side"], 3, 7)
+    names = [job.name for job in again.jobs(str(asked.start))]
+    assert set(names) <= {f"from0.5s_side_{k}" for k in range(3)}
+    assert names
+    _, log = open_run_log(reconstructed)
+    with pytest.raises(InputError, match="the driver is judged in its reconstruction"):
+        Loop(dataclasses.replace(trial, pool=(*asked.pool, log)), tmp_path / "other").run(1)
 
 
 def test_pools_that_spoil_the_judgement_are_refused(

@@ -8,13 +8,13 @@ from typing import Annotated
 import tyro
 
 from foredrive.cli.arguments import Settings, SomePaths, check_number, check_out_folder, check_run
-from foredrive.cli.drive_options import InTowns
+from foredrive.cli.drive_options import InReconstruction, InTowns
 from foredrive.cli.progress import job_progress
 from foredrive.data.log_paths import find_all_logs
 from foredrive.errors import InputError
 from foredrive.lazy import importing
 
-TRAINING = InTowns(routes="training-short")
+TRAINING, IN_TOWNS = InTowns(routes="training-short"), InReconstruction()
 ROUND = ("see.epochs=2", "see.lr=1e-3")
 """Settings of a round's training: it continues from weights that have been trained."""
 
@@ -24,6 +24,7 @@ def improve(
     pool: SomePaths,
     out: Path,
     towns: tyro.conf.OmitArgPrefixes[InTowns] = TRAINING,
+    reconstructed: tyro.conf.OmitArgPrefixes[InReconstruction] = IN_TOWNS,
     logs: SomePaths = (),
     judge: Annotated[str | None, tyro.conf.arg(metavar="SET|FILE.xml")] = None,
     rounds: int = 3,
@@ -43,20 +44,23 @@ def improve(
         pool: 123D logs, splits or data roots to choose from. Labels are read of the chosen moments alone.
         out: Folder of the loop: a folder for each round, summary.json and report.html.
         logs: Logs that every round trains on too; by default those that the run was trained on.
-        judge: Held-out routes, a set or a file, that judge the rounds; by default the routes of --routes.
-            Towns of held-out routes may not be in the pool.
+        judge: Held-out routes of towns, a set or a file, that judge the rounds; by default the routes of
+            --routes, or the drives in the reconstructed log (--in). Neither their towns nor this log may be
+            in the pool.
         rounds: Number of rounds.
         budget: Moments that are chosen in a round.
         strategy: How: random; uncertainty, where the driver is least sure of what it sees; diversity,
             k-centre over the embeddings; failures, those nearest to the failures, which take turns;
             failures-diversity, k-centre among three times as many of these; anew, from drives on the failed
-            routes in other traffic, in place of the pool.
+            routes in other traffic, or against the failed threats earlier, later, faster and beside, in place
+            of the pool.
         keep_best: Drop a round that is judged worse than the one before it; the next one starts from the
             better run.
         set: Entries of the run's recipe to replace in the rounds' training.
     """
     check_out_folder(out)
     towns.check()
+    reconstructed.check()
     if towns.carla is not None:
         raise InputError("the loop drives in the embedded towns: leave out --carla")
     check_number("--rounds", rounds, low=1)
@@ -77,13 +81,13 @@ def improve(
 
     if strategy not in STRATEGIES:
         raise InputError(f"no strategy {strategy!r}; there are {', '.join(STRATEGIES)}")
-    routes = towns.source(str(folder))
+    routes, rebuilt = towns.source(str(folder)), reconstructed.source()
     assert isinstance(routes, TownRoutes)
     improvement = Improvement(
         folder,
         pool_logs,
         open_driver(folder).logs if own is None else own,
-        routes,
+        rebuilt or routes,
         None if judge is None else dataclasses.replace(routes, routes=judge, only=()),
         strategy,
         budget,
@@ -99,7 +103,7 @@ def improve(
         say=lambda text: print(text, flush=True),
         progress=job_progress,
     )
-    result = loop.run(rounds, lambda result: write_improve_report(out, result))
+    result = loop.run(rounds, lambda result, state: write_improve_report(out, result, state))
     print_table(rounds_table(result), Console())
     if result.ended:
         print(f"ended: {result.ended}")

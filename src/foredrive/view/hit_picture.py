@@ -29,13 +29,8 @@ def hit_picture(hit: Hit, *, lidar: bool = True) -> UInt8[np.ndarray, "H W 3"]:
     A whole scene shows its front camera. For any other view, a mark at the lidar's edge shows its direction.
 
     Args:
-        lidar: False leaves the lidar's picture out.
+        lidar: False leaves the lidar's picture out, and the dark edges of the camera's.
     """
-    drawn = _drawn(hit)
-    return drawn if lidar else drawn[:, :WIDTH_PX]
-
-
-def _drawn(hit: Hit) -> UInt8[np.ndarray, "H W 3"]:
     canvas = Image.new("RGB", (WIDTH_PX + GAP_PX + HEIGHT_PX, HEIGHT_PX), palette.GROUND)
     canvas.paste(palette.PANEL, (0, 0, WIDTH_PX, HEIGHT_PX))
     canvas.paste(palette.PANEL, (WIDTH_PX + GAP_PX, 0, canvas.width, HEIGHT_PX))
@@ -46,6 +41,8 @@ def _drawn(hit: Hit) -> UInt8[np.ndarray, "H W 3"]:
     except InputError:
         ImageDraw.Draw(canvas).text((12, 12), f"{row.folder} cannot be read", fill=palette.FAINT)
         return np.asarray(canvas)
+    if picture is not None and not lidar:
+        return np.asarray(picture)
     if picture is not None:
         canvas.paste(picture, ((WIDTH_PX - picture.width) // 2, (HEIGHT_PX - picture.height) // 2))
     if sweep is not None:
@@ -53,7 +50,7 @@ def _drawn(hit: Hit) -> UInt8[np.ndarray, "H W 3"]:
         if row.azimuth_deg is not None:
             _point(above, row.azimuth_deg)
         canvas.paste(above, (WIDTH_PX + GAP_PX, 0))
-    return np.asarray(canvas)
+    return np.asarray(canvas if lidar else canvas.crop((0, 0, WIDTH_PX, HEIGHT_PX)))
 
 
 def lidar_from_above(sweep: LidarSweep, size_px: int) -> UInt8[np.ndarray, "S S 3"]:

@@ -14,7 +14,7 @@ from foredrive.engine.provenance import collect_provenance
 from foredrive.engine.summary import write_summary
 from foredrive.runs.drive.compare import values_of
 from foredrive.runs.improve.failures import Failure, counted
-from foredrive.runs.improve.records import LoopResult, Round
+from foredrive.runs.improve.records import LoopResult, Round, score_of
 from foredrive.search.find import Hit
 from foredrive.tasks.bootstrap import LEAST_ROUTES, NO_INTERVAL, BootstrapMean, bootstrap_mean
 from foredrive.view.drive_plots import draw_places, letter_of
@@ -68,7 +68,7 @@ def rounds_table(result: LoopResult) -> Table:
     columns = [
         Column("round", align="left"),
         Column("moments"),
-        Column("driving score", digits=1),
+        Column(_score_title(result), digits=1),
         Column("difference", wraps=False),
         *[Column(title, digits=2) for title in COLUMNS.values()],
         Column("", align="left"),
@@ -84,30 +84,36 @@ def rounds_table(result: LoopResult) -> Table:
     drives = len(result.rounds[0].judged)
     routes = len({drive.score.route for drive in result.rounds[0].judged.values()})
     intervals = "Intervals of 95 % (paired bootstrap over routes)." if routes >= LEAST_ROUTES else NO_INTERVAL
-    notes = [f"{drives} drives; counts are per drive. Differences are from the beginning. {intervals}"]
+    notes = [f"Drives: {drives}; counts are per drive. Differences are from the beginning. {intervals}"]
     return Table(columns, [Section(rows)], "Rounds", notes)
 
 
 def difference(first: Round, other: Round) -> BootstrapMean:
     """Return the mean difference of the driving scores of two rounds, over their common drives."""
     names = [name for name in first.judged if name in other.judged]
-    gains = [other.judged[name].driving_score_1_0 - first.judged[name].driving_score_1_0 for name in names]
+    gains = [score_of(other.judged[name]) - score_of(first.judged[name]) for name in names]
     routes = [first.judged[name].score.route for name in names]
     return bootstrap_mean(np.array(gains), routes, np.random.default_rng(0), least=LEAST_ROUTES)
 
 
-def write_improve_report(out: Path, result: LoopResult) -> None:
-    """Write summary.json and the page of a loop into its folder, and the films that the page shows."""
+def write_improve_report(out: Path, result: LoopResult, state: str = "") -> None:
+    """Write the page of a loop into its folder, and the films that it shows; at the end summary.json too.
+
+    Args:
+        state: what the loop is doing; the page then loads itself again. Empty at the end.
+    """
     rounds = [_show(out, result, number) for number in range(1, len(result.rounds))]
     with held_for_results(out):
-        write_summary(out / SUMMARY, figures_of(result) | collect_provenance())
+        if not state:
+            write_summary(out / SUMMARY, figures_of(result) | collect_provenance())
         write_page(
             out / REPORT,
             "improve_report.html.j2",
-            title=f"{result.rounds[0].run.name}, improved",
+            title="A driver, improved",
             rounds=rounds,
-            table=rounds_table(result),
+            table=rounds_table(result) if result.rounds else None,
             ended=result.ended,
+            state=state,
         )
 
 
@@ -124,6 +130,11 @@ def figures_of(result: LoopResult) -> dict[str, float | int | str | None]:
             f"{prefix}.kept": int(of_number.kept),
         }
     return out
+
+
+def _score_title(result: LoopResult) -> str:
+    drives = [drive for of_number in result.rounds for drive in of_number.judged.values()]
+    return "driving score" if all(drive.threat is None for drive in drives) else "NeuroNCAP score, % of 5"
 
 
 def _means(of_number: Round) -> dict[str, float]:
@@ -146,7 +157,7 @@ def _show(out: Path, result: LoopResult, place: int) -> ShownRound:
         f"{counted(of_number.failures)}; {len(of_number.hits)} moments chosen.",
         _maps(of_number.failures),
         ", ".join(f"{letter_of(kind)} {words(kind)}" for kind in dict.fromkeys(kinds)),
-        _answers(of_number),
+        answered(of_number),
         _films(out, before, of_number),
     )
 
@@ -167,7 +178,8 @@ def _maps(failures: Sequence[Failure]) -> list[tuple[str, Markup]]:
     ]
 
 
-def _answers(of_number: Round) -> list[AnsweredFailure]:
+def answered(of_number: Round) -> list[AnsweredFailure]:
+    """Return failures of a round with pictures of the moment before each and of what was chosen for it."""
     # Evenly over all, so that each kind of failure has a chance
     count = len(of_number.answers)
     shown = np.linspace(0, count - 1, min(count, FAILURES_SHOWN)).round().astype(int).tolist()
@@ -191,24 +203,23 @@ def _films(out: Path, before: Round, after: Round) -> list[Films]:
     common = [name for name in before.judged if name in after.judged]
 
     def gain(name: str) -> float:
-        return after.judged[name].driving_score_1_0 - before.judged[name].driving_score_1_0
+        return score_of(after.judged[name]) - score_of(before.judged[name])
 
     changed = sorted((name for name in common if gain(name)), key=lambda name: -abs(gain(name)))[:FILMS]
     return [
         Films(
-            f"{name}: {number(before.judged[name].driving_score_1_0, 1)} to "
-            f"{number(after.judged[name].driving_score_1_0, 1)}",
-            *[_film(out, of_number, name) for of_number in (before, after)],
+            f"{name}: " + " to ".join(number(score_of(of.judged[name]), 1) for of in (before, after)),
+            *[quote(str(film_of(of_number, name).relative_to(out))) for of_number in (before, after)],
         )
         for name in changed
     ]
 
 
-def _film(out: Path, of_number: Round, name: str) -> str:
-    """Return the address of a drive's film, relative to the page; write the film if it is missing."""
+def film_of(of_number: Round, name: str) -> Path:
+    """Return the film of a drive that judges a round; write it if it is missing."""
     assert of_number.suite is not None
     suite, drive = of_number.suite, of_number.judged[name]
     film = suite / VIDEOS / f"{name}.webp"
     if not film.is_file():
         write_drive_video(film, LogPath(suite / drive.log, suite / "maps"), drive)
-    return quote(str(film.relative_to(out)))
+    return film

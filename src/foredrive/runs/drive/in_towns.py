@@ -1,7 +1,8 @@
 """Drives over routes in the embedded towns."""
 
 import contextlib
-from collections.abc import Iterator
+import dataclasses
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -58,6 +59,10 @@ class TownRoutes(RouteSource):
                 lambda: town_log_frame(simulator, expert_plan()),
                 route.town,
             )
+
+    def anew(self, routes: Sequence[str], count: int, seed: int) -> "TownRoutes":
+        """Return some of the routes, each `count` times, with other traffic."""
+        return dataclasses.replace(self, only=tuple(routes), repetitions=count, seed=self.seed + seed)
 
     def scenario_of(self, route: DriveRoute, repetition: int, suite: DriveSuite) -> TownScenario:
         """Return the set-up of one drive."""

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from foredrive.data.log_paths import LogPath
 from foredrive.driving.drive_record import DriveRecord
+from foredrive.driving.ncap.outcome import Outcome
 from foredrive.driving.observation import FRAME_DT_S
 from foredrive.driving.scores import Ending
 from foredrive.engine.folder import DRIVES
@@ -75,8 +76,11 @@ def logs_before(failures: Sequence[Failure]) -> list[LogPath]:
 
 def _of_drive(suite: Path, name: str, drive: DriveRecord) -> list[Failure]:
     score = drive.score
+    # Who stands before what was sent into the way, or left the trusted region, has not failed
+    if drive.threat is not None and drive.threat.outcome not in (Outcome.COLLIDED, Outcome.LEFT_WAY):
+        return []
     events = [(entry.t_s, str(entry.kind), entry.what, entry.xy_world) for entry in score.infractions]
-    if score.ending is not Ending.COMPLETED:
+    if score.ending not in (Ending.COMPLETED, Ending.COLLISION, Ending.UNTRUSTED):
         stop = _last_moving(drive)
         # Who never moved has failed by the time that is looked back on
         stop_s = max(drive.track.t_s[stop], min(BEFORE_S, score.duration_s))

@@ -6,13 +6,11 @@ index of the moments before the failures), `run`, `drives` on the searched route
 `judged`. Everything is made by the function of a verb, which continues where an earlier call stopped.
 """
 
-import contextlib
 import dataclasses
 import functools
 import json
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 
 import numpy as np
@@ -29,12 +27,15 @@ from foredrive.engine.folder import DRIVES, RunFolder
 from foredrive.engine.interrupts import start_fork_server
 from foredrive.errors import InputError
 from foredrive.files import atomic_path
+from foredrive.runs.drive.in_reconstruction import ReconstructedRoutes
 from foredrive.runs.drive.in_towns import TownRoutes
 from foredrive.runs.drive.suite import DriveSuite, drive_suite
 from foredrive.runs.improve.choosing import ANEW, Moments, Request, before_failure, choose
 from foredrive.runs.improve.failures import Failure, counted, failures_of, logs_before
-from foredrive.runs.improve.records import Answer, Improvement, LoopResult, Round
+from foredrive.runs.improve.records import Answer, Improvement, LoopResult, Round, Routes
 from foredrive.runs.open_clips import open_clips
+from foredrive.runs.progress import Progress, fraction, silent
+from foredrive.runs.reconstruction.reconstruction_run import open_run_log
 from foredrive.runs.search.indexing import index_logs
 from foredrive.runs.train.driver import load_driver, open_driver, train_driver
 from foredrive.search.find import Hit
@@ -56,8 +57,6 @@ SHOWN = 3
 """Chosen moments that are shown for each failure."""
 CLIP_S = 0.01
 """Half the length of the part of a log that holds one key frame, s."""
-Progress = Callable[[str, int], AbstractContextManager[Callable[[], None]]]
-"""Shows an activity and its number of parts; the function is called after each part."""
 
 
 def _folder(improvement: Improvement, out: Path) -> RunFolder:
@@ -113,18 +112,21 @@ class Loop:
         *,
         on_ray: bool = False,
         say: Callable[[str], object] = lambda text: None,
-        progress: Progress = lambda what, count: nullcontext(lambda: None),
+        progress: Progress = silent,
     ) -> None:
         self.of, self.out, self.workers, self.on_ray = improvement, out, workers, on_ray
         self.say, self.progress = say, progress
         self.begin = Round(0, out / "round_0", improvement.start)
 
-    def run(self, rounds: int, report: Callable[[LoopResult], object] = lambda result: None) -> LoopResult:
+    def run(
+        self, rounds: int, report: Callable[[LoopResult, str], object] = lambda result, state: None
+    ) -> LoopResult:
         """Run the rounds; continue where an earlier call stopped. A later call may ask for more of them.
 
         Args:
             rounds: their number.
-            report: writes the report, after each round.
+            report: writes the report, with the state of the loop in words: at the beginning of each step, and
+                after the last one with an empty state.
 
         Raises:
             InputError: as `Improvement.check`; the pool is empty, or has logs of towns that have to stay
@@ -139,19 +141,32 @@ class Loop:
             self.say(f"pool: {len(self.moments)} moments of {len(self.of.pool)} logs")
             if not self.of.logs:
                 self.say("the run comes without its logs: rounds train on the chosen moments alone (--logs)")
-            result = LoopResult([self.judged(self.begin)])
-            report(result)
-            for number in range(1, rounds + 1):
-                learned = self.learned(number, result.rounds)
-                if isinstance(learned, str):
-                    self.say(f"round {number}: {learned}")
-                    return LoopResult(result.rounds, learned)
-                before = result.best.score
-                result = result.followed_by(self.judged(learned), keep_best=self.of.keep_best)
-                if not result.rounds[-1].kept:
-                    self.say(f"round {number}: dropped, {result.rounds[-1].score:.1f} after {before:.1f}")
-                report(result)
+            result = LoopResult([])
+            try:
+                for result, state in self._steps(rounds):
+                    report(result, state)
+            except BaseException:
+                report(result, "stopped; the same command goes on")
+                raise
             return result
+
+    def _steps(self, rounds: int) -> Iterator[tuple[LoopResult, str]]:
+        """Yield the result until now and what comes next, in words; at the end the result and nothing."""
+        yield LoopResult([]), "driving the routes for the first time"
+        result = LoopResult([self.judged(self.begin)])
+        for number in range(1, rounds + 1):
+            yield result, f"round {number}: choosing moments, and training on them"
+            learned = self.learned(number, result.rounds)
+            if isinstance(learned, str):
+                self.say(f"round {number}: {learned}")
+                result = LoopResult(result.rounds, learned)
+                break
+            yield result, f"round {number}: driving the routes again"
+            before = result.best.score
+            result = result.followed_by(self.judged(learned), keep_best=self.of.keep_best)
+            if not result.rounds[-1].kept:
+                self.say(f"round {number}: dropped, {result.rounds[-1].score:.1f} after {before:.1f}")
+        yield result, ""
 
     @functools.cached_property
     def recipe(self) -> DriverRecipe:
@@ -185,8 +200,8 @@ class Loop:
         drives = self._drive(best.run, self.of.routes, best.folder / DRIVES)
         failures = failures_of(best.folder / DRIVES)
         if not failures:
-            return f"no failures left in {len(drives)} drives"
-        self.say(f"round {number}: {counted(failures)} in {len(drives)} drives")
+            return f"no failures left (drives: {len(drives)})"
+        self.say(f"round {number}: {counted(failures)}; drives: {len(drives)}")
         used = {hit.row.key for of_number in rounds for hit in of_number.hits}
         hits, answers = self._chosen(number, best, failures, drives, used)
         if not hits:
@@ -205,19 +220,32 @@ class Loop:
         suite = of_number.folder / (DRIVES if self.of.held_out is None else JUDGED)
         drives = self._drive(of_number.run, source, suite)
         judged = dataclasses.replace(of_number, judged=drives, suite=suite)
-        self.say(f"round {of_number.number}: driving score {judged.score:.1f} in {len(drives)} drives")
+        self.say(f"round {of_number.number}: score {judged.score:.1f}; drives: {len(drives)}")
         return judged
 
     def _check_places(self) -> None:
-        """Refuse a pool with logs of the towns that judge the rounds and have to stay unseen."""
+        """Refuse a pool with logs of the towns that judge the rounds and have to stay unseen.
+
+        The log in whose reconstruction the driver is judged has to stay unseen too.
+        """
+        sources = [source for source in (self.of.routes, self.of.held_out) if source is not None]
         unseen = {
             route.town
-            for source in (self.of.routes, self.of.held_out)
-            if source is not None
+            for source in sources
+            if isinstance(source, TownRoutes)
             for route in load_route_set(source.routes)
             if source is self.of.held_out or route.town in TEST_TOWNS
         }
+        rebuilt = {
+            open_run_log(Path(source.run))[1].name
+            for source in sources
+            if isinstance(source, ReconstructedRoutes)
+        }
         for log in self.pool.logs:
+            if log.path.name in rebuilt:
+                raise InputError(
+                    f"{log.path.name}: the driver is judged in its reconstruction: leave it out of the pool"
+                )
             if log.metadata.location in unseen:
                 raise InputError(
                     f"{log.path.name}: recorded in {log.metadata.location}, where the routes that judge "
@@ -225,7 +253,7 @@ class Loop:
                 )
 
     def _index(self, logs: Sequence[LogPath], uri: Path, what: str) -> None:
-        with _fraction(self.progress, what) as tick:
+        with fraction(self.progress, what) as tick:
             done = index_logs(
                 logs, str(uri), "embedded", STRIDE_S, self.workers, on_ray=self.on_ray, tick=tick
             )
@@ -233,9 +261,10 @@ class Loop:
             name, why = next(iter(done.failed.items()))
             raise InputError(f"{len(done.failed)} logs cannot be indexed: {name}: {why}")
 
-    def _drive(self, run: Path, source: TownRoutes, out: Path) -> dict[str, DriveRecord]:
+    def _drive(self, run: Path, source: Routes, out: Path) -> dict[str, DriveRecord]:
         suite = DriveSuite(str(run.absolute()), source, sensors=False, lidar=False)
-        with self.progress(f"driving {source.routes}", len(suite.jobs())) as tick:
+        what = source.routes if isinstance(source, TownRoutes) else f"in {Path(source.run).name}"
+        with self.progress(f"driving {what}", len(suite.jobs())) as tick:
             driven = drive_suite(suite, out, self.workers, on_ray=self.on_ray, tick=lambda *_: tick())
         if driven.broken:
             job, why = next(iter(driven.broken.items()))
@@ -298,20 +327,16 @@ class Loop:
         drives: Mapping[str, DriveRecord],
         rng: np.random.Generator,
     ) -> tuple[Moments, list[Hit]]:
-        """Drive the routes of failures again, with other traffic, and return moments of these drives.
+        """Drive the routes of failures again, with other traffic or threats, and return moments of it.
 
         The truth of new drives is at hand, so that moments in which the driver is wrong come first; the
         others are drawn.
         """
         routes = tuple(dict.fromkeys(failure.route for failure in failures))
         driven_s = sum(drive.score.duration_s for drive in drives.values() if drive.score.route in routes)
-        source = dataclasses.replace(
-            self.of.routes,
-            only=routes,
-            # Twice as many moments as are chosen
-            repetitions=math.ceil(2 * self.of.budget * STRIDE_S / max(driven_s, 1.0)),
-            seed=self.of.routes.seed + ANEW_SEED * number,
-        )
+        # Twice as many moments as are chosen
+        count = math.ceil(2 * self.of.budget * STRIDE_S / max(driven_s, 1.0))
+        source = self.of.routes.anew(routes, count, ANEW_SEED * number)
         self._drive(best.run, source, folder)
         logs = find_logs(folder)
         dataset = open_clips(logs, self.recipe.clips, self.out / "cache")
@@ -362,21 +387,3 @@ def _merged(logs: Sequence[LogPath]) -> list[LogPath]:
     for log in logs:
         parts.setdefault((log.folder, log.maps_dir), []).extend(log.parts_s)
     return [LogPath(*place, tuple(sorted(of_log))) for place, of_log in parts.items()]
-
-
-@contextlib.contextmanager
-def _fraction(progress: Progress, what: str) -> Iterator[Callable[[int, int], None]]:
-    """Yield a function that takes the number of finished parts and of all parts, for `progress`."""
-    with contextlib.ExitStack() as stack:
-        ticks: list[Callable[[], None]] = []
-        finished = 0
-
-        def tick(done: int, total: int) -> None:
-            nonlocal finished
-            if not ticks:
-                ticks.append(stack.enter_context(progress(what, total)))
-            for _ in range(done - finished):
-                ticks[0]()
-            finished = done
-
-        yield tick

@@ -9,13 +9,17 @@ from pathlib import Path
 from foredrive.data.log_paths import LogPath
 from foredrive.driver.recipes import DriverRecipe
 from foredrive.driving.drive_record import DriveRecord
+from foredrive.driving.ncap.outcome import BEST
 from foredrive.engine.folder import CONFIG
 from foredrive.errors import InputError
+from foredrive.runs.drive.in_reconstruction import ReconstructedRoutes
 from foredrive.runs.drive.in_towns import TownRoutes
 from foredrive.runs.improve.failures import Failure
 from foredrive.runs.recipes.known import find_recipe
 from foredrive.runs.train.driver import open_driver
 from foredrive.search.find import Hit
+
+Routes = TownRoutes | ReconstructedRoutes
 
 
 @dataclass(frozen=True)
@@ -27,7 +31,7 @@ class Improvement:
     pool: tuple[LogPath, ...]
     logs: tuple[LogPath, ...]
     """Logs that every round trains on beside the chosen moments, as a rule those of the run."""
-    routes: TownRoutes
+    routes: Routes
     """Routes that are searched for failures; without `held_out` they judge the rounds too."""
     held_out: TownRoutes | None = None
     """Routes that judge a round and are never searched for failures."""
@@ -58,8 +62,9 @@ class Improvement:
         """
         open_driver(self.start).weights  # noqa: B018 - raises where training has not finished
         self.recipe()
-        for source in filter(None, (self.routes, self.held_out)):
-            source.jobs(str(self.start))
+        for source in (self.routes, self.held_out):
+            if source is not None:
+                source.jobs(str(self.start))
         for log in self.logs:
             if not log.folder.is_dir():
                 raise InputError(
@@ -72,6 +77,16 @@ class Improvement:
                 f"the pool has {len(common)} logs that the run was trained on, such as {common[0]}: "
                 "leave them out"
             )
+
+
+def score_of(drive: DriveRecord) -> float:
+    """Return the driving score of leaderboard 1.0, %; with a threat NeuroNCAP's score as a share of its best.
+
+    What ends where images are not trusted has not been hit until then.
+    """
+    if drive.threat is None:
+        return drive.driving_score_1_0
+    return 100.0 if drive.threat.score is None else 100.0 * drive.threat.score / BEST
 
 
 @dataclass(frozen=True)
@@ -105,8 +120,8 @@ class Round:
 
     @property
     def score(self) -> float:
-        """Return the mean driving score of the drives that judge the round."""
-        return statistics.fmean(drive.driving_score_1_0 for drive in self.judged.values())
+        """Return the mean score of the drives that judge the round, see `score_of`."""
+        return statistics.fmean(score_of(drive) for drive in self.judged.values())
 
 
 @dataclass(frozen=True)

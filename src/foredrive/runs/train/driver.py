@@ -2,7 +2,6 @@
 
 import json
 from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -28,13 +27,12 @@ from foredrive.engine.loop import train
 from foredrive.errors import InputError
 from foredrive.files import atomic_path
 from foredrive.runs.open_clips import open_clips
+from foredrive.runs.progress import Progress, silent
 from foredrive.runs.train.rigs import RIGS, trained_rigs, write_rigs
 from foredrive.runs.train.run import pretrained_weights, read_log, written_log
 
 SEE, PLAN = "see", "plan"
 """Folders of the stages."""
-Progress = Callable[[str, int], AbstractContextManager[Callable[[], None]]]
-"""Shows what is done, and how far a number of parts is; the function is called after each part."""
 
 
 @dataclass(frozen=True)
@@ -130,7 +128,7 @@ def train_driver(
     folder: Path,
     cache_dir: Path | None = None,
     start: Path | None = None,
-    progress: Progress = lambda what, count: nullcontext(lambda: None),
+    progress: Progress = silent,
 ) -> DriverRun:
     """Train the eyes, then fit the planner. It continues where an earlier call stopped.
 
