@@ -12,6 +12,7 @@ from PIL import Image
 from foredrive.driving.route_sets import load_route_set
 from foredrive.errors import InputError
 from foredrive.runs.demo import Demo, full_demo, quick_demo
+from foredrive.towns.map.names import TEST_TOWNS
 from foredrive.view.demo_report import Block, Outcome, Section, Step, do_steps, write_demo_report
 from foredrive.view.demo_steps import STEPS
 from foredrive.view.html import MetricTile, Provenance, picture, stored_film
@@ -49,10 +50,10 @@ def test_a_step_that_fails_says_so_and_the_others_go_on(tmp_path: Path) -> None:
 
 
 def test_a_long_step_says_how_long_it_takes(tmp_path: Path) -> None:
-    size, lines = dataclasses.replace(quick_demo(), minutes={"Step1": 3}), list[str]()
+    size, lines = dataclasses.replace(quick_demo(), seconds={"Step1": 30}), list[str]()
     do_steps(steps(section, section), Demo(size, tmp_path), lines.append)
-    assert lines == ["1/2 doing", "2/2 doing (about 3 min on two cores)"]
-    assert set(full_demo().minutes) == {step.title for step in STEPS}
+    assert lines == ["1/2 doing", "2/2 doing (about 30 s)"]
+    assert set(full_demo().seconds) == {step.title for step in STEPS}
 
 
 def test_an_error_of_the_program_is_told_in_one_line(tmp_path: Path) -> None:
@@ -85,8 +86,9 @@ def test_the_page_is_one_harmless_file_whose_loop_leads_to_its_sections(tmp_path
     assert [page.text.count(text) for text in told] == [2, 1]  # in the loop, and in its section
 
 
-def test_the_loop_has_six_steps_in_order() -> None:
-    assert [step.title for step in STEPS] == ["Record", "See", "Learn", "Drive", "Reconstruct", "Search"]
+def test_the_loop_has_seven_steps_in_order() -> None:
+    titles = ["Record", "See", "Learn", "Drive", "Reconstruct", "Search", "Improve"]
+    assert [step.title for step in STEPS] == titles
     assert all(line.startswith("foredrive ") for step in STEPS for line in step.commands)
 
 
@@ -94,7 +96,10 @@ def test_the_loop_has_six_steps_in_order() -> None:
 def test_no_model_learns_from_the_town_that_it_is_judged_in(size: object) -> None:
     assert isinstance(size, type(full_demo()))
     assert {size.test.town, size.reconstructed.town} == {"Town05"}
-    assert "Town05" not in {plan.town for plan in size.train}
+    assert "Town05" not in {plan.town for plan in (*size.train, size.own, size.pool)}
+    assert (size.own.town, size.own.seed) != (size.pool.town, size.pool.seed)
+    searched = {route.id: route.town for route in load_route_set("training-short")}
+    assert not {searched[route] for route in size.failing} & set(TEST_TOWNS)
     names = [plan.log_name for plan in Demo(size, Path()).plans]
     assert len(names) == len(set(names))
     assert size.route in [route.id for route in load_route_set("town05-short")]

@@ -4,13 +4,13 @@ import time
 from pathlib import Path
 
 from foredrive.cli.arguments import OptionalPath, check_out_folder
-from foredrive.cli.progress import duration, progress_lines
+from foredrive.cli.progress import duration, job_progress, progress_lines
 from foredrive.errors import InputError
 from foredrive.lazy import importing
 
 
 def demo(out: OptionalPath = None, quick: bool = False) -> None:
-    """Go once round the loop: record towns, see, learn, drive, reconstruct, search; one report shows it all.
+    """Go once round the loop: record towns, see, learn, drive, reconstruct, search, improve; in one report.
 
     Args:
         out: Folder for logs, runs and report.html; by default runs/demo or runs/demo-quick. An interrupted
@@ -37,10 +37,10 @@ def demo(out: OptionalPath = None, quick: bool = False) -> None:
         step, began = text, time.perf_counter()
         print(text, flush=True)
 
-    total = f"{sum(size.minutes.values())} minutes" if size.minutes else "a minute"
-    print(f"{len(STEPS)} steps, about {total} on two cores", flush=True)
+    total = f"{sum(size.seconds.values()) / 60:.0f} minutes" if size.seconds else "a minute"
+    print(f"{len(STEPS)} steps, about {total} of computing", flush=True)
     with progress_lines(lambda: f"still {step}: {duration(time.perf_counter() - began)}; in all"):
-        outcomes = do_steps(STEPS, Demo(size, folder), tell)
+        outcomes = do_steps(STEPS, Demo(size, folder, job_progress), tell)
     report = folder / "report.html"
     write_demo_report(report, outcomes, Provenance.of(collect_provenance()))
     print(f"done in {time.perf_counter() - started:.0f} s: the report is {report}")

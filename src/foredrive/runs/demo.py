@@ -5,7 +5,7 @@ The folder is a 123D data root. What an earlier call has finished is not done ag
 
 import dataclasses
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -22,9 +22,12 @@ from foredrive.runs.drive.agent_inputs import rig_of
 from foredrive.runs.drive.agents import CORRIDOR, EXPERT, REPLAY
 from foredrive.runs.drive.in_reconstruction import ReconstructedRoutes
 from foredrive.runs.drive.in_towns import TownRoutes
-from foredrive.runs.drive.recording import log_of, record_drives
+from foredrive.runs.drive.recording import EgosPlan, log_of, record_drives, record_egos
 from foredrive.runs.drive.suite import DriveSuite, drive_suite
 from foredrive.runs.evaluate.run import ExamplePrediction, evaluate_run, predict_examples
+from foredrive.runs.improve.loop import Loop
+from foredrive.runs.improve.records import Improvement, LoopResult
+from foredrive.runs.progress import Progress, fraction, silent
 from foredrive.runs.recipes.reconstruction import ReconstructionRecipe, gaussians_tiny, rescheduled_recipe
 from foredrive.runs.reconstruction.reconstruct import Reconstruction
 from foredrive.runs.reconstruction.reconstruct import reconstruct as reconstruct_log
@@ -36,8 +39,8 @@ from foredrive.runs.train.run import Run, open_run, train_run
 from foredrive.scene.conditions import BackgroundTraffic
 from foredrive.search.find import Hit
 from foredrive.search.index import FrameIndex
-from foredrive.search.query import Query
-from foredrive.sensors.rigs import SURROUND
+from foredrive.search.query import Modality, Query
+from foredrive.sensors.rigs import FRONT_TELE, SURROUND
 from foredrive.towns.campaign import DrivePlan
 
 SHIPPED = "embedded:nemo_town"
@@ -47,9 +50,17 @@ DRIVER = "embedded"
 ROUTES = "town05-short"
 MET_BY = (REPLAY, CORRIDOR)
 """Agents that meet the car in their way: one replays the recorded drive, the other one uses the lidar."""
-TEXTS = ("a pedestrian close by", "a street at night")
+TEXTS: Mapping[str, Modality] = {
+    "a pedestrian close by": "image",
+    "a street at night": "image",
+    "a parked car": "lidar",
+}
+"""Texts to search for, and what they are compared with: lidar cannot know whether it is night."""
 HITS = 3
-STRIDE_S = 0.5
+STRIDE_S = 1.0
+SEARCHED = "training-short"
+ROUND = ("see.epochs=4", "see.lr=1e-3", "see.batch_size=8")
+"""Settings of the driver's training in the round of the loop."""
 BEFORE_S, AFTER_S = 2.0, 4.0
 """The part of a log around a hit that goes into the list of clips, s."""
 
@@ -69,8 +80,16 @@ class DemoSize:
     """Id of the route of `ROUTES` that is driven."""
     examples: int
     """Number of moments that models are asked about for the pictures."""
-    minutes: Mapping[str, int] = field(default_factory=dict)
-    """Expected time of each step on two cores, min, by its title; without those that take seconds."""
+    failing: tuple[str, ...]
+    """Ids of the routes of `SEARCHED` in which the driver looks for failures."""
+    own: EgosPlan
+    """Virtual egos that every round trains on."""
+    pool: EgosPlan
+    """Virtual egos to choose from."""
+    budget: int
+    """Moments that are chosen."""
+    seconds: Mapping[str, int] = field(default_factory=dict)
+    """Expected computing time of each step on one core, s, by its title."""
 
 
 @dataclass(frozen=True)
@@ -79,6 +98,12 @@ class Demo:
 
     size: DemoSize
     out: Path
+    progress: Progress = silent
+
+    @property
+    def cores(self) -> int:
+        """Return the number of cores that the demo uses."""
+        return min(2, len(os.sched_getaffinity(0)))
 
     @property
     def plans(self) -> tuple[DrivePlan, ...]:
@@ -122,22 +147,38 @@ class Found:
 
 
 def full_demo() -> DemoSize:
-    """Return the full size: minutes on two cores."""
+    """Return the full size: seven minutes of one core."""
+    tiny = nemo_tiny()
     return DemoSize(
-        train=tuple(
-            plan_drive(*drive, seconds=60.0)
-            for drive in (("Town01", 1), ("Town03", 1), ("Town10HD", 1, "night"))
+        train=(
+            plan_drive("Town01", 1, seconds=40.0),
+            plan_drive("Town10HD", 1, "night", seconds=40.0),
         ),
-        test=plan_drive("Town05", 1, seconds=30.0),
-        reconstructed=plan_drive("Town05", 7, seconds=8.0, rate_hz=10.0),
-        recipe=nemo_tiny(),
+        test=plan_drive("Town05", 1, seconds=20.0),
+        reconstructed=plan_drive("Town05", 7, seconds=6.0, rate_hz=10.0),
+        recipe=dataclasses.replace(
+            tiny,
+            pretrain=None if tiny.pretrain is None else rescheduled(tiny.pretrain, steps=120),
+            finetune=rescheduled(tiny.finetune, steps=40),
+        ),
         reconstruction=dataclasses.replace(
             rescheduled_recipe(gaussians_tiny(), steps=300), image_hw=SURROUND.image_hw
         ),
         route="12",
-        examples=4,
-        # Estimates from speeds in benchmarks/results (towns, real-to-sim) and the training time in README
-        minutes={"Record": 2, "See": 1, "Learn": 10, "Drive": 2, "Reconstruct": 3, "Search": 1},
+        examples=8,
+        failing=("Town01-0",),
+        own=EgosPlan("Town03", 0, 16, ()),
+        pool=EgosPlan("Town01", 100, 24, ()),
+        budget=24,
+        seconds={
+            "Record": 65,
+            "See": 20,
+            "Learn": 120,
+            "Drive": 40,
+            "Reconstruct": 60,
+            "Search": 15,
+            "Improve": 90,
+        },
     )
 
 
@@ -160,6 +201,10 @@ def quick_demo() -> DemoSize:
         ),
         route="4",
         examples=1,
+        failing=("Town02-1",),
+        own=EgosPlan("Town02", 0, 2, ()),
+        pool=EgosPlan("Town02", 100, 4, ()),
+        budget=4,
     )
 
 
@@ -173,8 +218,8 @@ def plan_drive(
 
 def record_logs(demo: Demo) -> list[LogPath]:
     """Record the drives of the demo."""
-    cores = len(os.sched_getaffinity(0))
-    recorded = record_drives(demo.plans, demo.out, SURROUND, workers=min(2, cores))
+    with demo.progress("recording drives", len(demo.plans)) as tick:
+        recorded = record_drives(demo.plans, demo.out, SURROUND, demo.cores, tick=tick)
     if recorded.failed:
         raise InputError("; ".join(f"{plan.log_name}: {why}" for plan, why in recorded.failed.items()))
     return list(recorded.logs.values())
@@ -195,10 +240,12 @@ def drive_route(demo: Demo) -> dict[str, Driven]:
     """Drive a route of the held-out town: the shipped driver, and the expert without sensors."""
     folder = str(run_folder(Path(DRIVER), demo.out).absolute())
     source = TownRoutes(ROUTES, only=(demo.size.route,), rig=rig_of(folder))
-    return {
-        DRIVER: _driven(DriveSuite(folder, source, lidar=False), demo.out / "driven"),
-        EXPERT: _driven(DriveSuite(EXPERT, source, sensors=False), demo.out / "driven_expert"),
+    suites = {
+        DRIVER: (DriveSuite(folder, source, lidar=False), demo.out / "driven"),
+        EXPERT: (DriveSuite(EXPERT, source, sensors=False), demo.out / "driven_expert"),
     }
+    with demo.progress("driving", len(suites)) as tick:
+        return {agent: _driven(suite, out, tick) for agent, (suite, out) in suites.items()}
 
 
 def reconstruct_drive(demo: Demo) -> Reconstructed:
@@ -207,9 +254,9 @@ def reconstruct_drive(demo: Demo) -> Reconstructed:
     folder = demo.out / "reconstructed"
     scene = reconstruct_log(demo.size.reconstruction, log, folder)
     source = ReconstructedRoutes(str(folder.absolute()), threats=(Threat.STATIONARY,))
-    return Reconstructed(
-        scene, {agent: _driven(DriveSuite(agent, source), folder / agent) for agent in MET_BY}
-    )
+    with demo.progress("driving in it", len(MET_BY)) as tick:
+        met = {agent: _driven(DriveSuite(agent, source), folder / agent, tick) for agent in MET_BY}
+    return Reconstructed(scene, met)
 
 
 def search_logs(demo: Demo) -> list[Found]:
@@ -218,7 +265,7 @@ def search_logs(demo: Demo) -> list[Found]:
     The hits of the texts are written as a list of clips, which `foredrive train` takes as logs.
     """
     index = FrameIndex(str(_indexed(demo)))
-    results = [_found(index, Query(text=text, modality="joint", top=HITS)) for text in TEXTS]
+    results = [_found(index, Query(text=text, modality=kind, top=HITS)) for text, kind in TEXTS.items()]
     hits = [hit for result in results for hit in result.hits]
     if hits:
         best = hits[0].row
@@ -227,9 +274,26 @@ def search_logs(demo: Demo) -> list[Found]:
     return results
 
 
+def improve_driver(demo: Demo) -> LoopResult:
+    """Let the driver fail on training routes, and train it on the moments of a pool that resemble that."""
+    folder, size = run_folder(Path(DRIVER), demo.out).absolute(), demo.size
+    kept = []
+    for name, plan in (("own", size.own), ("pool", size.pool)):
+        with demo.progress(f"recording {plan.count} virtual egos", 1) as tick:
+            logs, failed = record_egos([plan], demo.out / "egos" / name, FRONT_TELE, demo.cores, tick=tick)
+        if failed:
+            raise InputError("; ".join(failed.values()))
+        kept.append(tuple(logs))
+    own, pool = kept
+    source = TownRoutes(SEARCHED, only=size.failing, rig=rig_of(str(folder)))
+    improvement = Improvement(folder, pool, own, source, budget=size.budget, settings=ROUND)
+    return Loop(improvement, demo.out / "improved", demo.cores, progress=demo.progress).run(1)
+
+
 def _indexed(demo: Demo) -> Path:
     folder = demo.out / "search"
-    done = index_logs(_logs(demo, demo.plans), str(folder), EMBEDDED, STRIDE_S, workers=1)
+    with fraction(demo.progress, "embedding images and sweeps") as tick:
+        done = index_logs(_logs(demo, demo.plans), str(folder), EMBEDDED, STRIDE_S, workers=1, tick=tick)
     if done.failed:
         raise InputError("; ".join(f"{log}: {why}" for log, why in done.failed.items()))
     return folder
@@ -260,8 +324,8 @@ def _judged(run: Run, demo: Demo, out: Path) -> Judged:
     return Judged(run, logs, read_summary(out / SUMMARY), predict_examples(run, logs, demo.size.examples))
 
 
-def _driven(suite: DriveSuite, out: Path) -> Driven:
-    result = drive_suite(suite, out)
+def _driven(suite: DriveSuite, out: Path, tick: Callable[[], None]) -> Driven:
+    result = drive_suite(suite, out, tick=lambda *_: tick())
     if result.broken:
         raise InputError("; ".join(result.broken.values()))
     ((job, record),) = result.drives.items()

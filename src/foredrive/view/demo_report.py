@@ -73,8 +73,8 @@ def do_steps(steps: Sequence[Step], demo: Demo, say: Callable[[str], None]) -> l
     """
     outcomes = []
     for number, step in enumerate(steps, 1):
-        minutes = demo.size.minutes.get(step.title)
-        expected = f" (about {minutes} min on two cores)" if minutes else ""
+        seconds = demo.size.seconds.get(step.title)
+        expected = f" (about {seconds} s)" if seconds else ""
         say(f"{number}/{len(steps)} {step.doing}{expected}")
         began, section, failure = time.perf_counter(), None, ""
         try:

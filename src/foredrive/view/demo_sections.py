@@ -8,7 +8,10 @@ import torch
 from jaxtyping import UInt8
 from PIL import Image, ImageOps
 
+from foredrive.data.batches import stack_records
+from foredrive.engine.folder import SUMMARY
 from foredrive.engine.metrics_log import read_metrics
+from foredrive.engine.summary import read_summary
 from foredrive.runs.demo import (
     DRIVER,
     TEXTS,
@@ -17,6 +20,7 @@ from foredrive.runs.demo import (
     Judged,
     Reconstructed,
     drive_route,
+    improve_driver,
     judge_shipped,
     reconstruct_drive,
     record_logs,
@@ -26,6 +30,7 @@ from foredrive.runs.demo import (
 from foredrive.runs.drive.agents import CORRIDOR, EXPERT, REPLAY
 from foredrive.runs.evaluate.run import ExamplePrediction
 from foredrive.runs.train.run import STAGES
+from foredrive.tasks.occupancy.vehicles_metric import RANGES_M, car_columns
 from foredrive.tasks.rendering.image_scores import psnr_db
 from foredrive.view.contact_sheet import write_contact_sheet
 from foredrive.view.demo_report import Block, Section
@@ -35,6 +40,7 @@ from foredrive.view.example_panel import comparison_picture, labelled_voxels, pr
 from foredrive.view.hit_picture import WIDTH_PX, content_text, hit_name, hit_picture
 from foredrive.view.html import MetricTile, Picture, inline_svg, picture, stored_film
 from foredrive.view.image_drawing import resize, to_image
+from foredrive.view.improve_report import answered, film_of, rounds_table, write_improve_report
 from foredrive.view.log_frames import CAMERA_WIDTH_PX, LogFrames
 from foredrive.view.log_sheet import write_log_sheet
 from foredrive.view.loss_curves import draw_loss_curves
@@ -47,9 +53,20 @@ from foredrive.view.table import Cell, Column, Table, number, simple_table, word
 COVER_HW = (225, 400)
 RECONSTRUCTION_WIDTH_PX = 512
 SHOWN_VIEWS = 2
+CARS = ("car_recall", "column_precision")
 IOU = "occupancy.above_ground.iou_now"
 L2 = "uniad.l2_avg_m"
-FILM = "The drive at twice real time: its cameras, and the scene from above, with each light at its stop line"
+SHIPPED_MIN = 30
+"""Minutes for which the shipped model was trained."""
+FILM = (
+    "The drive at twice real time: what it plans (red), and what it sees: lights as rings where it would "
+    "stop, road users on its route in orange. True lights are lines"
+)
+SHOWN_ANSWERS = 2
+ONE_ROUND = (
+    "One route and one round say nothing about a method: the score of one drive also changes by chance. "
+    "foredrive bench improve compares ways to choose, with intervals."
+)
 MET_BY = {REPLAY: "drives on as recorded", CORRIDOR: "stops for what the rendered lidar sees"}
 
 
@@ -81,16 +98,24 @@ def show_recording(demo: Demo) -> Section:
 def show_shipped(demo: Demo) -> Section:
     """Show the predictions of the shipped model in the held-out town."""
     judged = judge_shipped(demo)
-    best = _fastest(judged.examples)
+    best = _fullest(judged.examples)
     write_overview(demo.out / "hero.png", Overview.of(best))
     _write_run_report(judged, demo.out / "seen" / "report.html")
-    recall = number(judged.summary.get("vehicles.car_recall_20m"), 2)
+    recall, precision = (number(judged.summary.get(f"vehicles.{key}_20m"), 2) for key in CARS)
     return Section(
         f"occupancy IoU {_figure(judged, IOU)} in a town that it never saw",
         _cover(predicted_voxels(best, 0)),
         [
             Block(
-                tiles=[*_tiles(judged), MetricTile("Columns with a car that it finds, within 20 m", recall)]
+                tiles=[
+                    *_tiles(judged),
+                    MetricTile(
+                        "Columns with a car that it finds, within 20 m",
+                        recall,
+                        "",
+                        f"of the columns it predicts, {precision} are occupied",
+                    ),
+                ]
             ),
             Block(
                 figures=[_stored(demo.out / "hero.png", "Six cameras go in; occupancy and a plan come out")]
@@ -113,7 +138,7 @@ def show_training(demo: Demo) -> Section:
     losses = {stage: read_metrics(judged.run.folder / stage / "metrics.jsonl") for stage in STAGES}
     steps = [step for stage in losses.values() for step in stage]
     minutes = sum(float(step["step_s"]) for step in steps) / 60
-    best = _fastest(judged.examples)
+    best = _fullest(judged.examples)
     seen = [
         picture(predicted_voxels(best, 0), "Predicted occupancy, coloured by height"),
         picture(labelled_voxels(best, 0), "Labels: what the lidar's beams hit"),
@@ -130,6 +155,7 @@ def show_training(demo: Demo) -> Section:
                 ]
             ),
             Block("Losses", drawings=[curves] if (curves := draw_loss_curves(losses)) else []),
+            Block("What more would bring, on the same drive", table=_more(demo, judged, minutes)),
             Block("What it sees in Town05", figures=seen, columns="two"),
         ],
     )
@@ -185,7 +211,7 @@ def show_search(demo: Demo) -> Section:
     results = search_logs(demo)
     hits = [hit for result in results for hit in result.hits]
     return Section(
-        f"{len(hits)} hits for “{TEXTS[0]}” and {len(results) - 1} other queries",
+        f"{len(hits)} hits for “{next(iter(TEXTS))}” and {len(results) - 1} other queries",
         _cover(hit_picture(hits[0])[:, :WIDTH_PX]) if hits else None,
         [
             Block(
@@ -197,6 +223,36 @@ def show_search(demo: Demo) -> Section:
                 columns="three",
             )
             for result in results
+        ],
+    )
+
+
+def show_improvement(demo: Demo) -> Section:
+    """Do one round of the loop; show the failures, what was chosen for them, and the drives."""
+    result = improve_driver(demo)
+    write_improve_report(demo.out / "improved", result)
+    answers = answered(result.rounds[-1])[:SHOWN_ANSWERS]
+    scores = " to ".join(number(of_round.score, 0) for of_round in result.rounds)
+    first = next(iter(result.rounds[0].judged))
+    films = [
+        stored_film(film_of(of_round, first), f"{when} the round: {first}")
+        for when, of_round in zip(("before", "after"), result.rounds, strict=False)
+    ]
+    chosen = len(result.rounds[-1].hits)
+    return Section(
+        f"driving score {scores}: {chosen} moments chosen" if chosen else result.ended,
+        _cover(_middle_frame(film_of(result.rounds[-1], first))),
+        [
+            Block(text=ONE_ROUND, table=rounds_table(result)),
+            *[
+                Block(
+                    f"{answer.caption}: the moment before it, and what was chosen for it",
+                    figures=[answer.moment, *answer.chosen[:2]],
+                    columns="three",
+                )
+                for answer in answers
+            ],
+            Block("The drive before and after", figures=films, columns="two"),
         ],
     )
 
@@ -251,9 +307,33 @@ def _threats(met: Mapping[str, Driven]) -> Table:
     return simple_table((Column("agent", align="left"), Column("outcome", align="left")), rows)
 
 
-def _fastest(examples: Sequence[ExamplePrediction]) -> ExamplePrediction:
-    """Return the example with the highest speed, whose plan is long enough to be seen."""
-    return max(examples, key=lambda shown: float(shown.example.clip.ego_speed_mps.amax()))
+def _fullest(examples: Sequence[ExamplePrediction]) -> ExamplePrediction:
+    """Return the example with the most labelled columns of cars."""
+
+    def cars(shown: ExamplePrediction) -> int:
+        clip = shown.example.clip
+        boxes, labels = clip.boxes[clip.now], shown.example.occupancy[clip.now]
+        return int(car_columns(stack_records([boxes]), stack_records([labels]), RANGES_M[-1]).sum())
+
+    return max(examples, key=cars)
+
+
+def _more(demo: Demo, judged: Judged, minutes: float) -> Table:
+    """Return the figures of this training beside those of the shipped model, which learned for longer."""
+    shipped = read_summary(demo.out / "seen" / SUMMARY) if (demo.out / "seen" / SUMMARY).is_file() else {}
+    columns = (
+        Column(align="left"),
+        Column("minutes of training", digits=1),
+        Column("occupancy IoU, above the ground", digits=3),
+        Column("plan, L2, m", digits=2),
+    )
+    mine, mlp = judged.summary, judged.summary.get(f"planning.ego_mlp.{L2}")
+    rows = [
+        ("occupancy prior and ego-only MLP", None, mine.get(f"{IOU}.{PRIOR}"), mlp),
+        ("this model", minutes, mine.get(IOU), mine.get(f"planning.{L2}")),
+        ("the shipped model", SHIPPED_MIN, shipped.get(IOU), shipped.get(f"planning.{L2}")),
+    ]
+    return simple_table(columns, rows)
 
 
 def _from_above(shown: ExamplePrediction) -> list[Picture]:

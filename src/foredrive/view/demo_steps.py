@@ -3,6 +3,7 @@
 from foredrive.view.demo_report import Step
 from foredrive.view.demo_sections import (
     show_drive,
+    show_improvement,
     show_reconstruction,
     show_recording,
     show_search,
@@ -38,7 +39,7 @@ STEPS = (
     Step(
         "Learn",
         "training a tiny model from scratch",
-        "The same kind of model, smaller, from random weights: first occupancy and images, then plans. A few "
+        "The same kind of model, smaller, from random weights: first occupancy and images, then plans. Two "
         "minutes show how it is done, not how good it gets.",
         (
             "foredrive train nemo_tiny --logs data/logs/town_train --out runs/tiny",
@@ -77,12 +78,24 @@ STEPS = (
         "Search",
         "searching the recorded drives",
         "Small towers embed every image and every sweep, and texts beside them, so that a moment is found by "
-        "words or by example. The hits are a list of clips to train on, and the loop begins again.",
+        "words or by example. The hits are a list of clips to train on.",
         (
             "foredrive search index data/logs --index runs/search",
-            'foredrive search "a street at night" --modality joint --index runs/search --clips clips.json',
+            'foredrive search "a street at night" --index runs/search --clips clips.json',
             "foredrive train nemo_tiny --logs clips.json --out runs/again",
         ),
         show_search,
+    ),
+    Step(
+        "Improve",
+        "one round of the loop: failures choose what the driver learns next",
+        "The driver drives a training route, and fails. The seconds before each failure are an example of "
+        "what it cannot do yet. Moments of an unlabelled pool that resemble them are labelled and learned. "
+        "Then it drives again.",
+        (
+            "foredrive record --town Town01 --virtual-egos 40 --rig front_tele --out pool",
+            "foredrive improve embedded --pool pool --rounds 3 --budget 100 --out runs/improved",
+        ),
+        show_improvement,
     ),
 )
