@@ -28,6 +28,7 @@ from benchmarks.common.driver_study import (
 )
 from foredrive.data import LogPath
 from foredrive.driver.recipes import DriverRecipe
+from foredrive.driving.drive_record import DriveRecord
 from foredrive.engine.bench import Benchmark, study_identity
 from foredrive.runs.drive.compare import values_of
 from foredrive.runs.drive.in_towns import TownRoutes
@@ -136,7 +137,8 @@ def seen(round_of: Callable[[int], tuple[Loop, Round]], seed: int) -> Mapping[st
 def driven(round_of: Callable[[int], tuple[Loop, Round]], seed: int) -> Mapping[str, float]:
     """Return the driving score in the held-out town with its interval over routes, and infractions."""
     loop, learned = round_of(seed)
-    drives = list(loop.judged(learned).judged.values())
+    judged = loop.judged(learned).judged.values()
+    drives = [drive for drive in judged if isinstance(drive, DriveRecord)]
     values = [values_of(drive) for drive in drives]
     score = bootstrap_mean(
         np.array([value["driving_score_1_0"] for value in values]),

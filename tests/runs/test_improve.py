@@ -341,9 +341,9 @@ def test_failures_in_a_rebuilt_log_are_replayed_in_other_forms(
     result = Loop(trial, out).run(1, report)
     begin, first = result.rounds
     assert states == [
-        "driving the routes for the first time",
+        "judging for the first time",
         "round 1: choosing moments, and training on them",
-        "round 1: driving the routes again",
+        "round 1: judging again",
         "",
     ]
     # A driver that has learned nothing is hit

@@ -10,13 +10,11 @@ import tyro
 from foredrive.cli.arguments import Settings, SomePaths, check_number, check_out_folder, check_run
 from foredrive.cli.drive_options import InReconstruction, InTowns
 from foredrive.cli.progress import job_progress
-from foredrive.data.log_paths import find_all_logs
+from foredrive.data.log_paths import find_all_logs, find_logs
 from foredrive.errors import InputError
 from foredrive.lazy import importing
 
 TRAINING, IN_TOWNS = InTowns(routes="training-short"), InReconstruction()
-ROUND = ("see.epochs=2", "see.lr=1e-3")
-"""Settings of a round's training: it continues from weights that have been trained."""
 
 
 def improve(
@@ -25,28 +23,31 @@ def improve(
     out: Path,
     towns: tyro.conf.OmitArgPrefixes[InTowns] = TRAINING,
     reconstructed: tyro.conf.OmitArgPrefixes[InReconstruction] = IN_TOWNS,
+    on: SomePaths = (),
     logs: SomePaths = (),
-    judge: Annotated[str | None, tyro.conf.arg(metavar="SET|FILE.xml")] = None,
+    judge: Annotated[str | None, tyro.conf.arg(metavar="SET|FILE.xml|LOGS")] = None,
     rounds: int = 3,
     budget: int = 500,
     strategy: Annotated[str, tyro.conf.arg(metavar="NAME")] = "failures-diversity",
     keep_best: bool = False,
-    set: Settings = ROUND,
+    set: Settings = (),
 ) -> None:
-    """Improve a driver by the data that its failures ask for, in rounds.
+    """Improve a driver, or a detector, by the data that its failures ask for, in rounds.
 
     A round drives the routes, takes the seconds before each failure as examples, chooses moments of the pool
     that resemble them, trains on these and the run's own logs from the run's weights, and drives again. Each
-    round is a folder; an interrupted loop goes on, and --rounds may grow.
+    round is a folder; an interrupted loop goes on, and --rounds may grow. A world model with a head for
+    detection is judged on annotated logs (--on) in place of routes: by the likelihood of its detections.
 
     Args:
-        run: Folder of a driver's run, or embedded.
+        run: Folder of the run of a driver, or of a world model with a head for detection; or embedded.
         pool: 123D logs, splits or data roots to choose from. Labels are read of the chosen moments alone.
         out: Folder of the loop: a folder for each round, summary.json and report.html.
+        on: Annotated logs that are searched for moments in which the detector misses somebody.
         logs: Logs that every round trains on too; by default those that the run was trained on.
         judge: Held-out routes of towns, a set or a file, that judge the rounds; by default the routes of
             --routes, or the drives in the reconstructed log (--in). Neither their towns nor this log may be
-            in the pool.
+            in the pool. For a detector logs, by default those of --on.
         rounds: Number of rounds.
         budget: Moments that are chosen in a round.
         strategy: How: random; uncertainty, where the driver is least sure of what it sees; diversity,
@@ -56,7 +57,8 @@ def improve(
             of the pool.
         keep_best: Drop a round that is judged worse than the one before it; the next one starts from the
             better run.
-        set: Entries of the run's recipe to replace in the rounds' training.
+        set: Entries of the run's recipe to replace in the rounds' training. Without any, a driver trains for
+            two epochs (see.epochs=2, see.lr=1e-3), a detector for 100 steps (finetune.schedule.steps=100).
     """
     check_out_folder(out)
     towns.check()
@@ -74,21 +76,32 @@ def improve(
         from foredrive.runs.drive.in_towns import TownRoutes
         from foredrive.runs.improve.choosing import STRATEGIES
         from foredrive.runs.improve.loop import Loop
-        from foredrive.runs.improve.records import Improvement
+        from foredrive.runs.improve.records import Improvement, JudgedLogs, Source
         from foredrive.runs.train.driver import open_driver
+        from foredrive.runs.train.run import open_run
         from foredrive.view.improve_report import REPORT, rounds_table, write_improve_report
         from foredrive.view.table import print_table
 
     if strategy not in STRATEGIES:
         raise InputError(f"no strategy {strategy!r}; there are {', '.join(STRATEGIES)}")
-    routes, rebuilt = towns.source(str(folder)), reconstructed.source()
-    assert isinstance(routes, TownRoutes)
+    source: Source
+    held_out: Source | None
+    if on:
+        source = JudgedLogs(find_all_logs(on))
+        held_out = None if judge is None else JudgedLogs(tuple(find_logs(Path(judge))))
+        trained_on = open_run(folder).logs
+    else:
+        routes = towns.source(str(folder))
+        assert isinstance(routes, TownRoutes)
+        source = reconstructed.source() or routes
+        held_out = None if judge is None else dataclasses.replace(routes, routes=judge, only=())
+        trained_on = open_driver(folder).logs
     improvement = Improvement(
         folder,
         pool_logs,
-        open_driver(folder).logs if own is None else own,
-        rebuilt or routes,
-        None if judge is None else dataclasses.replace(routes, routes=judge, only=()),
+        trained_on if own is None else own,
+        source,
+        held_out,
         strategy,
         budget,
         tuple(set),

@@ -31,6 +31,17 @@ class LogPath:
         """Return the same location, independent of the working directory."""
         return LogPath(self.folder.absolute(), self.maps_dir.absolute(), self.parts_s)
 
+    def overlaps(self, other: "LogPath") -> bool:
+        """Return whether both are of one log, by its name, and have a time in common."""
+        if self.name != other.name:
+            return False
+        common = (
+            max(start, other_start) < min(end, other_end)
+            for start, end in self.parts_s
+            for other_start, other_end in other.parts_s
+        )
+        return not self.parts_s or not other.parts_s or any(common)
+
 
 def find_logs(path: Path) -> list[LogPath]:
     """Find all 123D logs at `path`.

@@ -123,7 +123,7 @@ def write_drive_report(out: Path, shown: int | None = None, safety: Table | None
     for name in worst_first:
         drive, video = drives[name], out / VIDEOS / f"{name}.webp"
         if not video.is_file():
-            write_drive_video(video, LogPath(out / drive.log, out / "maps"), drive, _lanes_of(out))
+            write_drive_video(video, LogPath(out / drive.log, out / "maps"), drive, lanes_of_suite(out))
     summary = read_summary(out / SUMMARY)
     write_page(
         out / REPORT,
@@ -306,7 +306,7 @@ def _order(path: Path) -> tuple[list[int], str]:
 
 
 @functools.lru_cache(maxsize=1)
-def _lanes_of(out: Path) -> Lanes:
+def lanes_of_suite(out: Path) -> Lanes:
     """Return the lanes of the log in whose reconstruction the suite drove; none in towns or without a map."""
     from foredrive.runs.drive.in_reconstruction import lane_outlines_of  # imports renderers
 

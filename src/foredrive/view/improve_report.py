@@ -9,15 +9,17 @@ import numpy as np
 from markupsafe import Markup
 
 from foredrive.data.log_paths import LogPath
+from foredrive.driving.drive_record import DriveRecord
 from foredrive.engine.folder import SUMMARY, held_for_results
 from foredrive.engine.provenance import collect_provenance
 from foredrive.engine.summary import write_summary
 from foredrive.runs.drive.compare import values_of
 from foredrive.runs.improve.failures import Failure, counted
-from foredrive.runs.improve.records import LoopResult, Round, score_of
+from foredrive.runs.improve.records import Judged, LoopResult, Round, ScoredMoment, score_of
 from foredrive.search.find import Hit
 from foredrive.tasks.bootstrap import LEAST_ROUTES, NO_INTERVAL, BootstrapMean, bootstrap_mean
 from foredrive.view.drive_plots import draw_places, letter_of
+from foredrive.view.drive_report import lanes_of_suite
 from foredrive.view.drive_video import write_drive_video
 from foredrive.view.hit_picture import content_text, hit_name, hit_picture
 from foredrive.view.html import Picture, inline_svg, picture, write_page
@@ -25,13 +27,15 @@ from foredrive.view.table import Column, Row, Section, Table, number, words
 
 REPORT, VIDEOS = "report.html", "videos"
 FILMS, FAILURES_SHOWN = 3, 12
-COLUMNS = {
+DRIVE_COLUMNS = {
     "completion": "completion, %",
     "red_lights": "red lights",
     "collisions": "collisions",
     "stop_signs": "stop signs",
 }
 """Values of drives beside the score; counts are per drive."""
+MOMENT_COLUMNS = {"missed": "missed", "false": "false", "localisation": "localisation"}
+"""Parts of the negative log-likelihood of moments, nats."""
 
 
 class AnsweredFailure(NamedTuple):
@@ -64,36 +68,41 @@ class ShownRound(NamedTuple):
 
 
 def rounds_table(result: LoopResult) -> Table:
-    """Return the drives that judge each round, with differences from those of the run at the beginning."""
+    """Return what judges each round, with differences from the run at the beginning."""
+    first = result.rounds[0]
+    title, columns_of = _of_kind(first)
     columns = [
         Column("round", align="left"),
-        Column("moments"),
-        Column(_score_title(result), digits=1),
+        Column("chosen moments"),
+        Column(title, digits=1),
         Column("difference", wraps=False),
-        *[Column(title, digits=2) for title in COLUMNS.values()],
+        *[Column(name, digits=2) for name in columns_of.values()],
         Column("", align="left"),
     ]
     rows = []
     for of_number in result.rounds:
         figures = _means(of_number)
-        change = "" if not of_number.number else _change(difference(result.rounds[0], of_number))
+        change = "" if not of_number.number else _change(difference(first, of_number))
         taken = "" if of_number.kept else "dropped"
-        first = "begin" if not of_number.number else str(of_number.number)
-        values = [figures[name] for name in COLUMNS]
-        rows.append(Row([first, len(of_number.hits) or None, of_number.score, change, *values, taken]))
-    drives = len(result.rounds[0].judged)
-    routes = len({drive.score.route for drive in result.rounds[0].judged.values()})
-    intervals = "Intervals of 95 % (paired bootstrap over routes)." if routes >= LEAST_ROUTES else NO_INTERVAL
-    notes = [f"Drives: {drives}; counts are per drive. Differences are from the beginning. {intervals}"]
-    return Table(columns, [Section(rows)], "Rounds", notes)
+        name = "begin" if not of_number.number else str(of_number.number)
+        values = [figures[column] for column in columns_of]
+        rows.append(Row([name, len(of_number.hits) or None, of_number.score, change, *values, taken]))
+    groups = len({_group(item) for item in first.judged.values()})
+    items, kind = ("Drives", "routes") if columns_of is DRIVE_COLUMNS else ("Moments", "logs")
+    intervals = (
+        f"Intervals of 95 % (paired bootstrap over {kind})." if groups >= LEAST_ROUTES else NO_INTERVAL
+    )
+    count = f"{items}: {len(first.judged)}; other columns are means over them."
+    note = f"{count} Differences are from the beginning."
+    return Table(columns, [Section(rows)], "Rounds", [f"{note} {intervals}"])
 
 
 def difference(first: Round, other: Round) -> BootstrapMean:
-    """Return the mean difference of the driving scores of two rounds, over their common drives."""
+    """Return the mean difference of the driving scores of two rounds, over what judges both."""
     names = [name for name in first.judged if name in other.judged]
     gains = [score_of(other.judged[name]) - score_of(first.judged[name]) for name in names]
-    routes = [first.judged[name].score.route for name in names]
-    return bootstrap_mean(np.array(gains), routes, np.random.default_rng(0), least=LEAST_ROUTES)
+    groups = [_group(first.judged[name]) for name in names]
+    return bootstrap_mean(np.array(gains), groups, np.random.default_rng(0), least=LEAST_ROUTES)
 
 
 def write_improve_report(out: Path, result: LoopResult, state: str = "") -> None:
@@ -109,7 +118,7 @@ def write_improve_report(out: Path, result: LoopResult, state: str = "") -> None
         write_page(
             out / REPORT,
             "improve_report.html.j2",
-            title="A driver, improved",
+            title="Rounds of the loop",
             rounds=rounds,
             table=rounds_table(result) if result.rounds else None,
             ended=result.ended,
@@ -124,7 +133,7 @@ def figures_of(result: LoopResult) -> dict[str, float | int | str | None]:
         prefix = f"round_{of_number.number}"
         out |= {f"{prefix}.{name}": value for name, value in _means(of_number).items()}
         out |= {
-            f"{prefix}.drives": len(of_number.judged),
+            f"{prefix}.judged": len(of_number.judged),
             f"{prefix}.moments": len(of_number.hits),
             f"{prefix}.failures": len(of_number.failures),
             f"{prefix}.kept": int(of_number.kept),
@@ -132,13 +141,27 @@ def figures_of(result: LoopResult) -> dict[str, float | int | str | None]:
     return out
 
 
-def _score_title(result: LoopResult) -> str:
-    drives = [drive for of_number in result.rounds for drive in of_number.judged.values()]
-    return "driving score" if all(drive.threat is None for drive in drives) else "NeuroNCAP score, % of 5"
+def _of_kind(of_number: Round) -> tuple[str, dict[str, str]]:
+    """Return the title of the score of what judges a round, and the titles of further values by name."""
+    items = list(of_number.judged.values())
+    if any(isinstance(item, ScoredMoment) for item in items):
+        return "log-likelihood, nats", MOMENT_COLUMNS
+    threats = any(isinstance(item, DriveRecord) and item.threat is not None for item in items)
+    return "NeuroNCAP score, % of 5" if threats else "driving score", DRIVE_COLUMNS
+
+
+def _group(item: Judged) -> str:
+    return item.log if isinstance(item, ScoredMoment) else item.score.route
+
+
+def _values(item: Judged) -> dict[str, float]:
+    if isinstance(item, DriveRecord):
+        return values_of(item)
+    return {name: getattr(item, name) for name in ("nll", *MOMENT_COLUMNS)}
 
 
 def _means(of_number: Round) -> dict[str, float]:
-    values = [values_of(drive) for drive in of_number.judged.values()]
+    values = [_values(item) for item in of_number.judged.values()]
     return {name: float(np.mean([row[name] for row in values])) for name in values[0]}
 
 
@@ -199,8 +222,8 @@ def _picture(hit: Hit) -> Picture:
 
 
 def _films(out: Path, before: Round, after: Round) -> list[Films]:
-    """Write films of the judged drives that changed most."""
-    common = [name for name in before.judged if name in after.judged]
+    """Write films of the judged drives that changed most; moments have none."""
+    common = [name for name in before.judged if isinstance(after.judged.get(name), DriveRecord)]
 
     def gain(name: str) -> float:
         return score_of(after.judged[name]) - score_of(before.judged[name])
@@ -217,9 +240,10 @@ def _films(out: Path, before: Round, after: Round) -> list[Films]:
 
 def film_of(of_number: Round, name: str) -> Path:
     """Return the film of a drive that judges a round; write it if it is missing."""
-    assert of_number.suite is not None
     suite, drive = of_number.suite, of_number.judged[name]
+    assert suite is not None
+    assert isinstance(drive, DriveRecord)
     film = suite / VIDEOS / f"{name}.webp"
     if not film.is_file():
-        write_drive_video(film, LogPath(suite / drive.log, suite / "maps"), drive)
+        write_drive_video(film, LogPath(suite / drive.log, suite / "maps"), drive, lanes_of_suite(suite))
     return film

@@ -62,7 +62,7 @@ def counted(failures: Sequence[Failure]) -> str:
     """Return the number of failures, in all and by kind."""
     kinds = [failure.kind.replace("_", " ") for failure in failures]
     of_kinds = ", ".join(f"{kinds.count(kind)} {kind}" for kind in dict.fromkeys(kinds))
-    return f"{len(failures)} failures ({of_kinds})"
+    return f"{len(failures)} {'failure' if len(failures) == 1 else 'failures'} ({of_kinds})"
 
 
 def logs_before(failures: Sequence[Failure]) -> list[LogPath]:

@@ -9,7 +9,6 @@ index of the moments before the failures), `run`, `drives` on the searched route
 import dataclasses
 import functools
 import json
-import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 
@@ -18,29 +17,21 @@ import numpy as np
 from foredrive.data.clip_list import ListedClip, clip_list, write_clip_list
 from foredrive.data.clips import ClipDataset
 from foredrive.data.log_paths import LogPath, find_logs
-from foredrive.driver.judging import missed_by, uncertainty_of
-from foredrive.driver.packed import PackedClips, batches
-from foredrive.driver.recipes import DriverRecipe
-from foredrive.driving.drive_record import DriveRecord
-from foredrive.driving.route_sets import load_route_set
 from foredrive.engine.folder import DRIVES, RunFolder
 from foredrive.engine.interrupts import start_fork_server
 from foredrive.errors import InputError
 from foredrive.files import atomic_path
-from foredrive.runs.drive.in_reconstruction import ReconstructedRoutes
 from foredrive.runs.drive.in_towns import TownRoutes
-from foredrive.runs.drive.suite import DriveSuite, drive_suite
 from foredrive.runs.improve.choosing import ANEW, Moments, Request, before_failure, choose
-from foredrive.runs.improve.failures import Failure, counted, failures_of, logs_before
-from foredrive.runs.improve.records import Answer, Improvement, LoopResult, Round, Routes
+from foredrive.runs.improve.detectors import DetectorPupil
+from foredrive.runs.improve.drivers import DriverPupil
+from foredrive.runs.improve.failures import Failure, counted, logs_before
+from foredrive.runs.improve.pupil import Means, Pupil
+from foredrive.runs.improve.records import Answer, Improvement, Judged, JudgedLogs, LoopResult, Round
 from foredrive.runs.open_clips import open_clips
-from foredrive.runs.progress import Progress, fraction, silent
-from foredrive.runs.reconstruction.reconstruction_run import open_run_log
-from foredrive.runs.search.indexing import index_logs
-from foredrive.runs.train.driver import load_driver, open_driver, train_driver
+from foredrive.runs.progress import Progress, silent
 from foredrive.search.find import Hit
 from foredrive.search.index import FrameIndex
-from foredrive.towns.map.names import TEST_TOWNS
 
 MOMENTS, FAILURES, INDEX, RUN, JUDGED, LOOP = (
     "moments.json",
@@ -114,8 +105,10 @@ class Loop:
         say: Callable[[str], object] = lambda text: None,
         progress: Progress = silent,
     ) -> None:
-        self.of, self.out, self.workers, self.on_ray = improvement, out, workers, on_ray
-        self.say, self.progress = say, progress
+        self.of, self.out, self.say = improvement, out, say
+        self.means = Means(out, workers, on_ray, progress)
+        detects = isinstance(improvement.routes, JudgedLogs)
+        self.pupil: Pupil = (DetectorPupil if detects else DriverPupil)(improvement, self.means)
         self.begin = Round(0, out / "round_0", improvement.start)
 
     def run(
@@ -135,7 +128,8 @@ class Loop:
             OSError: the disk is full.
         """
         self.of.check()
-        self._check_places()  # before the folder is there
+        self.pupil.check()
+        self.pupil.check_pool(self.pool.logs)  # before the folder is there
         with _folder(self.of, self.out).claimed():
             start_fork_server(preload=TownRoutes.__module__)
             self.say(f"pool: {len(self.moments)} moments of {len(self.of.pool)} logs")
@@ -152,7 +146,7 @@ class Loop:
 
     def _steps(self, rounds: int) -> Iterator[tuple[LoopResult, str]]:
         """Yield the result until now and what comes next, in words; at the end the result and nothing."""
-        yield LoopResult([]), "driving the routes for the first time"
+        yield LoopResult([]), "judging for the first time"
         result = LoopResult([self.judged(self.begin)])
         for number in range(1, rounds + 1):
             yield result, f"round {number}: choosing moments, and training on them"
@@ -161,7 +155,7 @@ class Loop:
                 self.say(f"round {number}: {learned}")
                 result = LoopResult(result.rounds, learned)
                 break
-            yield result, f"round {number}: driving the routes again"
+            yield result, f"round {number}: judging again"
             before = result.best.score
             result = result.followed_by(self.judged(learned), keep_best=self.of.keep_best)
             if not result.rounds[-1].kept:
@@ -169,20 +163,15 @@ class Loop:
         yield result, ""
 
     @functools.cached_property
-    def recipe(self) -> DriverRecipe:
-        """Return the recipe of the rounds."""
-        return self.of.recipe()
-
-    @functools.cached_property
     def pool(self) -> ClipDataset:
         """Return the clips of the pool."""
-        return open_clips(self.of.pool, self.recipe.clips, self.out / "cache")
+        return open_clips(self.of.pool, self.pupil.clips, self.out / "cache")
 
     @functools.cached_property
     def moments(self) -> Moments:
         """Return the moments of the pool with their embeddings; the first access indexes the pool."""
         keys = {self.pool.key(number) for number in range(len(self.pool))}
-        self._index(self.of.pool, self.out / INDEX, "indexing the pool")
+        self.means.index(self.of.pool, self.out / INDEX, "indexing the pool")
         moments = Moments.of(FrameIndex(str(self.out / INDEX)), keys)
         if not len(moments):
             raise InputError("the pool is empty: none of its moments has images and a key frame before it")
@@ -197,13 +186,14 @@ class Loop:
         """
         kept = [of_number for of_number in rounds if of_number.kept]
         best, folder = kept[-1], self.out / f"round_{number}"
-        drives = self._drive(best.run, self.of.routes, best.folder / DRIVES)
-        failures = failures_of(best.folder / DRIVES)
+        judged = self.pupil.judge(best.run, self.of.routes, best.folder / DRIVES)
+        failures = self.pupil.failures(best.folder / DRIVES, judged)
+        what = f"{self.pupil.items}: {len(judged)}"
         if not failures:
-            return f"no failures left (drives: {len(drives)})"
-        self.say(f"round {number}: {counted(failures)}; drives: {len(drives)}")
+            return f"no failures left ({what})"
+        self.say(f"round {number}: {counted(failures)}; {what}")
         used = {hit.row.key for of_number in rounds for hit in of_number.hits}
-        hits, answers = self._chosen(number, best, failures, drives, used)
+        hits, answers = self._chosen(number, best, failures, judged, used)
         if not hits:
             return "the pool is used up"
         # Also what the kept rounds before have chosen
@@ -211,97 +201,38 @@ class Loop:
         new = find_logs(folder / MOMENTS)
         self.say(f"round {number}: training on {len(hits)} moments of {len(new)} logs")
         run, logs = folder / RUN, (*self.of.logs, *_merged(chosen + new))
-        train_driver(self.recipe, logs, run, self.out / "cache", best.run, self.progress)
+        self.pupil.learn(logs, run, best.run)
         return Round(number, folder, run, failures, hits, answers)
 
     def judged(self, of_number: Round) -> Round:
-        """Drive the routes that judge a round."""
+        """Judge a round on the routes or logs for it."""
         source = self.of.routes if self.of.held_out is None else self.of.held_out
         suite = of_number.folder / (DRIVES if self.of.held_out is None else JUDGED)
-        drives = self._drive(of_number.run, source, suite)
-        judged = dataclasses.replace(of_number, judged=drives, suite=suite)
-        self.say(f"round {of_number.number}: score {judged.score:.1f}; drives: {len(drives)}")
+        items = self.pupil.judge(of_number.run, source, suite)
+        judged = dataclasses.replace(of_number, judged=items, suite=suite)
+        self.say(f"round {of_number.number}: score {judged.score:.1f}; {self.pupil.items}: {len(items)}")
         return judged
-
-    def _check_places(self) -> None:
-        """Refuse a pool with logs of the towns that judge the rounds and have to stay unseen.
-
-        The log in whose reconstruction the driver is judged has to stay unseen too.
-        """
-        sources = [source for source in (self.of.routes, self.of.held_out) if source is not None]
-        unseen = {
-            route.town
-            for source in sources
-            if isinstance(source, TownRoutes)
-            for route in load_route_set(source.routes)
-            if source is self.of.held_out or route.town in TEST_TOWNS
-        }
-        rebuilt = {
-            open_run_log(Path(source.run))[1].name
-            for source in sources
-            if isinstance(source, ReconstructedRoutes)
-        }
-        for log in self.pool.logs:
-            if log.path.name in rebuilt:
-                raise InputError(
-                    f"{log.path.name}: the driver is judged in its reconstruction: leave it out of the pool"
-                )
-            if log.metadata.location in unseen:
-                raise InputError(
-                    f"{log.path.name}: recorded in {log.metadata.location}, where the routes that judge "
-                    "the rounds are: leave such logs out of the pool"
-                )
-
-    def _index(self, logs: Sequence[LogPath], uri: Path, what: str) -> None:
-        with fraction(self.progress, what) as tick:
-            done = index_logs(
-                logs, str(uri), "embedded", STRIDE_S, self.workers, on_ray=self.on_ray, tick=tick
-            )
-        if done.failed:
-            name, why = next(iter(done.failed.items()))
-            raise InputError(f"{len(done.failed)} logs cannot be indexed: {name}: {why}")
-
-    def _drive(self, run: Path, source: Routes, out: Path) -> dict[str, DriveRecord]:
-        suite = DriveSuite(str(run.absolute()), source, sensors=False, lidar=False)
-        what = source.routes if isinstance(source, TownRoutes) else f"in {Path(source.run).name}"
-        with self.progress(f"driving {what}", len(suite.jobs())) as tick:
-            driven = drive_suite(suite, out, self.workers, on_ray=self.on_ray, tick=lambda *_: tick())
-        if driven.broken:
-            job, why = next(iter(driven.broken.items()))
-            raise InputError(f"{len(driven.broken)} drives failed, such as {job.name}: {why}")
-        # A driver that raises an error has no failures to learn from, and its score says nothing
-        for job, drive in driven.drives.items():
-            if drive.score.failed:
-                raise InputError(f"{run}: the driver failed in {out / DRIVES / job.name}.json: {drive.error}")
-        return {job.name: drive for job, drive in driven.drives.items()}
 
     def _chosen(
         self,
         number: int,
         best: Round,
         failures: Sequence[Failure],
-        drives: Mapping[str, DriveRecord],
+        judged: Mapping[str, Judged],
         used: set[str],
     ) -> tuple[list[Hit], list[Answer]]:
         """Return the moments of a round, and what was chosen for each failure; write a clip list."""
         folder = self.out / f"round_{number}"
-        self._index(logs_before(failures), folder / FAILURES, "indexing the failures")
+        self.means.index(logs_before(failures), folder / FAILURES, "indexing the failures")
         before = Moments.of(FrameIndex(str(folder / FAILURES)))
         rng = np.random.default_rng((self.of.seed, number))
 
-        def uncertainty() -> Mapping[str, float]:
-            clips = PackedClips(self.pool, self.out / "cache" / "packed")
-            with self.progress("packing the pool", clips.logs) as tick:
-                clips.pack(tick)
-            with self.progress("looking at the pool", batches(len(clips))) as tick:
-                unsure = uncertainty_of(load_driver(open_driver(best.run)), clips, tick)
-            return {self.pool.key(n): float(value) for n, value in enumerate(unsure)}
-
         if self.of.strategy == ANEW:
-            moments, hits = self._made_anew(folder / ANEW, number, best, failures, drives, rng)
+            moments, hits = self.pupil.anew(folder / ANEW, number, best.run, failures, judged, rng)
         else:
             moments = _without(self.moments, used)
-            request = Request(moments, failures, before, uncertainty, self.of.budget, rng)
+            unsure = functools.partial(self.pupil.unsure, best.run, self.pool)
+            request = Request(moments, failures, before, unsure, self.of.budget, rng)
             hits = choose(self.of.strategy, request)
         if not hits:
             return [], []
@@ -317,44 +248,6 @@ class Loop:
         notes = [{"log": hit.row.log, "t_s": hit.row.t_s, "score": hit.score} for hit in hits]
         write_clip_list(folder / MOMENTS, clip_list(clips, notes))
         return hits, _answers(failures, before, moments, hits)
-
-    def _made_anew(
-        self,
-        folder: Path,
-        number: int,
-        best: Round,
-        failures: Sequence[Failure],
-        drives: Mapping[str, DriveRecord],
-        rng: np.random.Generator,
-    ) -> tuple[Moments, list[Hit]]:
-        """Drive the routes of failures again, with other traffic or threats, and return moments of it.
-
-        The truth of new drives is at hand, so that moments in which the driver is wrong come first; the
-        others are drawn.
-        """
-        routes = tuple(dict.fromkeys(failure.route for failure in failures))
-        driven_s = sum(drive.score.duration_s for drive in drives.values() if drive.score.route in routes)
-        # Twice as many moments as are chosen
-        count = math.ceil(2 * self.of.budget * STRIDE_S / max(driven_s, 1.0))
-        source = self.of.routes.anew(routes, count, ANEW_SEED * number)
-        self._drive(best.run, source, folder)
-        logs = find_logs(folder)
-        dataset = open_clips(logs, self.recipe.clips, self.out / "cache")
-        clips = PackedClips(dataset, self.out / "cache" / "packed")
-        with self.progress("packing the new drives", clips.logs) as tick:
-            clips.pack(tick)
-        with self.progress("looking for mistakes", batches(len(clips))) as tick:
-            missed = missed_by(load_driver(open_driver(best.run)), clips, tick)
-        self._index(logs, folder / INDEX, "indexing the new drives")
-        moments = Moments.of(FrameIndex(str(folder / INDEX)))
-        rows = {row.key: row for row in moments.rows}
-        order = sorted(rng.permutation(len(dataset)).tolist(), key=lambda n: not missed[n])
-        hits = [
-            Hit(rows[dataset.key(n)], float(missed[n]), {"missed": float(missed[n])})
-            for n in order
-            if dataset.key(n) in rows
-        ]
-        return moments, hits[: self.of.budget]
 
 
 def _answers(

@@ -7,19 +7,40 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from foredrive.data.log_paths import LogPath
-from foredrive.driver.recipes import DriverRecipe
 from foredrive.driving.drive_record import DriveRecord
 from foredrive.driving.ncap.outcome import BEST
-from foredrive.engine.folder import CONFIG
 from foredrive.errors import InputError
 from foredrive.runs.drive.in_reconstruction import ReconstructedRoutes
 from foredrive.runs.drive.in_towns import TownRoutes
 from foredrive.runs.improve.failures import Failure
-from foredrive.runs.recipes.known import find_recipe
-from foredrive.runs.train.driver import open_driver
 from foredrive.search.find import Hit
 
-Routes = TownRoutes | ReconstructedRoutes
+
+@dataclass(frozen=True)
+class JudgedLogs:
+    """Annotated logs on which a detector is judged, in place of routes."""
+
+    logs: tuple[LogPath, ...]
+
+    def noted(self) -> Mapping[str, object]:
+        """Return the logs for JSON."""
+        return {"logs": [[str(log.folder), list(log.parts_s)] for log in self.logs]}
+
+
+@dataclass(frozen=True)
+class ScoredMoment:
+    """The set likelihood of what a detector sees at one moment, nats."""
+
+    log: str
+    t_s: float
+    nll: float
+    missed: float
+    false: float
+    localisation: float
+
+
+Source = TownRoutes | ReconstructedRoutes | JudgedLogs
+Judged = DriveRecord | ScoredMoment
 
 
 @dataclass(frozen=True)
@@ -27,66 +48,53 @@ class Improvement:
     """The request: a driver, where it drives, and a pool to learn from."""
 
     start: Path
-    """Folder of the driver's run that the loop begins with."""
+    """Folder of the run that the loop begins with."""
     pool: tuple[LogPath, ...]
     logs: tuple[LogPath, ...]
     """Logs that every round trains on beside the chosen moments, as a rule those of the run."""
-    routes: Routes
-    """Routes that are searched for failures; without `held_out` they judge the rounds too."""
-    held_out: TownRoutes | None = None
-    """Routes that judge a round and are never searched for failures."""
+    routes: Source
+    """Routes or logs that are searched for failures; without `held_out` they judge the rounds too."""
+    held_out: Source | None = None
+    """Routes or logs that judge a round and are never searched for failures."""
     strategy: str = "failures-diversity"
     budget: int = 500
     """Moments of each round."""
     settings: tuple[str, ...] = ()
-    """Entries of the run's recipe to replace, KEY.KEY=VALUE."""
+    """Entries of the run's recipe to replace, KEY.KEY=VALUE; without any, those of the pupil's `ROUND`."""
     keep_best: bool = False
     """Drop a round that is judged worse than the best one before it."""
     seed: int = 0
 
-    def recipe(self) -> DriverRecipe:
-        """Return the recipe of the rounds.
-
-        Raises:
-            InputError: a setting does not fit it.
-        """
-        recipe = find_recipe(str(self.start / CONFIG), self.settings, DriverRecipe)
-        return dataclasses.replace(recipe, see=dataclasses.replace(recipe.see, seed=self.seed))
-
     def check(self) -> None:
-        """Check what can be checked before the first drive.
+        """Check the logs of training and pool.
 
         Raises:
-            InputError: the run is no driver or not trained, there is no such route, a log of its training
-                is missing, or one of the pool is among them.
+            InputError: a log of the training is missing, or one of the pool is among them.
         """
-        open_driver(self.start).weights  # noqa: B018 - raises where training has not finished
-        self.recipe()
-        for source in (self.routes, self.held_out):
-            if source is not None:
-                source.jobs(str(self.start))
         for log in self.logs:
             if not log.folder.is_dir():
                 raise InputError(
                     f"{log.folder}: a log that the run was trained on is not here; --logs names others, on "
                     "which every round trains beside the chosen moments"
                 )
-        trained = {log.name for log in self.logs}
-        if common := [log.name for log in self.pool if log.name in trained]:
+        if common := [log.name for log in self.pool if any(log.overlaps(own) for own in self.logs)]:
             raise InputError(
                 f"the pool has {len(common)} logs that the run was trained on, such as {common[0]}: "
                 "leave them out"
             )
 
 
-def score_of(drive: DriveRecord) -> float:
-    """Return the driving score of leaderboard 1.0, %; with a threat NeuroNCAP's score as a share of its best.
+def score_of(item: Judged) -> float:
+    """Return the score of a drive or moment; higher is better.
 
-    What ends where images are not trusted has not been hit until then.
+    It is the driving score of leaderboard 1.0, %; with a threat NeuroNCAP's score, % of its best, where what
+    ends for images that are not trusted has not been hit until then; for a moment its log-likelihood, nats.
     """
-    if drive.threat is None:
-        return drive.driving_score_1_0
-    return 100.0 if drive.threat.score is None else 100.0 * drive.threat.score / BEST
+    if isinstance(item, ScoredMoment):
+        return -item.nll
+    if item.threat is None:
+        return item.driving_score_1_0
+    return 100.0 if item.threat.score is None else 100.0 * item.threat.score / BEST
 
 
 @dataclass(frozen=True)
@@ -111,17 +119,17 @@ class Round:
     """The chosen moments, in the order of choice."""
     answers: Sequence[Answer] = ()
     """The failures with their nearest chosen moments."""
-    judged: Mapping[str, DriveRecord] = field(default_factory=dict)
-    """The drives that judge the round, by name."""
+    judged: Mapping[str, Judged] = field(default_factory=dict)
+    """The drives or moments that judge the round, by name."""
     suite: Path | None = None
-    """Folder of these drives."""
+    """Folder of these."""
     kept: bool = True
     """False if the round was dropped, because it was judged worse."""
 
     @property
     def score(self) -> float:
-        """Return the mean score of the drives that judge the round, see `score_of`."""
-        return statistics.fmean(score_of(drive) for drive in self.judged.values())
+        """Return the mean score of what judges the round, see `score_of`."""
+        return statistics.fmean(score_of(item) for item in self.judged.values())
 
 
 @dataclass(frozen=True)
