@@ -69,7 +69,7 @@ def read_map_patch(log: Log, frame: int) -> MapPatch:
     return MapPatch(vertices=vertices, valid=valid, kind=kinds)
 
 
-def read_lane_outlines(log: Log) -> list[Float64[np.ndarray, "V 2"]] | None:
+def read_lane_outlines(log: Log) -> list[Float64[np.ndarray, "_ 2"]] | None:
     """Read the outlines of the lanes around the driven path, world frame. Return None without a map.
 
     The lanes are those within a circle around the whole path, enlarged by RADIUS_M.

@@ -52,7 +52,7 @@ LEGEND = ("plan", palette.PLAN), ("sees: road user on the route", SEEN), ("sees:
 LIGHT_COLOURS = {LightState.RED: "#ff3b3b", LightState.YELLOW: "#ffc53d", LightState.GREEN: "#3ddc6b"}
 
 
-Lanes = Sequence[Float64[np.ndarray, "V 2"]]
+Lanes = Sequence[Float64[np.ndarray, "_ 2"]]
 """Outlines of lanes, world frame, m."""
 
 

@@ -16,7 +16,7 @@ class LoggedLanes:
         outlines: outlines of the lanes, m, world frame.
     """
 
-    def __init__(self, outlines: Sequence[Float64[np.ndarray, "V 2"]]) -> None:
+    def __init__(self, outlines: Sequence[Float64[np.ndarray, "_ 2"]]) -> None:
         self._areas = shapely.STRtree([shapely.make_valid(shapely.Polygon(outline)) for outline in outlines])
 
     @property

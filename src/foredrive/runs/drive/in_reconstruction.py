@@ -226,7 +226,7 @@ def past_frames_of(agent: str) -> int:
     return inputs_of(agent).past_frames
 
 
-def lane_outlines_of(folder: Path) -> list[Float64[np.ndarray, "V 2"]] | None:
+def lane_outlines_of(folder: Path) -> list[Float64[np.ndarray, "_ 2"]] | None:
     """Read the lanes from the map of a run's log; return None if the log or its map is missing."""
     try:
         return read_lane_outlines(Log(open_run_log(folder)[1]))
