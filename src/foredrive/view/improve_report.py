@@ -90,7 +90,9 @@ def rounds_table(result: LoopResult) -> Table:
     groups = len({_group(item) for item in first.judged.values()})
     items, kind = ("Drives", "routes") if columns_of is DRIVE_COLUMNS else ("Moments", "logs")
     intervals = (
-        f"Intervals of 95 % (paired bootstrap over {kind})." if groups >= LEAST_ROUTES else NO_INTERVAL
+        f"Intervals of 95 % (paired bootstrap over {kind})."
+        if groups >= LEAST_ROUTES
+        else NO_INTERVAL.replace("routes", kind)
     )
     count = f"{items}: {len(first.judged)}; other columns are means over them."
     note = f"{count} Differences are from the beginning."
