@@ -11,11 +11,10 @@ import time
 from collections.abc import Mapping
 from pathlib import Path
 
-from benchmarks.common.study import PLANNERS, work_folder
+from benchmarks.common.study import work_folder
 from foredrive.engine.bench import Benchmark
 from foredrive.engine.metrics_log import read_metrics
 from foredrive.engine.summary import numbers, read_summary
-from foredrive.tasks.planning.protocols import PROTOCOLS
 
 WORK = work_folder(Path("runs/demo_benchmark"))
 STAGES = ("pretrain", "finetune")
@@ -40,11 +39,9 @@ def results(out: Path) -> dict[str, float]:
     figures: dict[str, float] = {}
     for part in ("seen", "learned"):
         summary = numbers(read_summary(out / part / "summary.json"))
-        keys = ["items", "failed", *(key for key in summary if key.startswith("vehicles.car_recall_20m"))]
-        keys += [key for key in summary if "iou_" in key and "threshold" not in key]
-        for planner in ("", *(f"{name}." for name in PLANNERS)):
-            for protocol in PROTOCOLS:
-                keys += [f"planning.{planner}{protocol}.{end}" for end in ("l2_avg_m", "collision_avg_pct")]
+        keys = ["items", "failed", "vehicles.car_recall_20m", "vehicles.column_precision_20m"]
+        keys += [key for key in summary if key.startswith("occupancy.above_ground.iou_")]
+        keys += [f"planning.{planner}uniad.l2_avg_m" for planner in ("", "ego_mlp.")]
         figures |= {f"{part}.{key}": summary[key] for key in keys if key in summary}
     for stage in STAGES:
         steps = read_metrics(out / "learned" / stage / "metrics.jsonl")

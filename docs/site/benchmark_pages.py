@@ -21,6 +21,8 @@ question; the others are folded. What these figures say about the papers' claims
 LONG, WIDE = 20, 6
 """Rows of a page, and columns of a table, that are not too many to be read at once."""
 DECIDING = {
+    "demo": "wall_min seen.occupancy.above_ground.iou_now learned.occupancy.above_ground.iou_now "
+    "driven.driving_score_1_0 rebuilt.psnr_db improved.round_1.driving_score_1_0",
     "domain-gap": "lidar.drop_pct lidar.range_p50_m lidar.intensity_p50 image.brightness image.gradient",
     "drive-expert": "ds_short rc_short ds_long rc_long",
     "driveworld-ablation": "occupancy_iou l2_avg_m ego_mlp.uniad.l2_avg_m collision_avg_pct",

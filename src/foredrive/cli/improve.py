@@ -77,7 +77,7 @@ def improve(
         from foredrive.runs.improve.choosing import STRATEGIES
         from foredrive.runs.improve.loop import Loop
         from foredrive.runs.improve.records import Improvement, JudgedLogs, Source
-        from foredrive.runs.train.driver import open_driver
+        from foredrive.runs.train.driver import is_driver, open_driver
         from foredrive.runs.train.run import open_run
         from foredrive.view.improve_report import REPORT, rounds_table, write_improve_report
         from foredrive.view.table import print_table
@@ -91,6 +91,8 @@ def improve(
         held_out = None if judge is None else JudgedLogs(tuple(find_logs(Path(judge))))
         trained_on = open_run(folder).logs
     else:
+        if not is_driver(folder):
+            raise InputError(f"{run}: not the run of a driver; a detector is judged on logs (--on LOGS)")
         routes = towns.source(str(folder))
         assert isinstance(routes, TownRoutes)
         source = reconstructed.source() or routes
