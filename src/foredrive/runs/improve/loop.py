@@ -139,8 +139,9 @@ class Loop:
             try:
                 for result, state in self._steps(rounds):
                     report(result, state)
-            except BaseException:
-                report(result, "stopped; the same command goes on")
+            except (InputError, KeyboardInterrupt) as error:
+                why = f": {error}" if isinstance(error, InputError) else ""
+                report(result, f"stopped{why}; the same command goes on")
                 raise
             return result
 
