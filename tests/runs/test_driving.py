@@ -222,7 +222,7 @@ def test_files_of_suites_and_drives_stay_what_they_were(driven: SuiteResult, out
     assert suite["image_hw"] == [18, 32]
     drive = json.loads((out / "drives" / "routea_rep0.json").read_text())
     fields = "town length_m score driving_score_1_0 driving_score_2_1 error events comfort nearest_s act_s"
-    fields += " route_xy track wall_s log lanes_known efficiency_pct smoothness_pct"
+    fields += " route_xy track wall_s log lanes_known plans efficiency_pct smoothness_pct"
     assert set(drive) == set(fields.split())
     assert set(drive["score"]) == {field.name for field in dataclasses.fields(RouteScore)}
     assert drive["score"]["ending"] == "completed"
