@@ -72,7 +72,8 @@ def write_drive_video(path: Path, log: LogPath, drive: DriveRecord, lanes: Lanes
 def draw_drive_frame(log: Log, index: int, drive: DriveRecord, lanes: Lanes = ()) -> Image.Image:
     """Draw one key frame of a drive."""
     plan, boxes = _plan_at(drive, _time_s(log, index)), read_boxes(log, index)
-    sent = None if drive.threat is None or boxes is None else boxes[boxes.track_id == drive.threat.track]
+    track = None if drive.threat is None else drive.threat.track
+    sent = None if track is None or boxes is None else boxes[boxes.track_id == track]
     above = draw_from_above(
         lanes if drive.town is None else _lane_outlines(drive.town),
         np.array(drive.route_xy),
@@ -243,7 +244,7 @@ def _caption(pen: ImageDraw.ImageDraw, left: int, top: int, log: Log, index: int
     """Write time, speed, the scenario that has begun and the last infractions below a corner."""
     t_s, font = _time_s(log, index), ImageFont.load_default(size=16)
     lines = [(f"{t_s:.1f} s   {log.speed_mps[index]:.1f} m/s", palette.INK)]
-    if drive.threat is not None and drive.threat.track is not None:
+    if drive.threat is not None:
         lines.append((f"sent into the way: {drive.threat.kind}", palette.SCENARIO))
     begun = [event for event in drive.scenario_events if 0.0 <= t_s - event.t_s < SCENARIO_CAPTION_S]
     lines += [(event.what.replace("_", " "), palette.SCENARIO) for event in begun[-1:]]
