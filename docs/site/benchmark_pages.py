@@ -391,4 +391,4 @@ def _seeds(content: Mapping[str, Any]) -> str:
 
 
 def _command(command: str) -> str:
-    return command.removeprefix("python -m ").partition(" --arms")[0]
+    return command.removeprefix("python -m ").partition(" --")[0]
