@@ -82,5 +82,6 @@ def test_the_program_of_the_wheel_helps_and_lists(python: Path, tmp_path: Path) 
 def test_the_demo_runs_from_the_wheel_alone(python: Path, tmp_path: Path) -> None:
     done(python.with_name("foredrive"), "demo", "--quick", "--out", "demo", cwd=tmp_path)
     report = (tmp_path / "demo" / "report.html").read_text()
-    assert report.count("data:image/webp") == 3  # films: a drive, and two that meet the car in the way
+    # Films: a drive, two that meet the car in the way, and the round's before it and, if there is one, after it
+    assert report.count("data:image/webp") in (4, 5)
     assert "This step failed" not in report
