@@ -82,6 +82,6 @@ def test_the_program_of_the_wheel_helps_and_lists(python: Path, tmp_path: Path) 
 def test_the_demo_runs_from_the_wheel_alone(python: Path, tmp_path: Path) -> None:
     done(python.with_name("foredrive"), "demo", "--quick", "--out", "demo", cwd=tmp_path)
     report = (tmp_path / "demo" / "report.html").read_text()
-    # Films: a drive, two that meet the car in the way, and the round's before it and, if there is one, after it
+    # Films: a drive, two that meet the car in the way, and those before and after the round, if there is one
     assert report.count("data:image/webp") in (4, 5)
     assert "This step failed" not in report
