@@ -1,4 +1,4 @@
-"""What tests of several folders build: logs that are reconstructed in seconds, and short routes."""
+"""Build what tests of several folders use: logs that are reconstructed in seconds, and short routes."""
 
 import dataclasses
 from pathlib import Path

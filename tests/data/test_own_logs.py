@@ -9,7 +9,7 @@ import pytest
 import torch
 from PIL import Image
 
-from foredrive.data import Box, CameraSpec, Points, Vehicle, find_logs, write_log
+from foredrive.data import Box, CameraSpec, LogPath, Points, Vehicle, find_logs, write_log
 from foredrive.data.boxes import read_boxes
 from foredrive.data.cameras import pinhole_cameras, read_camera
 from foredrive.data.lidar import read_sweep
@@ -53,6 +53,18 @@ def test_the_vehicle_and_its_motion(tmp_path: Path) -> None:
     np.testing.assert_allclose(centre, [1.5, 0.0, 0.8])
     np.testing.assert_allclose(size, [5.0, 2.0, 1.6])
     np.testing.assert_allclose(log.speed_mps, 8.0, rtol=1e-3)  # a chord is shorter than its arc
+
+
+def test_logs_overlap_where_name_and_time_are_common() -> None:
+    def log(*parts: tuple[float, float], name: str = "split/a") -> LogPath:
+        return LogPath(Path("root") / name, Path(), parts)
+
+    early, late = log((0.0, 2.0), (4.0, 5.0)), log((2.0, 4.0))
+    assert not early.overlaps(late)  # ends are exclusive
+    assert early.overlaps(log((4.9, 9.0)))
+    assert early.overlaps(log())  # the whole log
+    assert log().overlaps(late)
+    assert not log().overlaps(log(name="split/b"))
 
 
 def test_cameras_keep_123d_names_in_any_case_and_others_go_by_direction(tmp_path: Path) -> None:

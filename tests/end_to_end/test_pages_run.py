@@ -24,7 +24,7 @@ class Walk:
 
     pages: tuple[str, ...]
     smaller: Mapping[str, str]
-    """What is replaced, so that all commands together take two minutes."""
+    """Texts to replace, so that all commands together take two minutes."""
     files: tuple[str, ...]
     """Files that have to be there at the end."""
     skipped: str = "-"

@@ -109,7 +109,26 @@ def test_only_who_is_hit_or_leaves_the_way_fails_a_safety_test(tmp_path: Path) -
     failures = [(f.drive, f.kind, f.t_s) for f in failures_of(tmp_path)]
     assert failures == [("hit", "collision_vehicle", 4.0), ("left", "deviation", 9.75)]
     scores = {path.stem: score_of(read_drive(path)) for path in (tmp_path / DRIVES).glob("*.json")}
-    assert scores == {"hit": 30.0, "left": 0.0, "stood": 100.0, "untrusted": 100.0}
+    # Each went half of the way; who left the trusted region has no score
+    assert scores == {"hit": 15.0, "left": 0.0, "stood": 50.0, "untrusted": None}
+
+
+def test_drives_without_a_score_count_in_neither_round() -> None:
+    def against_threats(number: int, **scores: float | None) -> Round:
+        judged = {}
+        for name, score in scores.items():
+            outcome = Outcome.UNTRUSTED if score is None else Outcome.STOPPED_SHORT
+            threat = SafetyResult(Threat.SIDE, outcome, None, None, 9.0, score, 0.5)
+            judged[name] = dataclasses.replace(drive_of(route=name), threat=threat)
+        return Round(number, Path(), Path(), judged=judged, suite=Path("suite"))
+
+    begin, later = against_threats(0, a=5.0, b=1.0, c=None), against_threats(1, a=4.0, b=None, c=5.0)
+    assert (begin.score, later.score) == (30.0, 45.0)
+    assert difference(begin, later).mean == -10.0  # of a alone
+    table = rounds_table(LoopResult([begin, later]))
+    assert "2 drives of all rounds have no score and are left out" in table.notes[0]
+    with pytest.raises(InputError, match="suite: no drive has a score"):
+        against_threats(1, a=None).score  # noqa: B018 - raises
 
 
 def row(log: str, t_s: float) -> IndexRow:
@@ -381,6 +400,11 @@ def test_pools_that_spoil_the_judgement_are_refused(
     pool = str(egos[4][0].folder)
     arguments = ["improve", str(asked.start), "--pool", pool, "--out", str(tmp_path / "out")]
     assert main([*arguments, "--strategy", "luck"]) == 2
-    assert "no strategy 'luck'; there are random, uncertainty" in capsys.readouterr().err
+    assert (
+        "no strategy 'luck' for what is judged by drives; there are random, uncertainty"
+        in capsys.readouterr().err
+    )
+    assert main([*arguments, "--on", pool, "--only", "Town02-1"]) == 2
+    assert "--on does not go with routes or --in" in capsys.readouterr().err
     assert main([*arguments, "--routes", "nowhere.xml"]) == 2
     assert "nowhere.xml" in capsys.readouterr().err

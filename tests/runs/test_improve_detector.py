@@ -103,7 +103,9 @@ def test_what_does_not_fit_a_detector_is_refused(
 
     refused("judges the rounds: leave it out of the pool", pool=(part(road, 7.0, 8.5),))
     refused("the pool has 1 logs that the run was trained on", pool=(part(road, 3.9, 6.0),))
-    refused("--strategy anew is for drivers; detectors have random", strategy="anew")
+    refused("no strategy 'anew' for what is judged by moments; there are random", strategy="anew")
+    twice = part(dataclasses.replace(road, folder=Path("elsewhere") / road.name), 0.0, 1.0)
+    refused("two of the logs that judge have one name", held_out=JudgedLogs((road, twice)))
     refused("has no head for detection", start=trained.folder)
     command = ["improve", str(asked.start), "--pool", str(road.folder), "--out", str(tmp_path / "out")]
     assert main(command) == 2

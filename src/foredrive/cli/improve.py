@@ -3,16 +3,19 @@
 import dataclasses
 import os
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
 from foredrive.cli.arguments import Settings, SomePaths, check_number, check_out_folder, check_run
 from foredrive.cli.drive_options import InReconstruction, InTowns
 from foredrive.cli.progress import job_progress
-from foredrive.data.log_paths import find_all_logs, find_logs
+from foredrive.data.log_paths import LogPath, find_all_logs, find_logs
 from foredrive.errors import InputError
 from foredrive.lazy import importing
+
+if TYPE_CHECKING:
+    from foredrive.runs.improve.records import Source
 
 TRAINING, IN_TOWNS = InTowns(routes="training-short"), InReconstruction()
 
@@ -73,31 +76,12 @@ def improve(
     with importing():
         from rich.console import Console
 
-        from foredrive.runs.drive.in_towns import TownRoutes
-        from foredrive.runs.improve.choosing import STRATEGIES
         from foredrive.runs.improve.loop import Loop
-        from foredrive.runs.improve.records import Improvement, JudgedLogs, Source
-        from foredrive.runs.train.driver import is_driver, open_driver
-        from foredrive.runs.train.run import open_run
+        from foredrive.runs.improve.records import Improvement
         from foredrive.view.improve_report import REPORT, rounds_table, write_improve_report
         from foredrive.view.table import print_table
 
-    if strategy not in STRATEGIES:
-        raise InputError(f"no strategy {strategy!r}; there are {', '.join(STRATEGIES)}")
-    source: Source
-    held_out: Source | None
-    if on:
-        source = JudgedLogs(find_all_logs(on))
-        held_out = None if judge is None else JudgedLogs(tuple(find_logs(Path(judge))))
-        trained_on = open_run(folder).logs
-    else:
-        if not is_driver(folder):
-            raise InputError(f"{run}: not the run of a driver; a detector is judged on logs (--on LOGS)")
-        routes = towns.source(str(folder))
-        assert isinstance(routes, TownRoutes)
-        source = reconstructed.source() or routes
-        held_out = None if judge is None else dataclasses.replace(routes, routes=judge, only=())
-        trained_on = open_driver(folder).logs
+    source, held_out, trained_on = _sources(run, folder, towns, reconstructed, on, judge)
     improvement = Improvement(
         folder,
         pool_logs,
@@ -124,3 +108,31 @@ def improve(
         print(f"ended: {result.ended}")
     print(f"best: {result.best.run}")
     print(f"report: {out / REPORT}")
+
+
+def _sources(
+    run: Path,
+    folder: Path,
+    towns: InTowns,
+    reconstructed: InReconstruction,
+    on: SomePaths,
+    judge: str | None,
+) -> "tuple[Source, Source | None, tuple[LogPath, ...]]":
+    """Return the source of failures, the one that judges the rounds, and the logs of the run's training."""
+    from foredrive.runs.drive.in_towns import TownRoutes
+    from foredrive.runs.improve.records import JudgedLogs
+    from foredrive.runs.train.driver import is_driver, open_driver
+    from foredrive.runs.train.run import open_run
+
+    rebuilt = reconstructed.source()
+    if on:
+        if rebuilt is not None or towns.only or towns.routes != TRAINING.routes:
+            raise InputError("a detector is judged on logs: --on does not go with routes or --in")
+        held_out = None if judge is None else JudgedLogs(tuple(find_logs(Path(judge))))
+        return JudgedLogs(find_all_logs(on)), held_out, open_run(folder).logs
+    if not is_driver(folder):
+        raise InputError(f"{run}: not the run of a driver; a detector is judged on logs (--on LOGS)")
+    routes = towns.source(str(folder))
+    assert isinstance(routes, TownRoutes)
+    held_out_routes = None if judge is None else dataclasses.replace(routes, routes=judge, only=())
+    return rebuilt or routes, held_out_routes, open_driver(folder).logs

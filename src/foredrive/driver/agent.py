@@ -225,7 +225,7 @@ class SightDriver:
     def __init__(self, driver: Driver, perceive: Callable[[Clip], PathEstimate] | None = None) -> None:
         self._planner, self._perceive = driver.planner, perceive or Perception(driver)
         self.sight: PathEstimate | None = None
-        """What the last plan was made from."""
+        """Estimate that the last plan was made from."""
 
     @torch.no_grad()
     def act(self, observation: Clip) -> Trajectory:

@@ -59,7 +59,7 @@ class DrivePlan(NamedTuple):
     xy: Float64[np.ndarray, "_ 2"]
     """Its points in the ego frame then, m."""
     sight: PathEstimate | None
-    """What the agent saw of its path then; None if it does not say so."""
+    """Estimate of its path by the agent then; None if it does not tell."""
 
 
 @dataclass(frozen=True, eq=False)

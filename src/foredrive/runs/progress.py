@@ -1,4 +1,4 @@
-"""How long work shows its progress to a caller: an activity with a number of parts."""
+"""Show the progress of long work to a caller: an activity with a number of parts."""
 
 import contextlib
 from collections.abc import Callable, Iterator

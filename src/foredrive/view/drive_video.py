@@ -125,8 +125,8 @@ class Place(NamedTuple):
 
 def _places(log: Log) -> dict[str, Place]:
     """Return the names of the cameras to show, with their places."""
-    known = pinhole_cameras(log)
-    shown = {name: camera for name in (*FRONT, TELE) if (camera := find_camera(known, name)) is not None}
+    cameras = pinhole_cameras(log)
+    shown = {name: camera for name in (*FRONT, TELE) if (camera := find_camera(cameras, name)) is not None}
     if AHEAD in shown and TELE in shown:
         large = 2 * ABOVE_WH[0] // 3
         columns = {AHEAD: (0, large), TELE: (large, ABOVE_WH[0] - large)}

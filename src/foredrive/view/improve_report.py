@@ -15,7 +15,7 @@ from foredrive.engine.provenance import collect_provenance
 from foredrive.engine.summary import write_summary
 from foredrive.runs.drive.compare import values_of
 from foredrive.runs.improve.failures import Failure, counted
-from foredrive.runs.improve.records import Judged, LoopResult, Round, ScoredMoment, score_of
+from foredrive.runs.improve.records import Judged, LoopResult, Round, ScoredMoment
 from foredrive.search.find import Hit
 from foredrive.tasks.bootstrap import LEAST_ROUTES, NO_INTERVAL, BootstrapMean, bootstrap_mean
 from foredrive.view.drive_plots import draw_places, letter_of
@@ -95,14 +95,17 @@ def rounds_table(result: LoopResult) -> Table:
         else NO_INTERVAL.replace("routes", kind)
     )
     count = f"{items}: {len(first.judged)}; other columns are means over them."
-    note = f"{count} Differences are from the beginning."
+    unscored = sum(len(of_number.judged) - len(of_number.scores) for of_number in result.rounds)
+    left_out = f" {unscored} drives of all rounds have no score and are left out." if unscored else ""
+    note = f"{count} Differences are from the beginning.{left_out}"
     return Table(columns, [Section(rows)], "Rounds", [f"{note} {intervals}"])
 
 
 def difference(first: Round, other: Round) -> BootstrapMean:
-    """Return the mean difference of the driving scores of two rounds, over what judges both."""
-    names = [name for name in first.judged if name in other.judged]
-    gains = [score_of(other.judged[name]) - score_of(first.judged[name]) for name in names]
+    """Return the mean difference of the scores of two rounds, over what has a score in both."""
+    before, after = first.scores, other.scores
+    names = [name for name in before if name in after]
+    gains = [after[name] - before[name] for name in names]
     groups = [_group(first.judged[name]) for name in names]
     return bootstrap_mean(np.array(gains), groups, np.random.default_rng(0), least=LEAST_ROUTES)
 
@@ -149,7 +152,7 @@ def _of_kind(of_number: Round) -> tuple[str, dict[str, str]]:
     if any(isinstance(item, ScoredMoment) for item in items):
         return "log-likelihood, nats", MOMENT_COLUMNS
     threats = any(isinstance(item, DriveRecord) and item.threat is not None for item in items)
-    return "NeuroNCAP score, % of 5" if threats else "driving score", DRIVE_COLUMNS
+    return "NeuroNCAP score times progress, % of 5" if threats else "driving score", DRIVE_COLUMNS
 
 
 def _group(item: Judged) -> str:
@@ -224,19 +227,16 @@ def _picture(hit: Hit) -> Picture:
 
 
 def _films(out: Path, before: Round, after: Round) -> list[Films]:
-    """Write films of the judged drives that changed most; moments have none."""
-    common = [name for name in before.judged if isinstance(after.judged.get(name), DriveRecord)]
-
-    def gain(name: str) -> float:
-        return score_of(after.judged[name]) - score_of(before.judged[name])
-
-    changed = sorted((name for name in common if gain(name)), key=lambda name: -abs(gain(name)))[:FILMS]
+    """Write films of the judged drives whose scores changed most; moments have none."""
+    old, new = before.scores, after.scores
+    drives = [name for name in old if name in new and isinstance(after.judged[name], DriveRecord)]
+    changed = sorted((name for name in drives if new[name] != old[name]), key=lambda n: -abs(new[n] - old[n]))
     return [
         Films(
-            f"{name}: " + " to ".join(number(score_of(of.judged[name]), 1) for of in (before, after)),
+            f"{name}: {number(old[name], 1)} to {number(new[name], 1)}",
             *[quote(str(film_of(of_number, name).relative_to(out))) for of_number in (before, after)],
         )
-        for name in changed
+        for name in changed[:FILMS]
     ]
 
 

@@ -9,27 +9,24 @@ from typing import Any
 import numpy as np
 
 from foredrive.data.clip_config import ClipConfig
-from foredrive.data.clips import ClipDataset
 from foredrive.data.log_paths import LogPath
 from foredrive.data.logs import Log
 from foredrive.engine.folder import CONFIG
 from foredrive.errors import InputError
 from foredrive.methods.recipe import Recipe, rescheduled
 from foredrive.runs.evaluate.run import RESULTS, evaluate_run
-from foredrive.runs.improve.choosing import DIVERSE_FAILURES, DIVERSITY, FAILURES, RANDOM, Moments
+from foredrive.runs.improve.choosing import DIVERSE_FAILURES, DIVERSITY, FAILURES, RANDOM
 from foredrive.runs.improve.failures import APART_S, Failure
-from foredrive.runs.improve.pupil import Means
-from foredrive.runs.improve.records import Improvement, Judged, JudgedLogs, ScoredMoment, Source
+from foredrive.runs.improve.pupil import Pupil
+from foredrive.runs.improve.records import Judged, JudgedLogs, ScoredMoment, Source
 from foredrive.runs.recipes.known import find_recipe
 from foredrive.runs.score.run import FRAMES, score_detections
 from foredrive.runs.train.run import open_run, train_run
-from foredrive.search.find import Hit
 from foredrive.search.scores import read_scores
 from foredrive.tasks.detection.score import ScoreConfig
 
 ROUND = ("finetune.schedule.steps=100",)
 """Settings of a round's training: it continues from weights that have been trained."""
-STRATEGIES = (RANDOM, DIVERSITY, FAILURES, DIVERSE_FAILURES)
 SCORED, DETECTION = "scored", "detection.json"
 MISSED_NATS = 3.0
 """A moment fails if the objects that are missed in it cost more than this."""
@@ -38,18 +35,11 @@ MOST = 12
 MOMENT_S = 0.01
 
 
-class DetectorPupil:
-    """A `Pupil` that detects road users.
-
-    Args:
-        improvement: the request; its routes are `JudgedLogs`.
-        means: folder, workers and progress of the loop.
-    """
+class DetectorPupil(Pupil):
+    """A detector of road users; the routes of its request are `JudgedLogs`."""
 
     items = "moments"
-
-    def __init__(self, improvement: Improvement, means: Means) -> None:
-        self._of, self._means = improvement, means
+    strategies = (RANDOM, DIVERSITY, FAILURES, DIVERSE_FAILURES)
 
     @property
     def clips(self) -> ClipConfig:
@@ -57,18 +47,16 @@ class DetectorPupil:
         return self._recipe().clips
 
     def check(self) -> None:
-        """Check the run, the settings, the logs and the strategy."""
+        """Check the run, its heads, the settings, the logs and the strategy."""
+        super().check()
         open_run(self._of.start).weights  # noqa: B018 - raises where training has not finished
         tasks = self._recipe().tasks
         if tasks is None or "detection" not in tasks.heads.tasks:
             raise InputError(f"{self._of.start}: has no head for detection (foredrive train --tasks)")
         for source in (self._of.routes, self._of.held_out):
-            if source is not None:
-                _logs(source)
-        if self._of.strategy not in STRATEGIES:
-            raise InputError(
-                f"--strategy {self._of.strategy} is for drivers; detectors have {', '.join(STRATEGIES)}"
-            )
+            names = [log.name for log in _logs(source)] if source is not None else []
+            if len(set(names)) < len(names):
+                raise InputError("two of the logs that judge have one name: leave out one of them")
 
     def check_pool(self, pool: Sequence[Log]) -> None:
         """Refuse a pool with parts of the logs that judge the rounds."""
@@ -107,22 +95,6 @@ class DetectorPupil:
     def learn(self, logs: Sequence[LogPath], folder: Path, start: Path) -> None:
         """Train world model and heads on logs, from those of a run."""
         train_run(self._recipe(), logs, folder, self._means.cache, start)
-
-    def unsure(self, run: Path, pool: ClipDataset) -> Mapping[str, float]:
-        """Refuse: `check` has refused the strategy that asks for it."""
-        raise NotImplementedError
-
-    def anew(
-        self,
-        folder: Path,
-        number: int,
-        run: Path,
-        failures: Sequence[Failure],
-        judged: Mapping[str, Judged],
-        rng: np.random.Generator,
-    ) -> tuple[Moments, list[Hit]]:
-        """Refuse: `check` has refused the strategy that asks for it."""
-        raise NotImplementedError
 
     def _recipe(self) -> Recipe[Any, Any]:
         recipe = find_recipe(str(self._of.start / CONFIG), self._of.settings or ROUND)

@@ -21,10 +21,10 @@ from foredrive.errors import InputError
 from foredrive.runs.drive.in_reconstruction import ReconstructedRoutes
 from foredrive.runs.drive.in_towns import TownRoutes
 from foredrive.runs.drive.suite import DriveSuite, drive_suite
-from foredrive.runs.improve.choosing import Moments
+from foredrive.runs.improve.choosing import STRATEGIES, Moments
 from foredrive.runs.improve.failures import Failure, failures_of
-from foredrive.runs.improve.pupil import STRIDE_S, Means
-from foredrive.runs.improve.records import Improvement, Judged, JudgedLogs, Source
+from foredrive.runs.improve.pupil import STRIDE_S, Pupil
+from foredrive.runs.improve.records import Judged, JudgedLogs, Source
 from foredrive.runs.open_clips import open_clips
 from foredrive.runs.recipes.known import find_recipe
 from foredrive.runs.reconstruction.reconstruction_run import open_run_log
@@ -39,18 +39,11 @@ ANEW_SEED = 10_000
 """Distance of the seeds of drives that are made anew from those of the routes, per round."""
 
 
-class DriverPupil:
-    """A `Pupil` that drives.
-
-    Args:
-        improvement: the request.
-        means: folder, workers and progress of the loop.
-    """
+class DriverPupil(Pupil):
+    """A driver by sight."""
 
     items = "drives"
-
-    def __init__(self, improvement: Improvement, means: Means) -> None:
-        self._of, self._means = improvement, means
+    strategies = STRATEGIES
 
     @property
     def clips(self) -> ClipConfig:
@@ -58,7 +51,8 @@ class DriverPupil:
         return self._recipe().clips
 
     def check(self) -> None:
-        """Check the run, the settings and the routes."""
+        """Check the run, the settings, the routes and the strategy."""
+        super().check()
         open_driver(self._of.start).weights  # noqa: B018 - raises where training has not finished
         self._recipe()
         for source in (self._of.routes, self._of.held_out):
@@ -130,13 +124,7 @@ class DriverPupil:
         return {pool.key(n): float(value) for n, value in enumerate(unsure)}
 
     def anew(
-        self,
-        folder: Path,
-        number: int,
-        run: Path,
-        failures: Sequence[Failure],
-        judged: Mapping[str, Judged],
-        rng: np.random.Generator,
+        self, folder: Path, number: int, run: Path, failures: Sequence[Failure], judged: Mapping[str, Judged]
     ) -> tuple[Moments, list[Hit]]:
         """Drive the routes of failures again, with other traffic or threats, and return moments of it.
 
@@ -160,6 +148,7 @@ class DriverPupil:
         self._means.index(logs, folder / "index", "indexing the new drives")
         moments = Moments.of(FrameIndex(str(folder / "index")))
         rows = {row.key: row for row in moments.rows}
+        rng = np.random.default_rng((self._of.seed, number))
         order = sorted(rng.permutation(len(dataset)).tolist(), key=lambda n: not missed[n])
         hits = [
             Hit(rows[dataset.key(n)], float(missed[n]), {"missed": float(missed[n])})

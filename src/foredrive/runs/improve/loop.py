@@ -140,8 +140,8 @@ class Loop:
                 for result, state in self._steps(rounds):
                     report(result, state)
             except (InputError, KeyboardInterrupt) as error:
-                why = f": {error}" if isinstance(error, InputError) else ""
-                report(result, f"stopped{why}; the same command goes on")
+                why = str(error) if isinstance(error, InputError) else "the same command goes on"
+                report(result, f"stopped: {why}")
                 raise
             return result
 
@@ -226,12 +226,12 @@ class Loop:
         folder = self.out / f"round_{number}"
         self.means.index(logs_before(failures), folder / FAILURES, "indexing the failures")
         before = Moments.of(FrameIndex(str(folder / FAILURES)))
-        rng = np.random.default_rng((self.of.seed, number))
 
         if self.of.strategy == ANEW:
-            moments, hits = self.pupil.anew(folder / ANEW, number, best.run, failures, judged, rng)
+            moments, hits = self.pupil.anew(folder / ANEW, number, best.run, failures, judged)
         else:
             moments = _without(self.moments, used)
+            rng = np.random.default_rng((self.of.seed, number))
             unsure = functools.partial(self.pupil.unsure, best.run, self.pool)
             request = Request(moments, failures, before, unsure, self.of.budget, rng)
             hits = choose(self.of.strategy, request)

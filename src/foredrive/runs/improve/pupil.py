@@ -1,11 +1,9 @@
-"""What learns in the rounds of the loop, a driver or a detector, and what it needs for that."""
+"""Describe what learns in the rounds of the loop: a driver or a detector."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
-
-import numpy as np
 
 from foredrive.data.clip_config import ClipConfig
 from foredrive.data.clips import ClipDataset
@@ -14,7 +12,7 @@ from foredrive.data.logs import Log
 from foredrive.errors import InputError
 from foredrive.runs.improve.choosing import Moments
 from foredrive.runs.improve.failures import Failure
-from foredrive.runs.improve.records import Judged, Source
+from foredrive.runs.improve.records import Improvement, Judged, Source
 from foredrive.runs.progress import Progress, fraction, silent
 from foredrive.runs.search.indexing import index_logs
 from foredrive.search.find import Hit
@@ -52,63 +50,69 @@ class Means:
             raise InputError(f"{len(done.failed)} logs cannot be indexed: {name}: {why}")
 
 
-class Pupil(Protocol):
-    """What is judged, fails and learns."""
+class Pupil(ABC):
+    """A run that is judged, fails and learns.
+
+    Args:
+        improvement: the request.
+        means: folder, workers and progress of the loop.
+    """
+
+    items: str
+    """Word for what judges it: drives, or moments."""
+    strategies: tuple[str, ...]
+    """The strategies that it can be asked for."""
+
+    def __init__(self, improvement: Improvement, means: Means) -> None:
+        self._of, self._means = improvement, means
 
     @property
-    def items(self) -> str:
-        """Return the word for what is judged: drives, or moments."""
-        ...
-
-    @property
+    @abstractmethod
     def clips(self) -> ClipConfig:
         """Return what a clip of the pool has to hold."""
-        ...
 
     def check(self) -> None:
-        """Check the run that the loop begins with, the settings and the sources, before anything is made.
+        """Check the run that the loop begins with, the settings, the sources and the strategy.
 
         Raises:
             InputError: something does not fit.
         """
-        ...
+        if self._of.strategy not in self.strategies:
+            raise InputError(
+                f"no strategy {self._of.strategy!r} for what is judged by {self.items}; there are "
+                f"{', '.join(self.strategies)}"
+            )
 
+    @abstractmethod
     def check_pool(self, pool: Sequence[Log]) -> None:
         """Refuse a pool with logs that judge the rounds and have to stay unseen.
 
         Raises:
             InputError: there is one.
         """
-        ...
 
+    @abstractmethod
     def judge(self, run: Path, source: Source, out: Path) -> dict[str, Judged]:
         """Return what judges a run, by name. What is in the folder already stays.
 
         Raises:
             InputError: the run, or the simulator, fails.
         """
-        ...
 
+    @abstractmethod
     def failures(self, out: Path, judged: Mapping[str, Judged]) -> list[Failure]:
         """Return the failures among what `judge` returned for a folder."""
-        ...
 
+    @abstractmethod
     def learn(self, logs: Sequence[LogPath], folder: Path, start: Path) -> None:
         """Train on logs, from the weights of a run."""
-        ...
 
     def unsure(self, run: Path, pool: ClipDataset) -> Mapping[str, float]:
-        """Return how unsure a run is about each moment of the pool, by key."""
-        ...
+        """Return how unsure a run is about each moment of the pool, by key, for `uncertainty`."""
+        raise NotImplementedError
 
     def anew(
-        self,
-        folder: Path,
-        number: int,
-        run: Path,
-        failures: Sequence[Failure],
-        judged: Mapping[str, Judged],
-        rng: np.random.Generator,
+        self, folder: Path, number: int, run: Path, failures: Sequence[Failure], judged: Mapping[str, Judged]
     ) -> tuple[Moments, list[Hit]]:
-        """Return new moments that resemble failures, and which of them are chosen in a round."""
-        ...
+        """Return new moments that resemble failures, and those that a round chooses, for `anew`."""
+        raise NotImplementedError

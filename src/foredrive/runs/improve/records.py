@@ -84,17 +84,19 @@ class Improvement:
             )
 
 
-def score_of(item: Judged) -> float:
+def score_of(item: Judged) -> float | None:
     """Return the score of a drive or moment; higher is better.
 
-    It is the driving score of leaderboard 1.0, %; with a threat NeuroNCAP's score, % of its best, where what
-    ends for images that are not trusted has not been hit until then; for a moment its log-likelihood, nats.
+    It is the driving score of leaderboard 1.0, %; with a threat NeuroNCAP's score times progress, % of its
+    best, because who never moves is never hit; for a moment its log-likelihood, nats. None: a drive against a
+    threat that ended where images are not trusted has no score.
     """
     if isinstance(item, ScoredMoment):
         return -item.nll
     if item.threat is None:
         return item.driving_score_1_0
-    return 100.0 if item.threat.score is None else 100.0 * item.threat.score / BEST
+    scored = item.threat.score_progress
+    return None if scored is None else 100.0 * scored / BEST
 
 
 @dataclass(frozen=True)
@@ -127,9 +129,21 @@ class Round:
     """False if the round was dropped, because it was judged worse."""
 
     @property
+    def scores(self) -> dict[str, float]:
+        """Return the scores of what judges the round, by name, where there is one; see `score_of`."""
+        scores = {name: score_of(item) for name, item in self.judged.items()}
+        return {name: score for name, score in scores.items() if score is not None}
+
+    @property
     def score(self) -> float:
-        """Return the mean score of what judges the round, see `score_of`."""
-        return statistics.fmean(score_of(item) for item in self.judged.values())
+        """Return the mean of the scores.
+
+        Raises:
+            InputError: nothing has a score.
+        """
+        if not self.scores:
+            raise InputError(f"{self.suite}: no drive has a score: none stays where images are trusted")
+        return statistics.fmean(self.scores.values())
 
 
 @dataclass(frozen=True)
