@@ -1,7 +1,7 @@
 """Compare what chooses data: `foredrive bench improve`, a round of `foredrive improve` by each strategy.
 
 A driver is trained on few virtual egos of the training towns (one seed, three epochs). It drives training
-routes in all weathers; then each strategy chooses as many moments of a pool of four other seeds, or makes
+routes in all weathers; then each strategy chooses as many moments of a pool of two other seeds, or makes
 them anew, and the driver goes on learning. Arms of one seed have the same beginning and the same failures.
 
 `begin` is the driver before the round. Arms are judged by what they see of virtual egos in the held-out town
@@ -43,9 +43,9 @@ from foredrive.tasks.bootstrap import bootstrap_mean
 from foredrive.towns.map.names import TEST_TOWNS
 
 EPOCHS = 3
-POOL_SEEDS, HELD_SEEDS, HELD_EGOS = range(100, 104), range(3), 100
+POOL_SEEDS, HELD_SEEDS, HELD_EGOS = range(100, 102), range(3), 100
 SEARCHED = "training-short"
-ROUTES = tuple(f"{town}-{number}" for town in TRAINING_TOWNS for number in range(4))
+ROUTES = tuple(f"{town}-{number}" for town in TRAINING_TOWNS for number in range(3))
 JUDGED = "town05-short"
 BUDGET, SETTINGS = 500, ("see.epochs=2", "see.lr=1e-3")
 CORES = len(os.sched_getaffinity(0))
