@@ -47,7 +47,8 @@ level = np.cos(elevation)
 parts = (level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation) + 0 * azimuth)
 rays = np.stack(parts, axis=-1).reshape(-1, 3)
 distance = range_along(LIDAR, rays)
-points = (LIDAR + distance[:, None] * rays)[distance < 60]  # of each frame: the street does not change
+near = distance < 60
+points = LIDAR + distance[near, None] * rays[near]  # of each frame: the street does not change
 
 # %% [markdown]
 # ## The ten lines

@@ -1,7 +1,4 @@
-"""The commands of README and of the first pages run as they are printed, from an empty folder: only smaller.
-
-README runs with every test; the other pages with the slow ones.
-"""
+"""README, the first pages and the tutorials run as they are printed, from an empty folder: only smaller."""
 
 import re
 import shlex
@@ -40,11 +37,19 @@ class Walk:
             for block in re.findall(r"^```bash\n(.*?)^```", text[text.index(self.section) :], re.M | re.S):
                 lines += re.findall(r"^foredrive .+?(?= +[#>] |$)", block, re.M)
         kept = [line for line in lines if not re.match(f"foredrive ({self.skipped})", line)]
-        text = "\n".join(kept)
-        for printed, small in self.smaller.items():
-            assert printed in text, printed
-            text = text.replace(printed, small)
-        return text.splitlines()
+        return smaller("\n".join(kept), self.smaller).splitlines()
+
+
+def smaller(text: str, changes: Mapping[str, str]) -> str:
+    """Return a text with these changes.
+
+    Raises:
+        AssertionError: the text has nothing to change.
+    """
+    for printed, small in changes.items():
+        assert printed in text, printed
+        text = text.replace(printed, small)
+    return text
 
 
 README = Walk(
@@ -88,17 +93,29 @@ HOW_TO = Walk(
     ("runs/heads/tasks/model.safetensors", "at_4s.png", "futures.mp4", "runs/town/export/model.onnx"),
     "evaluate runs/(heads|town --in)|view (?!.*--save)",
 )
-SLOW = pytest.mark.slow
+TUTORIALS: Mapping[str, Mapping[str, str]] = {
+    "failures": {
+        "--seeds 2 --conditions clear night": "--seeds 4..4 --conditions night",
+        "--seconds 8": "--seconds 6",
+    },
+    "own_log": {},
+    "protocols": {"--seconds 12": "--seconds 6", "clips[6]": "clips[0]"},
+    "reconstruct": {
+        "--rate 5": "--rate 4",
+        "--image-size 96 160": "--image-size 36 64",
+        "steps=200": "steps=4",
+    },
+    "world_model": {
+        "--seconds 40": "--seconds 8",
+        "steps=150": "steps=12",
+        "warmup_steps=15": "warmup_steps=2",
+        "steps=30": "steps=2",
+    },
+}
+"""What is smaller in each tutorial."""
 
 
-@pytest.mark.parametrize(
-    "walk",
-    [
-        pytest.param(README, id="README"),
-        pytest.param(FIRST_HOUR, id="first-hour", marks=SLOW),
-        pytest.param(HOW_TO, id="how-to", marks=SLOW),
-    ],
-)
+@pytest.mark.parametrize("walk", [README, FIRST_HOUR, HOW_TO], ids=["README", "first-hour", "how-to"])
 def test_the_commands_of_a_page_run(
     walk: Walk, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -108,7 +125,30 @@ def test_the_commands_of_a_page_run(
     commands = walk.commands()
     assert len(commands) >= 8
     for command in commands:
-        code = main(shlex.split(command)[1:])
-        assert code == 0, f"{command}: {capsys.readouterr().err}"
+        run_command(command, capsys)
     for file in walk.files:
         assert (tmp_path / file).stat().st_size > 0
+
+
+def run_command(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """Run a command as the shell does."""
+    code = main(shlex.split(command)[1:])
+    assert code == 0, f"{command}: {capsys.readouterr().err}"
+
+
+@pytest.mark.parametrize(
+    "tutorial", sorted((ROOT / "docs" / "tutorials").glob("*.py")), ids=lambda file: file.stem
+)
+def test_a_tutorial_runs(
+    tutorial: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("MPLBACKEND", "agg")
+    names: dict[str, object] = {}
+    for cell in re.split(r"^# %%", smaller(tutorial.read_text(), TUTORIALS[tutorial.stem]), flags=re.M):
+        kind, _, source = cell.partition("\n")
+        if "bash" in kind:
+            for command in re.findall(r"^# (foredrive .+)", source, re.M):
+                run_command(command, capsys)
+        elif "markdown" not in kind:
+            exec(compile(source, tutorial, "exec"), names)
