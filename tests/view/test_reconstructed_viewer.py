@@ -112,6 +112,18 @@ def test_an_actor_stays_where_it_is_dragged(page: Page) -> None:
     )
 
 
+def test_an_actor_is_moved_by_numbers_in_its_own_frame(page: Page) -> None:
+    page.show(0.2)
+    page.edits.choose(PARKED)
+    start = np.array(page.edits.gizmo.position)
+    page.edits.by.value = (2.0, -1.0, 90.0)
+    page.edits._change("move")
+    page.edits._change("move")  # ahead is to the left of where it was
+    assert node(page, f"/scene/actors/{PARKED}").position == pytest.approx(
+        start + np.array([3.0, 1.0, 0.0]), abs=1e-3
+    )
+
+
 def test_an_actor_may_be_removed_while_the_log_plays(page: Page, monkeypatch: pytest.MonkeyPatch) -> None:
     """One thread waits in the middle of drawing until the other edits, unless they keep each other out."""
     both, draw = threading.Barrier(2), page.nodes.show

@@ -1,6 +1,7 @@
 """The part of the page that edits a reconstructed scene: make, undo and save edits."""
 
 import functools
+import math
 import threading
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -16,6 +17,7 @@ from foredrive.methods.reconstruction.edits import (
     Edit,
     EditedScene,
     Insert,
+    Move,
     Remove,
     ShiftEgo,
     apply_edits,
@@ -160,7 +162,8 @@ class EditPanel:
             self.actor = gui.add_dropdown(
                 "actor", (NO_ACTOR, *map(str, ids)), hint="or click at one; then drag it by its arrows"
             )
-            self.change = gui.add_button_group("change it", ("remove", "duplicate"))
+            self.change = gui.add_button_group("change it", ("remove", "duplicate", "move"))
+            self.by = gui.add_vector3("move by", (0.0, 1.0, 0.0), hint="m ahead, m and degrees to the left")
             self.shift_m = gui.add_number("ego to the left, m", 2.0, step=0.5)
             self.shift = gui.add_button("Shift ego")
             with gui.add_folder("From another run", expand_by_default=False):
@@ -189,6 +192,9 @@ class EditPanel:
             self._tell("choose an actor first: click at one, or take it from the list")
         elif how == "remove":
             self.add(Remove(self.chosen))
+        elif how == "move":
+            ahead_m, left_m, turn_deg = self.by.value
+            self.add(Move(self.chosen, (ahead_m, left_m, 0.0), math.radians(turn_deg)))
         else:
             self._add_and_choose(Duplicate(self.chosen, unused_id(self.edited.graph), DUPLICATE_OFFSET_M))
 
