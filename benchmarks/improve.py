@@ -5,8 +5,8 @@ routes in all weathers; then each strategy chooses as many moments of a pool of 
 them anew, and the driver goes on learning. Arms of one seed have the same beginning and the same failures.
 
 `begin` is the driver before the round. Arms are judged by what they see of virtual egos in the held-out town
-in all weathers; ARM@driven by the short routes there. Seeds are those of the first training, of the traffic
-in which failures are looked for, and of the choice.
+in all weathers; ARM@driven by every second of the short routes there. Seeds are those of the first training,
+of the traffic in which failures are looked for, and of the choice.
 """
 
 import dataclasses
@@ -46,14 +46,14 @@ EPOCHS = 3
 POOL_SEEDS, HELD_SEEDS, HELD_EGOS = range(100, 102), range(3), 100
 SEARCHED = "training-short"
 ROUTES = tuple(f"{town}-{number}" for town in TRAINING_TOWNS for number in range(3))
-JUDGED = "town05-short"
+JUDGED, HELD_ROUTES = "town05-short", tuple(str(number) for number in range(0, 32, 2))
 BUDGET, SETTINGS = 500, ("see.epochs=2", "see.lr=1e-3")
 CORES = len(os.sched_getaffinity(0))
 CONFIG = {
     "recipe": dataclasses.asdict(recipe_of("driver_small", 0)),
     "epochs": EPOCHS,
     "egos": [EGOS, list(POOL_SEEDS), list(HELD_SEEDS), HELD_EGOS],
-    "routes": [SEARCHED, *ROUTES, JUDGED],
+    "routes": [SEARCHED, *ROUTES, JUDGED, *HELD_ROUTES],
     "round": [BUDGET, *SETTINGS],
 }
 DECIDED_BY = (
@@ -87,7 +87,7 @@ def _loop(strategy: str, seed: int) -> Loop:
     )
     pool = egos(POOL_SEEDS, WORK / "pool", CORES, tuple(CONDITIONS))
     routes = TownRoutes(SEARCHED, seed=seed, conditions=ANY_CONDITIONS, rig=FRONT_TELE, only=ROUTES)
-    judged = TownRoutes(JUDGED, seed=0, conditions=ANY_CONDITIONS, rig=FRONT_TELE)
+    judged = TownRoutes(JUDGED, seed=0, conditions=ANY_CONDITIONS, rig=FRONT_TELE, only=HELD_ROUTES)
     improvement = Improvement(
         start.folder.absolute(),
         tuple(pool),
