@@ -92,6 +92,18 @@ def test_an_interrupted_index_goes_on_where_it_stopped(
     assert FrameIndex(uri).count() == ROWS
 
 
+def test_an_index_of_a_relative_path_is_asked_from_another_folder(
+    logs: list[LogPath], towers: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    uri = str(tmp_path / "index")
+    root = logs[0].maps_dir.parent
+    monkeypatch.chdir(root)
+    index_logs([LogPath(logs[0].folder.relative_to(root), Path("maps"))], uri, towers, 0.5, 1)
+    monkeypatch.chdir(tmp_path)
+    (hit, *_) = ask(FrameIndex(uri), Query(like="one@1s/left", gap_s=0.4, view="left")).hits
+    assert hit.row.folder == logs[0].folder
+
+
 def test_a_log_that_has_changed_is_put_in_anew(towers: str, tmp_path: Path) -> None:
     uri = str(tmp_path / "index")
     log = write_log(tmp_path, "changing", FRAMES)

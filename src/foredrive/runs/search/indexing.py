@@ -91,7 +91,7 @@ def index_logs(
     with contextlib.nullcontext() if "://" in uri else held(Path(uri)):
         index = FrameIndex.make(uri, IndexSettings(tower.name, tower.fingerprint, tower.dim, stride_s))
         failed: dict[str, str] = {}
-        jobs = _plan(logs, index, failed)
+        jobs = _plan([log.absolute() for log in logs], index, failed)
         indexed = index.parts()
         todo = [job for job in jobs if job.part not in indexed]
         total = sum(len(job.frames) for job in todo)
