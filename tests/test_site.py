@@ -1,10 +1,13 @@
 """The generated pages of the site: tables of benchmarks, links that leave docs/, pages of the API."""
 
 import json
+import re
 import sys
 from pathlib import Path
 
 import pytest
+
+from foredrive.cli.main import VERBS
 
 ROOT = Path(__file__).parents[1]
 sys.path.append(str(ROOT / "docs" / "site"))
@@ -197,6 +200,12 @@ def test_files_that_pages_link_to_are_shown() -> None:
     pages = ["[a](../src/foredrive/scene/clip.py) [b](../benchmarks/results/ops.json) [c](../src/none.py)"]
     assert linked_files(ROOT, pages) == ["src/foredrive/scene/clip.py"]
     assert "class Clip" in source_page(ROOT, "src/foredrive/scene/clip.py")
+
+
+def test_the_picture_of_the_loop_links_every_verb() -> None:
+    linked = re.findall(r'href="how-to/verbs\.html#([\w-]+)"', (ROOT / "docs" / "loop.svg").read_text())
+    families = {"fetch-av2" if verb == "fetch av2" else verb.split()[0] for verb in VERBS}
+    assert sorted(linked) == sorted(families)
 
 
 def test_the_reference_has_what_folders_export_and_no_kernels() -> None:

@@ -18,6 +18,9 @@ ROOT = Path(__file__).parents[2]
 LOADED = re.compile(r"<(?:script|img|iframe|link)\b[^>]*\b(?:src|href)=.?https?:[^ >]*")
 """Matches what a page loads from the web."""
 
+LOOP = re.compile(r'<img [^>]*src="loop.svg"[^>]*>')
+"""Matches the picture of the loop, in pages beside it."""
+
 
 def on_files(files: Files, *, config: MkDocsConfig) -> Files:
     """Add the generated pages: API, benchmarks, verbs, files of the repository that pages link to."""
@@ -42,6 +45,11 @@ def is_text(content: str | bytes) -> TypeGuard[str]:
 def on_page_markdown(markdown: str, *, page: Page, config: MkDocsConfig, files: Files) -> str:
     """Lead links to files outside docs/ to their pages in the site."""
     return rewritten(markdown, page.file.src_uri)
+
+
+def on_page_content(html: str, *, page: Page, config: MkDocsConfig, files: Files) -> str:
+    """Put the picture of the loop into its pages, because links of a picture that is only shown are dead."""
+    return LOOP.sub(lambda _: (ROOT / "docs" / "loop.svg").read_text(), html)
 
 
 def on_post_page(output: str, *, page: Page, config: MkDocsConfig) -> str:
