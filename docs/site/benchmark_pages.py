@@ -30,6 +30,7 @@ DECIDING = {
     "above_ground.iou_future_1s.carried_copy occupancy.above_ground.iou_now "
     "occupancy.above_ground.iou_future_1s occupancy.above_ground.iou_future_1s.copy "
     "occupancy.above_ground.iou_future_1s.carried_copy",
+    "improve": "ds conflict_recall light_accuracy_40m red_missed_40m",
     "learning": "iou_10min iou_30min samples_per_cpu_s samples_per_cpu_s_ratio",
     "ncap": "score collision_rate progress score_progress",
     "ncap-transfer": "pairs collision_agreement kappa score_in_town score_in_rebuild score_correlation",
