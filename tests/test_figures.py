@@ -145,6 +145,6 @@ def test_an_interval_of_a_difference_is_paired_by_seed() -> None:
     ]
     middle = sum(differences) / 3
     # 4.303: the 97.5 % quantile of Student's t with two degrees of freedom
-    half = 4.303 * (sum((each - middle) ** 2 for each in differences) / 2 / 3) ** 0.5
+    half = 4.303 * (sum((value - middle) ** 2 for value in differences) / 2 / 3) ** 0.5
     said = figure("sets-training energy pmb_nll [-] matching pmb_nll +.2f")
     assert said == f"{middle:+.2f} [{middle - half:.2f}, {middle + half:.2f}]"
