@@ -77,6 +77,7 @@ def real_data() -> Path:
 
 
 LONGEST = "tests/end_to_end/test_pages_run.py"
+"""File of tests that takes longest."""
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:

@@ -112,7 +112,7 @@ TUTORIALS: Mapping[str, Mapping[str, str]] = {
         "steps=30": "steps=2",
     },
 }
-"""What is smaller in each tutorial."""
+"""Texts of each tutorial to replace, as in a walk."""
 
 
 @pytest.mark.parametrize("walk", [README, FIRST_HOUR, HOW_TO], ids=["README", "first-hour", "how-to"])
