@@ -34,6 +34,7 @@ from foredrive.runs.drive.compare import values_of
 from foredrive.runs.drive.in_towns import TownRoutes
 from foredrive.runs.drive.recording import EgosPlan
 from foredrive.runs.improve.choosing import STRATEGIES
+from foredrive.runs.improve.drivers import ROUND
 from foredrive.runs.improve.loop import INDEX, Loop
 from foredrive.runs.improve.records import Improvement, Round
 from foredrive.runs.train.driver import open_driver
@@ -47,7 +48,7 @@ POOL_SEEDS, HELD_SEEDS, HELD_EGOS = range(100, 102), range(3), 100
 SEARCHED = "training-short"
 ROUTES = tuple(f"{town}-{number}" for town in TRAINING_TOWNS for number in range(3))
 JUDGED, HELD_ROUTES = "town05-short", tuple(str(number) for number in range(0, 32, 2))
-BUDGET, SETTINGS = 500, ("see.epochs=2", "see.lr=1e-3")
+BUDGET, SETTINGS = 500, ROUND
 CORES = len(os.sched_getaffinity(0))
 CONFIG = {
     "recipe": dataclasses.asdict(recipe_of("driver_small", 0)),

@@ -61,7 +61,8 @@ def improve(
         keep_best: Drop a round that is judged worse than the one before it; the next one starts from the
             better run.
         set: Entries of the run's recipe to replace in the rounds' training. Without any, a driver trains for
-            two epochs (see.epochs=2, see.lr=1e-3), a detector for 100 steps (finetune.schedule.steps=100).
+            four epochs (emphasis=1, see.epochs=4, see.lr=3e-3), a detector for 100 steps
+            (finetune.schedule.steps=100).
     """
     check_out_folder(out)
     towns.check()
