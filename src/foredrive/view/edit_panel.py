@@ -162,8 +162,9 @@ class EditPanel:
             self.actor = gui.add_dropdown(
                 "actor", (NO_ACTOR, *map(str, ids)), hint="or click at one; then drag it by its arrows"
             )
-            self.change = gui.add_button_group("change it", ("remove", "duplicate", "move"))
+            self.change = gui.add_button_group("change it", ("remove", "duplicate"))
             self.by = gui.add_vector3("move by", (0.0, 1.0, 0.0), hint="m ahead, m and degrees to the left")
+            self.move = gui.add_button("Move actor")
             self.shift_m = gui.add_number("ego to the left, m", 2.0, step=0.5)
             self.shift = gui.add_button("Shift ego")
             with gui.add_folder("From another run", expand_by_default=False):
@@ -176,6 +177,7 @@ class EditPanel:
             self.keep = gui.add_button_group("edits", ("save", "load"))
         self.actor.on_update(lambda _: self._show_chosen())
         self.change.on_click(lambda _: self._change(self.change.value))
+        self.move.on_click(lambda _: self._change("move"))
         self.shift.on_click(lambda _: self._shift())
         self.insert.on_click(lambda _: self._insert())
         self.undo.on_click(lambda _: self._undo())
