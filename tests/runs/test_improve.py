@@ -405,6 +405,6 @@ def test_pools_that_spoil_the_judgement_are_refused(
         in capsys.readouterr().err
     )
     assert main([*arguments, "--on", pool, "--only", "Town02-1"]) == 2
-    assert "--on does not go with routes or --in" in capsys.readouterr().err
+    assert "--only: for routes through towns; with --on there are none" in capsys.readouterr().err
     assert main([*arguments, "--routes", "nowhere.xml"]) == 2
     assert "nowhere.xml" in capsys.readouterr().err

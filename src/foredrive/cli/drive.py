@@ -39,10 +39,8 @@ def drive(
     check_out_folder(out)
     for options in (planning, inputs, towns, reconstructed):
         options.check()
-    if reconstructed.reconstructed is not None and (
-        towns.rig is not None or towns.other_rig or towns.image_size is not None
-    ):
-        raise InputError("--rig, --other-rig and --image-size do not go with --in: the cameras are the log's")
+    if reconstructed.reconstructed is not None:
+        towns.check_unchanged(InTowns(), "--in")
     with importing():
         from foredrive.runs.drive.suite import DriveSuite, drive_suite
 

@@ -1,7 +1,7 @@
 """Options of `foredrive drive`, in groups: planning, routes through towns, a reconstructed log."""
 
 from collections.abc import Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -147,6 +147,21 @@ class InTowns:
         check_number("--vehicles", self.vehicles, low=0)
         check_number("--people", self.people, low=0)
         check_number("--workers", self.workers, low=0)
+
+    def check_unchanged(self, usual: "InTowns", instead: str) -> None:
+        """Raise `InputError` if an option of routes was given to a command that drives no routes.
+
+        Args:
+            usual: the options of a command without any.
+            instead: the option that takes the place of routes.
+        """
+        names = [option.name for option in fields(self) if option.name not in ("seed", "workers", "ray")]
+        given = [name for name in names if getattr(self, name) != getattr(usual, name)]
+        if given:
+            flags = ", ".join(
+                f"--{'no-' if getattr(usual, name) is True else ''}{name.replace('_', '-')}" for name in given
+            )
+            raise InputError(f"{flags}: for routes through towns; with {instead} there are none")
 
     def source(self, agent: str) -> "TownRoutes | CarlaRoutes":
         """Return the source of the drives of an agent."""

@@ -127,12 +127,15 @@ def _sources(
 
     rebuilt = reconstructed.source()
     if on:
-        if rebuilt is not None or towns.only or towns.routes != TRAINING.routes:
-            raise InputError("a detector is judged on logs: --on does not go with routes or --in")
+        if rebuilt is not None:
+            raise InputError("a detector is judged on logs: --on does not go with --in")
+        towns.check_unchanged(TRAINING, "--on")
         held_out = None if judge is None else JudgedLogs(tuple(find_logs(Path(judge))))
         return JudgedLogs(find_all_logs(on)), held_out, open_run(folder).logs
     if not is_driver(folder):
         raise InputError(f"{run}: not the run of a driver; a detector is judged on logs (--on LOGS)")
+    if rebuilt is not None and judge is None:
+        towns.check_unchanged(TRAINING, "--in")
     routes = towns.source(str(folder))
     assert isinstance(routes, TownRoutes)
     held_out_routes = None if judge is None else dataclasses.replace(routes, routes=judge, only=())
