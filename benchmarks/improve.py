@@ -4,9 +4,10 @@ A driver is trained on few virtual egos of the training towns (one seed, three e
 routes in all weathers; then each strategy chooses as many moments of a pool of two other seeds, or makes
 them anew, and the driver goes on learning. Arms of one seed have the same beginning and the same failures.
 
-`begin` is the driver before the round. Arms are judged by what they see of virtual egos in the held-out town
-in all weathers; ARM@driven by every second of the short routes there. Seeds are those of the first training,
-of the traffic in which failures are looked for, and of the choice.
+`begin` is the driver before the round, and `same_logs` trains for as many epochs on its own logs alone. Arms
+are judged by what they see of virtual egos in the held-out town in all weathers; ARM@driven by every second
+of the short routes there. Seeds are those of the first training, of the traffic in which failures are looked
+for, and of the choice.
 """
 
 import dataclasses
@@ -35,7 +36,7 @@ from foredrive.runs.drive.in_towns import TownRoutes
 from foredrive.runs.drive.recording import EgosPlan
 from foredrive.runs.improve.choosing import STRATEGIES
 from foredrive.runs.improve.drivers import ROUND
-from foredrive.runs.improve.loop import INDEX, Loop
+from foredrive.runs.improve.loop import INDEX, RUN, Loop
 from foredrive.runs.improve.records import Improvement, Round
 from foredrive.runs.train.driver import open_driver
 from foredrive.scene.conditions import ANY_CONDITIONS, CONDITIONS
@@ -127,6 +128,14 @@ def begin(seed: int) -> tuple[Loop, Round]:
     return loop, loop.begin
 
 
+def same_logs(seed: int) -> tuple[Loop, Round]:
+    """Return the loop and a run that goes on with the driver's own logs alone."""
+    loop, folder = _loop(STRATEGIES[0], seed), WORK / f"same_logs_seed{seed}"
+    run = folder / RUN
+    loop.pupil.learn(loop.of.logs, run, loop.of.start)
+    return loop, Round(1, folder, run)
+
+
 def seen(round_of: Callable[[int], tuple[Loop, Round]], seed: int) -> Mapping[str, float]:
     """Return how well the driver of a round sees the held-out town."""
     _, learned = round_of(seed)
@@ -152,6 +161,7 @@ def driven(round_of: Callable[[int], tuple[Loop, Round]], seed: int) -> Mapping[
 
 ROUNDS: Mapping[str, Callable[[int], tuple[Loop, Round]]] = {
     "begin": begin,
+    "same_logs": same_logs,
     **{strategy.replace("-", "_"): partial(_round, strategy) for strategy in STRATEGIES},
 }
 BENCHMARK = Benchmark(

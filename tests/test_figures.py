@@ -64,8 +64,12 @@ def average(name: str, arms: str, key: str) -> float:
 
 
 def seeds(name: str, arm: str, key: str) -> dict[int, float]:
-    """Return a figure of each seed of an arm."""
-    return {run["seed"]: run["figures"][key] for run in results(name)["runs"] if run["arm"] == arm}
+    """Return a figure of each seed of an arm, or of a part of it (ARM@PART)."""
+    return {
+        run["seed"]: run["figures"][key]
+        for run in results(name)["runs"]
+        if run["arm"].partition("@")[0] == arm and key in run["figures"]
+    }
 
 
 def numbers(name: str, arm: str, key: str, *how: str) -> list[float]:
