@@ -5,6 +5,7 @@ The program runs as a process of its own group, and the whole group gets SIGINT,
 
 import fnmatch
 import os
+import re
 import shutil
 import signal
 import time
@@ -36,7 +37,7 @@ Sign = Callable[[], bool]
 
 def is_progress(text: str) -> bool:
     """Return whether every line says how far a program is: on a slow machine it shows some."""
-    return all(" of " in line or line.startswith("still ") for line in text.splitlines())
+    return all(re.search(r": .*\d+ of \d+, |^still \d/\d ", line) for line in text.splitlines())
 
 
 class Programs:

@@ -155,7 +155,7 @@ class InTowns:
             usual: the options of a command without any.
             instead: the option that takes the place of routes.
         """
-        names = [option.name for option in fields(self) if option.name not in ("seed", "workers", "ray")]
+        names = [option.name for option in fields(self) if option.name not in ("workers", "ray")]
         given = [name for name in names if getattr(self, name) != getattr(usual, name)]
         if given:
             flags = ", ".join(

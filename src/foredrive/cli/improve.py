@@ -107,7 +107,7 @@ def improve(
     print_table(rounds_table(result), Console())
     if result.ended:
         print(f"ended: {result.ended}")
-    print(f"best: {result.best.run}")
+    print(f"run: {result.best.run}")
     print(f"report: {out / REPORT}")
 
 
@@ -126,16 +126,19 @@ def _sources(
     from foredrive.runs.train.run import open_run
 
     rebuilt = reconstructed.source()
+    usual = dataclasses.replace(TRAINING, seed=towns.seed)  # The seed is that of the choice, too
     if on:
         if rebuilt is not None:
             raise InputError("a detector is judged on logs: --on does not go with --in")
-        towns.check_unchanged(TRAINING, "--on")
+        towns.check_unchanged(usual, "--on")
         held_out = None if judge is None else JudgedLogs(tuple(find_logs(Path(judge))))
         return JudgedLogs(find_all_logs(on)), held_out, open_run(folder).logs
     if not is_driver(folder):
         raise InputError(f"{run}: not the run of a driver; a detector is judged on logs (--on LOGS)")
-    if rebuilt is not None and judge is None:
-        towns.check_unchanged(TRAINING, "--in")
+    if rebuilt is not None:
+        # With held-out routes the other options are those of their drives
+        given = towns if judge is None else dataclasses.replace(usual, routes=towns.routes, only=towns.only)
+        given.check_unchanged(usual, "--in")
     routes = towns.source(str(folder))
     assert isinstance(routes, TownRoutes)
     held_out_routes = None if judge is None else dataclasses.replace(routes, routes=judge, only=())

@@ -133,7 +133,7 @@ def write_improve_report(out: Path, result: LoopResult, state: str = "") -> None
 
 def figures_of(result: LoopResult) -> dict[str, float | int | str | None]:
     """Return the figures of all rounds as flat dotted keys."""
-    out: dict[str, float | int | str | None] = {"rounds": len(result.rounds) - 1, "best": result.best.number}
+    out: dict[str, float | int | str | None] = {"rounds": len(result.rounds) - 1, "kept": result.best.number}
     for of_number in result.rounds:
         prefix = f"round_{of_number.number}"
         out |= {f"{prefix}.{name}": value for name, value in _means(of_number).items()}
