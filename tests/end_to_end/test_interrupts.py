@@ -187,5 +187,8 @@ def test_the_demo_goes_on_from_every_phase(programs: Programs, tmp_path: Path) -
     assert [line["step"] for line in read_metrics(run / "pretrain/metrics.jsonl")] == list(range(1, 13))
     assert read_summary(run / "summary.json")["failed"] == 0
     report = (tmp_path / "report.html").read_text()
-    assert report.count('<img alt="" src="data:image/jpeg') == 6  # the covers: no step failed
-    assert report.count("data:image/webp") == 3  # the drive, and two that meet the car in the way
+    assert report.count('<img alt="" src="data:image/jpeg') == 7  # the covers: no step failed
+    # The drive, two that meet the car in the way, and one without failures: nothing is learned from it
+    assert report.count("data:image/webp") == 4
+    assert "no failures left" in report
+    assert "before the round" not in report

@@ -234,11 +234,11 @@ def show_improvement(demo: Demo) -> Section:
     answers = answered(result.rounds[-1])[:SHOWN_ANSWERS]
     scores = " to ".join(number(of_round.score, 0) for of_round in result.rounds)
     first = next(iter(result.rounds[0].judged))
+    chosen = len(result.rounds[-1].hits)
     films = [
-        stored_film(film_of(of_round, first), f"{when} the round: {first}")
+        stored_film(film_of(of_round, first), f"{when} the round: {first}" if chosen else first)
         for when, of_round in zip(("before", "after"), result.rounds, strict=False)
     ]
-    chosen = len(result.rounds[-1].hits)
     return Section(
         f"driving score {scores}: {chosen} moments chosen" if chosen else result.ended,
         _cover(_middle_frame(film_of(result.rounds[-1], first))),
@@ -252,7 +252,7 @@ def show_improvement(demo: Demo) -> Section:
                 )
                 for answer in answers
             ],
-            Block("The drive before and after", figures=films, columns="two"),
+            Block("The drive before and after" if chosen else "The drive", figures=films, columns="two"),
         ],
     )
 
