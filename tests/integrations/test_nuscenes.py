@@ -24,6 +24,7 @@ from foredrive.data.lidar import read_sweep
 from foredrive.data.log_writer import LogWriter
 from foredrive.data.logs import Log
 from foredrive.data.maps import write_map
+from foredrive.integrations.nuscenes.scene import _drawn
 from foredrive.integrations.nuscenes.streams import lidar_axes
 from foredrive.scene import Attribute, Category
 from foredrive.tasks.detection.protocols import CLASSES
@@ -266,6 +267,14 @@ def test_the_mask_of_the_map(tmp_path: Path) -> None:
     offset = np.subtract(log.T_world_ego[0, :2, 3], tables.rows("ego_pose")[0]["translation"][:2])
     np.testing.assert_allclose(offset, drive["world_offset_m"], atol=1e-9)
     np.testing.assert_allclose(offset, offset.round(), atol=1e-9)
+
+
+def test_the_south_of_a_mask_is_its_last_row() -> None:
+    strip = np.array([[100.0, 50, 0], [104, 50, 0], [104, 51, 0], [100, 51, 0]])  # 1 m along the south
+    mask = _drawn([[strip]], np.array([100.0, 50.0]), np.array([40, 30]))
+    assert mask.shape == (30, 40)
+    assert (mask[-8:] == 255).all()
+    assert not mask[:15].any()
 
 
 def test_logs_that_share_a_map_share_its_frame(tmp_path: Path) -> None:
