@@ -1,6 +1,7 @@
 """Short logs from virtual egos: what is in them, and that equal seeds give equal bytes."""
 
 import dataclasses
+import math
 import shutil
 from pathlib import Path
 
@@ -139,6 +140,49 @@ def test_clips_are_those_that_see_something(logs: list[LogPath]) -> None:
     assert bool(clip.image_valid.all())
     assert clip.t_s.tolist() == pytest.approx([-1.0, -0.5, 0.0])
     assert bool(clip.future.valid.all())
+
+
+def test_no_demonstration_leads_through_anybody(logs: list[LogPath]) -> None:
+    """Egos do not see the people who were added. A future through one of them is masked, and few others."""
+    clips, through = ClipDataset(logs, ClipConfig(1, 0, (24, 40), GRID), None), 0
+    for index in range(len(clips)):
+        number, frames = clips.frames_of(index)
+        met_s, clear_m = _nearest_person(clips.logs[number], frames[1], seconds=5.0)
+        valid = bool(clips.clip(index).future.valid.any())
+        through += not valid and met_s < 5.0
+        assert not (valid and met_s < 3.0)
+        assert valid or clear_m < 1.0
+        assert clips.demonstration(index)[1].valid.any() == valid
+    assert through > 0
+    assert clips.touching >= through
+
+
+def _nearest_person(log: Log, frame: int, seconds: float) -> tuple[float, float]:
+    """When the ego's outline first holds the middle of a person or cyclist, and how near one comes, s, m.
+
+    A person's middle is inside of the box of the vehicle, a coarser test than that of the package.
+    """
+    centre, size = log.ego_box
+    half = 0.5 * torch.from_numpy(size[:2])
+    met_s, nearest_m = math.inf, math.inf
+    for later in range(frame, min(frame + round(seconds / 0.5), len(log) - 1)):
+        boxes = [read_boxes(log, number) or pytest.fail("no boxes") for number in (later, later + 1)]
+        kinds = torch.tensor([int(Category.BICYCLE), int(Category.PEDESTRIAN)])
+        persons = [torch.isin(boxes[k].category, kinds) for k in (0, 1)]
+        ids = [each.track_id[chosen].tolist() for each, chosen in zip(boxes, persons, strict=True)]
+        for track in set(ids[0]) & set(ids[1]):
+            at = [each.centre[each.track_id == track][0, :2].double() for each in boxes]
+            for share in np.linspace(0, 1, 26):
+                t_us = (1 - share) * log.t_us[later] + share * log.t_us[later + 1]
+                T = torch.from_numpy(log.poses_at(np.array([t_us]))[0][0])
+                world = [torch.from_numpy(log.T_world_ego[later + k]) for k in (0, 1)]
+                xy = [world[k][:2, :2] @ at[k] + world[k][:2, 3] for k in (0, 1)]
+                now = T[:2, :2].T @ ((1 - share) * xy[0] + share * xy[1] - T[:2, 3])
+                beyond = ((now - torch.from_numpy(centre[:2])).abs() - half).clamp_min(0).norm()
+                nearest_m = min(nearest_m, float(beyond))
+                if float(beyond) == 0.0:
+                    met_s = min(met_s, 0.5 * (later - frame + share))
+    return met_s, nearest_m
 
 
 def test_a_world_model_learns_from_past_now_and_what_comes(logs: list[LogPath]) -> None:

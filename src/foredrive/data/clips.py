@@ -1,5 +1,6 @@
 """A torch dataset of clips from 123D logs, with voxel labels."""
 
+import dataclasses
 import functools
 import math
 from collections import Counter
@@ -23,6 +24,7 @@ from foredrive.data.logs import Log
 from foredrive.data.maps import read_map_patch
 from foredrive.data.recorded import read_expert_plan
 from foredrive.data.recorded_labels import check_recorded_occupancy
+from foredrive.data.truth.contacts import demonstrates
 from foredrive.data.truth.store import TaskTruthStore
 from foredrive.errors import InputError
 from foredrive.scene import Clip, Example, Trajectory, VoxelGrid
@@ -89,6 +91,18 @@ class ClipDataset(Dataset[Example]):
                 count_command_sources(log, of_log, self.config.horizon_steps, self.config.horizon_dt_s)
             )
         return dict(counts)
+
+    @functools.cached_property
+    def touching(self) -> int:
+        """Number of clips whose driven path is no demonstration, because the vehicle touches somebody.
+
+        Raises:
+            InputError: boxes cannot be read.
+        """
+        horizon_s = self.config.horizon_steps * self.config.horizon_dt_s
+        nows = self._clip_frames[:, self.config.past_frames].tolist()
+        by_log = zip(self._clip_logs.tolist(), nows, strict=True)
+        return sum(not demonstrates(self.logs[number], frame, horizon_s) for number, frame in by_log)
 
     @functools.cached_property
     def left_out(self) -> dict[str, int]:
@@ -210,7 +224,11 @@ class ClipDataset(Dataset[Example]):
         steps, dt_s = self.config.horizon_steps, self.config.horizon_dt_s
         plan = read_expert_plan(log, now) if self.config.future_source == "expert" else None
         if plan is None:
-            return log.driven_future(now, steps, dt_s)
+            driven = log.driven_future(now, steps, dt_s)
+            if demonstrates(log, now, steps * dt_s):
+                return driven
+            # Nobody learns from a drive through somebody, or is measured by it
+            return dataclasses.replace(driven, valid=torch.zeros_like(driven.valid))
         return _at_times(plan, dt_s * np.arange(1, steps + 1))
 
     def clip(self, index: int) -> Clip:

@@ -82,7 +82,7 @@ def read_instances(log: Log, frame: int, steps: int, dt_s: float, spec: PlaneSpe
         rows = np.flatnonzero(states.valid[:, step] & valid[step])
         size_m = tracks.size_lwh[states.box[rows, step], :2]
         # Cells of each box at the step, by the size of the observation before it
-        quads = _corners(states.xy[rows, step], size_m, states.yaw[rows, step])
+        quads = box_corners_xy(states.xy[rows, step], size_m, states.yaw[rows, step])
         for track, quad in zip(rows.tolist(), quads, strict=True):
             fill_polygon([quad], track + 1, spec, drawn[step])
     # The drawing holds rows + 1: replace them by track ids + 1
@@ -97,7 +97,7 @@ def track_states(
     t_us: Int64[np.ndarray, "S"],
 ) -> TrackStates:
     """Return tracks at any times in an ego frame, linear between the observations around each time."""
-    order, ids, key = _in_order_of_tracks(tracks)
+    order, ids, key = in_order_of_tracks(tracks)
     start_us = tracks.row_t_us[0]
     # Range of each track's boxes in the sorted key
     wanted = np.searchsorted(ids, track_id)[:, None] * _TRACK_US
@@ -133,7 +133,7 @@ def track_states(
 
 
 @functools.lru_cache(maxsize=4)
-def _in_order_of_tracks(tracks: Tracks) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def in_order_of_tracks(tracks: Tracks) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the boxes by track and time, the ids of the tracks, and the sorted key of each box."""
     ids, number = np.unique(tracks.track_id, return_inverse=True)
     # One sortable number for each box: track first, then time
@@ -158,9 +158,10 @@ def annotated_at(tracks: Tracks, t_us: Int64[np.ndarray, "S"]) -> Bool[np.ndarra
     return inside & (gap_us <= MAX_GAP_S * 1e6)
 
 
-def _corners(
+def box_corners_xy(
     xy: Float64[np.ndarray, "K 2"], size_lw: Float64[np.ndarray, "K 2"], yaw: Float64[np.ndarray, "K"]
 ) -> Float64[np.ndarray, "K 4 2"]:
+    """Return the corners of boxes from above, m."""
     local = 0.5 * size_lw[:, None] * np.array([[1, 1], [1, -1], [-1, -1], [-1, 1]])
     cos, sin = np.cos(yaw)[:, None], np.sin(yaw)[:, None]
     turned = np.stack(

@@ -167,6 +167,12 @@ def train_run(
                 write_rigs(rigs, folder)
         if fabric.is_global_zero:
             _warn_without_labels(dataset)
+            if dataset.touching:
+                _log.warning(
+                    "in %d of %d clips the vehicle touches a road user: no plan is learned from them",
+                    dataset.touching,
+                    len(dataset),
+                )
         _train_stages(run, dataset, pretrained or kept, fabric)
     return run
 
