@@ -52,8 +52,9 @@ class PlannerConfig:
     """Also sample the volume along the initial plan. Not in the paper."""
     feed_forward: float = 2.0
     """Hidden width of the feed-forward networks of the decoder, as a multiple of C."""
-    dropout: float = 0.1
-    """Dropout of the decoder."""
+    dropout: float = 0.0
+    """Dropout of the decoder. It has one query: whatever is dropped is missing from the whole plan, and with
+    0.1 it never learns to find a cell of the plane."""
     final_norm: bool = False
     """Normalise the output of the decoder, as pre-norm decoders do. False in runs from before there was a
     choice."""
@@ -156,9 +157,10 @@ class VolumePlanner(nn.Module):
             nn.Linear(width, width),
             nn.LayerNorm(width),
         )
-        # Learned place of each row and column, since attention itself knows no positions
-        self.row = nn.Parameter(0.02 * torch.randn(ny, 1, width))
-        self.column = nn.Parameter(0.02 * torch.randn(1, nx, width))
+        # Learned place of each row and column, since attention itself knows no positions. They are as large as
+        # the features, which `fold` normalises: places of 0.02 are lost beside them
+        self.row = nn.Parameter(torch.randn(ny, 1, width))
+        self.column = nn.Parameter(torch.randn(1, nx, width))
         self.command = nn.Embedding(len(Command) + 1, width)  # the last entry: unknown command
         # Speed and its flag, 4 numbers per past frame, and x, y and flag of the target
         inputs = 2 + 4 * config.history + 3 * config.target
