@@ -3,12 +3,13 @@
 import contextlib
 import errno
 import fcntl
+import hashlib
 import os
 import re
 import shutil
 import socket
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextvars import ContextVar
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -43,6 +44,19 @@ def naming(path: Path | str) -> Iterator[None]:
     except Exception as error:
         error.add_note(f"{WHILE_WRITING}{path}")
         raise
+
+
+def digest_of(files: Iterable[Path]) -> str:
+    """Return a digest of the names and the contents of files, in their order.
+
+    Raises:
+        OSError: a file cannot be read.
+    """
+    digest = hashlib.sha256()
+    for file in files:
+        with file.open("rb") as opened:
+            digest.update(f"{file.name} ".encode() + hashlib.file_digest(opened, "sha256").digest())
+    return digest.hexdigest()
 
 
 def make_folder(folder: Path) -> None:

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import math
+import subprocess
 import sys
 from pathlib import Path
 from types import ModuleType
@@ -17,7 +18,7 @@ from foredrive.cli.main import main
 from foredrive.errors import InputError
 from foredrive.integrations.navsim import records
 from foredrive.integrations.navsim.agent import IMAGE_HW, input_of, plan_by_navsim
-from foredrive.integrations.own_agents import Needs, absolute, needs_of, own_agent
+from foredrive.integrations.own_agents import Needs, absolute, files_of, needs_of, own_agent
 from foredrive.runs.drive.agent_inputs import inputs_of, rig_of
 from foredrive.runs.drive.agents import absolute_name
 from foredrive.scene import Clip, LidarSweep, Trajectory
@@ -338,6 +339,115 @@ def test_an_own_planner_is_tried_and_drives(
     drive_record = json.loads(record.read_text())
     assert not drive_record["error"]
     assert drive_record["driving_score_1_0"] == 100.0
+
+
+FAILS_LATER = """
+from steps import STEP_M
+
+class Planner:
+    calls = 0
+    def act(self, clip):
+        from steps import AFTER
+        self.calls += 1
+        if self.calls > AFTER:
+            raise ValueError("queue is empty")
+        return [(STEP_M * (k + 1), 0.0) for k in range(6)]
+"""
+
+
+def test_a_planner_that_was_mended_or_changed_is_not_the_same(
+    route: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A drive that failed is driven again; good ones are kept, and not taken for those of another version."""
+    file, beside, out = tmp_path / "planner.py", tmp_path / "steps.py", tmp_path / "out"
+    file.write_text(FAILS_LATER)
+    beside.write_text("STEP_M, AFTER = 0.8, 12\n")
+    agent = f"python:{file}:Planner"
+
+    def again() -> tuple[int, str, dict[str, Any]]:
+        """A new process for each call: modules are imported once."""
+        still = ["--vehicles", "0", "--people", "0", "--no-scenarios", "--no-sensors", "--workers", "1"]
+        command = [sys.executable, "-m", "foredrive", "drive", "--agent", agent, "--routes", str(route)]
+        done = subprocess.run([*command, "--out", str(out), *still], capture_output=True, text=True)
+        (record,) = (out / "drives").glob("*.json")
+        return done.returncode, done.stderr + done.stdout, json.loads(record.read_text())
+
+    code, _, record = again()
+    assert code == 0
+    assert record["error"] == "ValueError: queue is empty"
+    beside.write_text("STEP_M, AFTER = 0.8, 12000\n")  # a module that it imports in a function
+    code, said, record = again()
+    assert code == 0, said
+    assert not record["error"]
+    assert record["driving_score_1_0"] == 100.0
+    beside.write_text("STEP_M, AFTER = 0.0, 12000\n")
+    code, said, kept = again()
+    assert code == 2
+    assert f"holds the drives of another version of {agent}; choose another folder" in said
+    assert kept == record
+    beside.write_text("STEP_M, AFTER = 0.8, 12000\n")
+    code, said, kept = again()
+    assert code == 0
+    assert kept == record
+
+
+def test_files_that_decide_what_a_planner_does(tmp_path: Path) -> None:
+    """Those that it imports beside it, in packages too, and those of its arguments; nothing installed."""
+    (tmp_path / "parts").mkdir()
+    texts = {
+        "planner.py": "import numpy, parts.net\nfrom parts import sizes\ndef Planner(w, n): ...",
+        "parts/__init__.py": "",
+        "parts/net.py": "from .sizes import WIDTH\n",
+        "parts/sizes.py": "WIDTH = 3\n",
+        "unused.py": "",
+        "weights.pt": "1",
+    }
+    for name, text in texts.items():
+        (tmp_path / name).write_text(text)
+    found = files_of(f"python:{tmp_path / 'planner.py'}:Planner?w={tmp_path / 'weights.pt'}&n=3")
+    named = [str(file.relative_to(tmp_path)) for file in found]
+    assert named == ["parts/__init__.py", "parts/net.py", "parts/sizes.py", "planner.py", "weights.pt"]
+
+
+@pytest.mark.parametrize("kind", ["constructor", "initialize"])
+def test_a_planner_that_cannot_be_made_is_one_line(
+    kind: str,
+    route: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A checkpoint that is missing is the most common first error."""
+    loads = "open('absent.pt')"
+    (tmp_path / f"{kind}_fails.py").write_text(
+        f"class Planner:\n    def __init__(self):\n        {loads if kind == 'constructor' else 'pass'}\n"
+        f"    def initialize(self):\n        {loads}\n    def act(self, clip):\n        return []\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    name = f"python:{tmp_path}/{kind}_fails.py" if kind == "constructor" else f"navsim:{kind}_fails"
+    assert drive(f"{name}:Planner", route, tmp_path / "out") == 2
+    told = capsys.readouterr().err.strip()
+    assert "\n" not in told
+    assert "cannot be made: FileNotFoundError: [Errno 2] No such file or directory: 'absent.pt' (" in told
+    assert not (tmp_path / "out").exists()
+
+
+def test_an_agent_of_navsim_1_drives(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Its base class needs no sampling, and a trajectory has 4 s."""
+    (tmp_path / "of_v1.py").write_text(
+        "from navsim.agents.abstract_agent import AbstractAgent\n"
+        "from navsim.common.dataclasses import SensorConfig, Trajectory\n"
+        "import numpy as np\n"
+        "class Agent(AbstractAgent):\n"
+        "    def __init__(self): super().__init__()\n"
+        "    def initialize(self): pass\n"
+        "    def get_sensor_config(self): return SensorConfig.build_no_sensors()\n"
+        "    def compute_trajectory(self, given):\n"
+        "        return Trajectory(np.outer(np.arange(1, 9), [2.5, 0.5, 0.0]))\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    plan = own_agent("navsim:of_v1:Agent").act(navsim_clip()[None])
+    assert plan.xy[0, 0, [0, -1]].flatten().tolist() == pytest.approx([2.5, 0.5, 15.0, 3.0])
 
 
 @pytest.mark.parametrize(

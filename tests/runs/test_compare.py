@@ -24,7 +24,7 @@ Given = dict[tuple[str, int], tuple[float, list[str], str]]
 """By route and repetition: completion, kinds of infractions, ending."""
 
 
-def suite(folder: Path, drives: Given, **settings: object) -> Path:
+def suite(folder: Path, drives: Given, *, town: str | None = None, **settings: object) -> Path:
     (folder / "drives").mkdir(parents=True)
     (folder / "suite.json").write_text(json.dumps({"agent": folder.name, "routes": "r.xml", **settings}))
     factors = {"red_light": 0.7, "collision_vehicle": 0.6}
@@ -33,7 +33,7 @@ def suite(folder: Path, drives: Given, **settings: object) -> Path:
         for kind in kinds:
             score *= factors[kind]
         record = {
-            "town": None,
+            "town": town,
             "length_m": 10.0,
             "score": {
                 "route": route,
@@ -91,6 +91,27 @@ def test_a_failed_drive_is_no_bad_drive(tmp_path: Path) -> None:
         compare([agents[0], read_agent(str(suite(tmp_path / "all", {("1", 0): (0.5, [], "crashed")})))])
 
 
+def test_routes_of_one_number_in_other_sets_are_others(tmp_path: Path) -> None:
+    """Town05 short and long both have routes 16 to 20; the ten short ones are of the 32."""
+    ids: Given = {(route, 0): (0.1 * int(route) - 1, [], DONE) for route in ("16", "17")}
+    long = suite(tmp_path / "long", ids, town="Town05", routes="town05-long")
+    short = suite(tmp_path / "short", ids, town="Town05", routes="town05-short")
+    ten = suite(tmp_path / "ten", ids, town="Town05", routes="town05-short-10")
+    moved = suite(tmp_path / "moved", ids, town="Town05", routes="a/r.xml", routes_sha256="0" * 64)
+    for other in (long, moved):
+        with pytest.raises(InputError, match="no route and repetition in common"):
+            compare(read_agents([str(short), str(other)]))
+    assert [route for route, *_ in compare(read_agents([str(short), str(ten)])).keys] == ["16", "17"]
+    both = compare([read_agent(f"a={short},{long}"), read_agent(f"b={ten},{long}")])
+    assert [route for route, *_ in both.keys] == [
+        "16 (Town05, town05-long)",
+        "16 (Town05, town05-short)",
+        "17 (Town05, town05-long)",
+        "17 (Town05, town05-short)",
+    ]
+    assert len(both.rated_routes) == 4
+
+
 @pytest.mark.parametrize(
     "source",
     [
@@ -99,7 +120,11 @@ def test_a_failed_drive_is_no_bad_drive(tmp_path: Path) -> None:
         ReconstructedRoutes("runs/a"),
     ],
 )
-def test_baselines_have_the_same_drives(source: DriveSource, tmp_path: Path) -> None:
+def test_baselines_have_the_same_drives(
+    source: DriveSource, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "edits.yaml").write_text("[]")
     suite = DriveSuite("embedded", source, period_s=1.0, latency_s=0.2)
     (tmp_path / "suite.json").write_text(json.dumps(suite.noted()))
     baseline = same_drives(tmp_path, "stop")

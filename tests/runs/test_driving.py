@@ -24,14 +24,14 @@ from foredrive.engine.summary import read_summary
 from foredrive.errors import InputError
 from foredrive.files import atomic_path
 from foredrive.runs.drive.agent_inputs import inputs_of
-from foredrive.runs.drive.agents import AGENTS
+from foredrive.runs.drive.agents import AGENTS, agent_digest
 from foredrive.runs.drive.in_towns import TownRoutes
 from foredrive.runs.drive.records import read_drive, summarise
 from foredrive.runs.drive.route_source import job_of
 from foredrive.runs.drive.suite import DriveJob, DriveSuite, SuiteResult, drive_one, drive_suite, folder_of
 from foredrive.runs.train.run import Run
 from foredrive.scene import VoxelSpec
-from foredrive.scene.conditions import CONDITIONS
+from foredrive.scene.conditions import CONDITIONS, carla_weather, conditions_of_weather
 from foredrive.sensors.rigs import SURROUND
 from foredrive.towns.driving.routes import snap_route
 from foredrive.towns.driving.town import grow
@@ -215,10 +215,10 @@ def test_while_a_drive_is_broken_there_is_no_summary(
 
 
 def test_files_of_suites_and_drives_stay_what_they_were(driven: SuiteResult, out: Path) -> None:
-    """Folders of before go on, and are read by who knows their keys."""
+    """They are read by who knows their keys."""
     suite = json.loads((out / "suite.json").read_text())
     fields = "agent routes repetitions seed conditions sensors image_hw vehicles people scenarios"
-    assert set(suite) == {*fields.split(), "period_s", "latency_s"}
+    assert set(suite) == {*fields.split(), "period_s", "latency_s", "routes_sha256"}
     assert suite["image_hw"] == [18, 32]
     drive = json.loads((out / "drives" / "routea_rep0.json").read_text())
     fields = "town length_m score driving_score_1_0 driving_score_2_1 error events comfort nearest_s act_s"
@@ -257,6 +257,78 @@ def test_a_folder_holds_one_suite(driven: SuiteResult, suite: DriveSuite, out: P
     (out / "drives" / "routea_rep0.json").write_text("{}")
     with pytest.raises(InputError, match="not the record of a drive"):
         drive_suite(suite, out, workers=1)
+
+
+def test_another_file_of_the_same_name_is_another_suite(
+    suite: DriveSuite, routes: Path, tmp_path: Path
+) -> None:
+    """A route is moved in its file, or the weights of a run change; the names stay."""
+    file, run = tmp_path / "own.xml", tmp_path / "run"
+    file.write_text(routes.read_text())
+    source = dataclasses.replace(suite.source, routes=str(file))
+    before = folder_of(dataclasses.replace(suite, source=source), tmp_path).wanted
+    file.write_text(routes.read_text().replace('z="', 'z="1'))
+    after = folder_of(dataclasses.replace(suite, source=source), tmp_path).wanted
+    assert [what for what in before if before[what] != after[what]] == [
+        f"the drives of another version of {file}"
+    ]
+    (run / "finetune").mkdir(parents=True)
+    (run / "config.yaml").write_text("")
+    digests = []
+    for text in ("a", "b", "a"):
+        (run / "finetune" / "model.safetensors").write_text(text)
+        digests.append([agent_digest(f"{kind}{run}") for kind in ("", "student:", "true-lights:")])
+    assert digests[0] == digests[2]
+    assert all(one != other for one, other in zip(*digests[:2], strict=True))
+    assert agent_digest("expert") is agent_digest("http://localhost:1") is None
+
+
+WEATHER = (
+    '<weathers><weather route_percentage="{}" cloudiness="90" precipitation="80" precipitation_deposits="90"'
+    ' wetness="90" sun_altitude_angle="{}" fog_density="40"/></weathers>'
+)
+
+
+def test_the_weather_of_a_route_file_is_played(
+    routes: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """In the forms of leaderboard 1.0 and 2.x; other conditions that are asked for come first."""
+    first, second, _ = routes.read_text().split("</route>")
+    night = WEATHER.format(0, -60).removesuffix("</weathers>") + WEATHER.format(100, 45).removeprefix(
+        "<weathers>"
+    )
+    plain = '<weather id="a" cloudiness="0" precipitation="0" wetness="0" sun_altitude_angle="75"/>'
+    file = tmp_path / "weather.xml"
+    file.write_text(f"{first}{night}</route>{second}{plain}</route></routes>")
+    source = TownRoutes(str(file))
+    seen, noon = source.conditions_of("a", 0), source.conditions_of("b", 0)
+    assert seen is not None
+    assert noon is not None
+    assert (seen.hour, seen.clouds, seen.rain_mmph) == (24.0, 0.9, pytest.approx(32.0))
+    assert (seen.wetness, seen.visibility_m) == (0.9, pytest.approx(398.1, abs=0.1))
+    assert (noon.hour, noon.rain_mmph, noon.visibility_m) == (12.0, 0.0, CONDITIONS["clear"].visibility_m)
+    source.jobs("stop")
+    assert "the weather of 1 routes changes on the way; it stays as it begins" in caplog.messages[-1]
+    assert TownRoutes(str(file), conditions="fog").conditions_of("a", 0) == CONDITIONS["fog"]
+    assert TownRoutes(str(routes)).conditions_of("a", 0) is None
+    file.write_text(file.read_text().replace('"90"', '"much"'))
+    with pytest.raises(InputError, match="weather that is no number"):
+        TownRoutes(str(file)).jobs("stop")
+
+
+@pytest.mark.parametrize("name", CONDITIONS)
+def test_conditions_return_from_carlas_weather(name: str) -> None:
+    """A morning returns as the evening that is as bright; thin haze as clear air."""
+    before = CONDITIONS[name]
+    after = conditions_of_weather(carla_weather(before))
+    assert abs(after.hour - 12) == pytest.approx(abs(before.hour - 12))
+    assert after.clouds == pytest.approx(before.clouds)
+    assert after.rain_mmph == pytest.approx(before.rain_mmph)
+    assert after.wetness == pytest.approx(before.wetness)
+    if before.visibility_m < 500:
+        assert after.visibility_m == pytest.approx(before.visibility_m)
+    else:
+        assert after.visibility_m > 1000
 
 
 def claim(suite: DriveSuite, out: Path) -> None:

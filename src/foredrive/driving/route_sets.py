@@ -15,8 +15,11 @@ from jaxtyping import Float64
 
 from foredrive.errors import InputError
 from foredrive.files import atomic_path
+from foredrive.scene.conditions import Conditions, conditions_of_weather
 
 SHIPPED = "route_sets.json"
+ROUTE_FILE = ".xml"
+"""Ending of the names of CARLA's route files."""
 SHORT_10, OF = "town05-short-10", "town05-short"
 """The ten routes of the first version of Town05 short are the first ten of today's 32."""
 
@@ -36,6 +39,8 @@ class RouteWaypoints:
     xyz_m: Float64[np.ndarray, "W 3"]
     scenarios: tuple[str, ...] = ()
     """Types of the scenarios that its file places on it. Drives have others, of their own."""
+    weathers: tuple[Conditions, ...] = ()
+    """The weather that its file sets, from the begin to the end of the route."""
 
     def __post_init__(self) -> None:
         if not re.fullmatch(r"[\w-][\w.-]{0,99}", self.id):
@@ -55,7 +60,7 @@ def load_route_set(name_or_path: str) -> list[RouteWaypoints]:
     Raises:
         InputError: the set or the file does not exist, or the file has an error.
     """
-    if name_or_path.endswith(".xml"):
+    if name_or_path.endswith(ROUTE_FILE):
         return read_carla_routes(Path(name_or_path))
     sets = shipped_sets()
     if name_or_path == SHORT_10:
@@ -130,6 +135,22 @@ def _route(path: Path, number: int, element: ElementTree.Element) -> RouteWaypoi
         raise InputError(f"{where} has a waypoint that is not finite")
     try:
         # CARLA's y axis points to the right
-        return RouteWaypoints(name, town, np.array(xyz) * [1.0, -1.0, 1.0], scenarios)
+        return RouteWaypoints(
+            name, town, np.array(xyz) * [1.0, -1.0, 1.0], scenarios, _weathers(element, where)
+        )
     except InputError as error:
         raise InputError(f"route number {number + 1} of {path}: {error}") from None
+
+
+def _weathers(element: ElementTree.Element, where: str) -> tuple[Conditions, ...]:
+    """Return the weather of a route, at one place of leaderboard 1.0 or at several of 2.x."""
+    rows = [row.attrib for row in (*element.findall("weather"), *element.findall("weathers/weather"))]
+    try:
+        numbers = [{name: float(text) for name, text in row.items() if name != "id"} for row in rows]
+    except ValueError as error:
+        raise InputError(f"{where} has weather that is no number: {error}") from None
+    for row in numbers:
+        if not all(map(math.isfinite, row.values())):
+            raise InputError(f"{where} has weather that is not finite")
+    numbers.sort(key=lambda row: row.get("route_percentage", 0.0))
+    return tuple(conditions_of_weather(row) for row in numbers)

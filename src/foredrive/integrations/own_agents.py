@@ -5,6 +5,7 @@ arguments are written behind the class: `?checkpoint=FILE&width=64`. A function 
 the place of the class.
 """
 
+import ast
 import dataclasses
 import functools
 import importlib
@@ -12,7 +13,8 @@ import importlib.util
 import inspect
 import json
 import sys
-from collections.abc import Callable
+import traceback
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
@@ -75,6 +77,50 @@ def needs_of(agent: str) -> Needs:
         first = error.errors()[0]
         where = ".".join(str(part) for part in first["loc"][:1])
         raise InputError(f"{agent}: needs{f'.{where}' if where else ''}: {first['msg']}") from error
+
+
+def files_of(agent: str) -> list[Path]:
+    """Return the files that decide what an agent does, in a fixed order.
+
+    They are its own file, the files beside it that these import, also in functions, and those that its
+    arguments name. Installed packages are left out.
+
+    Raises:
+        InputError: there is no such class.
+    """
+    _, arguments = _made_by(agent)
+    place, _ = _split(agent, NAVSIM if agent.startswith(NAVSIM) else PYTHON)
+    if agent.startswith(NAVSIM):
+        # The folder in which the imports of a module begin is above all packages of its name
+        file = Path(inspect.getfile(sys.modules[place]))
+        root = file.parents[place.count(".") + (file.name == "__init__.py")]
+    else:
+        file, root = Path(place), Path(place).parent
+    found, todo = list[Path](), [file.absolute()]
+    while todo:
+        if (path := todo.pop()) not in found:
+            found.append(path)
+            todo += _imported(path, root.absolute())
+    named = (Path(value) for value in arguments.values() if isinstance(value, str))
+    return sorted(found) + sorted(path.absolute() for path in named if path.is_file())
+
+
+def _imported(file: Path, root: Path) -> Iterator[Path]:
+    """Yield the files below a folder that a Python file imports from there."""
+    for node in ast.walk(ast.parse(file.read_bytes())):
+        if isinstance(node, ast.Import):
+            names, base = [alias.name for alias in node.names], root
+        elif isinstance(node, ast.ImportFrom):
+            # What is imported from a package may be a module of it
+            names = [f"{node.module or ''}.{alias.name}".strip(".") for alias in node.names]
+            names += [node.module or ""]
+            base = file.parents[node.level - 1] if node.level else root
+        else:
+            continue
+        for name in names:
+            path = base.joinpath(*name.split("."))
+            there = (path.with_suffix(".py"), path / "__init__.py")
+            yield from (each for each in there if name and each.is_file())
 
 
 def own_agent(agent: str) -> "OwnAgent":
@@ -150,7 +196,7 @@ def _waypoints(answer: Any, agent: str) -> "np.ndarray[Any, np.dtype[np.float32]
 def _instance(agent: str) -> Any:
     instance = _make(agent)
     if agent.startswith(NAVSIM):
-        instance.initialize()
+        _of_user(agent, instance.initialize)
     return instance
 
 
@@ -160,7 +206,22 @@ def _make(agent: str) -> Any:
         inspect.signature(make).bind(**arguments)
     except TypeError as error:
         raise InputError(f"{agent}: {error}; arguments are written behind it: ?NAME=VALUE&…") from error
-    return make(**arguments)
+    return _of_user(agent, lambda: make(**arguments))
+
+
+def _of_user(agent: str, made: Callable[[], Any]) -> Any:
+    """Return what a user's own code makes.
+
+    Raises:
+        InputError: it raises an error, as where a checkpoint is missing. The message has the error and its
+            place.
+    """
+    try:
+        return made()
+    except Exception as error:  # any error of the user's own code
+        at = traceback.extract_tb(error.__traceback__)[-1]
+        text = f"{type(error).__name__}: {error}".splitlines()[0]
+        raise InputError(f"{agent}: cannot be made: {text} ({at.filename}, line {at.lineno})") from error
 
 
 def _made_by(agent: str) -> tuple[Callable[..., Any], dict[str, Any]]:

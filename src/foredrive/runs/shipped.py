@@ -1,12 +1,11 @@
 """Trained models that come with the package: `embedded:NAME` in place of a run folder."""
 
-import hashlib
 import json
 import shutil
 from pathlib import Path
 
 from foredrive.errors import InputError
-from foredrive.files import atomic_path
+from foredrive.files import atomic_path, digest_of
 
 EMBEDDED = "embedded:"
 DRIVER = "driver"
@@ -50,7 +49,7 @@ def run_folder(run: Path, copies: Path = COPIES) -> Path:
         raise InputError(f"{run}: no such model; there are {', '.join(shipped_models()) or 'none'}")
     source, copy = MODELS / name, copies / f"embedded_{name}"
     if copy.exists():
-        if _digest(source) != _digest(copy):
+        if run_digest(source) != run_digest(copy):
             raise InputError(f"{copy}: not a copy of this version of {run}; move it away")
     else:
         with atomic_path(copy) as temporary:
@@ -62,9 +61,14 @@ def run_folder(run: Path, copies: Path = COPIES) -> Path:
     return copy
 
 
-def _digest(folder: Path) -> str | None:
-    """Return a digest of recipe and weights; None if there is no run."""
-    files = [folder / CONFIG, *sorted(folder.glob(f"*/{WEIGHTS}"))]
-    if not files[0].is_file():
-        return None
-    return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()
+def run_digest(folder: Path) -> str | None:
+    """Return a digest of the recipe and of all weights of a run; None if the folder holds no run."""
+    files = run_files(folder)
+    return digest_of(files) if files else None
+
+
+def run_files(folder: Path) -> list[Path]:
+    """Return the files of the recipe and of all weights of a run, in a fixed order; none if it is no run."""
+    if not (folder / CONFIG).is_file():
+        return []
+    return [folder / CONFIG, *sorted(folder.glob("*.safetensors")), *sorted(folder.glob(f"*/{WEIGHTS}"))]

@@ -1,9 +1,10 @@
 """The records of NAVSIM's interface at 0a380a9, as far as an agent meets them.
 
-They stand in for NAVSIM's own where its package, or nuPlan's, cannot be imported.
+They stand in for NAVSIM's own where its package, or nuPlan's, cannot be imported. Agents of NAVSIM 1, whose
+base class and trajectories have a sampling by default, find the same defaults.
 """
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from typing import Any
 
 import numpy as np
@@ -27,6 +28,11 @@ class TrajectorySampling:
             self.num_poses = round(self.time_horizon / self.interval_length)
         else:
             raise ValueError("a sampling needs two of num_poses, time_horizon and interval_length")
+
+
+def _four_seconds() -> TrajectorySampling:
+    """Return the sampling of NAVSIM 1."""
+    return TrajectorySampling(time_horizon=4, interval_length=0.5)
 
 
 @dataclass
@@ -90,7 +96,7 @@ class Trajectory:
     """Poses x, y, heading in the ego frame at now."""
 
     poses: np.ndarray
-    trajectory_sampling: TrajectorySampling
+    trajectory_sampling: TrajectorySampling = field(default_factory=_four_seconds)
 
     def __post_init__(self) -> None:
         assert self.poses.shape == (self.trajectory_sampling.num_poses, 3)
@@ -136,10 +142,12 @@ class AbstractTargetBuilder:
 class AbstractAgent(torch.nn.Module):
     """Base class of agents, as far as evaluation calls it."""
 
-    def __init__(self, trajectory_sampling: TrajectorySampling, requires_scene: bool = False) -> None:
+    def __init__(
+        self, trajectory_sampling: TrajectorySampling | None = None, requires_scene: bool = False
+    ) -> None:
         super().__init__()
         self.requires_scene = requires_scene
-        self._trajectory_sampling = trajectory_sampling
+        self._trajectory_sampling = trajectory_sampling or _four_seconds()
 
     def get_feature_builders(self) -> list[Any]:
         """Return what computes the features; agents that learn have some."""

@@ -157,8 +157,8 @@ class VolumePlanner(nn.Module):
             nn.Linear(width, width),
             nn.LayerNorm(width),
         )
-        # Learned place of each row and column, since attention itself knows no positions. They are as large as
-        # the features, which `fold` normalises: places of 0.02 are lost beside them
+        # Learned place of each row and column, since attention itself knows no positions. They are as large
+        # as the features, which `fold` normalises: places of 0.02 are lost beside them
         self.row = nn.Parameter(torch.randn(ny, 1, width))
         self.column = nn.Parameter(torch.randn(1, nx, width))
         self.command = nn.Embedding(len(Command) + 1, width)  # the last entry: unknown command

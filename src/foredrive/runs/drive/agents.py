@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from foredrive.errors import InputError
+from foredrive.files import digest_of
 
 if TYPE_CHECKING:
     from foredrive.scene import Agent
@@ -344,6 +345,24 @@ def absolute_name(agent: str) -> str:
 
         return absolute(agent)
     return str(Path(agent).absolute()) if Path(agent).is_dir() else agent
+
+
+def agent_digest(agent: str) -> str | None:
+    """Return a digest of an agent's code and weights; None if the package or another process has them.
+
+    Raises:
+        InputError: there is no such agent.
+    """
+    kind, argument = find_agent(agent)
+    if kind.sensors == "declared":
+        from foredrive.integrations.own_agents import files_of
+
+        return digest_of(files_of(agent))
+    if kind.argument != "RUN":
+        return None
+    from foredrive.runs.shipped import run_digest
+
+    return run_digest(agent_folder(agent, argument))
 
 
 def is_foreign(agent: str) -> bool:

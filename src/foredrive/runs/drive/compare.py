@@ -11,10 +11,12 @@ import numpy as np
 
 from foredrive.driving.drive_record import DriveRecord
 from foredrive.driving.item_response import Ratings, rate
+from foredrive.driving.route_sets import OF, SHORT_10
 from foredrive.driving.scores import Ending, InfractionKind
 from foredrive.engine.folder import DRIVES
 from foredrive.errors import InputError
 from foredrive.runs.drive.records import read_drive, read_suite
+from foredrive.runs.drive.suite import ROUTES_SHA256
 from foredrive.tasks.bootstrap import LEAST_ROUTES, BootstrapMean, bootstrap_mean
 
 COLLISIONS = (
@@ -35,7 +37,7 @@ METRICS = (
 SAME_WORLD = ("routes", "seed", "conditions", "vehicles", "people", "scenarios")
 """Settings of a suite in which two drives must agree to have met the same traffic."""
 Key = tuple[str, int, int]
-"""Route, place of the folder among those of its agent, repetition."""
+"""Name of the route (`_route_name`), place of the folder among those of its agent, repetition."""
 
 
 @dataclass(frozen=True)
@@ -154,8 +156,32 @@ def read_agent(given: str) -> ComparedAgent:
             raise InputError(f"{folder}: no drives to compare (no {DRIVES}/*.json)")
         for file in files:
             drive = read_drive(file)
-            drives[drive.score.route, place, drive.score.repetition] = drive
+            drives[_route_name(folder, drive), place, drive.score.repetition] = drive
     return ComparedAgent(name if equals else folders[0].absolute().name, folders, drives)
+
+
+def _route_name(folder: Path, drive: DriveRecord) -> str:
+    """Return the id of a drive's route; in towns with the town and the set, since sets share their ids."""
+    suite = read_suite(folder)
+    if drive.town is None:
+        return drive.score.route
+    of = str(suite.get("routes"))
+    if digest := suite.get(ROUTES_SHA256):  # a file may lie in several places
+        of = f"{Path(of).name} {str(digest)[:8]}"
+    return f"{drive.score.route} ({drive.town}, {OF if of == SHORT_10 else of})"
+
+
+def _without_set(agents: Sequence[ComparedAgent]) -> list[ComparedAgent]:
+    """Return the agents with bare ids of routes, unless there are several towns or sets."""
+    if len({route.partition(" ")[2] for agent in agents for route, *_ in agent.drives}) > 1:
+        return list(agents)
+    return [
+        dataclasses.replace(
+            agent,
+            drives={(key[0].partition(" ")[0], *key[1:]): drive for key, drive in agent.drives.items()},
+        )
+        for agent in agents
+    ]
 
 
 def compare(agents: Sequence[ComparedAgent], seed: int = 0, resamples: int = 10_000) -> Comparison:
@@ -177,6 +203,7 @@ def compare(agents: Sequence[ComparedAgent], seed: int = 0, resamples: int = 10_
     names = [agent.name for agent in agents]
     if len(set(names)) < len(names):
         raise InputError(f"two agents have the same name ({', '.join(names)}): write NAME=FOLDER")
+    agents = _without_set(agents)
     common = set.intersection(*(agent.driven() for agent in agents))
     if not common:
         failed = ", ".join(f"{agent.name} {agent.failed}" for agent in agents if agent.failed)
@@ -295,4 +322,5 @@ def _unlike(agents: Sequence[ComparedAgent]) -> tuple[str, ...]:
 def _order(key: Key) -> tuple[int, str, int, int]:
     """Sort numbered routes by their numbers."""
     route, place, repetition = key
-    return (int(route) if route.isdigit() else 0, route, place, repetition)
+    number = route.partition(" ")[0]
+    return (int(number) if number.isdigit() else 0, route, place, repetition)

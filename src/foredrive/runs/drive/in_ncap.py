@@ -25,6 +25,7 @@ from foredrive.driving.ncap.scenario_file import load_scenarios, outside_protoco
 from foredrive.driving.ncap.self_test import SelfTest, run_reference, self_test
 from foredrive.driving.replay.logged_drive import LoggedDrive
 from foredrive.errors import InputError
+from foredrive.files import digest_of
 from foredrive.methods.reconstruction.renderer import ReconstructedRenderer
 from foredrive.runs.drive.agent_inputs import check_seeing
 from foredrive.runs.drive.agents import Sees, is_remote
@@ -38,8 +39,9 @@ from foredrive.runs.drive.in_reconstruction import (
     renders_for,
     shown_vehicle,
 )
-from foredrive.runs.drive.suite import DriveJob, DriveSetup, DriveSuite
+from foredrive.runs.drive.suite import ROUTES_SHA256, DriveJob, DriveSetup, DriveSuite
 from foredrive.runs.reconstruction.reconstruction_run import open_run_log
+from foredrive.runs.shipped import run_files
 from foredrive.towns.driving.drive_log import drive_log, log_frame
 
 BEFORE_S = (2.0, 1.0)
@@ -86,6 +88,7 @@ class SafetyTests:
             "rules": self.rules,
             "count": self.count,
             "routes": self.scenarios,
+            ROUTES_SHA256: digest_of(file for run in self.runs for file in run_files(Path(run))),
         }
 
     def jobs(self, agent: str) -> Sequence[DriveJob]:

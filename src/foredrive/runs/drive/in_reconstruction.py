@@ -26,13 +26,14 @@ from foredrive.driving.replay.threats import AS_PLANNED, Threat, Variation, refe
 from foredrive.driving.route_progress import RouteLine
 from foredrive.driving.simple_agents import ReplayAgent
 from foredrive.errors import InputError
+from foredrive.files import digest_of
 from foredrive.methods.reconstruction.edits import DriveStraight, Edit, load_edits
 from foredrive.methods.reconstruction.renderer import ReconstructedRenderer
 from foredrive.methods.reconstruction.trust import Trust
 from foredrive.methods.reconstruction.vehicle import LoggedVehicle
 from foredrive.runs.drive.agent_inputs import chosen_cameras, inputs_of, own_rig
 from foredrive.runs.drive.agents import CORRIDOR, EXPERT, REPLAY, Sees, is_remote, make_agent
-from foredrive.runs.drive.suite import DriveJob, DriveSetup, DriveSuite
+from foredrive.runs.drive.suite import ROUTES_SHA256, DriveJob, DriveSetup, DriveSuite
 from foredrive.runs.reconstruction.reconstruction_run import (
     OpenedReconstruction,
     edited_scene,
@@ -40,6 +41,7 @@ from foredrive.runs.reconstruction.reconstruction_run import (
     open_run_log,
 )
 from foredrive.runs.reconstruction.trust import trust_of
+from foredrive.runs.shipped import run_files
 from foredrive.scene import Agent, Clip, Trajectory
 from foredrive.sensors.rigs import camera_rig
 from foredrive.towns.driving.drive_log import drive_log, log_frame
@@ -77,7 +79,9 @@ class ReconstructedRoutes:
         for name in ("stay_trusted", "variations", "seed", "only"):
             if not fields[name]:
                 del fields[name]
-        return {**fields, "routes": self.run}
+        edits = [] if self.edits is None else [Path(self.edits)]
+        _edits_of(self.edits)  # a file that cannot be read is one line
+        return {**fields, "routes": self.run, ROUTES_SHA256: digest_of([*run_files(Path(self.run)), *edits])}
 
     def jobs(self, agent: str) -> Sequence[DriveJob]:
         """Return one drive for each start and threat, or for each variation of these.

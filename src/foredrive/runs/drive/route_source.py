@@ -7,12 +7,14 @@ import zlib
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
-from foredrive.driving.route_sets import RouteWaypoints, load_route_set
+from foredrive.driving.route_sets import ROUTE_FILE, RouteWaypoints, load_route_set
 from foredrive.errors import InputError
+from foredrive.files import digest_of
 from foredrive.runs.drive.agent_inputs import check_rig_of, inputs_of
 from foredrive.runs.drive.agents import check_without_log
-from foredrive.runs.drive.suite import DriveJob
+from foredrive.runs.drive.suite import ROUTES_SHA256, DriveJob
 from foredrive.scene.conditions import (
     ANY_CONDITIONS,
     CONDITIONS,
@@ -38,8 +40,8 @@ class RouteSource:
     seed: int = 0
     """Seed of the town and its traffic in the first repetition; each repetition adds one."""
     conditions: str | None = None
-    """Name of the conditions. `ANY_CONDITIONS` draws a name for each drive; None draws bright daylight from
-    the seed.
+    """Name of the conditions. `ANY_CONDITIONS` draws a name for each drive; None takes the weather of the
+    route's file, or draws bright daylight from the seed.
     """
     rig: RigPlan = SURROUND
     """Cameras of the vehicle."""
@@ -66,6 +68,9 @@ class RouteSource:
         if not self.other_rig:
             del fields["other_rig"]
         other = {} if self.rig.cameras == SURROUND.cameras else {"cameras": rig["cameras"]}
+        if self.routes.endswith(ROUTE_FILE):
+            load_route_set(self.routes)  # a file that cannot be read is one line
+            other[ROUTES_SHA256] = digest_of([Path(self.routes)])
         return {**fields, "image_hw": self.rig.image_hw, **other}
 
     def jobs(self, agent: str) -> Sequence[DriveJob]:
@@ -86,6 +91,8 @@ class RouteSource:
         chosen = [routes[name] for name in self.only or routes]
         _check_towns(self.routes, chosen)
         _tell_scenarios(self.routes, tuple(kind for route in chosen for kind in route.scenarios))
+        if self.conditions is None:
+            _tell_weather(self.routes, sum(len(set(route.weathers)) > 1 for route in chosen))
         return [job_of(route.id, n) for n in range(self.repetitions) for route in chosen]
 
     def route_of(self, job: DriveJob) -> DriveRoute:
@@ -95,7 +102,8 @@ class RouteSource:
     def conditions_of(self, route: str, seed: int) -> Conditions | None:
         """Return the conditions of the drive of a route with a seed."""
         if self.conditions is None:
-            return None
+            of_file = (each.weathers for each in load_route_set(self.routes) if each.id == route)
+            return next(iter(next(of_file, ())), None)
         if self.conditions != ANY_CONDITIONS:
             return find_conditions(self.conditions)
         return CONDITIONS[DRAWN[drive_hash(seed, route) % len(DRAWN)]]
@@ -118,6 +126,13 @@ def _tell_scenarios(name: str, types: tuple[str, ...]) -> None:
         counted = ", ".join(f"{count} {kind}" for kind, count in sorted(Counter(types).items()))
         text = "%s: scenarios left out: %s; --scenarios has scenarios of its own"
         _log.warning(text, name, counted)
+
+
+@functools.cache
+def _tell_weather(name: str, changing: int) -> None:
+    """Say once in a process that the weather of a route stays as it begins."""
+    if changing:
+        _log.warning("%s: the weather of %d routes changes on the way; it stays as it begins", name, changing)
 
 
 def job_of(route: str, repetition: int) -> DriveJob:

@@ -31,10 +31,13 @@ from foredrive.engine.interrupts import start_fork_server
 from foredrive.engine.summary import write_summary
 from foredrive.errors import InputError
 from foredrive.files import atomic_path, together
-from foredrive.runs.drive.agents import check_ready, is_foreign
+from foredrive.runs.drive.agents import agent_digest, check_ready, is_foreign
 from foredrive.runs.drive.preflight import try_agent
 from foredrive.runs.drive.records import read_drive, read_suite, summarise, write_drive
 from foredrive.scene import Agent, Simulator
+
+AGENT_SHA256, ROUTES_SHA256 = "agent_sha256", "routes_sha256"
+"""Digests in the file of a suite: of the agent's code and weights, and of the files of its routes."""
 
 
 @dataclass(frozen=True)
@@ -87,7 +90,7 @@ class DriveSource(Protocol):
         ...
 
     def noted(self) -> Mapping[str, object]:
-        """Return the fields for JSON; "routes" names the routes."""
+        """Return the fields for JSON; "routes" names the routes, `ROUTES_SHA256` digests their files."""
         ...
 
     def jobs(self, agent: str) -> Sequence[DriveJob]:
@@ -136,6 +139,8 @@ class DriveSuite:
             del of_all["faults"]
         else:
             of_all["faults"] = dataclasses.asdict(self.faults)
+        if (digest := agent_digest(self.agent)) is not None:
+            of_all[AGENT_SHA256] = digest
         noted: dict[str, object] = json.loads(json.dumps({**of_all, **self.source.noted()}))
         return noted
 
@@ -162,7 +167,7 @@ def drive_suite(
     report: Callable[[SuiteResult], object] = lambda driven: None,
     tried: Callable[[str], object] = lambda text: None,
 ) -> SuiteResult:
-    """Drive all jobs that have no record in the folder yet; write the summary when every job has one.
+    """Drive all jobs that have no record in the folder yet, or failed; write the summary at the end.
 
     Args:
         workers: number of drives at a time, if the source allows more than one; on Ray as for
@@ -182,14 +187,14 @@ def drive_suite(
     threads = None if in_turn else max(1, torch.get_num_threads() // workers)
     work = functools.partial(drive_one, suite=suite, out=out, threads=threads)
     drives, broken = dict[DriveJob, DriveRecord](), dict[DriveJob, str]()
-    missing = [job for job in jobs if not _file(out, job).is_file()]
+    missing = [job for job in jobs if not _driven(out, job)]
     # Before the folder is there: an agent that fails leaves nothing
     if missing and is_foreign(suite.agent):
         check_ready(suite.agent)
         tried(try_agent(suite, missing[0]).text(suite.period_s))
     with folder_of(suite, out).claimed():
         for job in jobs:
-            if _file(out, job).is_file():
+            if _driven(out, job):
                 drives[job] = read_drive(_file(out, job))
                 tick(job, drives[job])
         skipped = len(drives)
@@ -257,13 +262,21 @@ def drive_one(job: DriveJob, suite: DriveSuite, out: Path, threads: int | None =
 def folder_of(suite: DriveSuite, out: Path) -> RunFolder:
     """Return the folder of a suite. It belongs to another suite while it holds drives of that suite."""
     path, wanted, grows = out / SUITE, suite.noted(), suite.source.grows
-    what = "the drives of another suite"
+    contents = {
+        AGENT_SHA256: f"the drives of another version of {suite.agent}",
+        ROUTES_SHA256: f"the drives of another version of {wanted['routes']}",
+    }
 
     def fixed(noted: Mapping[str, object]) -> dict[str, object]:
-        return {key: value for key, value in noted.items() if key not in grows}
+        others = {key: value for key, value in noted.items() if key not in (*grows, *contents)}
+        return {
+            "the drives of another suite": others,
+            **{what: noted.get(key) for key, what in contents.items()},
+        }
 
     def noted_there() -> dict[str, object] | None:
-        if not any((out / DRIVES).glob("*.json")):
+        # Drives that failed are driven again, so they hold nothing
+        if all(_failed(file) for file in (out / DRIVES).glob("*.json")):
             return None
         try:
             return read_suite(out)
@@ -272,7 +285,7 @@ def folder_of(suite: DriveSuite, out: Path) -> RunFolder:
 
     def read() -> dict[str, object] | None:
         note = noted_there()
-        return None if note is None else {what: fixed(note)}
+        return None if note is None else fixed(note)
 
     def write() -> None:
         old, note = noted_there() or {}, dict(wanted)
@@ -283,7 +296,21 @@ def folder_of(suite: DriveSuite, out: Path) -> RunFolder:
         with atomic_path(path) as temporary:
             temporary.write_text(json.dumps(note, indent=1) + "\n")
 
-    return RunFolder(out, {what: fixed(wanted)}, read, write, grows=True)
+    return RunFolder(out, fixed(wanted), read, write, grows=True)
+
+
+def _driven(out: Path, job: DriveJob) -> bool:
+    """Return whether there is the record of a drive that did not fail."""
+    file = _file(out, job)
+    return file.is_file() and not _failed(file)
+
+
+def _failed(file: Path) -> bool:
+    """Return whether a file is the record of a drive in which the agent failed."""
+    try:
+        return read_drive(file).score.failed
+    except InputError:  # whoever uses the drive is told what is wrong
+        return False
 
 
 def _file(out: Path, job: DriveJob) -> Path:
