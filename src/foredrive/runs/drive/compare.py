@@ -247,6 +247,7 @@ def _rated(agents: Sequence[ComparedAgent], seed: int) -> tuple[Ratings, tuple[s
         np.array([number for number, _ in rows]),
         np.array([routes.index(route) for _, (route, *_) in rows]),
         np.random.default_rng(seed),
+        np.array([place for _, (_, place, _) in rows]),
     )
     return ratings, tuple(routes)
 
