@@ -112,6 +112,25 @@ def test_routes_of_one_number_in_other_sets_are_others(tmp_path: Path) -> None:
     assert len(both.rated_routes) == 4
 
 
+def test_trainings_that_differ_are_part_of_the_interval(tmp_path: Path) -> None:
+    """Two trainings of equal agents on twelve routes; then one training of the second is far better."""
+    rng, widths = np.random.default_rng(0), []
+    for offset in (0.0, 0.3):
+        folders: dict[str, list[str]] = {}
+        for name, shift in (("a0", 0.0), ("a1", 0.0), ("b0", 0.0), ("b1", offset)):
+            driven = 0.4 + shift + 0.02 * rng.normal(size=12)
+            drives: Given = {(str(k), 0): (float(value), [], DONE) for k, value in enumerate(driven)}
+            path = suite(tmp_path / f"{offset}{name}", drives)
+            folders.setdefault(name[0], []).append(str(path))
+        agents = [read_agent(f"{name}={','.join(of)}") for name, of in folders.items()]
+        found = compare(agents).differences["driving_score_1_0"]["b"]
+        assert found.mean == pytest.approx(50 * offset, abs=1.0)
+        assert found.low < found.mean < found.high
+        widths.append(found.high - found.low)
+    assert widths[0] < 10
+    assert widths[1] > 60  # two trainings 30 points apart, with one degree of freedom
+
+
 @pytest.mark.parametrize(
     "source",
     [

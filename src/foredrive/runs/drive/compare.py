@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float64
 
 from foredrive.driving.drive_record import DriveRecord
 from foredrive.driving.item_response import Ratings, rate
@@ -187,7 +188,8 @@ def _without_set(agents: Sequence[ComparedAgent]) -> list[ComparedAgent]:
 def compare(agents: Sequence[ComparedAgent], seed: int = 0, resamples: int = 10_000) -> Comparison:
     """Compare agents with the first one, on the drives that all have.
 
-    Intervals are those of a bootstrap over routes: repetitions of one route resemble each other. There are
+    Intervals are those of a bootstrap over routes: repetitions of one route resemble each other. Where an
+    agent has several folders, as of training seeds, what these differ by is part of the interval. There are
     none of fewer than `LEAST_ROUTES` routes.
 
     Args:
@@ -210,20 +212,13 @@ def compare(agents: Sequence[ComparedAgent], seed: int = 0, resamples: int = 10_
         reason = f" (failed drives: {failed})" if failed else ""
         raise InputError(f"the folders have no route and repetition in common{reason}: nothing to compare")
     keys = tuple(sorted(common, key=_order))
-    routes = [route for route, *_ in keys]
-    differences: dict[str, dict[str, BootstrapMean]] = {}
-    for metric in METRICS:
-        first = np.array(agents[0].values(metric, keys))
-        differences[metric] = {
-            agent.name: bootstrap_mean(
-                np.array(agent.values(metric, keys)) - first,
-                routes,
-                np.random.default_rng(seed),
-                resamples=resamples,
-                least=LEAST_ROUTES,
-            )
+    differences = {
+        metric: {
+            agent.name: _difference(agent, agents[0], metric, keys, np.random.default_rng(seed), resamples)
             for agent in agents[1:]
         }
+        for metric in METRICS
+    }
     everything = set.union(*(set(agent.drives) for agent in agents))
     return Comparison(
         tuple(agents),
@@ -234,6 +229,46 @@ def compare(agents: Sequence[ComparedAgent], seed: int = 0, resamples: int = 10_
         _unlike(agents),
         *_rated(agents, seed),
     )
+
+
+def _difference(
+    agent: ComparedAgent,
+    first: ComparedAgent,
+    metric: str,
+    keys: Sequence[Key],
+    rng: np.random.Generator,
+    resamples: int,
+) -> BootstrapMean:
+    """Return the mean difference of a metric between two agents with its interval."""
+    from scipy.stats import t as student  # takes 0.5 s
+
+    values = [np.array(one.values(metric, keys)) for one in (agent, first)]
+    routes, places = [route for route, *_ in keys], [place for _, place, _ in keys]
+    mean = bootstrap_mean(
+        values[0] - values[1], routes, rng, resamples=resamples, least=LEAST_ROUTES
+    )  # of one training each
+    if len(set(places)) == 1:
+        return mean
+    # The variance over routes, and for each agent that of the mean of its trainings. A bootstrap of two or
+    # three trainings would be too narrow, so their degrees of freedom count (Satterthwaite 1946)
+    of_routes = _means(values[0] - values[1], routes)
+    parts = [(float(np.var(of_routes, ddof=1)) / len(of_routes), len(of_routes) - 1)]
+    for of_agent in values:
+        of_places = _means(of_agent, places)
+        parts.append((float(np.var(of_places, ddof=1)) / len(of_places), len(of_places) - 1))
+    variance = sum(part for part, _ in parts)
+    if variance == 0.0 or np.isnan(mean.low):
+        return mean
+    freedom = variance**2 / sum(part**2 / count for part, count in parts)
+    reach = float(student.ppf(0.975, freedom)) * variance**0.5
+    p_value = float(2 * student.sf(abs(mean.mean) / variance**0.5, freedom))
+    return BootstrapMean(mean.mean, mean.mean - reach, mean.mean + reach, p_value)
+
+
+def _means(values: Float64[np.ndarray, "n"], groups: Sequence[str | int]) -> Float64[np.ndarray, "G"]:
+    """Return the mean of each group."""
+    _, which = np.unique(np.asarray(groups), return_inverse=True)
+    return np.asarray(np.bincount(which, values) / np.bincount(which))
 
 
 def _rated(agents: Sequence[ComparedAgent], seed: int) -> tuple[Ratings, tuple[str, ...]]:
