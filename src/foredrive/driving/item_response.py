@@ -171,18 +171,18 @@ def _cost(
     values: Float64[np.ndarray, "P"], drives: _Drives, weight: float
 ) -> tuple[float, Float64[np.ndarray, "P"]]:
     """Return the negative logarithm of likelihood and prior, and its gradient."""
-    found = _integrate(drives, values, weight)
+    integral = _integrate(drives, values, weight)
     precision = np.full(len(values), PRIOR_SPREAD**-2)
     precision[-1] = DIFFICULTY_SPREAD**-2
-    cost = 0.5 * float(precision @ values**2) - found.log_likelihood
-    return cost, precision * values - found.gradient.sum(0)
+    cost = 0.5 * float(precision @ values**2) - integral.log_likelihood
+    return cost, precision * values - integral.gradient.sum(0)
 
 
 def _fit(drives: _Drives) -> tuple[Float64[np.ndarray, "P"], float]:
     """Return the values of `_integrate` that are most likely, and the weight of a score.
 
     Scores between 0 and 1 vary less around their expectation than right or wrong answers do, so each says
-    more. Their weight is the inverse of their dispersion, found together with the abilities. Without it the
+    more. Their weight is the inverse of their dispersion, estimated together with the abilities. Without it the
     spread of difficulties, and with it that of abilities, is estimated too small. Scores of 0 and 1 alone are
     answers, and count 1.
     """
@@ -194,10 +194,10 @@ def _fit(drives: _Drives) -> tuple[Float64[np.ndarray, "P"], float]:
         values = minimize(_cost, values, (drives, weight), "BFGS", jac=True, options={"gtol": 1e-7}).x
         if answers:
             break
-        found = _integrate(drives, values, weight)
-        likely = found.posterior[drives.route]
-        squared = ((drives.score[:, None] - found.expected) ** 2 * likely).sum()
-        of_answers = (found.expected * (1 - found.expected) * likely).sum()
+        integral = _integrate(drives, values, weight)
+        likely = integral.posterior[drives.route]
+        squared = ((drives.score[:, None] - integral.expected) ** 2 * likely).sum()
+        of_answers = (integral.expected * (1 - integral.expected) * likely).sum()
         before, weight = weight, float(np.clip(of_answers / max(squared, 1e-12), 1.0, MAX_WEIGHT))
         if abs(weight - before) < _WEIGHED * before:
             break
@@ -241,8 +241,8 @@ def _between_trainings(
     drives: _Drives, values: Float64[np.ndarray, "P"], weight: float
 ) -> Float64[np.ndarray, "A"]:
     """Return the variance that the trainings of each agent contribute to its gradient; 0 for one training."""
-    found = _integrate(drives, values, weight)
-    residual = weight * (drives.score[:, None] - found.expected) * found.posterior[drives.route]
+    integral = _integrate(drives, values, weight)
+    residual = weight * (drives.score[:, None] - integral.expected) * integral.posterior[drives.route]
     total = residual.sum(1)
     variance = np.zeros(drives.agents)
     for agent in range(drives.agents):

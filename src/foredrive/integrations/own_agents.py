@@ -96,13 +96,13 @@ def files_of(agent: str) -> list[Path]:
         root = file.parents[place.count(".") + (file.name == "__init__.py")]
     else:
         file, root = Path(place), Path(place).parent
-    found, todo = list[Path](), [file.absolute()]
+    files, todo = list[Path](), [file.absolute()]
     while todo:
-        if (path := todo.pop()) not in found:
-            found.append(path)
+        if (path := todo.pop()) not in files:
+            files.append(path)
             todo += _imported(path, root.absolute())
     named = (Path(value) for value in arguments.values() if isinstance(value, str))
-    return sorted(found) + sorted(path.absolute() for path in named if path.is_file())
+    return sorted(files) + sorted(path.absolute() for path in named if path.is_file())
 
 
 def _imported(file: Path, root: Path) -> Iterator[Path]:
@@ -119,8 +119,8 @@ def _imported(file: Path, root: Path) -> Iterator[Path]:
             continue
         for name in names:
             path = base.joinpath(*name.split("."))
-            there = (path.with_suffix(".py"), path / "__init__.py")
-            yield from (each for each in there if name and each.is_file())
+            candidates = (path.with_suffix(".py"), path / "__init__.py")
+            yield from (module for module in candidates if name and module.is_file())
 
 
 def own_agent(agent: str) -> "OwnAgent":

@@ -102,7 +102,7 @@ class RouteSource:
     def conditions_of(self, route: str, seed: int) -> Conditions | None:
         """Return the conditions of the drive of a route with a seed."""
         if self.conditions is None:
-            of_file = (each.weathers for each in load_route_set(self.routes) if each.id == route)
+            of_file = (one.weathers for one in load_route_set(self.routes) if one.id == route)
             return next(iter(next(of_file, ())), None)
         if self.conditions != ANY_CONDITIONS:
             return find_conditions(self.conditions)
