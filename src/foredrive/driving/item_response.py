@@ -182,9 +182,9 @@ def _fit(drives: _Drives) -> tuple[Float64[np.ndarray, "P"], float]:
     """Return the values of `_integrate` that are most likely, and the weight of a score.
 
     Scores between 0 and 1 vary less around their expectation than right or wrong answers do, so each says
-    more. Their weight is the inverse of their dispersion, estimated together with the abilities. Without it the
-    spread of difficulties, and with it that of abilities, is estimated too small. Scores of 0 and 1 alone are
-    answers, and count 1.
+    more. Their weight is the inverse of their dispersion, estimated together with the abilities. Without it
+    the spread of difficulties, and with it that of abilities, is estimated too small. Scores of 0 and 1 alone
+    are answers, and count 1.
     """
     from scipy.optimize import minimize  # takes 0.3 s
 

@@ -219,9 +219,11 @@ def _of_user(agent: str, made: Callable[[], Any]) -> Any:
     try:
         return made()
     except Exception as error:  # any error of the user's own code
-        at = traceback.extract_tb(error.__traceback__)[-1]
+        place = traceback.extract_tb(error.__traceback__)[-1]
         text = f"{type(error).__name__}: {error}".splitlines()[0]
-        raise InputError(f"{agent}: cannot be made: {text} ({at.filename}, line {at.lineno})") from error
+        raise InputError(
+            f"{agent}: cannot be made: {text} ({place.filename}, line {place.lineno})"
+        ) from error
 
 
 def _made_by(agent: str) -> tuple[Callable[..., Any], dict[str, Any]]:
