@@ -24,7 +24,7 @@ CONCENTRATION = 2.0
 
 
 def measure(seed: int, kind: Literal["answers", "graded"]) -> Mapping[str, float]:
-    """Return for each size the share of intervals that hold the true ability, and how far abilities spread."""
+    """Return for each size the share of intervals that hold the true ability, and how far they spread."""
     figures: dict[str, float] = {}
     for agents in AGENTS:
         for routes in ROUTES:
