@@ -108,7 +108,8 @@ def rate(
     # Only differences of abilities count
     middle = values[: drives.agents].mean()
     ability = values[: drives.agents] - middle
-    draws = rng.multivariate_normal(ability, covariance, DRAWS, method="eigh")
+    # A covariance around the mean has no full rank, so it is not checked for being one
+    draws = rng.multivariate_normal(ability, covariance, DRAWS, "ignore", method="eigh")
     if drives.routes < LEAST_ROUTES:
         reach, draws = np.full_like(reach, np.nan), np.full_like(draws, np.nan)
     ranks = _ranks(draws) if drives.routes >= LEAST_ROUTES else draws

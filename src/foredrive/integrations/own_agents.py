@@ -219,7 +219,9 @@ def _of_user(agent: str, made: Callable[[], Any]) -> Any:
     try:
         return made()
     except Exception as error:  # any error of the user's own code
-        place = traceback.extract_tb(error.__traceback__)[-1]
+        lines = traceback.extract_tb(error.__traceback__)
+        # The last line of the user's own code; what is below are the libraries that it calls
+        place = next((line for line in reversed(lines) if "site-packages" not in line.filename), lines[-1])
         text = f"{type(error).__name__}: {error}".splitlines()[0]
         raise InputError(
             f"{agent}: cannot be made: {text} ({place.filename}, line {place.lineno})"
