@@ -224,3 +224,22 @@ def write_ros2(
             if topic not in opened:
                 opened[topic] = writer.add_connection(topic, kind, typestore=messages.store)
             writer.write(opened[topic], t_ns, messages.store.serialize_cdr(message, kind))
+
+
+def write_mcap_of_ros1(path: Path) -> None:
+    """Write the recording as `mcap convert` does from a ROS 1 bag, in chunks of some messages."""
+    from mcap.writer import Writer
+
+    messages = Messages(1)
+    with path.open("wb") as file:
+        writer = Writer(file, chunk_size=4096)
+        writer.start(profile="ros1")
+        channels: dict[str, int] = {}
+        for topic, t_ns, message in messages.recording():
+            kind = message.__msgtype__
+            if topic not in channels:
+                schema = writer.register_schema(kind.replace("/msg/", "/"), "ros1msg", b"")
+                channels[topic] = writer.register_channel(topic, "ros1", schema)
+            data = bytes(messages.store.serialize_ros1(message, kind))
+            writer.add_message(channels[topic], t_ns, data, t_ns)
+        writer.finish()

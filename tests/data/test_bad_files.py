@@ -31,7 +31,8 @@ from PIL import Image
 from foredrive.data.boxes import read_tracks
 from foredrive.data.cameras import pinhole_cameras, read_camera
 from foredrive.data.clip_list import ListedClip, clip_list, read_clip_list, write_clip_list
-from foredrive.data.formats.bag_topics import propose_topics, topics_file
+from foredrive.data.formats.bag_proposal import propose_topics
+from foredrive.data.formats.bag_topics import topics_file
 from foredrive.data.formats.convert import convert
 from foredrive.data.formats.nuscenes_names import read_table
 from foredrive.data.lidar import read_sweep
@@ -346,8 +347,8 @@ HARMLESS = {
         for damage in ("an alias of itself", "an entry twice", "longer than any")
     ),
     *(
-        ("ros2 folder", "metadata.yaml", damage)  # read by rosbags, which copies nothing of it
-        for damage in ("an unknown entry", "an alias of itself", "longer than any")
+        ("ros2 folder", "metadata.yaml", damage)  # only the names of the files are read of it
+        for damage in ("an unknown entry", "an alias of itself", "longer than any", "cut in half")
     ),
     ("scores", "scores.json", "empty"),  # no frame is scored
     ("scores", "scores.json", "not a number"),  # scores may be infinite or unknown

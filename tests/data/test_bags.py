@@ -11,15 +11,16 @@ from rosbags.rosbag2 import StoragePlugin
 
 from foredrive.cli.main import main
 from foredrive.data.cameras import pinhole_cameras, read_camera
+from foredrive.data.formats.bag_images import read_image
 from foredrive.data.formats.bag_messages import (
     Placed,
     read_calibration,
     read_cloud,
-    read_image,
     seconds_since_stamp,
     time_unit,
 )
-from foredrive.data.formats.bag_topics import propose_topics, read_topics, topics_file
+from foredrive.data.formats.bag_proposal import propose_topics
+from foredrive.data.formats.bag_topics import read_topics, topics_file
 from foredrive.data.formats.convert import convert
 from foredrive.data.formats.frame_tree import FrameTree
 from foredrive.data.lidar import read_sweep
@@ -197,7 +198,8 @@ def test_damaged_messages_are_left_out_and_counted(tmp_path: Path) -> None:
         "/lidar/points: unreadable messages, left out: 1 (message 3, 1700000000.300 s: a point cloud of 2",
     )
     assert all(any(notice.startswith(start) for notice in notices) for start in starts)
-    assert len(notices) == 3
+    assert any(each.startswith("/front/image_raw/compressed: frames without a message") for each in notices)
+    assert len(notices) == 4
 
 
 def test_a_topic_without_any_readable_message_is_refused(tmp_path: Path) -> None:
@@ -207,8 +209,10 @@ def test_a_topic_without_any_readable_message_is_refused(tmp_path: Path) -> None
                 message.data = message.data[:60]
         return recording
 
+    cameras = {"front": {"images": "/front/image_raw/compressed", "info": "/front/camera_info"}}
+    bag = changed_bag(tmp_path, damage, cameras=cameras)
     with pytest.raises(InputError, match=r"/compressed: none of its messages can be read; message 0, 17000"):
-        convert(changed_bag(tmp_path, damage), "rosbag", tmp_path / "out")
+        convert(bag, "rosbag", tmp_path / "out")
     assert not list((tmp_path / "out").rglob("*.arrow"))
 
 
@@ -230,9 +234,8 @@ def test_poses_a_microsecond_beside_frames_and_messages_out_of_order(tmp_path: P
     for k in range(len(log)):
         sweep = read_sweep(log, k)
         assert sweep is not None
-    assert read_notices(path.folder)[0] == (
-        "/lidar/points: messages out of order, sorted by their stamps: 1 (message 2, 1700000000.100 s)"
-    )
+    told = "/lidar/points: messages out of order, sorted by their stamps: 1 (message 2, 1700000000.100 s)"
+    assert told in read_notices(path.folder)
 
 
 def test_poses_of_the_named_topic_are_not_mixed_with_transforms(tmp_path: Path) -> None:
@@ -406,8 +409,8 @@ def test_a_bag_whose_point_times_fit_no_unit_asks_for_it(tmp_path: Path) -> None
     assert sweep[0].dt_s.tolist() == [0.0, 0.0]
 
 
-@pytest.mark.parametrize("end", [0, 10, 1000, -200])
-def test_a_cut_bag_is_named(end: int, tmp_path: Path) -> None:
+@pytest.mark.parametrize("end", [0, 10, 1000])
+def test_a_bag_without_a_whole_message_is_named(end: int, tmp_path: Path) -> None:
     bag = ros1(tmp_path)
     bag.write_bytes(bag.read_bytes()[:end])
     code = main(["convert", "rosbag", str(bag), "--propose"])
@@ -457,7 +460,7 @@ def test_transforms_in_a_circle_are_refused() -> None:
     T = np.eye(4)
     tree = FrameTree([Placed("a", "b", 0, T), Placed("b", "a", 0, T)])
     with pytest.raises(InputError, match="in a circle"):
-        tree.between("a", "b", 0)
+        tree.between("a", "b", np.array([0]))
 
 
 def test_a_tree_of_frames_joins_fixed_and_moving_ones() -> None:
@@ -479,4 +482,4 @@ def test_a_tree_of_frames_joins_fixed_and_moving_ones() -> None:
     assert tree.span_us("map", "base") == (0, 1_000_000)
     poses = tree.pose("map", "base", np.array([0.0, 250_000.0, 2e6]))
     assert poses[:, 0, 3].tolist() == [100.0, 100.5, 102.0]
-    assert tree.between("base", "lidar", 750_000)[0, 3] == pytest.approx(1.5)
+    assert tree.between("base", "lidar", np.array([750_000]))[0, 0, 3] == pytest.approx(1.5)

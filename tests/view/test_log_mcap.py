@@ -14,7 +14,8 @@ from miniature import write_log
 from foredrive.cli.main import main
 from foredrive.data.boxes import read_boxes
 from foredrive.data.cameras import encoded_image, pinhole_cameras, read_camera
-from foredrive.data.formats.bag_topics import propose_topics, topics_file
+from foredrive.data.formats.bag_proposal import propose_topics
+from foredrive.data.formats.bag_topics import topics_file
 from foredrive.data.formats.convert import convert
 from foredrive.data.lidar import read_sweep
 from foredrive.data.logs import Log

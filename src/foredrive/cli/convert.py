@@ -81,7 +81,8 @@ def convert(
 
 def _propose(bag: Path, topics: Path | None) -> None:
     with importing():
-        from foredrive.data.formats.bag_topics import propose_topics, topics_file
+        from foredrive.data.formats.bag_proposal import propose_topics
+        from foredrive.data.formats.bag_topics import topics_file
         from foredrive.data.formats.guard import reading_raw
 
     file = topics or topics_file(bag)

@@ -29,7 +29,9 @@ def decoded(image: Path | str | bytes) -> Shaped[np.ndarray, "H W *channels"]:
     try:
         with Image.open(io.BytesIO(image) if isinstance(image, bytes) else image) as opened:
             return np.asarray(opened if opened.mode in _DEEP_MODES else opened.convert("RGB"))
-    except (OSError, UnidentifiedImageError, Image.DecompressionBombError, SyntaxError, ValueError) as error:
+    except UnidentifiedImageError as error:  # its text has the address of an object
+        raise InputError(f"{name}cannot read the image: its format is not known") from error
+    except (OSError, Image.DecompressionBombError, SyntaxError, ValueError) as error:
         raise InputError(f"{name}cannot read the image: {error}") from error
 
 

@@ -27,7 +27,7 @@ from foredrive.data.arrow_files import (
     pose_matrices,
     reading,
 )
-from foredrive.data.ego_path import interpolated_poses
+from foredrive.data.ego_path import MAX_GAP_S, interpolated_poses
 from foredrive.data.log_mirror import hold
 from foredrive.data.log_paths import LogPath
 from foredrive.errors import InputError
@@ -88,8 +88,6 @@ def _read_metadata(folder: Path) -> LogDirectoryMetadata:
 
 
 _EGO = ModalityType.EGO_STATE_SE3.serialize()
-_MAX_GAP_S = 1.0
-"""Maximum time between ego poses for interpolation."""
 
 
 class Log:
@@ -231,7 +229,7 @@ class Log:
         return (
             (t_us >= times_us[0])
             & (t_us <= times_us[-1])
-            & (times_us[after] - times_us[after - 1] <= _MAX_GAP_S * 1e6)
+            & (times_us[after] - times_us[after - 1] <= MAX_GAP_S * 1e6)
         )
 
     def _read_ego(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

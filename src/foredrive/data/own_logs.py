@@ -19,7 +19,7 @@ from py123d.geometry import PoseSE3
 
 from foredrive.data.camera_streams import CameraSpec
 from foredrive.data.category_names import category_named
-from foredrive.data.ego_path import interpolated_poses
+from foredrive.data.ego_path import MAX_GAP_S, interpolated_poses
 from foredrive.data.images import read_rgb, whole_jpeg
 from foredrive.data.log_paths import LogPath
 from foredrive.data.log_writer import Frame, LogWriter
@@ -29,6 +29,8 @@ from foredrive.scene.boxes import unlabelled
 
 Num = Shaped[np.ndarray, "..."]
 RGB = UInt8[np.ndarray, "H W 3"]
+Exposure = tuple[int, Float64[np.ndarray, "4 4"]]
+"""Time (µs) of an image, and pose of the vehicle."""
 DATASET = "own"
 _MAX_S = 1e11
 """Times beyond the year 5000 are in another unit."""
@@ -88,6 +90,7 @@ def write_log(
     cameras: Sequence[CameraSpec] = (),
     images: Mapping[str, Sequence[Path | str | bytes | Num | None]] | None = None,
     image_t_s: Mapping[str, Num] | None = None,
+    image_mounts: Mapping[str, Num] | None = None,
     sweeps: Sequence[Points | LidarSweep | None] | None = None,
     lidar_position_m: tuple[float, float, float] = (0.0, 0.0, 1.8),
     boxes: Sequence[Sequence[Box] | None] | None = None,
@@ -112,6 +115,7 @@ def write_log(
         images: by camera: image files, their bytes, or uint8 RGB arrays [H, W, 3].
         image_t_s: by camera: time at which the middle row of each image was exposed. Default: that of the
             frame. Poses between frames are interpolated.
+        image_mounts: by camera that moves on the vehicle, as on a pan unit: T_ego_cam [T, 4, 4].
         sweeps: points of the lidar, whose beams that did not return are unknown; or whole sweeps, unbatched,
             in the ego frame at the frame's time, where they are known if there are any.
         lidar_position_m: of the lidar, in the ego frame.
@@ -134,13 +138,19 @@ def write_log(
         drive = dataclasses.replace(drive, denser=denser)
     # All checks that need no file come before the first frame is written
     _check_cameras(name, cameras)
-    images, image_t_s = images or {}, image_t_s or {}
+    images, image_t_s, image_mounts = images or {}, image_t_s or {}, image_mounts or {}
     given: dict[str, Sequence[Any] | np.ndarray | None] = {"sweeps": sweeps, "boxes": boxes, **image_t_s}
+    given |= {f"mounts of {camera}": mounts for camera, mounts in image_mounts.items()}
     _check_counts(
         name, len(drive.t_us), given | {f"images of {camera}": rows for camera, rows in images.items()}
     )
     _check_image_times(name, images, image_t_s)
     exposed = {camera: drive.exposures(np.asarray(times)) for camera, times in image_t_s.items()}
+    for spec in cameras:
+        if spec.name in image_mounts:
+            exposed[spec.name] = _moved(
+                exposed.get(spec.name) or drive.exposures(t_s), spec, image_mounts[spec.name]
+            )
     place = (Path(out), split, name, list(cameras), None, None, None)
     with LogWriter(*place, vehicle=_metadata(vehicle), dataset=DATASET) as writer:
         for frame in range(len(drive.t_us)):
@@ -231,17 +241,32 @@ class _Drive:
         )
         return interpolated_poses(times_us, np.concatenate([before[None], T, after[None]]), t_us)
 
-    def exposures(self, t_s: Float64[np.ndarray, "T"]) -> list[tuple[int, Float64[np.ndarray, "4 4"]]]:
+    def exposures(self, t_s: Float64[np.ndarray, "T"]) -> list[Exposure]:
         """Return time (µs) and pose at times at which images were taken."""
         t_us = np.round(t_s * 1e6)
         return list(zip(t_us.astype(np.int64).tolist(), self.poses_at(t_us), strict=True))
 
 
+def _moved(exposed: list[Exposure], spec: CameraSpec, T_ego_cam: Num) -> list[Exposure]:
+    """Return the exposures with the vehicle moved, so that the camera's mount puts it where it was."""
+    T_cam_ego = np.linalg.inv(spec.T_ego_cam)
+    return [
+        (t_us, T @ mount @ T_cam_ego) for (t_us, T), mount in zip(exposed, np.asarray(T_ego_cam), strict=True)
+    ]
+
+
 def _rates(values: Float64[np.ndarray, "T 3"], t_us: Int64[np.ndarray, "T"]) -> Float64[np.ndarray, "T 3"]:
-    """Return the rate of change (per s) since the frame before; the first frame's is that of the second."""
+    """Return the rate of change (per s) since the frame before; the first frame's is that of the second.
+
+    A frame behind a hole of more than `MAX_GAP_S` is a first one: its rate is that of the frame after it.
+    """
     if len(t_us) == 1:
         return np.zeros_like(values)
-    rate = np.diff(values, axis=0) / (np.diff(t_us)[:, None] * 1e-6)
+    dt_s = np.diff(t_us) * 1e-6
+    rate = np.diff(values, axis=0) / dt_s[:, None]
+    for hole in np.flatnonzero(dt_s > MAX_GAP_S)[::-1]:
+        if hole + 1 < len(rate):
+            rate[hole] = rate[hole + 1]
     return np.concatenate([rate[:1], rate])
 
 
@@ -258,7 +283,7 @@ def _check_cameras(name: str, cameras: Sequence[CameraSpec]) -> None:
             raise InputError(f"{name}: the calibration of {spec.name} is not finite")
         if K[0, 0] <= 0 or K[1, 1] <= 0:
             raise InputError(f"{name}: the focal lengths of {spec.name} must be above 0")
-        if not np.allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-3):
+        if not np.allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-3) or np.linalg.det(T[:3, :3]) < 0:
             raise InputError(f"{name}: T_ego_cam of {spec.name} holds a rotation that is none")
 
 

@@ -1,74 +1,29 @@
-"""Messages of ROS 1 bags, ROS 2 bags and MCAP files of ROS or Foxglove messages.
-
-ROS messages are read by the definitions that come with `rosbags`, not by those embedded in a bag, from which
-`rosbags` would generate code. Foxglove's protocol buffers are read by `mcap-protobuf-support`.
-"""
+"""Opening of ROS 1 bags, ROS 2 bags and MCAP files of ROS or Foxglove messages."""
 
 import contextlib
 import functools
 import importlib.util
-from collections import Counter
-from collections.abc import Callable, Collection, Iterator
-from dataclasses import dataclass
+import re
+from collections.abc import Collection, Iterator
 from pathlib import Path
-from typing import Any
 
+from foredrive.data.formats.bag1_rest import open_rest
+from foredrive.data.formats.bag_contents import Bag, Message, Topic, joined_topics, ros_decoder
+from foredrive.data.formats.mcap_files import open_mcap
+from foredrive.data.notices import note
 from foredrive.errors import InputError
 from foredrive.plain_yaml import read_yaml
 
-KINDS = {
-    "sensor_msgs/msg/Image": "image",
-    "sensor_msgs/msg/CompressedImage": "image",
-    "sensor_msgs/msg/CameraInfo": "info",
-    "sensor_msgs/msg/PointCloud2": "points",
-    "tf2_msgs/msg/TFMessage": "tf",
-    "tf/msg/tfMessage": "tf",
-    "nav_msgs/msg/Odometry": "odometry",
-    "geometry_msgs/msg/PoseStamped": "pose",
-    "geometry_msgs/msg/PoseWithCovarianceStamped": "pose",
-    "foxglove.RawImage": "image",
-    "foxglove.CompressedImage": "image",
-    "foxglove.CameraCalibration": "info",
-    "foxglove.PointCloud": "points",
-    "foxglove.FrameTransform": "tf",
-    "foxglove.FrameTransforms": "tf",
-    "foxglove.PoseInFrame": "pose",
-}
-"""Kind of sensor data by message type. Other types are left out."""
+_METADATA = "metadata.yaml"
+_PART = re.compile(r"(.+)_(\d+)\.(mcap|db3)")
 
 
-@dataclass(frozen=True)
-class Message:
-    """One message as it lies in a bag."""
+def is_bag(path: Path) -> bool:
+    """Return whether a path is that of one bag, and not of a folder of bags.
 
-    topic: str
-    recorded_s: float
-    """When the recorder received it, s. The stamp of what it measured is in its content."""
-    decode: Callable[[], Any]
-    """Returns its content; raises an error of any class if the message is damaged."""
-
-
-@dataclass(frozen=True)
-class Topic:
-    """One topic of a bag."""
-
-    name: str
-    type: str
-    count: int
-
-    @property
-    def kind(self) -> str | None:
-        """Return what its messages hold, or None for a type that is not read."""
-        return KINDS.get(self.type)
-
-
-@dataclass(frozen=True)
-class Bag:
-    """An open bag."""
-
-    topics: dict[str, Topic]
-    read: Callable[[Collection[str]], Iterator[Message]]
-    """Yields the messages of the named topics in the order of the bag."""
+    The folder of a ROS 2 bag has its metadata, unless the recorder was cut off before it wrote them.
+    """
+    return path.is_file() or (path / _METADATA).is_file() or bool(_numbered(path))
 
 
 @contextlib.contextmanager
@@ -81,32 +36,65 @@ def open_bag(path: Path) -> Iterator[Bag]:
     for package in ("rosbags", "mcap"):
         if importlib.util.find_spec(package) is None:
             raise InputError(f"bags need the package {package}: pip install 'foredrive[bags]'")
-    # A ROS 2 bag is a folder with its metadata, or a single file
-    ros2_folder = path.is_dir() and (path / "metadata.yaml").is_file()
-    if not ros2_folder and path.suffix not in (".bag", ".db3", ".mcap"):
+    described = path.is_dir() and (path / _METADATA).is_file()
+    parts = [path] if path.is_file() else _described(path) if described else _numbered(path)
+    if parts and all(part.suffix == ".mcap" and part.is_file() for part in parts):
+        if path.is_dir() and not described:
+            note(path.name, f"no {_METADATA}; {len(parts)} files were read as one bag")
+        yield open_mcap(parts)
+    elif path.suffix == ".bag" or path.name.endswith(".bag.active"):
+        with _open_ros1(path) as bag:
+            yield bag
+    elif path.suffix == ".db3" or described:
+        with _open_ros2(path) as bag:
+            yield bag
+    elif parts and path.is_dir():
+        raise InputError(f"{path}: a ROS 2 bag without metadata.yaml; write it by: ros2 bag reindex {path}")
+    else:
         raise InputError(f"{path}: neither a .bag, .db3 or .mcap nor the folder of a ROS 2 bag")
-    if ros2_folder:  # the reader of rosbags would follow aliases of aliases for ever
-        read_yaml(path / "metadata.yaml", "the metadata of a bag")
-    with _open_foxglove(path) if _is_foxglove(path) else _open_ros(path) as bag:
-        yield bag
+
+
+def _described(folder: Path) -> list[Path]:
+    """Return the files that the metadata of a ROS 2 bag name, and those that they should name."""
+    # The reader of rosbags would follow aliases of aliases in the metadata for ever
+    metadata = read_yaml(folder / _METADATA, "the metadata of a bag")
+    bag = metadata.get("rosbag2_bagfile_information") if isinstance(metadata, dict) else None
+    names = bag.get("relative_file_paths") if isinstance(bag, dict) else None
+    files = [folder / Path(str(name)).name for name in names] if isinstance(names, list) else []
+    # Metadata of a recorder that was cut off may end with an earlier file
+    numbered = _numbered(folder)
+    if not set(files) < set(numbered):
+        return files
+    for file in set(numbered) - set(files):
+        note(folder.name, f"files that {_METADATA} does not name, read as well", file.name)
+    return numbered
+
+
+def _numbered(folder: Path) -> list[Path]:
+    """Return the files of a ROS 2 bag without metadata: NAME_0.mcap, NAME_1.mcap, … or the same with .db3.
+
+    Bags that have YAML files beside them are bags of their own.
+    """
+    if any(folder.glob("*.topics.yaml")):
+        return []
+    matches = [(match, file) for file in folder.glob("*") if (match := _PART.fullmatch(file.name))]
+    files = [file for _, file in sorted((int(match[2]), file) for match, file in matches)]
+    whole = sorted(int(match[2]) for match, _ in matches) == list(range(len(matches)))
+    return files if whole and len({(match[1], match[3]) for match, _ in matches}) == 1 else []
 
 
 @contextlib.contextmanager
-def _open_ros(path: Path) -> Iterator[Bag]:
-    from rosbags.rosbag1 import Reader as Reader1
-    from rosbags.rosbag2 import Reader as Reader2
-    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+def _open_ros1(path: Path) -> Iterator[Bag]:
+    from rosbags.rosbag1 import Reader
 
-    is_ros1 = path.suffix == ".bag"
-    types = get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.LATEST)
-    if is_ros1:  # rosbags' definitions of ROS 1 lack these
-        for name in ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage"):
-            types.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", name))
-    decode = types.deserialize_ros1 if is_ros1 else types.deserialize_cdr
-    with Reader1(path) if is_ros1 else Reader2(path) as reader:
-        topics = {
-            name: Topic(name, info.msgtype or "", info.msgcount) for name, info in reader.topics.items()
-        }
+    try:
+        reader = Reader(path)
+        reader.open()
+    except Exception:  # of a bag without an index, rosbags 0.11 raises errors of several classes
+        yield open_rest(path)
+        return
+    with contextlib.closing(reader):
+        decode = ros_decoder(1)
 
         def read(names: Collection[str]) -> Iterator[Message]:
             # Only connections of the named topics are read
@@ -115,51 +103,29 @@ def _open_ros(path: Path) -> Iterator[Bag]:
                 content = functools.partial(decode, data, connection.msgtype)
                 yield Message(connection.topic, t_ns * 1e-9, content)
 
-        yield Bag(topics, read)
-
-
-def _is_foxglove(path: Path) -> bool:
-    """Return whether an MCAP file has protocol buffers."""
-    if path.suffix != ".mcap":
-        return False
-    from mcap.reader import make_reader
-
-    with path.open("rb") as file:
-        summary = make_reader(file).get_summary()
-        return summary is not None and any(one.encoding == "protobuf" for one in summary.schemas.values())
+        yield Bag(
+            joined_topics(Topic(one.topic, one.msgtype, one.msgcount) for one in reader.connections), read
+        )
 
 
 @contextlib.contextmanager
-def _open_foxglove(path: Path) -> Iterator[Bag]:
-    if importlib.util.find_spec("mcap_protobuf") is None:
-        raise InputError("Foxglove's MCAP needs mcap-protobuf-support: pip install 'foredrive[bags]'")
-    from mcap.reader import make_reader
-    from mcap_protobuf.decoder import DecoderFactory
+def _open_ros2(path: Path) -> Iterator[Bag]:
+    from rosbags.rosbag2 import Reader
 
-    with path.open("rb") as file:
-        summary = make_reader(file).get_summary()
-    if summary is None:
-        raise InputError(f"{path}: an MCAP file without a summary; it was not closed")
-    counts = Counter(summary.statistics.channel_message_counts if summary.statistics else {})
-    topics = {
-        one.topic: Topic(one.topic, summary.schemas[one.schema_id].name, counts[one.id])
-        for one in summary.channels.values()
-        if one.schema_id in summary.schemas
-    }
+    decode = ros_decoder(2)
+    with Reader(path) as reader:
 
-    decoders = DecoderFactory()
+        def read(names: Collection[str]) -> Iterator[Message]:
+            wanted = [one for one in reader.connections if one.topic in names]
+            try:
+                for connection, t_ns, data in reader.messages(connections=wanted) if wanted else ():
+                    content = functools.partial(decode, data, connection.msgtype)
+                    yield Message(connection.topic, t_ns * 1e-9, content)
+            except Exception as error:  # sqlite3's in rosbags 0.10, apsw's in 0.11
+                if type(error).__name__ not in ("DatabaseError", "CorruptError"):
+                    raise
+                note(path.name, f"the recording is damaged; what comes before that was read: {error}")
 
-    def decoded(schema: Any, channel: Any, data: bytes) -> Any:
-        decoder = decoders.decoder_for(channel.message_encoding, schema)
-        if decoder is None:
-            raise InputError(f"messages of encoding {channel.message_encoding!r} are not read")
-        return decoder(data)
-
-    def read(names: Collection[str]) -> Iterator[Message]:
-        with path.open("rb") as opened:
-            reader = make_reader(opened)
-            for schema, channel, message in reader.iter_messages(topics=list(names)) if names else ():
-                content = functools.partial(decoded, schema, channel, message.data)
-                yield Message(channel.topic, message.log_time * 1e-9, content)
-
-    yield Bag(topics, read)
+        yield Bag(
+            joined_topics(Topic(one.topic, one.msgtype, one.msgcount) for one in reader.connections), read
+        )

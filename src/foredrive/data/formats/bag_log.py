@@ -7,27 +7,29 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float64, UInt8
+from jaxtyping import Float64, Int64, UInt8
 from py123d.datatypes import LogMetadata
-from scipy.spatial.transform import Rotation
 
 from foredrive.data.camera_streams import CameraSpec
-from foredrive.data.formats.bag_files import Bag, Message, open_bag
-from foredrive.data.formats.bag_index import BagIndex, index_bag, transforms
+from foredrive.data.ego_path import MAX_GAP_S
+from foredrive.data.formats.bag_contents import Bag, Message
+from foredrive.data.formats.bag_files import is_bag, open_bag
+from foredrive.data.formats.bag_images import read_image, read_pixels
+from foredrive.data.formats.bag_index import BagIndex, Stamp, index_bag, transforms
 from foredrive.data.formats.bag_messages import (
     Calibration,
-    frame_of,
+    read_calibration,
     read_cloud,
-    read_image,
-    read_pixels,
     seconds_since_stamp,
     stamp_us,
     time_unit,
 )
+from foredrive.data.formats.bag_mounts import USUAL_POSITION_M, Mounts
 from foredrive.data.formats.bag_topics import (
     BagTopics,
     CameraTopics,
-    Mount,
+    LidarTopic,
+    is_rectified_camera,
     read_topics,
     topics_file,
 )
@@ -40,6 +42,8 @@ from foredrive.data.notices import note
 from foredrive.data.own_logs import Points, write_log
 from foredrive.errors import InputError
 
+_NEAR_M = 1e-3
+
 
 def find_bags(source: Path, topics: Path | None = None) -> Iterator[RawLog]:
     """Yield a bag, or the bags of a folder that have their YAML beside them.
@@ -47,7 +51,7 @@ def find_bags(source: Path, topics: Path | None = None) -> Iterator[RawLog]:
     Raises:
         InputError: the YAML of the bag is missing.
     """
-    bags = [source] if source.is_file() or (source / "metadata.yaml").is_file() else []
+    bags = [source] if is_bag(source) else []
     if not bags:
         # A folder without metadata may hold several bags, each with its YAML beside it
         files = sorted(source.glob("*.topics.yaml"))
@@ -86,36 +90,35 @@ class BagLog:
                 tree.pose(topics.world_frame, topics.ego_frame, times_us.astype(np.float64)) @ T_ego_origin
             )
 
-            def mounted(topic: str, frame: str | None, mount: Mount | None) -> Float64[np.ndarray, "4 4"]:
-                if mount is not None:
-                    T = _matrix(mount)
-                else:
-                    # Sensors do not move on the vehicle, so one time is enough
-                    sensor = frame or frame_of(index.first[topic])
-                    T = tree.between(topics.ego_frame, sensor, int(times_us[0]))
-                return np.asarray(np.linalg.inv(T_ego_origin) @ T)
-
-            images, image_t_s, cameras = {}, {}, []
+            mounts = Mounts(tree, topics.ego_frame, T_ego_origin)
+            images, image_t_s, image_mounts, cameras = {}, {}, {}, []
             for name, camera in topics.cameras.items():
                 # Each camera is a stream of images, read one at a time
                 calibration = _calibration(camera, index)
-                T_ego_cam = mounted(camera.images, camera.frame, camera.mount)
-                spec = CameraSpec(name, calibration.K, T_ego_cam, calibration.size_hw, dist=calibration.dist)
-                cameras.append(spec)
-                read = functools.partial(_image, size_hw=spec.size_hw, value_range=camera.value_range)
-                stream = _Stream(bag, camera.images, index.stamps[camera.images], times_us, read)
+                stamps, first = index.stamps[camera.images], index.first[camera.images]
+                read = functools.partial(_image, size_hw=calibration.size_hw, value_range=camera.value_range)
+                stream = _Stream(bag, camera.images, stamps, times_us, read)
+                T_ego_cam = mounts.of_camera(camera, first, stream.t_us)
+                T_ego_cam[:, :3, :3] = T_ego_cam[:, :3, :3] @ calibration.R_optical_cam
+                cameras.append(
+                    CameraSpec(name, calibration.K, T_ego_cam[0], calibration.size_hw, dist=calibration.dist)
+                )
                 images[name], image_t_s[name] = stream, stream.t_us * 1e-6
+                if not np.allclose(T_ego_cam, T_ego_cam[:1], atol=1e-6):
+                    note(
+                        camera.images, "its camera moves on the vehicle; each image has the mount of its time"
+                    )
+                    image_mounts[name] = T_ego_cam
                 if camera.value_range is not None:
                     low, high = camera.value_range
                     note(camera.images, f"images of 16 bits; {low:g} became 0 and {high:g} became 255")
             # Without a lidar its position is unimportant: a usual place on a roof
-            sweeps, position = None, np.array([0.0, 0.0, 1.8])
+            sweeps, position_m = None, USUAL_POSITION_M
             if topics.lidar is not None:
-                lidar = topics.lidar
-                T_ego_lidar = mounted(lidar.topic, lidar.frame, lidar.mount)
-                points = self._points(T_ego_lidar, self._time_unit(index))
-                position, stamps = T_ego_lidar[:3, 3], index.stamps[lidar.topic]
-                sweeps = _Stream(bag, lidar.topic, stamps, times_us, points)
+                lidar, first = topics.lidar, index.first[topics.lidar.topic]
+                position_m = mounts.position_m(lidar, first, int(times_us[0]))
+                points = functools.partial(_points, lidar, mounts, self._time_unit(index))
+                sweeps = _Stream(bag, lidar.topic, index.stamps[lidar.topic], times_us, points)
             # A sensor without a single readable message is an error
             for stream in [*images.values(), *([] if sweeps is None else [sweeps])]:
                 stream.check()
@@ -128,7 +131,8 @@ class BagLog:
                 images=images,
                 image_t_s=image_t_s,
                 sweeps=sweeps,
-                lidar_position_m=tuple(position.tolist()),
+                image_mounts=image_mounts,
+                lidar_position_m=position_m,
                 path=self._path(tree, times_us, T_ego_origin),
                 split=topics.split,
                 tick=tick,
@@ -170,35 +174,6 @@ class BagLog:
         note(lidar.topic, f"times of points were read as {unit}")
         return unit
 
-    def _points(self, T_ego_lidar: Float64[np.ndarray, "4 4"], unit: str | None) -> Callable[[Any], Points]:
-        assert self.topics.lidar is not None
-        lidar = self.topics.lidar
-
-        def read(message: Any) -> Points:
-            cloud = read_cloud(message)
-            # Points from the lidar's frame to the bag's ego frame
-            xyz = cloud.xyz_m @ T_ego_lidar[:3, :3].T + T_ego_lidar[:3, 3]
-            intensity = (
-                None if cloud.intensity is None else np.nan_to_num(cloud.intensity / lidar.intensity_max)
-            )
-            if intensity is not None and (intensity > 1).any():
-                largest = f"up to {intensity.max() * lidar.intensity_max:g}"
-                note(lidar.topic, f"sweeps with intensities above {lidar.intensity_max:g}, clipped", largest)
-            dt_s = None
-            if unit is not None and cloud.times is not None:
-                dt_s = seconds_since_stamp(cloud.times, stamp_us(message), unit)
-            # Channels are stored in 8 bits
-            fits = cloud.channel is not None and ((cloud.channel >= 0) & (cloud.channel <= 255)).all()
-            return Points(
-                xyz,
-                None if intensity is None else intensity.clip(0, 1),
-                dt_s,
-                cloud.channel if fits else None,
-                lidar.compensated,
-            )
-
-        return read
-
     def _check_topics(self, bag: Bag) -> None:
         cameras = self.topics.cameras.values()
         named = [topic for camera in cameras for topic in (camera.images, camera.info) if topic is not None]
@@ -221,11 +196,21 @@ class BagLog:
                 names = ", ".join(sorted(tree.frames)) or "none"
                 raise InputError(f"{self.bag}: no transform has the frame {frame!r}; there are: {names}")
         low, high = tree.span_us(topics.world_frame, topics.ego_frame)
-        kept = stamps[(stamps >= low) & (stamps <= high)]
+        outside = {
+            "frames before the first pose, left out": stamps < low,
+            "frames after the last pose, left out": stamps > high,
+            f"frames between poses more than {MAX_GAP_S:g} s apart, left out": tree.holes(
+                topics.world_frame, topics.ego_frame, stamps
+            ),
+        }
+        for text, out in outside.items():
+            for t_us in stamps[out].tolist():
+                note(first, text, f"{t_us * 1e-6:.3f} s")
+        kept = stamps[~np.any(list(outside.values()), axis=0)]
         if not len(kept):
-            raise InputError(
-                f"{self.bag}: no message of {first} lies in the time of the poses: other clocks?"
-            )
+            times = (f"{t_us * 1e-6:.3f}" for t_us in (stamps[0], stamps[-1], low, high))
+            message = "{}: no message of {} ({} to {} s) lies between poses ({} to {} s) at most {:g} s apart"
+            raise InputError(message.format(self.bag, first, *times, MAX_GAP_S))
         return kept
 
 
@@ -233,7 +218,16 @@ def _calibration(camera: CameraTopics, index: BagIndex) -> Calibration:
     """Return the calibration of a camera: that of its topic, or the given one at the size of its images."""
     if camera.intrinsics is None:
         assert camera.info is not None
-        return index.calibrations[camera.info]
+        rectified = is_rectified_camera(camera)
+        calibration = read_calibration(index.first[camera.info], rectified)
+        if rectified:
+            note(camera.images, f"rectified images; P and R of {camera.info} hold, without distortion")
+        if abs(calibration.offset_m) > _NEAR_M:
+            text = (
+                f"P of {camera.info} is that of a camera {abs(calibration.offset_m):.3f} m beside another one"
+            )
+            note(camera.images, f"{text}; the camera is where its own frame is")
+        return calibration
     # ROS has pixel centres at whole numbers, the log at +0.5
     lens = camera.intrinsics
     K = np.array([[lens.fx, 0, lens.cx + 0.5], [0, lens.fy, lens.cy + 0.5], [0, 0, 1]])
@@ -244,15 +238,39 @@ def _calibration(camera: CameraTopics, index: BagIndex) -> Calibration:
     return Calibration(K, dist, (height, width))
 
 
-def _matrix(mount: Mount) -> Float64[np.ndarray, "4 4"]:
-    T = np.eye(4)
-    T[:3, :3] = Rotation.from_quat(mount.quaternion_wxyz, scalar_first=True).as_matrix()
-    T[:3, 3] = mount.position_m
-    return T
+def _points(lidar: LidarTopic, mounts: Mounts, unit: str | None, message: Any, t_us: int) -> Points:
+    """Return the points of a message in the log's ego frame at their own times.
+
+    Args:
+        lidar: its topic.
+        mounts: where it is.
+        unit: of the points' times; None: they are not used.
+        message: the cloud.
+        t_us: its stamp on the common clock.
+    """
+    cloud = read_cloud(message)
+    T_ego_lidar = mounts.of_cloud(lidar, message, t_us)
+    intensity = None if cloud.intensity is None else np.nan_to_num(cloud.intensity / lidar.intensity_max)
+    if intensity is not None and (intensity > 1).any():
+        largest = f"up to {intensity.max() * lidar.intensity_max:g}"
+        note(lidar.topic, f"sweeps with intensities above {lidar.intensity_max:g}, clipped", largest)
+    dt_s = None
+    if unit is not None and cloud.times is not None:
+        dt_s = seconds_since_stamp(cloud.times, stamp_us(message), unit)
+    # Channels are stored in 8 bits
+    fits = cloud.channel is not None and ((cloud.channel >= 0) & (cloud.channel <= 255)).all()
+    return Points(
+        cloud.xyz_m @ T_ego_lidar[:3, :3].T + T_ego_lidar[:3, 3],
+        None if intensity is None else intensity.clip(0, 1),
+        dt_s,
+        cloud.channel if fits else None,
+        # What registered points in the world has removed the motion within the sweep
+        lidar.compensated or mounts.is_registered(lidar, message),
+    )
 
 
 def _image(
-    message: Any, *, size_hw: tuple[int, int], value_range: tuple[float, float] | None
+    message: Any, _: int, *, size_hw: tuple[int, int], value_range: tuple[float, float] | None
 ) -> UInt8[np.ndarray, "H W 3"]:
     return check_size(read_image(message, value_range), size_hw)
 
@@ -267,12 +285,12 @@ class _Stream(PartSequence):
         self,
         bag: Bag,
         topic: str,
-        stamps: list[tuple[int, int]],
+        stamps: list[Stamp],
         times_us: np.ndarray,
-        decode: Callable[[Any], Any],
+        decode: Callable[[Any, int], Any],
     ) -> None:
         super().__init__(topic, "messages", len(times_us))
-        numbers, stamps_us = np.array(stamps, np.int64).reshape(-1, 2).T
+        numbers, stamps_us, _ = np.array(stamps, np.int64).reshape(-1, 3).T
         # Messages may come out of order: note them and sort by stamp
         for row in np.flatnonzero(np.diff(stamps_us) < 0) + 1:
             place = f"message {numbers[row]}, {stamps_us[row] * 1e-6:.3f} s"
@@ -287,7 +305,21 @@ class _Stream(PartSequence):
         # The last frame that needs each message, after which it can be dropped
         self._last_frame = dict(zip(self._numbers[frames].tolist(), frames.tolist(), strict=True))
         self._bag, self._topic, self._decode = bag, topic, decode
+        self._note_missing(times_us, stamps_us)
         self._rewind()
+
+    def _note_missing(self, times_us: Int64[np.ndarray, "T"], stamps_us: Int64[np.ndarray, "N"]) -> None:
+        """Say which frames have no message beside them."""
+        missing = times_us[~self._exists].tolist()
+        if len(missing) < len(times_us):
+            for t_us in missing:
+                note(self._topic, "frames without a message beside them", f"{t_us * 1e-6:.3f} s")
+            return
+        spans = (f"{t_us * 1e-6:.3f}" for t_us in (stamps_us[0], stamps_us[-1], times_us[0], times_us[-1]))
+        message = (
+            "none of its {} messages ({} to {} s) is beside a frame ({} to {} s): the log has none of them"
+        )
+        note(self._topic, message.format(len(stamps_us), *spans))
 
     def _rewind(self) -> None:
         self._messages = enumerate(self._bag.read([self._topic]))
@@ -314,7 +346,8 @@ class _Stream(PartSequence):
         if self._last_frame[number] == frame:
             del self._ahead[number]
         place = f"message {number}, {self.t_us[frame] * 1e-6:.3f} s"
-        return self._read(place, lambda: self._decode(message.decode()))
+        t_us = int(self.t_us[frame])
+        return self._read(place, lambda: self._decode(message.decode(), t_us))
 
     def check(self) -> None:
         """Check that one of the messages can be read, and begin anew."""

@@ -1,44 +1,19 @@
-"""Reading of single messages of ROS and Foxglove into arrays: images, calibrations, points, poses."""
+"""Reading of single messages of ROS and Foxglove into arrays: calibrations, points, poses."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
-import cv2
 import numpy as np
-from jaxtyping import Float64, Shaped, UInt8
+from jaxtyping import Float64, Shaped
 from scipy.spatial.transform import Rotation
 
-from foredrive.data.images import decoded, grey_to_rgb
 from foredrive.errors import InputError
 
 _NUMPY_OF_ROS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 _NUMPY_OF_FOXGLOVE = {1: "u1", 2: "i1", 3: "u2", 4: "i2", 5: "u4", 6: "i4", 7: "f4", 8: "f8"}
 """PointField.datatype and PackedElementField.NumericType."""
 
-_TO_RGB = {
-    "rgb8": None,
-    "bgr8": cv2.COLOR_BGR2RGB,
-    "rgba8": cv2.COLOR_RGBA2RGB,
-    "bgra8": cv2.COLOR_BGRA2RGB,
-    "8UC3": cv2.COLOR_BGR2RGB,
-    "mono8": cv2.COLOR_GRAY2RGB,
-    "8UC1": cv2.COLOR_GRAY2RGB,
-    "mono16": None,
-    "16UC1": None,
-    "bayer_rggb8": cv2.COLOR_BayerRGGB2RGB,
-    "bayer_bggr8": cv2.COLOR_BayerBGGR2RGB,
-    "bayer_gbrg8": cv2.COLOR_BayerGBRG2RGB,
-    "bayer_grbg8": cv2.COLOR_BayerGRBG2RGB,
-    "uyvy": cv2.COLOR_YUV2RGB_UYVY,
-    "yuv422": cv2.COLOR_YUV2RGB_UYVY,
-    "yuyv": cv2.COLOR_YUV2RGB_YUYV,
-    "yuv422_yuy2": cv2.COLOR_YUV2RGB_YUYV,
-}
-"""OpenCV's conversions of ROS' and Foxglove's encodings. A Bayer pattern is named by its first two rows."""
-_CHANNELS = {"rgb8": 3, "bgr8": 3, "8UC3": 3, "rgba8": 4, "bgra8": 4}
-_DEEP = ("mono16", "16UC1")
-_PAIRED = ("uyvy", "yuv422", "yuyv", "yuv422_yuy2")
 _INTENSITY, _CHANNEL = ("intensity", "i", "reflectivity"), ("ring", "channel", "line", "laser_id")
 _TIMES = ("t", "time", "timestamp", "time_stamp", "offset_time", "time_offset")
 UNITS_NS = {"s": 10**9, "ms": 10**6, "us": 1000, "ns": 1}
@@ -59,11 +34,15 @@ class Calibration:
     """Pixel centres at +0.5; ROS and Foxglove have them at whole numbers."""
     dist: Float64[np.ndarray, "5"]
     size_hw: tuple[int, int]
+    R_optical_cam: Float64[np.ndarray, "3 3"] = field(default_factory=lambda: np.eye(3))
+    """From the axes of the images to those of the optical frame: rectified images are turned."""
+    offset_m: float = 0.0
+    """Distance to another camera in whose frame P is, as of the right one of a pair. It is not used."""
 
 
 @dataclass(frozen=True)
 class Cloud:
-    """Points in the frame of their sensor."""
+    """Points in the frame that their message names."""
 
     xyz_m: Float64[np.ndarray, "N 3"]
     intensity: Float64[np.ndarray, "N"] | None
@@ -82,6 +61,10 @@ class Placed:
     """Empty where a message does not say whose pose it is."""
     t_us: int
     T_parent_child: Float64[np.ndarray, "4 4"]
+    fixed: bool = False
+    """Whether it holds for all times (`is_static`)."""
+    recorded_us: int = 0
+    """When the recorder received its message."""
 
 
 def stamp_us(message: Any) -> int:
@@ -99,79 +82,59 @@ def frame_of(message: Any) -> str:
     return str(name).lstrip("/")
 
 
-def read_image(message: Any, value_range: tuple[float, float] | None = None) -> UInt8[np.ndarray, "H W 3"]:
-    """Return an image as RGB.
+def read_calibration(message: Any, rectified: bool = False) -> Calibration:
+    """Return the calibration of a CameraInfo or CameraCalibration.
 
     Args:
-        message: an Image, CompressedImage or RawImage.
-        value_range: values of an image with 16 bits that become 0 and 255.
-
-    Raises:
-        InputError: the encoding is not known, the data do not fit it, or 16 bits have no range.
-    """
-    pixels = read_pixels(message)
-    if pixels.ndim == 3:
-        return pixels
-    if value_range is None:
-        raise InputError(
-            f"an image of 16 bits ({pixels.min()} to {pixels.max()}); the YAML needs its `value_range`"
-        )
-    return grey_to_rgb(pixels, value_range)
-
-
-def read_pixels(message: Any) -> Shaped[np.ndarray, "H W *channels"]:
-    """Return an image as uint8 RGB [H, W, 3], or as grey [H, W] if it has 16 bits.
-
-    Raises:
-        InputError: the encoding is not known, or the data do not fit it.
-    """
-    if not hasattr(message, "encoding"):
-        return decoded(bytes(message.data))
-    encoding = message.encoding
-    if encoding not in _TO_RGB:
-        raise InputError(f"images of encoding {encoding!r} are not read; there are: {', '.join(_TO_RGB)}")
-    step, height, width = int(message.step), int(message.height), int(message.width)
-    depth = np.dtype("u2" if encoding in _DEEP else "u1")
-    channels = 2 if encoding in _PAIRED else _CHANNELS.get(encoding, 1)
-    data = np.frombuffer(bytes(message.data), np.uint8)
-    # Rows may be padded to a step, but never shorter than their pixels
-    row = width * channels * depth.itemsize
-    if data.size != height * step or row > step or not row or not height:
-        raise InputError(f"an image of {height} x {width} px in rows of {step} bytes has {data.size} bytes")
-    pixels = np.ascontiguousarray(data.reshape(height, step)[:, :row])
-    # 16 bits stay grey, with the byte order of the message
-    if depth.itemsize == 2:
-        big = bool(getattr(message, "is_bigendian", 0))
-        return pixels.view(depth.newbyteorder(">" if big else "<")).reshape(height, width)
-    pixels = pixels.reshape((height, width) if channels == 1 else (height, width, channels))
-    code = _TO_RGB[encoding]
-    return pixels if code is None else np.asarray(cv2.cvtColor(pixels, code))
-
-
-def read_calibration(message: Any) -> Calibration:
-    """Return the calibration of a CameraInfo or CameraCalibration.
+        message: the calibration.
+        rectified: whether it is that of rectified images: their camera matrix is in P, they have no
+            distortion, and R turns the camera's axes to theirs. Else K and D hold, those of the raw images.
 
     Raises:
         InputError: it is none, or its lens is not OpenCV's with five coefficients.
     """
-    K = np.array(message.k if hasattr(message, "k") else message.K, np.float64)
-    dist = np.array(message.d if hasattr(message, "d") else message.D, np.float64)
+    k, d, r, p = (
+        np.array(getattr(message, name if hasattr(message, name) else name.upper()), np.float64)
+        for name in "kdrp"
+    )
+    size_hw = int(message.height), int(message.width)
     model = message.distortion_model
+    K, dist, R, offset_m = k, np.zeros(5), np.eye(3), 0.0
+    if rectified:
+        # A camera without distortion may leave P and R empty: its raw images are rectified
+        if p.size == 12 and p.any():
+            K = p.reshape(3, 4)[:, :3].reshape(-1)
+            offset_m = float(-p[3] / p[0]) if p[0] else 0.0
+        elif d.any():
+            raise InputError("a camera of rectified images without P, their camera matrix")
+        R = _rectification(r)
     if K.size != 9 or not np.isfinite(K).all() or K[0] <= 0 or K[4] <= 0:
-        raise InputError(f"a camera without a calibration (K is {K.tolist()})")
-    # Without coefficients an equidistant lens is still a fisheye, so its name alone decides.
-    if model not in ("plumb_bob", "rational_polynomial", "") or dist[5:].any():
-        raise InputError(f"lenses of the model {model!r} are not read; undistort the images first")
-    K = K.reshape(3, 3)
+        raise InputError(f"a camera without a calibration ({'P' if rectified else 'K'} is {K.tolist()})")
+    if not rectified:
+        # Without coefficients an equidistant lens is still a fisheye, so its name alone decides.
+        if model not in ("plumb_bob", "rational_polynomial", "") or d[5:].any():
+            raise InputError(f"lenses of the model {model!r} are not read; undistort the images first")
+        dist[: min(len(d), 5)] = d[:5]
+    K = K.reshape(3, 3).copy()
     # Pixel centres at +0.5
     K[:2, 2] += 0.5
-    five = np.zeros(5)
-    five[: min(len(dist), 5)] = dist[:5]
-    return Calibration(K, five, (int(message.height), int(message.width)))
+    return Calibration(K, dist, size_hw, R, offset_m)
+
+
+def _rectification(r: Float64[np.ndarray, "_"]) -> Float64[np.ndarray, "3 3"]:
+    """Return the rotation from rectified to camera axes. R of a CameraInfo is its inverse; zeros are none."""
+    if r.size != 9 or not r.any():
+        return np.eye(3)
+    R = r.reshape(3, 3)
+    if not np.allclose(R @ R.T, np.eye(3), atol=1e-3) or np.linalg.det(R) < 0:
+        raise InputError("a camera whose R is no rotation")
+    return np.asarray(R.T)
 
 
 def read_cloud(message: Any) -> Cloud:
     """Return the points of a PointCloud2 or PointCloud that are finite.
+
+    A PointCloud of Foxglove has a pose in its frame, by which its points are moved.
 
     Raises:
         InputError: it has no x, y and z, or its data do not fit its fields.
@@ -189,28 +152,44 @@ def read_cloud(message: Any) -> Cloud:
         return None if name is None else cells[name][kept]
 
     intensity, channel = column(_INTENSITY), column(_CHANNEL)
+    T = cloud_pose(message)
     return Cloud(
-        xyz[kept],
+        xyz[kept] @ T[:3, :3].T + T[:3, 3],
         None if intensity is None else intensity.astype(np.float64),
         column(_TIMES),
         None if channel is None else channel.astype(np.float64),
     )
 
 
+def cloud_pose(message: Any) -> Float64[np.ndarray, "4 4"]:
+    """Return the pose of a cloud in the frame that its message names; only Foxglove's clouds have one."""
+    pose = getattr(message, "pose", None)
+    if pose is None or not any(
+        (pose.orientation.x, pose.orientation.y, pose.orientation.z, pose.orientation.w)
+    ):
+        # A message of protocol buffers without the field has one of zeros, which is no rotation
+        return np.eye(4)
+    return _matrix(pose.position, pose.orientation)
+
+
 # Fields of arbitrary types at arbitrary offsets, as numpy's structured arrays
 def _cells(message: Any) -> np.ndarray:
-    """Return the points of a cloud as a structured array."""
-    if hasattr(message, "point_step"):
-        step, count = int(message.point_step), int(message.width) * int(message.height)
-        order = ">" if message.is_bigendian else "<"
-        kinds = {one.name: (_NUMPY_OF_ROS.get(int(one.datatype)), int(one.offset)) for one in message.fields}
-    else:
-        step, order = int(message.point_stride), "<"
-        count = len(message.data) // step if step else 0
-        kinds = {one.name: (_NUMPY_OF_FOXGLOVE.get(int(one.type)), int(one.offset)) for one in message.fields}
+    """Return the points of a cloud as a structured array, row by row."""
     data = bytes(message.data)
-    if not kinds or step <= 0 or len(data) < count * step:
-        raise InputError(f"a point cloud of {count} points of {step} bytes has {len(data)} bytes")
+    if hasattr(message, "point_step"):
+        step, width, height = int(message.point_step), int(message.width), int(message.height)
+        row, order, numbers = int(message.row_step), ">" if message.is_bigendian else "<", _NUMPY_OF_ROS
+        kinds = {one.name: (numbers.get(int(one.datatype)), int(one.offset)) for one in message.fields}
+    else:
+        step, order, numbers = int(message.point_stride), "<", _NUMPY_OF_FOXGLOVE
+        width, height, row = len(data) // step if step else 0, 1, 0
+        kinds = {one.name: (numbers.get(int(one.type)), int(one.offset)) for one in message.fields}
+    # Rows begin every row_step bytes. Many drivers leave it 0, or write the size of all rows
+    tight = width * step
+    if row < tight or len(data) < (height - 1) * row + tight:
+        row = tight
+    if not kinds or step <= 0 or len(data) < (height - 1) * row + tight:
+        raise InputError(f"a point cloud of {width * height} points of {step} bytes has {len(data)} bytes")
     for name, (kind, offset) in kinds.items():
         if kind is None or offset < 0 or offset + np.dtype(kind).itemsize > step:
             raise InputError(f"the field {name!r} of a point cloud does not fit into its points")
@@ -220,7 +199,8 @@ def _cells(message: Any) -> np.ndarray:
         "offsets": [offset for _, offset in kinds.values()],
         "itemsize": step,
     }
-    return np.frombuffer(data, np.dtype(layout), count)  # type: ignore[call-overload]
+    cells = np.ndarray((height, width), np.dtype(layout), data, strides=(row, step))  # type: ignore[call-overload]
+    return cells.reshape(-1)
 
 
 def time_unit(times: Shaped[np.ndarray, "N"], stamp_us: int, period_s: float) -> str | None:
@@ -273,6 +253,11 @@ def seconds_since_stamp(times: Shaped[np.ndarray, "N"], stamp_us: int, unit: str
         furthest_s = float(np.abs(since_s).max())
         raise InputError(f"point times in {unit} that are up to {furthest_s:g} s away from the stamp")
     return since_s
+
+
+def is_static(topic: str) -> bool:
+    """Return whether transforms of a topic hold for the whole recording, whenever they were sent."""
+    return topic.endswith("tf_static")
 
 
 def read_placed(message: Any) -> Iterator[Placed]:

@@ -1,0 +1,146 @@
+"""Recordings that were cut off give what is whole in them, and MCAP files are read whatever they hold."""
+
+import base64
+import json
+from pathlib import Path
+
+import made_bags
+import numpy as np
+import pytest
+from mcap.writer import Writer
+from rosbags.rosbag2 import StoragePlugin
+
+from foredrive.data.formats.bag_contents import Bag
+from foredrive.data.formats.bag_files import open_bag
+from foredrive.data.formats.bag_messages import read_cloud, read_placed, stamp_us
+from foredrive.data.formats.bag_proposal import propose_topics
+from foredrive.data.formats.bag_topics import topics_file
+from foredrive.data.formats.convert import convert
+from foredrive.data.logs import Log
+from foredrive.data.notices import read_notices
+from foredrive.errors import InputError
+
+
+def counted(bag: Bag) -> dict[str, int]:
+    """The number of messages that are read and can be decoded, by topic."""
+    counts = dict.fromkeys(bag.topics, 0)
+    for message in bag.read(list(bag.topics)):
+        message.decode()
+        counts[message.topic] += 1
+    return counts
+
+
+def test_a_ros1_recording_in_mcap_is_the_same_as_its_bag(tmp_path: Path) -> None:
+    made_bags.write_ros1(tmp_path / "drive.bag")
+    made_bags.write_mcap_of_ros1(tmp_path / "drive.mcap")
+    with open_bag(tmp_path / "drive.bag") as bag, open_bag(tmp_path / "drive.mcap") as mcap:
+        assert mcap.topics == bag.topics
+        assert counted(mcap) == counted(bag) == {name: topic.count for name, topic in bag.topics.items()}
+
+
+def test_a_cut_mcap_gives_its_whole_messages_and_says_so(tmp_path: Path) -> None:
+    whole, cut = tmp_path / "whole.mcap", tmp_path / "cut.mcap"
+    made_bags.write_mcap_of_ros1(whole)
+    content = whole.read_bytes()
+    cut.write_bytes(content[: int(0.6 * len(content))])
+    with open_bag(whole) as complete, open_bag(cut) as rest:
+        assert {name: topic.count for name, topic in rest.topics.items()} == counted(rest)
+        assert 30 < sum(counted(rest).values()) < sum(counted(complete).values())
+    propose_topics(cut, topics_file(cut))
+    (path,) = convert(cut, "rosbag", tmp_path / "out")
+    assert 2 <= len(Log(path)) < made_bags.FRAMES
+    assert "cut.mcap: the recording was cut off; " in read_notices(path.folder)[0]
+
+
+def test_a_damaged_chunk_of_a_cut_mcap_costs_itself_alone(tmp_path: Path) -> None:
+    file = tmp_path / "drive.mcap"
+    made_bags.write_mcap_of_ros1(file)
+    content = bytearray(file.read_bytes())
+    second = content.index(b"zstd", content.index(b"zstd") + 4) + 40
+    content[second : second + 8] = b"\xff" * 8
+    file.write_bytes(content[:-100])
+    with open_bag(file) as bag:
+        last_s = max(message.recorded_s for message in bag.read(list(bag.topics)))
+    assert last_s > made_bags.START_NS * 1e-9 + 0.5
+
+
+@pytest.mark.parametrize("name", ["drive.bag", "drive.bag.active"])
+def test_a_ros1_bag_that_was_not_closed_gives_its_whole_messages(name: str, tmp_path: Path) -> None:
+    made_bags.write_ros1(tmp_path / "whole.bag")
+    content = (tmp_path / "whole.bag").read_bytes()
+    index = content.index(b"index_pos=") + len(b"index_pos=")
+    position = int.from_bytes(content[index : index + 8], "little")
+    bag = tmp_path / name
+    bag.write_bytes(content[:index] + bytes(8) + content[index + 8 : position - 400])
+    with open_bag(tmp_path / "whole.bag") as complete, open_bag(bag) as rest:
+        assert {name: topic.type for name, topic in rest.topics.items()}.items() <= {
+            name: topic.type for name, topic in complete.topics.items()
+        }.items()
+        assert counted(rest) == {name: topic.count for name, topic in rest.topics.items()}
+        assert sum(counted(rest).values()) > 30
+
+
+def test_a_ros2_bag_without_metadata_is_read(tmp_path: Path) -> None:
+    made_bags.write_ros2(tmp_path / "drive", StoragePlugin.MCAP)
+    with open_bag(tmp_path / "drive") as bag:
+        topics, counts = bag.topics, counted(bag)
+    (tmp_path / "drive" / "metadata.yaml").unlink()
+    (file,) = (tmp_path / "drive").iterdir()
+    file.rename(tmp_path / "drive" / "drive_0.mcap")
+    with open_bag(tmp_path / "drive") as bag:
+        assert (bag.topics, counted(bag)) == (topics, counts)
+
+
+def write_json(path: Path) -> None:
+    """A pose of the vehicle, and a cloud with one point that has a pose of its own, as JSON."""
+    stamp = {"sec": 1_700_000_000, "nsec": 250_000_000}
+    turn = {"x": 0, "y": 0, "z": 0, "w": 1}
+    field = [{"name": axis, "offset": 4 * k, "type": 7} for k, axis in enumerate("xyz")]
+    point = base64.b64encode(np.array([1, 2, 3], "<f4").tobytes()).decode()
+    mount = {"position": {"x": 1, "y": 0, "z": 2}, "orientation": turn}
+    rows = {
+        "/tf": (
+            "foxglove.FrameTransform",
+            {
+                "timestamp": stamp,
+                "parent_frame_id": "world",
+                "child_frame_id": "ego",
+                "translation": {"x": 4, "y": 5, "z": 6},
+                "rotation": turn,
+            },
+        ),
+        "/lidar": (
+            "foxglove.PointCloud",
+            {
+                "timestamp": stamp,
+                "frame_id": "ego",
+                "pose": mount,
+                "point_stride": 12,
+                "fields": field,
+                "data": point,
+            },
+        ),
+        "/chatter": ("std_msgs/String", {"data": "x"}),
+    }
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        for topic, (name, content) in rows.items():
+            schema = writer.register_schema(name, "jsonschema", b"{}")
+            channel = writer.register_channel(topic, "json", schema)
+            writer.add_message(channel, 1, json.dumps(content).encode(), 1)
+        writer.finish()
+
+
+def test_json_of_foxgloves_schemas_is_read_and_other_json_named(tmp_path: Path) -> None:
+    write_json(tmp_path / "drive.mcap")
+    with open_bag(tmp_path / "drive.mcap") as bag:
+        contents = {message.topic: message.decode() for message in bag.read(["/tf", "/lidar"])}
+        assert bag.topics["/chatter"].unread is not None
+    (placed,) = read_placed(contents["/tf"])
+    assert (placed.parent, placed.child, placed.t_us) == ("world", "ego", 1_700_000_000_250_000)
+    assert placed.T_parent_child[:3, 3].tolist() == [4.0, 5.0, 6.0]
+    assert stamp_us(contents["/lidar"]) == placed.t_us
+    assert read_cloud(contents["/lidar"]).xyz_m.tolist() == [[2.0, 2.0, 5.0]]
+    with pytest.raises(InputError, match=r"neither a \.bag"), open_bag(tmp_path):
+        pass
