@@ -2,8 +2,11 @@
 
 import gzip
 import importlib
+import io
 import pickle
 import resource
+import sys
+import types
 from pathlib import Path
 
 import numpy as np
@@ -127,3 +130,49 @@ def test_tables_load_as_they_were(protocol: int, tmp_path: Path) -> None:
         loaded = load_table(file)
         assert type(loaded) is pd.DataFrame
         pd.testing.assert_frame_equal(loaded, kept)
+
+
+@pytest.mark.parametrize("protocol", [2, 4, 5])
+def test_tables_with_texts_of_arrow_load(protocol: int, tmp_path: Path) -> None:
+    """As pandas 3 stores texts; a part of a larger table, and one without a value."""
+    table = pd.DataFrame({"x": [1.5, 2.5, 3.5], "name": pd.Series(["a", None, "Straße"], dtype="str")})
+    for kept in (table, table.iloc[1:], table.set_index("name"), table.iloc[:0]):
+        file = tmp_path / "table.pkl.gz"
+        file.write_bytes(gzip.compress(pickle.dumps(kept, protocol=protocol)))
+        pd.testing.assert_frame_equal(load_table(file), kept)
+
+
+def test_texts_that_point_out_of_their_bytes_are_refused(tmp_path: Path) -> None:
+    table = pd.DataFrame({"name": pd.Series(["a", "bc"], dtype="str")})
+    content = pickle.dumps(table, protocol=4)
+    offsets = np.array([0, 1, 3], "<i8").tobytes()
+    assert content.count(offsets) == 1
+    file = tmp_path / "table.pkl.gz"
+    far = np.array([0, 1, 10**9], "<i8").tobytes()
+    file.write_bytes(gzip.compress(content.replace(offsets, far)))
+    with pytest.raises(InputError, match="cannot read it as a pickle of plain data"):
+        load_table(file)
+
+
+def test_an_integer_index_of_pandas_1_loads(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Before pandas 2 it has a class of its own, which is gone."""
+    old = types.ModuleType("pandas.core.indexes.numeric")
+    old.Int64Index = type("Int64Index", (), {"__module__": old.__name__})  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, old.__name__, old)
+
+    class Pickler(pickle.Pickler):
+        def reducer_override(self, value: object) -> object:
+            if isinstance(value, pd.Index) and value.dtype == np.int64:
+                made, (_, state), *_ = value.__reduce__()
+                return made, (old.Int64Index, state)
+            return NotImplemented
+
+    table = pd.DataFrame({"x": [1.5, 2.5]}, index=pd.Index([7, 5], name="n"))
+    table.columns = table.columns.astype(object)
+    out = io.BytesIO()
+    Pickler(out, 2).dump(table)
+    assert b"Int64Index" in out.getvalue()
+    file = tmp_path / "table.pkl.gz"
+    file.write_bytes(gzip.compress(out.getvalue()))
+    monkeypatch.delitem(sys.modules, old.__name__)
+    pd.testing.assert_frame_equal(load_table(file), table)

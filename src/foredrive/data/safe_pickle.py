@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+import pyarrow as pa
 from numpy._core import multiarray
 
 from foredrive.errors import InputError
@@ -47,6 +48,18 @@ _TABLE = _PLAIN | {
     ("pandas.core.indexes.base", "Index"),
     ("pandas.core.indexes.base", "_new_Index"),
     ("pandas.core.indexes.range", "RangeIndex"),
+    # Indexes of numbers of pandas before 2
+    ("pandas.core.indexes.numeric", "Int64Index"),
+    ("pandas.core.indexes.numeric", "UInt64Index"),
+    ("pandas.core.indexes.numeric", "Float64Index"),
+    # Texts of pandas 3, which are arrays of Arrow
+    ("pandas", "StringDtype"),
+    ("pandas.arrays", "ArrowStringArray"),
+    ("pyarrow.lib", "_restore_array"),
+    ("pyarrow.lib", "py_buffer"),
+    ("pyarrow.lib", "type_for_alias"),
+    ("builtins", "bytearray"),
+    ("builtins", "bytes"),
 }
 """Names that a pickled pandas table of numbers and strings needs in addition."""
 
@@ -60,7 +73,7 @@ class _Unpickler(pickle.Unpickler):
 
     def find_class(self, module: str, name: str) -> Any:
         module = module.replace("numpy.core.", "numpy._core.")  # The name before numpy 2
-        module = self._moved.get(module, module)
+        module = "builtins" if module == "__builtin__" else self._moved.get(module, module)  # Of protocol 2
         if (module, name) not in self._allowed:
             raise pickle.UnpicklingError(f"it asks for {module}.{name}, which plain data do not need")
         if name == "DataFrame":
@@ -102,9 +115,71 @@ def _new_index(kind: object, state: dict[str, Any]) -> Any:
         index = pd.RangeIndex(state["start"], state["stop"], state["step"], name=state.get("name"))
         if len(index) <= MAX_ROWS:
             return index
-    elif kind is _INDEX and isinstance(state["data"], np.ndarray | pd.api.extensions.ExtensionArray):
-        return pd.Index(state["data"], dtype=state["data"].dtype, name=state.get("name"))
+    elif kind is _INDEX:
+        data = _plain_values(state["data"])
+        if isinstance(data, np.ndarray | pd.api.extensions.ExtensionArray):
+            return pd.Index(data, dtype=data.dtype, name=state.get("name"))
     raise pickle.UnpicklingError("the index of a table is not as pandas writes it")
+
+
+class _Texts:
+    """Takes the place of pandas' array of Arrow texts until its state is there."""
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.values, self.dtype = state["_pa_array"], state["_dtype"]
+        if not isinstance(self.values, pa.ChunkedArray | pa.Array) or not isinstance(
+            self.dtype, pd.StringDtype
+        ):
+            raise pickle.UnpicklingError("an array of texts is not as pandas writes it")
+
+
+def _plain_values(values: Any) -> Any:
+    return pd.array(values.values.to_pylist(), dtype=values.dtype) if isinstance(values, _Texts) else values
+
+
+def _block(values: Any, placement: Any, ndim: int) -> Any:
+    """Return a part of a table."""
+    from pandas._libs.internals import _unpickle_block
+
+    return _unpickle_block(_plain_values(values), placement, ndim)
+
+
+def _text_type(storage: str = "pyarrow", na_value: Any = np.nan) -> pd.StringDtype:
+    return pd.StringDtype(storage, na_value)
+
+
+def _arrow_type(alias: str) -> Any:
+    if alias not in ("string", "large_string"):
+        raise pickle.UnpicklingError(
+            f"an array of Arrow has the type {alias!r:.50}, which plain tables do not need"
+        )
+    return pa.type_for_alias(alias)
+
+
+def _arrow_texts(state: tuple[Any, ...]) -> Any:
+    """Return an array of Arrow. It is checked as a whole: its offsets could point out of its bytes."""
+    kind, length, null_count, offset, buffers, children, dictionary = state
+    if children or dictionary is not None:
+        raise pickle.UnpicklingError("an array of texts is not as Arrow writes it")
+    array = pa.Array.from_buffers(kind, length, buffers, null_count, offset)
+    array.validate(full=True)
+    return array
+
+
+def _bytearray(content: bytes = b"", encoding: str = "latin1") -> bytearray:
+    """Return bytes. A number would be the size of empty ones."""
+    return bytearray(_encode(content, encoding) if isinstance(content, str) else memoryview(content))
+
+
+def _no_bytes() -> bytes:
+    """Return what protocols before 3 write for no bytes."""
+    return b""
+
+
+def _buffer(content: object) -> Any:
+    if not isinstance(content, bytes | bytearray):
+        raise pickle.UnpicklingError("a buffer of Arrow has no bytes")
+    return pa.py_buffer(content)
 
 
 @functools.cache
@@ -129,6 +204,17 @@ _CHECKED: Mapping[str, Any] = {
     "scalar": _scalar,
     "encode": _encode,
     "_new_Index": _new_index,
+    "Int64Index": _INDEX,
+    "UInt64Index": _INDEX,
+    "Float64Index": _INDEX,
+    "_unpickle_block": _block,
+    "StringDtype": _text_type,
+    "ArrowStringArray": _Texts,
+    "_restore_array": _arrow_texts,
+    "type_for_alias": _arrow_type,
+    "py_buffer": _buffer,
+    "bytearray": _bytearray,
+    "bytes": _no_bytes,
 }
 """Replacements by allowed name. Other allowed names cannot allocate more memory than they are given."""
 
