@@ -171,13 +171,53 @@ def test_a_drive_whose_sweeps_are_all_damaged_is_refused(made: Path, tmp_path: P
         convert(made, "kitti-raw", tmp_path / "out")
 
 
-def test_a_drive_of_one_record_stands(made: Path, tmp_path: Path) -> None:
+def test_a_drive_of_one_record_stands_beside_it(made: Path, tmp_path: Path) -> None:
+    """A frame more than a period later is left out: the vehicle may be anywhere."""
     for frame in range(1, 4):
         (made / "2011_09_26" / DRIVE / "oxts" / "data" / f"{frame:010d}.txt").unlink()
     (path,) = convert(made, "kitti-raw", tmp_path / "out")
     log = Log(path)
-    assert len(log) == 4
+    assert len(log) == 2
     assert np.ptp(log.T_world_ego[:, :3, 3], axis=0).tolist() == [0.0, 0.0, 0.0]
+    assert (
+        f"{DRIVE}: frames without OXTS' records within 1 s around them, left out: 2 (0000000002; 00"
+        in (read_notices(path.folder)[-1])
+    )
+
+
+def test_a_hole_in_the_records_costs_the_frames_in_it(made: Path, tmp_path: Path) -> None:
+    """The times of the drive are stretched to 0.8 s a frame, and one record is lost."""
+    drive = made / "2011_09_26" / DRIVE
+    for stream in STREAMS:
+        lines = [f"2011-09-26 13:04:{32.5 + k * 0.8:012.9f}" for k in range(4)]
+        (drive / stream / "timestamps.txt").write_text("\n".join(lines) + "\n")
+    (drive / "oxts" / "data" / f"{1:010d}.txt").unlink()
+    (path,) = convert(made, "kitti-raw", tmp_path / "out")
+    assert np.diff(Log(path).t_us).tolist() == [1_600_000, 800_000]
+    assert any(notice.startswith(f"{DRIVE}: frames without OXTS'") for notice in read_notices(path.folder))
+
+
+@pytest.mark.parametrize("size_wh", [(64, 28), (60, 32), (70, 44)])
+def test_cut_and_unrectified_images_are_refused(made: Path, tmp_path: Path, size_wh: tuple[int, int]) -> None:
+    for frame in range(4):
+        file = made / "2011_09_26" / DRIVE / "image_02" / "data" / f"{frame:010d}.png"
+        Image.new("RGB", size_wh).save(file)
+    told = f"image_02: .*an image of {size_wh[0]} x {size_wh[1]} px is not one of 64 x 32 px that was shrunk"
+    with pytest.raises(InputError, match=told):
+        convert(made, "kitti-raw", tmp_path / "out")
+
+
+@pytest.mark.parametrize("renamed", [True, False])
+def test_an_unsynced_drive_is_refused(made: Path, tmp_path: Path, renamed: bool) -> None:
+    drive = made / "2011_09_26" / DRIVE
+    if renamed:
+        drive.rename(drive.parent / DRIVE.replace("sync", "extract"))
+    else:
+        for sweep in (drive / "velodyne_points" / "data").iterdir():
+            sweep.rename(sweep.with_suffix(".txt"))
+    with pytest.raises(InputError, match="unsynced and unrectified recordings are not read") as refused:
+        convert(made, "kitti-raw", tmp_path / "out")
+    assert "\n" not in str(refused.value)
 
 
 def test_a_missing_calibration_is_named(made: Path, tmp_path: Path) -> None:

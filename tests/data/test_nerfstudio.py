@@ -260,3 +260,47 @@ def test_a_byte_order_mark_is_no_part_of_the_text(tmp_path: Path) -> None:
     file.write_bytes(b"\xef\xbb\xbf" + file.read_bytes().replace(b"\n", b"\r\n"))
     (path,) = convert(folder, "nerfstudio", tmp_path / "out")
     assert len(Log(path)) == 2
+
+
+@pytest.mark.parametrize("spans", [(0.0, 1.0), (-1.0, 1.0), (0.0, 0.9)])
+def test_normalised_times_become_a_tenth_of_a_second(spans: tuple[float, float], tmp_path: Path) -> None:
+    """D-NeRF's `time` says nothing of seconds: the images are apart as those without times."""
+    low, high = spans
+    frames = rig_frames("images/{camera}/{k}.png", timed=False)
+    for row, frame in enumerate(frames):
+        frame["time"] = low + (high - low) * (row // 3) / 5
+    (path,) = convert(write(tmp_path / "rig", frames), "nerfstudio", tmp_path / "out")
+    log = Log(path)
+    assert np.diff(log.t_us) == pytest.approx(np.full(5, 100_000), abs=1)
+    assert log.speed_mps[2:] == pytest.approx(np.full(4, 5.0), rel=0.15)
+    (told,) = read_notices(path.folder)
+    assert f"entries `time` run from {low:g} to {high:g}, as normalised ones" in told
+
+
+def test_times_that_end_at_exactly_one_are_told(tmp_path: Path) -> None:
+    frames = rig_frames("images/{camera}/{k}.png", timed=False)
+    for row, frame in enumerate(frames):
+        frame["timestamp"] = (row // 3) / 5
+    (path,) = convert(write(tmp_path / "rig", frames), "nerfstudio", tmp_path / "out")
+    assert np.diff(Log(path).t_us).tolist() == [200_000] * 5
+    assert "times from 0 to exactly 1 were read as seconds; normalised?" in read_notices(path.folder)[0]
+
+
+def test_images_in_a_hole_of_the_first_cameras_path_are_left_out(tmp_path: Path) -> None:
+    """The front camera has no images for 1.7 s in which the left one has two."""
+    times_s = {"front": [0.0, 0.1, 0.2, 0.3, 2.0, 2.1, 2.2, 2.3], "left": [0.0, 0.3, 1.0, 1.5, 2.0, 2.3]}
+    frames = []
+    for camera, stamps in times_s.items():
+        x, y, yaw = MOUNTS[camera]
+        for k, t_s in enumerate(stamps):
+            pose = turned(5 * t_s + x, y, yaw)
+            path = f"images/{camera}/{k}.png"
+            frames.append({"file_path": path, "transform_matrix": pose, "timestamp": 100.0 + t_s})
+    (path,) = convert(write(tmp_path / "rig", frames), "nerfstudio", tmp_path / "out")
+    log = Log(path)
+    assert ((log.t_us - log.t_us[0]) * 1e-6).tolist() == pytest.approx(times_s["front"])
+    assert log.speed_mps == pytest.approx(np.full(8, 5.0), rel=1e-3)
+    told = (
+        "frames: images of others between those of front more than 1 s apart, left out: 2 (101.000 s; 101.5"
+    )
+    assert any(line.startswith(told) for line in read_notices(path.folder))

@@ -150,6 +150,10 @@ POINTS = Points(np.ones((5, 3)))
 BOX = Box("car", 1, (1.0, 2.0, 0.5), (4.0, 2.0, 1.5), 0.0)
 
 
+MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
+"""Axes with y to the right: it is no rotation."""
+
+
 @pytest.mark.parametrize(
     ("given", "message"),
     [
@@ -181,6 +185,18 @@ BOX = Box("car", 1, (1.0, 2.0, 0.5), (4.0, 2.0, 1.5), 0.0)
             "the calibration of front is not finite",
         ),
         ({"cameras": [dataclasses.replace(CAMERA, K=-CAMERA.K)]}, "focal lengths of front must be above 0"),
+        (
+            {"cameras": [dataclasses.replace(CAMERA, T_ego_cam=MIRROR @ CAMERA.T_ego_cam)]},
+            "T_ego_cam of front holds a rotation that is none",
+        ),
+        (
+            {"image_mounts": {"front": np.stack([CAMERA.T_ego_cam] * 3)}},
+            "3 entries in mounts of front, but 4 frames",
+        ),
+        (
+            {"image_mounts": {"front": np.stack([MIRROR @ CAMERA.T_ego_cam] * 4)}},
+            "a mount of front is no rotation",
+        ),
         (
             {"cameras": [dataclasses.replace(CAMERA, T_ego_cam=2 * CAMERA.T_ego_cam)]},
             "T_ego_cam of front holds a rotation that is none",

@@ -31,9 +31,10 @@ from ncore.data.v4 import (
     SequenceComponentGroupsWriter,
     SequenceLoaderV4,
 )
-from ncore.impl.common.transformations import HalfClosedInterval
+from ncore.impl.common.transformations import HalfClosedInterval, transform_bbox
 from ncore.impl.data.stores import consolidate_compressed_metadata
 from PIL import Image
+from scipy.spatial.transform import Rotation
 from test_own_logs import CAMERA, SIZE_HW, pose_at
 from upath import UPath
 
@@ -187,11 +188,17 @@ def rays(mounted: np.ndarray, at_us: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 
 def write_foreign(
-    folder: Path, store_type: str = "itar", lens: CameraModelParameters = FISHEYE, *, poses: bool = True
+    folder: Path,
+    store_type: str = "itar",
+    lens: CameraModelParameters = FISHEYE,
+    *,
+    poses: bool = True,
+    left: np.ndarray = LEFT,
 ) -> Path:
     """A sequence as another program writes it.
 
-    Two lidars at 10 Hz with two returns, one of them turned; a fisheye at 20 Hz; a box in a lidar's frame.
+    Two lidars at 10 Hz with two returns, one of them turned; a fisheye at 20 Hz; a box in the frame of the
+    lidar that is mounted at `left`.
     """
     end_us = START_US + 4 * SWEEP_US
     writer = SequenceComponentGroupsWriter(
@@ -205,13 +212,13 @@ def write_foreign(
             "rig", "world", np.stack([pose_at(t * 1e-6) for t in t_us.tolist()]), t_us.astype(np.uint64)
         )
         for name, mounted in (
-            ("left", LEFT),
+            ("left", left),
             ("right", RIGHT),
             ("fish", CAMERA.T_ego_cam.astype(np.float64)),
         ):
             graph.store_static_pose(name, "rig", mounted)
     register(IntrinsicsComponent.Writer, "own").store_camera_intrinsics("fish", lens)
-    for name, mounted in (("left", LEFT), ("right", RIGHT)):
+    for name, mounted in (("left", left), ("right", RIGHT)):
         lidar = register(LidarSensorComponent.Writer, name, name)
         for sweep in range(4):
             span_us = np.array([START_US + sweep * SWEEP_US, START_US + (sweep + 1) * SWEEP_US], np.uint64)
@@ -231,10 +238,8 @@ def write_foreign(
         camera.store_frame(fisheye_image(begin_us), "png", np.array([begin_us, begin_us], np.uint64), {}, {})
     # A box around THING, seen in the middle of the second sweep, in the frame of a lidar at that time
     seen_us = START_US + SWEEP_US * 3 // 2
-    T_left_world = np.linalg.inv(pose_at(seen_us * 1e-6) @ LEFT)
-    centre = T_left_world @ [*THING, 1.0]
-    yaw = np.arctan2(T_left_world[1, 0], T_left_world[0, 0]) + 0.3
-    box = BBox3(tuple(centre[:3].tolist()), (4.0, 2.0, 1.5), (0.0, 0.0, float(yaw)))
+    upright = left if np.linalg.det(left) > 0 else LEFT
+    box = box_of_thing(np.linalg.inv(pose_at(seen_us * 1e-6) @ upright))
     source = LabelSource.AUTOLABEL
     register(CuboidsComponent.Writer, "own").store_observations(
         [
@@ -244,6 +249,12 @@ def write_foreign(
     )
     writer.finalize()
     return folder
+
+
+def box_of_thing(T_lidar_world: np.ndarray) -> BBox3:
+    """The upright box around THING with a heading of 0.3 in the world, as the library moves it to a lidar."""
+    box = transform_bbox(np.array([*THING, 4.0, 2.0, 1.5, 0.0, 0.0, 0.3]), T_lidar_world)
+    return BBox3.from_array(box)
 
 
 def fisheye_image(t_us: int) -> bytes:
@@ -299,6 +310,27 @@ def test_a_sequence_of_another_program(store_type: str, lens: CameraModelParamet
     told = "\n".join(read_notices(path.folder))
     for fact in ("hovercraft", lens.type(), "several returns", "vehicle-bbox", "masks"):
         assert fact in told
+
+
+@pytest.mark.parametrize(("axis", "angle_rad"), [("y", 0.35), ("x", np.pi), ("xy", (np.pi, 0.35))])
+def test_boxes_of_lidars_that_are_not_upright(axis: str, angle_rad: Any, tmp_path: Path) -> None:
+    """A lidar that is pitched, and one upside down: the library's angles are about fixed axes."""
+    mounted = LEFT.copy()
+    mounted[:3, :3] = Rotation.from_euler(axis, angle_rad).as_matrix()
+    (path,) = convert(write_foreign(tmp_path / "raw", left=mounted), "ncore", tmp_path / "out")
+    log = Log(path)
+    boxes, T = read_boxes(log, 1), log.T_world_ego[1]
+    assert boxes is not None
+    centre = boxes.centre.double().numpy() @ T[:3, :3].T + T[:3, 3]
+    np.testing.assert_allclose(centre, [THING, THING], atol=2e-3)
+    heading = boxes.yaw + np.arctan2(T[1, 0], T[0, 0])
+    assert torch.cos(heading - 0.3).tolist() == pytest.approx([1.0, 1.0], abs=1e-5)
+
+
+def test_a_lidar_whose_mount_mirrors_is_refused(tmp_path: Path) -> None:
+    raw = write_foreign(tmp_path / "raw", left=LEFT @ np.diag([1.0, -1.0, 1.0, 1.0]))
+    with pytest.raises(InputError, match="the mount of left mirrors"):
+        convert(raw, "ncore", tmp_path / "out")
 
 
 def test_bad_sequences(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -103,8 +103,8 @@ def write_log(
 
     All sequences have one entry for each of T frames, and None where a frame lacks it. They are read one
     entry at a time, so a sequence may load its entries when they are read, which limits the memory.
-    Velocities and accelerations are differences to the previous frame, so that they contain nothing of later
-    frames. Images are stored as JPEG; those that are JPEGs are kept as they are.
+    Velocities and accelerations are differences to the previous frame, and contain nothing of later frames.
+    Images are stored as JPEG; those that are JPEGs are kept as they are.
 
     Args:
         out: 123D data root; the log is out/logs/SPLIT/NAME.
@@ -115,7 +115,7 @@ def write_log(
         images: by camera: image files, their bytes, or uint8 RGB arrays [H, W, 3].
         image_t_s: by camera: time at which the middle row of each image was exposed. Default: that of the
             frame. Poses between frames are interpolated.
-        image_mounts: by camera that moves on the vehicle, as on a pan unit: T_ego_cam [T, 4, 4].
+        image_mounts: by camera that moves on the vehicle: T_ego_cam [T, 4, 4].
         sweeps: points of the lidar, whose beams that did not return are unknown; or whole sweeps, unbatched,
             in the ego frame at the frame's time, where they are known if there are any.
         lidar_position_m: of the lidar, in the ego frame.
@@ -145,6 +145,9 @@ def write_log(
         name, len(drive.t_us), given | {f"images of {camera}": rows for camera, rows in images.items()}
     )
     _check_image_times(name, images, image_t_s)
+    for camera, mounts in image_mounts.items():
+        if not all(_is_rotation(T) for T in np.asarray(mounts, np.float64)):
+            raise InputError(f"{name}: a mount of {camera} is no rotation")
     exposed = {camera: drive.exposures(np.asarray(times)) for camera, times in image_t_s.items()}
     for spec in cameras:
         if spec.name in image_mounts:
@@ -249,24 +252,21 @@ class _Drive:
 
 def _moved(exposed: list[Exposure], spec: CameraSpec, T_ego_cam: Num) -> list[Exposure]:
     """Return the exposures with the vehicle moved, so that the camera's mount puts it where it was."""
-    T_cam_ego = np.linalg.inv(spec.T_ego_cam)
-    return [
-        (t_us, T @ mount @ T_cam_ego) for (t_us, T), mount in zip(exposed, np.asarray(T_ego_cam), strict=True)
-    ]
+    T_ego_moved = np.asarray(T_ego_cam) @ np.linalg.inv(spec.T_ego_cam)
+    return [(t_us, T @ moved) for (t_us, T), moved in zip(exposed, T_ego_moved, strict=True)]
 
 
 def _rates(values: Float64[np.ndarray, "T 3"], t_us: Int64[np.ndarray, "T"]) -> Float64[np.ndarray, "T 3"]:
     """Return the rate of change (per s) since the frame before; the first frame's is that of the second.
 
-    A frame behind a hole of more than `MAX_GAP_S` is a first one: its rate is that of the frame after it.
+    A frame behind a gap of more than `MAX_GAP_S` is a first one.
     """
     if len(t_us) == 1:
         return np.zeros_like(values)
     dt_s = np.diff(t_us) * 1e-6
     rate = np.diff(values, axis=0) / dt_s[:, None]
-    for hole in np.flatnonzero(dt_s > MAX_GAP_S)[::-1]:
-        if hole + 1 < len(rate):
-            rate[hole] = rate[hole + 1]
+    for hole in np.flatnonzero(dt_s[:-1] > MAX_GAP_S)[::-1]:
+        rate[hole] = rate[hole + 1]
     return np.concatenate([rate[:1], rate])
 
 
@@ -283,8 +283,13 @@ def _check_cameras(name: str, cameras: Sequence[CameraSpec]) -> None:
             raise InputError(f"{name}: the calibration of {spec.name} is not finite")
         if K[0, 0] <= 0 or K[1, 1] <= 0:
             raise InputError(f"{name}: the focal lengths of {spec.name} must be above 0")
-        if not np.allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-3) or np.linalg.det(T[:3, :3]) < 0:
+        if not _is_rotation(T):
             raise InputError(f"{name}: T_ego_cam of {spec.name} holds a rotation that is none")
+
+
+def _is_rotation(T: Float64[np.ndarray, "4 4"]) -> bool:
+    """Return whether a pose turns, and does not mirror or scale."""
+    return bool(np.allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-3) and np.linalg.det(T[:3, :3]) > 0)
 
 
 def _metadata(vehicle: Vehicle) -> EgoStateSE3Metadata:
@@ -367,7 +372,6 @@ def _compensated(
     xyz_m: Float64[np.ndarray, "N 3"], dt_s: Float64[np.ndarray, "N"], drive: _Drive, frame: int
 ) -> Float64[np.ndarray, "N 3"]:
     """Move points from the ego frame at their own times to that at the frame's time."""
-    # Many points share a time, so each pose is computed once
     times_us, which = np.unique(np.round(dt_s * 1e6), return_inverse=True)
     T = np.linalg.inv(drive.T_world_ego[frame]) @ drive.poses_at(drive.t_us[frame] + times_us)
     return np.einsum("nij,nj->ni", T[which, :3, :3], xyz_m) + T[which, :3, 3]

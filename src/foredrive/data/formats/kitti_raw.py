@@ -36,6 +36,7 @@ from py123d.parser.base_dataset_parser import BaseLogParser, ModalitiesSync
 from py123d.parser.kitti360.utils.kitti360_constants import KITTI360_EGO_STATE_SE3_METADATA
 from scipy.spatial.transform import Rotation, Slerp
 
+from foredrive.data.ego_path import MAX_GAP_S, in_holes
 from foredrive.data.formats.guard import PartReader
 from foredrive.data.formats.point_files import KITTI, IntensityScale, read_points
 from foredrive.data.formats.raw_log import RawLog, folders_with
@@ -49,6 +50,8 @@ _PERIOD_US = 103_600
 """Time of one turn of the lidar, where no file has it."""
 _CHANNELS = 64
 _LIDAR = "velodyne_points"
+_PROPORTION = 0.01
+"""Share by which the height of a shrunk image may differ, beside one pixel."""
 
 
 class KittiRawParser(BaseLogParser):
@@ -70,7 +73,11 @@ class KittiRawParser(BaseLogParser):
         """Yield the frames that have a sweep or an image: ego pose, lidar and the colour cameras.
 
         The time of a frame is that of the sweep, or of an image where the lidar has none.
+
+        Raises:
+            InputError: the drive is not synced and rectified, or all files of a stream are damaged.
         """
+        _check_synced(self._folder)
         times_us = {
             name: _times_us(self._folder / name / "timestamps.txt")
             for name in (_LIDAR, *_CAMERAS)
@@ -87,6 +94,10 @@ class KittiRawParser(BaseLogParser):
             t_us = next((t for stream in times_us.values() if (t := _time_of(stream, frame))), 0)
             if not t_us:
                 note(self._folder.name, "frames without a time, left out", f"{frame:010d}")
+                continue
+            if path.misses(t_us):
+                text = f"frames without OXTS' records within {MAX_GAP_S:g} s around them, left out"
+                note(self._folder.name, text, f"{frame:010d}")
                 continue
             modalities: list[BaseModality] = []
             for name, file in files.items():
@@ -219,6 +230,13 @@ class _Path:
         turn = Rotation.from_euler("ZYX", rows[:, [5, 4, 3]])
         return cls(times_us, position_m - position_m[0], Slerp(times_us, turn))
 
+    def misses(self, t_us: int) -> bool:
+        """Return whether a time is in a hole of the path, or more than a period before or after it."""
+        if t_us < self.t_us[0] - _PERIOD_US or t_us > self.t_us[-1] + _PERIOD_US:
+            return True
+        T = self.at(self.t_us)
+        return bool(in_holes(self.t_us, T, np.array([t_us]))[0])
+
     def at(self, t_us: Int64[np.ndarray, "M"]) -> Float64[np.ndarray, "M 4 4"]:
         """Return T_world_imu at times: linear in between, standing still before and after."""
         # Before the first and after the last record the vehicle stands still
@@ -269,14 +287,37 @@ class _Calibration:
     def camera(
         self, number: str, size_wh: tuple[int, int]
     ) -> tuple[Float64[np.ndarray, "3 3"], Float64[np.ndarray, "4 4"]]:
-        """Return K for images of a size, which may be shrunk, and T_imu_cam."""
+        """Return K for images of a size, which may be shrunk, and T_imu_cam.
+
+        Raises:
+            InputError: images have other proportions, so they are cut or not rectified.
+        """
         P = self.projections[number]
+        width, height = self.sizes[number].tolist()
+        shrunk = abs(size_wh[0] * height / width - size_wh[1])
+        if shrunk > max(1.0, _PROPORTION * size_wh[1]):
+            raise InputError(
+                f"an image of {size_wh[0]} x {size_wh[1]} px is not one of {width:g} x {height:g} px that "
+                "was shrunk: it is cut, where is not known, or not rectified"
+            )
         T_cam_rect = np.eye(4)
         # Offset of the camera from camera 0: P = K [I | t]
         T_cam_rect[:3, 3] = np.linalg.solve(P[:, :3], P[:, 3])
         # Shrunk images scale the rows of K
         K = np.diag([*(size_wh / self.sizes[number]), 1.0]) @ P[:, :3]
         return K, self.T_imu_rect @ np.linalg.inv(T_cam_rect)
+
+
+def _check_synced(folder: Path) -> None:
+    """Check that a drive is one of those that KITTI calls "synced and rectified".
+
+    Raises:
+        InputError: it is an "extract": images with distortion, sweeps in text, records of OXTS at 100 Hz.
+    """
+    sweeps = {file.suffix for file in (folder / _LIDAR / "data").glob("[0-9]*")}
+    if folder.name.endswith("_extract") or (".txt" in sweeps and ".bin" not in sweeps):
+        message = "unsynced and unrectified recordings are not read; use the …_sync of the drive"
+        raise InputError(f"{folder}: {message}")
 
 
 def _channels(azimuth: Float64[np.ndarray, "P"]) -> np.ndarray | None:
@@ -333,6 +374,8 @@ def _rigid(R: Float64[np.ndarray, "9"], t: Float64[np.ndarray, "3"]) -> Float64[
     """Return a pose with its rotation orthonormalised, because the files have only seven digits."""
     T = np.eye(4)
     U, _, V = np.linalg.svd(R.reshape(3, 3))
+    if np.linalg.det(U @ V) < 0:
+        raise InputError("a calibration file has a rotation that mirrors")
     T[:3, :3], T[:3, 3] = U @ V, t
     return T
 

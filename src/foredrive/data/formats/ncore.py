@@ -18,6 +18,7 @@ from py123d.datatypes import LogMetadata
 from scipy.spatial.transform import Rotation
 
 from foredrive.data.category_names import category_or_other
+from foredrive.data.ego_path import MAX_GAP_S, in_holes
 from foredrive.data.formats.guard import DEFAULT_PERIOD_S
 from foredrive.data.formats.ncore_sensors import (
     FRAME_TIMES,
@@ -83,7 +84,12 @@ class NCoreLog:
             raise InputError("no frame lies in the time of the poses")
         for outside_us in t_us[~inside].tolist():
             note("frames", "before the first or after the last pose, left out", f"{outside_us} µs")
-        t_us = t_us[inside]
+        holes = in_holes(path_us, path, t_us)
+        for hole_us in t_us[holes].tolist():
+            note("frames", f"between poses more than {MAX_GAP_S:g} s apart, left out", f"{hole_us} µs")
+        t_us = t_us[inside & ~holes]
+        if not len(t_us):
+            raise InputError(f"no frame lies between poses at most {MAX_GAP_S:g} s apart")
         T_world_ego = sequence.pose_graph.evaluate_poses(RIG, WORLD, t_us.astype(np.uint64))
         cameras = {name: Images(sequence, name, t_us) for name in cameras_of(sequence)}
         sweeps = Sweeps(sequence, t_us, T_world_ego) if lidars_of(sequence) else None
@@ -207,7 +213,7 @@ def _boxes(
         T_ego_world = np.linalg.inv(T_world_ego[frame])
         at_us = np.array(one.reference_frame_timestamp_us, np.uint64)
         T_ego_ref = T_ego_world @ sequence.pose_graph.evaluate_poses(one.reference_frame_id, WORLD, at_us)
-        R_ego_box = T_ego_ref[:3, :3] @ Rotation.from_euler("XYZ", one.bbox3.rot).as_matrix()
+        R_ego_box = T_ego_ref[:3, :3] @ Rotation.from_euler("xyz", one.bbox3.rot).as_matrix()
         x, y, z = (T_ego_ref[:3, :3] @ one.bbox3.centroid + T_ego_ref[:3, 3]).tolist()
         length, width, height = (float(value) for value in one.bbox3.dim)
         vx, vy, _ = (T_ego_world[:3, :3] @ velocity_mps[row]).tolist()

@@ -148,6 +148,10 @@ class Sweeps(PartSequence):
         super().__init__("lidar", "sweeps", len(t_us))
         self._t_us, self._T_world_ego, self._graph = t_us, T_world_ego, sequence.pose_graph
         self._lidars = lidars_of(sequence)
+        for lidar in self._lidars:
+            (T,) = sequence.pose_graph.evaluate_poses(lidar.sensor_id, RIG, t_us[:1].astype(np.uint64))
+            if np.linalg.det(T[:3, :3]) < 0:
+                raise InputError(f"the mount of {lidar.sensor_id} mirrors; it is no rotation")
         self._nearest = [
             nearest_parts(_frames_of(lidar.lidar_reader, lidar.frames_timestamps_us[:, 1]), t_us)
             for lidar in self._lidars

@@ -6,6 +6,7 @@ looks ahead along it. Lengths are the file's units, which are metres only if its
 image is of which camera is found by `camera_split`.
 """
 
+import dataclasses
 import json
 import os
 import re
@@ -20,9 +21,9 @@ from jaxtyping import Float64, Int64, UInt8
 from py123d.datatypes import LogMetadata
 
 from foredrive.data.camera_streams import CameraSpec
-from foredrive.data.ego_path import interpolated_poses
+from foredrive.data.ego_path import MAX_GAP_S, in_holes, interpolated_poses
 from foredrive.data.formats.camera_split import PosedImage, RigCamera, split_into_cameras
-from foredrive.data.formats.guard import PartReader, PartSequence, nearest_parts
+from foredrive.data.formats.guard import DEFAULT_PERIOD_S, PartReader, PartSequence, nearest_parts
 from foredrive.data.formats.raw_log import RawLog, folders_with
 from foredrive.data.images import check_size, decoded, read_rgb
 from foredrive.data.log_paths import LogPath
@@ -105,9 +106,10 @@ class NerfstudioLog:
         whole = json.loads(file.read_bytes())  # bytes may begin with a byte order mark
         if not isinstance(whole, dict) or not isinstance(whole.get("frames"), list) or not whole["frames"]:
             raise InputError(f"{file}: it has no frames")
-        return [
+        frames = [
             _frame(self.folder, whole, entry, f"{file}, frame {k}") for k, entry in enumerate(whole["frames"])
         ]
+        return _in_seconds(frames, normalised=any("time" in entry for entry in whole["frames"]))
 
 
 class _ImageFiles(PartSequence):
@@ -156,7 +158,12 @@ def _frames_of(cameras: list[RigCamera]) -> tuple[Int64[np.ndarray, "T"], Float6
     others = np.unique(np.concatenate([camera.t_us for camera in cameras]))
     off_us = np.abs(others[:, None] - base.t_us[None]).min(axis=1)
     inside = (others > base.t_us[0]) & (others < base.t_us[-1])
-    t_us = np.union1d(base.t_us, others[inside & (off_us > half_us)])
+    added = others[inside & (off_us > half_us)]
+    holes = in_holes(base.t_us, base.T_world_cam, added)
+    for t_us in added[holes].tolist():
+        text = f"images of others between those of {base.name} more than {MAX_GAP_S:g} s apart, left out"
+        note("frames", text, f"{t_us * 1e-6:.3f} s")
+    t_us = np.union1d(base.t_us, added[~holes])
     # A single image has no motion to interpolate
     if len(base.t_us) == 1:
         return t_us, base.T_world_cam
@@ -184,6 +191,38 @@ def _camera(name: str, lens: tuple[float, ...], T_ego_cam: Float64[np.ndarray, "
     width, height, fx, fy, cx, cy, *dist = lens
     K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
     return CameraSpec(name, K, T_ego_cam, (int(height), int(width)), dist=np.array(dist))
+
+
+def _in_seconds(frames: list[PosedImage], normalised: bool) -> list[PosedImage]:
+    """Return the frames with times in s.
+
+    The entry `time` is that of D-NeRF, which is 0 at the first and 1 at the last image, or -1 and 1, whatever
+    the drive lasted. They are scaled as if images were `DEFAULT_PERIOD_S` apart, as those without times.
+
+    Args:
+        frames: of one file.
+        normalised: whether their times may be such ones.
+    """
+    times = np.unique([frame.t_s for frame in frames if frame.t_s is not None])
+    if len(times) < 2 or times[0] < -1 or times[-1] > 1:
+        return frames
+    scale = DEFAULT_PERIOD_S / float(np.median(np.diff(times)))
+    if not normalised:
+        if times[-1] == 1 and times[0] in (0, -1):
+            note(
+                _FILE,
+                f"times from {times[0]:g} to exactly 1 were read as seconds; normalised?",
+            )
+        return frames
+    note(
+        _FILE,
+        f"entries `time` run from {times[0]:g} to {times[-1]:g}, as normalised ones; "
+        f"they were scaled so that images are {DEFAULT_PERIOD_S:g} s apart (`timestamp` is in seconds)",
+    )
+    return [
+        frame if frame.t_s is None else dataclasses.replace(frame, t_s=(frame.t_s - float(times[0])) * scale)
+        for frame in frames
+    ]
 
 
 def _frame(folder: Path, shared: dict[str, Any], entry: Any, where: str) -> PosedImage:
