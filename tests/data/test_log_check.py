@@ -1,5 +1,6 @@
 """The check of a log: a sound log has no findings, and each fault is found and named."""
 
+import dataclasses
 import re
 from pathlib import Path
 from typing import Any
@@ -7,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from arrow_surgery import rewrite_column
+from scipy.spatial.transform import Rotation
 
 from foredrive.data import Box, CameraSpec, Points, find_logs, write_log
 from foredrive.data.log_check import LogCheck, check_log
@@ -23,28 +25,38 @@ CAMERA = CameraSpec(
 
 
 def sound_drive() -> dict[str, Any]:
-    """Two seconds along a road in a curve, with images that change, a flat road and a car with points."""
+    """Two seconds along a street in a curve, with images that change, and a car ahead with points."""
     t_s = 0.1 * np.arange(FRAMES)
     yaw = 0.2 * t_s
     T = np.tile(np.eye(4), (FRAMES, 1, 1))
     T[:, 0, 0], T[:, 0, 1], T[:, 1, 0], T[:, 1, 1] = np.cos(yaw), -np.sin(yaw), np.sin(yaw), np.cos(yaw)
     T[:, 0, 3], T[:, 1, 3] = 30 * np.sin(yaw), 30 * (1 - np.cos(yaw))  # 6 m/s on a radius of 30 m
     rng = np.random.default_rng(0)
-    x, y = np.meshgrid(np.arange(-14, 14, 0.5), np.arange(-14, 14, 0.5))
-    road = np.stack([x, y, rng.uniform(-0.02, 0.02, x.shape)], axis=-1).reshape(-1, 3)
     car = rng.uniform([9, 1, 0.3], [13, 3, 1.4], (60, 3))
-    wall = np.stack([x, np.full_like(x, 8.0), np.abs(y) / 3 + 0.1], axis=-1).reshape(-1, 3)
-    points = Points(
-        np.concatenate([road, car, wall]), dt_s=np.linspace(-0.05, 0.04, len(road) + 60 + len(wall))
-    )
+    street_m = street(rng)
+    sweeps = []
+    for T_world_ego in T:
+        xyz = (street_m - T_world_ego[:3, 3]) @ T_world_ego[:3, :3]
+        xyz = np.concatenate([xyz[np.linalg.norm(xyz, axis=1) < 16], car])
+        sweeps.append(Points(xyz, dt_s=np.linspace(-0.05, 0.04, len(xyz))))
     return {
         "t_s": t_s,
         "T_world_ego": T,
         "cameras": [CAMERA],
         "images": {"front": [rng.integers(0, 255, (*SIZE_HW, 3), dtype=np.uint8) for _ in t_s]},
-        "sweeps": [points] * FRAMES,
+        "sweeps": sweeps,
         "boxes": [[Box("car", 3, (11.0, 2.0, 0.75), (4.0, 2.0, 1.5), 0.0, (6.0, 0.0))]] * FRAMES,
     }
+
+
+def street(rng: np.random.Generator) -> np.ndarray:
+    """Points of a road, of a wall on each side, and of the front of a house, in the world."""
+    x, y = np.meshgrid(np.arange(-20, 30, 0.5), np.arange(-20, 30, 0.5))
+    along, up = np.meshgrid(np.arange(-20, 30, 0.4), np.arange(0.2, 4, 0.4))
+    road = np.stack([x, y, rng.uniform(-0.02, 0.02, x.shape)], axis=-1)
+    walls = [np.stack([along, np.full_like(up, side), up], axis=-1) for side in (-6.0, 11.0)]
+    front = np.stack([np.full_like(up, 17.0), along, up], axis=-1)
+    return np.concatenate([part.reshape(-1, 3) for part in (road, *walls, front)])
 
 
 def checked(tmp_path: Path, **changed: Any) -> LogCheck:
@@ -77,10 +89,35 @@ def without(values: list[Any], gone: range) -> list[Any]:
     return [None if frame in gone else value for frame, value in enumerate(values)]
 
 
-LIFTED = [Points(DRIVE["sweeps"][0].xyz_m + np.array([0, 0, 0.9]), dt_s=DRIVE["sweeps"][0].dt_s)] * FRAMES
+def moved(sweeps: list[Points], change: Any) -> list[Points]:
+    return [dataclasses.replace(points, xyz_m=change(points.xyz_m)) for points in sweeps]
+
+
+def turned(axis: str, degrees: float) -> list[Points]:
+    """The sweeps of a lidar whose mount is turned, 1.8 m above the ground."""
+    R, at_m = Rotation.from_euler(axis, degrees, degrees=True).as_matrix(), np.array([0.0, 0.0, 1.8])
+    return moved(DRIVE["sweeps"], lambda xyz_m: (xyz_m - at_m) @ R.T + at_m)
+
+
+def over_a_hole() -> np.ndarray:
+    """Poses that were interpolated from 0.4 to 1.5 s."""
+    T = DRIVE["T_world_ego"].copy()
+    share = np.linspace(0, 1, 12)[:, None]
+    T[4:16, :3, 3] = T[4, :3, 3] + share * (T[15, :3, 3] - T[4, :3, 3])
+    return T
+
+
+def looking(axis: str, degrees: float) -> list[CameraSpec]:
+    """The camera, turned about one of its own axes."""
+    T = CAMERA.T_ego_cam.astype(np.float64)
+    T[:3, :3] = T[:3, :3] @ Rotation.from_euler(axis, degrees, degrees=True).as_matrix()
+    return [dataclasses.replace(CAMERA, T_ego_cam=T)]
+
+
+LIFTED = moved(DRIVE["sweeps"], lambda xyz_m: xyz_m + np.array([0, 0, 0.9]))
 SIDEWAYS = DRIVE["T_world_ego"] @ np.array([[0.0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
 TIPPED = DRIVE["T_world_ego"] @ np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
-FAR = [[Box("car", 3, (11.0, -9.0, 3.0), (4.0, 2.0, 1.5), 0.0)]] * FRAMES
+FAR = [[Box("car", 3, (11.0, -2.0, 9.0), (4.0, 2.0, 1.5), 0.0)]] * FRAMES
 FAST = [[Box("car", 3, (11.0, 2.0, 0.75), (4.0, 2.0, 1.5), 0.0, (90.0, 0.0))]] * FRAMES
 
 
@@ -96,12 +133,25 @@ FAST = [[Box("car", 3, (11.0, 2.0, 0.75), (4.0, 2.0, 1.5), 0.0, (90.0, 0.0))]] *
         ({"T_world_ego": TIPPED}, "ego poses", r"tilted by 1\.6 rad"),
         ({"sweeps": LIFTED}, "lidar", r"the ground is at z = 0\.\d+ m"),
         (
+            {"sweeps": turned("z", 5.0)},
+            "lidar",
+            r"pairs of sweeps .*turned by -[456]\.\d° to the left and -?0\.",
+        ),
+        ({"sweeps": turned("y", 5.0)}, "lidar", r"pairs of sweeps .*to the left and [456]\.\d° up"),
+        ({"sweeps": [DRIVE["sweeps"][0]] * FRAMES}, "lidar", "pairs of sweeps .* do not lie on each other"),
+        ({"T_world_ego": over_a_hole()}, "ego poses", r"from 0\.40 to 1\.50 s the path is a straight line"),
+        (
+            {"cameras": looking("x", 90.0)},
+            "front",
+            "no lidar point falls into its images; it looks 90° above",
+        ),
+        (
             {"sweeps": without(DRIVE["sweeps"], range(5, 9))},
             "lidar.lidar_top",
             r"1 gap; it lasts 0\.50 s, from 0\.40 s",
         ),
         ({"sweeps": [Points(np.zeros((0, 3)))] * FRAMES}, "lidar", "12 of 12 sampled sweeps are empty"),
-        ({"sweeps": [Points(DRIVE["sweeps"][0].xyz_m)] * FRAMES}, "lidar", "no times of their own"),
+        ({"sweeps": [Points(one.xyz_m) for one in DRIVE["sweeps"]]}, "lidar", "no times of their own"),
         (
             {"images": {"front": DRIVE["images"]["front"][:1] * FRAMES}},
             "front",

@@ -1,20 +1,26 @@
 """A check of a log: its content, and problems in it."""
 
 import functools
+import itertools
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+import torch
 from jaxtyping import Float, Float64
 
 from foredrive.data.boxes import read_boxes, read_tracks, with_counted_points
 from foredrive.data.cameras import pinhole_cameras, read_camera
+from foredrive.data.ego_path import MAX_GAP_S
 from foredrive.data.lidar import frames_with_lidar, read_sweep
 from foredrive.data.log_paths import LogPath
 from foredrive.data.logs import Log
 from foredrive.data.notices import read_notices
+from foredrive.data.sweep_check import shifted_sweeps
 from foredrive.errors import InputError
+from foredrive.geometry.projection import project
+from foredrive.geometry.se3 import inverse_se3, transform_points
 from foredrive.scene import LidarSweep
 
 Level = Literal["problem", "note"]
@@ -25,6 +31,11 @@ CHECK_HW = (135, 240)
 MAX_ACCELERATION_MPS2, MAX_TURN_RADPS, MAX_TILT_RAD = 15.0, 1.5, 0.35
 """Limits of the motion of road vehicles."""
 SPEED_DIFFERS_MPS, SPEED_DIFFERS_SHARE = 1.0, 0.1
+EVEN_MPS, JERK_MPS = 1e-3, 0.3
+"""Velocities that differ by less are equal, and a change from which a straight line is no drive."""
+MIN_SEEN_POINTS, SECTOR_RAD = 5, np.deg2rad(10.0)
+STEEP_RAD, LEVEL_RAD, ALL_AROUND_RAD = np.deg2rad((60.0, 10.0, 330.0))
+"""Angles of a camera's axis from the horizon: too steep, and level; and a lidar that sees all around."""
 GAP = 1.5
 """A gap is longer than this many times the sensor's usual period."""
 MAX_GROUND_M, NEAR_GROUND_M = 0.3, (4.0, 12.0)
@@ -80,7 +91,14 @@ def check_log(path: LogPath) -> LogCheck:
     """
     log = Log(path)
     streams = list(_streams(log))
-    checks: tuple[Callable[[Log], Iterator[Finding]], ...] = (_poses, _images, _sweeps, _tracks)
+    checks: tuple[Callable[[Log], Iterator[Finding]], ...] = (
+        _poses,
+        _straight_holes,
+        _images,
+        _views,
+        _sweeps,
+        _tracks,
+    )
     findings = [Finding("note", "conversion", notice) for notice in read_notices(path.folder)]
     findings += _gaps(log, streams)
     for check in checks:
@@ -174,6 +192,55 @@ def _jumps(
         yield Finding("problem", "ego poses", f"{text} ({int(wrong.sum())} frames like this)")
 
 
+def _straight_holes(log: Log) -> Iterator[Finding]:
+    """Find poses that were interpolated over a hole: a straight line at one speed, with jerks at its ends."""
+    t_s = (log.t_us - log.t_us[0]) * 1e-6
+    if len(log) < 5:
+        return
+    velocity = np.diff(log.T_world_ego[:, :3, 3], axis=0) / np.diff(t_s)[:, None]
+    change = np.linalg.norm(np.diff(velocity, axis=0), axis=-1)
+    # Runs of steps with equal velocities, between two changes
+    ends = [-1, *np.flatnonzero(change > EVEN_MPS).tolist(), len(change)]
+    for before, after in itertools.pairwise(ends):
+        first, last = before + 1, after + 1
+        lasts_s = float(t_s[last] - t_s[first])
+        jerks = [float(change[row]) for row in (before, after) if 0 <= row < len(change)]
+        if lasts_s > MAX_GAP_S and last - first > 2 and jerks and min(jerks) > JERK_MPS:
+            text = f"from {t_s[first]:.2f} to {t_s[last]:.2f} s the path is a straight line at one speed,"
+            text += f" between jerks of up to {max(jerks):.1f} m/s, as interpolated over a hole in the poses"
+            yield Finding("problem", "ego poses", text)
+
+
+def _views(log: Log) -> Iterator[Finding]:
+    """Find cameras into whose images no lidar point falls: level ones, and those that look up or down."""
+    lidar = set(frames_with_lidar(log).tolist())
+    for name, camera in pinhole_cameras(log).items():
+        frames = np.array([k for k in log.rows(camera.modality_key)[0].tolist() if k in lidar], np.int64)
+        inside, around, up_rad = [], [], 0.0
+        for frame in _sampled(frames):
+            try:
+                view = read_camera(log, int(frame), camera, CHECK_HW, with_image=False)
+                loaded = read_sweep(log, int(frame))
+            except InputError:
+                continue  # the checks of images and sweeps report it
+            if loaded is None:
+                continue
+            points = loaded[0][loaded[0].returned & loaded[0].valid].points_ego
+            _, _, seen = project(
+                transform_points(inverse_se3(view.T_ego_cam), points), view.K, view.dist, CHECK_HW
+            )
+            inside.append(int(seen.sum()))
+            azimuth = torch.atan2(points[:, 1], points[:, 0])
+            around.append(len((azimuth / SECTOR_RAD).round().unique()) * SECTOR_RAD)
+            up_rad = float(torch.asin(view.T_ego_cam[2, 2].clamp(-1, 1)))
+        if not inside or np.median(inside) >= MIN_SEEN_POINTS:
+            continue
+        text = f"no lidar point falls into its images; it looks {np.degrees(up_rad):.0f}° above the horizon"
+        # A lidar that sees all around meets what a level camera sees
+        wrong = abs(up_rad) > STEEP_RAD or (abs(up_rad) < LEVEL_RAD and np.median(around) > ALL_AROUND_RAD)
+        yield Finding("problem" if wrong else "note", name, text)
+
+
 def _images(log: Log) -> Iterator[Finding]:
     """Find images that cannot be decoded, are black or frozen, and clocks that differ."""
     for name, camera in pinhole_cameras(log).items():
@@ -245,6 +312,8 @@ def _sweeps(log: Log) -> Iterator[Finding]:
         yield Finding("note", "lidar", text)
     if ground_m and abs(np.median(ground_m)) > MAX_GROUND_M:
         text = f"the ground is at z = {np.median(ground_m):.2f} m in the ego frame, which should stand on it"
+        yield Finding("problem", "lidar", text)
+    for text in shifted_sweeps(log):
         yield Finding("problem", "lidar", text)
     if near and bare / near > MAX_EMPTY_SHARE:
         text = f"{bare} of {near} sampled boxes within {NEAR_BOX_M:.0f} m have no lidar point in them"

@@ -34,7 +34,7 @@ DELAY_STEPS_S = ((1, 0.02), (1, 0.01))
 """Steps of the searches, from coarse to fine: the number of axes that are searched, and the size of the step.
 The first are tried on a grid, the others climb.
 """
-MAX_ROTATION_RAD, MAX_TRANSLATION_M, MAX_DELAY_S = math.radians(4.0), 0.8, 0.12
+MAX_ROTATION_RAD, MAX_TRANSLATION_M, MAX_DELAY_S = math.radians(7.0), 0.8, 0.12
 """Bounds of the searches. The best offset within them is no optimum if it lies at a bound."""
 _VIEWS, _MIN_VIEWS = 10, 4
 _MIN_EDGES, _MAX_EDGES = 30, 800
@@ -56,6 +56,8 @@ _GOOD_SCORE, _FAR_GAIN = 0.35, 0.15
 """Score from which the nearest optimum is taken, since repeated structures look alike, and the gain by which
 another must be better if the nearest scores less.
 """
+_BESIDE_VIEW_RAD = math.radians(8.0)
+"""Points are kept that are seen up to this angle beside a view."""
 _TYPICAL_RANGE_M = 10.0
 _MIN_FOCAL = 150.0
 """Minimum focal length, px/rad: coarser images cannot show half a degree."""
@@ -183,9 +185,9 @@ def calibration_views(cameras: Sequence[CameraView], edges: Sequence[SweepEdges]
     )
 
 
-def agreement(views: CalibrationViews) -> float:
-    """Return the score as calibrated (see `OffsetFit.score_before`)."""
-    return float(_scores(views, torch.eye(4).expand(len(views), 4, 4), 0.0).mean())
+def agreement(views: CalibrationViews, step_rad: float = 0.0) -> float:
+    """Return the score as calibrated (see `OffsetFit.score_before`), in images as coarse as a step."""
+    return float(_scores(views, torch.eye(4).expand(len(views), 4, 4), step_rad).mean())
 
 
 def best_camera_rotation(views: CalibrationViews) -> OffsetFit:
@@ -337,7 +339,7 @@ def _near_view(points_cam: Float[Tensor, "N 3"], view: CameraView) -> Bool[Tenso
     half_rad = torch.atan2(torch.tensor([width, height]), 2 * view.K.diagonal()[:2]).norm()
     off_axis_rad = torch.atan2(points_cam[:, :2].norm(dim=-1), points_cam[:, 2])
     # The margin covers a turned camera and a moved lidar
-    return off_axis_rad < half_rad + 2 * MAX_ROTATION_RAD
+    return off_axis_rad < half_rad + _BESIDE_VIEW_RAD
 
 
 def _edge_strength(views: Sequence[CameraView]) -> Float[Tensor, "V 2 H W"]:

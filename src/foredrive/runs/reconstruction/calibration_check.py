@@ -17,6 +17,7 @@ from foredrive.methods.reconstruction.calibration import (
     sweep_edges,
     with_images_from,
 )
+from foredrive.methods.reconstruction.lens_fit import best_camera_lens
 from foredrive.methods.reconstruction.tracks import ActorTracks
 from foredrive.methods.reconstruction.views import CameraView, SweepView
 
@@ -28,6 +29,10 @@ _MIN_GAIN, _MIN_IMPROVED_SHARE = 0.05, 0.8
 """An offset is accepted if it raises the agreement by at least this much, in at least this share of views."""
 _SIMPLER = 0.85
 """Share of the gain of rotations for which one clock or one lidar is the better explanation."""
+_SOUND_AGREEMENT, _MIN_LENS_GAIN, _MIN_LENS_SCORE, _MIN_FOCAL_SHARE = 0.5, 0.1, 0.3, 0.05
+"""Another lens is looked for where the agreement is below the first number. It is accepted if it raises the
+agreement by more than the second over that of any rotation, to more than the third, and differs by more than
+the last."""
 _MAX_OWN_AGREEMENT, _MIN_DIFFERENCE = 0.15, 0.2
 """Images are assigned to another camera if their agreement with their own camera is below the first number
 and that with the other camera is higher by more than the second.
@@ -87,7 +92,10 @@ def calibration_findings(
 
 
 def _camera_findings(name: str, views: CalibrationViews, rotation: OffsetFit) -> list[CalibrationFinding]:
-    """Return what explains a camera's images better than its calibration: a rotation or another clock."""
+    """Return what explains a camera's images better than its calibration: a lens, a rotation or a clock."""
+    lens = _lens(views, rotation)
+    if lens is not None:
+        return [CalibrationFinding(f"camera {name} {lens}", large=True)]
     shift_rad = mean_shift_rad(views, rotation.offset)
     turned = _is_significant(rotation, shift_rad, MIN_ROTATION_RAD)
     delay = best_camera_delay(views)
@@ -97,6 +105,26 @@ def _camera_findings(name: str, views: CalibrationViews, rotation: OffsetFit) ->
     if turned:
         return [CalibrationFinding(f"camera {name} {_rotation(rotation)}", shift_rad >= LARGE_ROTATION_RAD)]
     return []
+
+
+def _lens(views: CalibrationViews, rotation: OffsetFit) -> str | None:
+    """Return which other lens explains the images much better than any rotation, or None."""
+    if agreement(views) > _SOUND_AGREEMENT:
+        return None
+    lens = best_camera_lens(views)
+    fit = lens.rotation
+    gain = fit.score_after - max(rotation.score_after, rotation.score_before)
+    if (
+        gain < _MIN_LENS_GAIN
+        or fit.score_after < _MIN_LENS_SCORE
+        or abs(lens.focal_scale - 1) < _MIN_FOCAL_SHARE
+    ):
+        return None
+    undistorted = " and no distortion" if lens.undistorted else ""
+    return (
+        f"fits the lidar better with {lens.focal_scale:.2f} of its focal length{undistorted} (agreement "
+        f"{fit.score_after:.2f} instead of {rotation.score_before:.2f}); were the images changed?"
+    )
 
 
 def _rotation(fit: OffsetFit) -> str:
