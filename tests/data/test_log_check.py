@@ -114,6 +114,7 @@ def looking(axis: str, degrees: float) -> list[CameraSpec]:
     return [dataclasses.replace(CAMERA, T_ego_cam=T)]
 
 
+STRETCHED = np.array([[1, 1, 1], [1, 1.05, 1], [1, 1, 1]], np.float32)
 LIFTED = moved(DRIVE["sweeps"], lambda xyz_m: xyz_m + np.array([0, 0, 0.9]))
 SIDEWAYS = DRIVE["T_world_ego"] @ np.array([[0.0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
 TIPPED = DRIVE["T_world_ego"] @ np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
@@ -139,6 +140,11 @@ FAST = [[Box("car", 3, (11.0, 2.0, 0.75), (4.0, 2.0, 1.5), 0.0, (90.0, 0.0))]] *
         ),
         ({"sweeps": turned("y", 5.0)}, "lidar", r"pairs of sweeps .*to the left and [456]\.\d° up"),
         ({"sweeps": [DRIVE["sweeps"][0]] * FRAMES}, "lidar", "pairs of sweeps .* do not lie on each other"),
+        (
+            {"cameras": [dataclasses.replace(CAMERA, K=CAMERA.K * STRETCHED)]},
+            "front",
+            r"30\.0 and 31\.5 px: were",
+        ),
         ({"T_world_ego": over_a_hole()}, "ego poses", r"from 0\.40 to 1\.50 s the path is a straight line"),
         (
             {"cameras": looking("x", 90.0)},

@@ -33,6 +33,8 @@ MAX_ACCELERATION_MPS2, MAX_TURN_RADPS, MAX_TILT_RAD = 15.0, 1.5, 0.35
 SPEED_DIFFERS_MPS, SPEED_DIFFERS_SHARE = 1.0, 0.1
 EVEN_MPS, JERK_MPS = 1e-3, 0.3
 """Velocities that differ by less are equal, and a change from which a straight line is no drive."""
+MAX_STRETCH = 0.03
+"""Share by which the focal lengths of a camera may differ."""
 MIN_SEEN_POINTS, SECTOR_RAD = 5, np.deg2rad(10.0)
 STEEP_RAD, LEVEL_RAD, ALL_AROUND_RAD = np.deg2rad((60.0, 10.0, 330.0))
 """Angles of a camera's axis from the horizon: too steep, and level; and a lidar that sees all around."""
@@ -215,6 +217,10 @@ def _views(log: Log) -> Iterator[Finding]:
     """Find cameras into whose images no lidar point falls: level ones, and those that look up or down."""
     lidar = set(frames_with_lidar(log).tolist())
     for name, camera in pinhole_cameras(log).items():
+        fx, fy = camera.intrinsics.fx, camera.intrinsics.fy
+        if abs(fx / fy - 1) > MAX_STRETCH:
+            text = f"its focal lengths are {fx:.1f} and {fy:.1f} px: were cut images taken for scaled?"
+            yield Finding("note", name, text)
         frames = np.array([k for k in log.rows(camera.modality_key)[0].tolist() if k in lidar], np.int64)
         inside, around, up_rad = [], [], 0.0
         for frame in _sampled(frames):
