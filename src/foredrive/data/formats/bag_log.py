@@ -91,27 +91,16 @@ class BagLog:
             )
 
             mounts = Mounts(tree, topics.ego_frame, T_ego_origin)
-            images, image_t_s, image_mounts, cameras = {}, {}, {}, []
+            # Each camera is a stream of images, read one at a time
+            images, cameras, image_mounts = {}, [], {}
             for name, camera in topics.cameras.items():
-                # Each camera is a stream of images, read one at a time
-                calibration = _calibration(camera, index)
-                stamps, first = index.stamps[camera.images], index.first[camera.images]
-                read = functools.partial(_image, size_hw=calibration.size_hw, value_range=camera.value_range)
-                stream = _Stream(bag, camera.images, stamps, times_us, read)
-                T_ego_cam = mounts.of_camera(camera, first, stream.t_us)
-                T_ego_cam[:, :3, :3] = T_ego_cam[:, :3, :3] @ calibration.R_optical_cam
-                cameras.append(
-                    CameraSpec(name, calibration.K, T_ego_cam[0], calibration.size_hw, dist=calibration.dist)
-                )
-                images[name], image_t_s[name] = stream, stream.t_us * 1e-6
+                stream, spec, T_ego_cam = _stream_of_camera(name, camera, bag, index, times_us, mounts)
+                images[name] = stream
+                cameras.append(spec)
                 if not np.allclose(T_ego_cam, T_ego_cam[:1], atol=1e-6):
-                    note(
-                        camera.images, "its camera moves on the vehicle; each image has the mount of its time"
-                    )
+                    text = "its camera moves on the vehicle; each image has the mount of its time"
+                    note(camera.images, text)
                     image_mounts[name] = T_ego_cam
-                if camera.value_range is not None:
-                    low, high = camera.value_range
-                    note(camera.images, f"images of 16 bits; {low:g} became 0 and {high:g} became 255")
             # Without a lidar its position is unimportant: a usual place on a roof
             sweeps, position_m = None, USUAL_POSITION_M
             if topics.lidar is not None:
@@ -129,7 +118,7 @@ class BagLog:
                 poses,
                 cameras=cameras,
                 images=images,
-                image_t_s=image_t_s,
+                image_t_s={name: stream.t_us * 1e-6 for name, stream in images.items()},
                 sweeps=sweeps,
                 image_mounts=image_mounts,
                 lidar_position_m=position_m,
@@ -212,6 +201,23 @@ class BagLog:
             message = "{}: no message of {} ({} to {} s) lies between poses ({} to {} s) at most {:g} s apart"
             raise InputError(message.format(self.bag, first, *times, MAX_GAP_S))
         return kept
+
+
+def _stream_of_camera(
+    name: str, camera: CameraTopics, bag: Bag, index: BagIndex, times_us: np.ndarray, mounts: Mounts
+) -> tuple["_Stream", CameraSpec, Float64[np.ndarray, "N 4 4"]]:
+    """Return the images of a camera, its description, and its mount T_ego_cam at the time of each image."""
+    calibration = _calibration(camera, index)
+    read = functools.partial(_image, size_hw=calibration.size_hw, value_range=camera.value_range)
+    stream = _Stream(bag, camera.images, index.stamps[camera.images], times_us, read)
+    T_ego_cam = mounts.of_camera(camera, index.first[camera.images], stream.t_us)
+    # Rectified images are turned against the optical axes
+    T_ego_cam[:, :3, :3] = T_ego_cam[:, :3, :3] @ calibration.R_optical_cam
+    if camera.value_range is not None:
+        low, high = camera.value_range
+        note(camera.images, f"images of 16 bits; {low:g} became 0 and {high:g} became 255")
+    spec = CameraSpec(name, calibration.K, T_ego_cam[0], calibration.size_hw, dist=calibration.dist)
+    return stream, spec, T_ego_cam
 
 
 def _calibration(camera: CameraTopics, index: BagIndex) -> Calibration:
