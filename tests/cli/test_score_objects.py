@@ -151,6 +151,36 @@ def test_what_the_truth_lacks_is_not_judged(tmp_path: Path, detections: Content)
     assert figures["detection.nuscenes.car.ate_m"] == pytest.approx(0.4)
 
 
+def test_results_without_points_do_not_count(tmp_path: Path, truth: Path, detections: Content) -> None:
+    """As in the devkit, whose own files state points in every box: a third car has none and is dropped."""
+    expected = score(tmp_path, detections, truth, "detection")
+    for boxes in detections.values():
+        boxes[1]["num_pts"] = 12
+        unseen = {"detection_score": 0.95, "attribute_name": "vehicle.moving", "num_pts": 0}
+        boxes.append(box(30.0, "car", "detection", **unseen))
+    figures = score(tmp_path, detections, truth, "detection")
+    assert figures["found"] == expected["found"] + 3
+    for name in ("nuscenes", "vad"):
+        assert figures[f"detection.{name}.car.ap"] == expected[f"detection.{name}.car.ap"]
+
+
+@pytest.mark.parametrize("stated", [True, False])
+def test_an_empty_frame_is_filtered_by_range_as_results_state_it(
+    stated: bool, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Only boxes tell where the ego vehicle is, and a frame of the truth has none: those of results do."""
+    near = box(5.0, "car", "detection", ego_translation=[5.0, 0.0, 1.0], num_pts=5)
+    far = box(70.0, "car", "detection", detection_score=0.95)
+    if stated:
+        far["ego_translation"] = [60.0, 0.0, 1.0]
+    truth = write(tmp_path / "truth.json", {"a0": [near], "a1": [], "a2": []})
+    found = {"a0": [{**near, "detection_score": 0.9}], "a1": [dict(far) for _ in range(6)]}
+    figures = score(tmp_path, found, truth, "detection")
+    told = "boxes of 1 of 3 frames are not filtered by range: no file states the ego vehicle's place there"
+    assert caplog.messages == ([] if stated else [told])
+    assert (figures["detection.nuscenes.car.ap"] == pytest.approx(1.0)) is stated
+
+
 Edit = Callable[[Content], object]
 
 

@@ -5,14 +5,16 @@ returns them). A box has `translation` (m, global), `size` (w, l, h in m), `rota
 `velocity` (m/s, NaN where unknown), and either `detection_name`, `detection_score` and `attribute_name`, or
 `tracking_name`, `tracking_score` and `tracking_id`.
 
-Truth may have either name, and `num_pts`, `ego_translation` and `tracking_id`. Boxes with the name of a
-bicycle rack are no objects. Boxes without length, width or height are left out. Tracking needs the scene and
-the time of each sample: `scene_token` and `timestamp` (µs), in its boxes or under `samples`, an object by
-sample token. There `ego_translation` is the place of the ego vehicle; in a box it is the box's offset from
-it.
+Boxes of both files may have `num_pts` and `ego_translation`. Truth may have either name, and `tracking_id`.
+Boxes with the name of a bicycle rack are no objects. Boxes without length, width or height are left out.
+Tracking needs the scene and the time of each sample: `scene_token` and `timestamp` (µs), in its boxes or
+under `samples`, an object by sample token. There `ego_translation` is the place of the ego vehicle; in a box
+it is the box's offset from it.
 """
 
+import dataclasses
 import itertools
+import logging
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -41,6 +43,7 @@ from foredrive.tasks.tracking.truth import (
 )
 
 Box = Mapping[str, Any]
+_log = logging.getLogger(__name__)
 
 
 def read_labels(
@@ -174,6 +177,7 @@ def read_results(
     columns: dict[str, ndarray] = {
         "score": read_scores(boxes, f"{task}_score", names, only_ranks=task == "detection"),
         "velocity": read_velocities(boxes, names),
+        "num_points": read_points(boxes, names),
         # Range from the ego vehicle decides about what counts
         "from_ego": centre[:, :2] - truth.ego[frame],
     }
@@ -188,6 +192,38 @@ def read_results(
     rows = make_rows(frame, label, centre, size_lwh, yaw, **columns)
     check_tracks(rows, identities, names)
     return FoundObjects(_with_size([rows], path)[0], missing)
+
+
+def with_places_of_results(truth: ObjectTruth, path: Path) -> ObjectTruth:
+    """Return the truth with the ego vehicle's place from a results file in the frames that lack it.
+
+    One line says in how many frames with boxes the place stays unknown: nothing is too far away there.
+
+    Raises:
+        InputError: an offset of the results is wrong.
+    """
+    by_frame = boxes_by_frame(path, read_object(path))
+    ego, unfiltered = truth.ego.copy(), 0
+    not_empty = set(truth.boxes.frame.tolist())
+    for n in np.flatnonzero(np.isnan(ego[:, 0])).tolist():
+        found = by_frame.get(truth.names[n], ())
+        place = _place(found, f"{path}: frame {truth.names[n]}")
+        if place is not None:
+            ego[n] = place
+        elif found or n in not_empty:
+            unfiltered += 1
+    if unfiltered:
+        _log.warning(
+            "boxes of %d of %d frames are not filtered by range: "
+            "no file states the ego vehicle's place there",
+            unfiltered,
+            len(ego),
+        )
+    boxes, racks = (
+        dataclasses.replace(rows, from_ego=rows.centre[:, :2] - ego[rows.frame])
+        for rows in (truth.boxes, truth.racks)
+    )
+    return dataclasses.replace(truth, boxes=boxes, racks=racks, ego=ego, lacks=lacking(boxes))
 
 
 def read_json_truth(path: Path, task: ObjectTask, classes: Sequence[str]) -> ObjectTruth:
@@ -295,20 +331,26 @@ def _name(box: Box) -> object:
 
 
 def _sample(stated: Mapping[str, Any], boxes: Sequence[Box], where: str) -> Sample:
-    """Return scene, time and ego vehicle as a sample, or else its first box, states them."""
+    """Return scene, time and ego vehicle as a sample, or else its boxes, state them."""
     box = boxes[0] if boxes else {}
     scene, time_us = (stated.get(key, box.get(key)) for key in ("scene_token", "timestamp"))
-    ego = None
     if "ego_translation" in stated:
-        ego = read_numbers(stated, "ego_translation", 3, where)[:2]
-    elif "ego_translation" in box:
-        offset = read_numbers(box, "ego_translation", 3, f"{where}, box 0")
-        # In boxes, `ego_translation` is the offset from the ego vehicle
-        if offset.any():  # the devkit writes zeros where it does not know
-            ego = (read_numbers(box, "translation", 3, f"{where}, box 0") - offset)[:2]
+        ego: ndarray | None = read_numbers(stated, "ego_translation", 3, where)[:2]
+    else:
+        ego = _place(boxes, where)
     if time_us is not None and not isinstance(time_us, int):
         raise InputError(f"{where}: its timestamp is no whole number of microseconds")
     return Sample(None if scene is None else str(scene), time_us, ego)
+
+
+def _place(boxes: Sequence[Box], where: str) -> Float[ndarray, "2"] | None:
+    """Return the place of the ego vehicle from the first box that states its offset from it."""
+    for n, box in enumerate(boxes):
+        if "ego_translation" in box:
+            offset = read_numbers(box, "ego_translation", 3, f"{where}, box {n}")
+            if offset.any():  # the devkit writes zeros where it does not know
+                return (read_numbers(box, "translation", 3, f"{where}, box {n}") - offset)[:2]
+    return None
 
 
 def _in_time(samples: Mapping[str, Sample], path: Path) -> list[str]:

@@ -21,6 +21,7 @@ from foredrive.tasks.tracking.nuscenes_json import (
     read_json_truth,
     read_object,
     read_results,
+    with_places_of_results,
 )
 from foredrive.tasks.tracking.nuscenes_tables import find_tables, read_tables_truth
 from foredrive.tasks.tracking.object_rows import Frames, ObjectRows
@@ -91,6 +92,8 @@ def read_objects(results: Path, truth: Path, task: ObjectTask) -> tuple[FoundObj
             true = read_log_truth(truth, listed, results, protocol.classes)
         else:
             true = read_tables_truth(tables, listed, results, task, protocol.classes)
+    if np.isnan(true.ego).any():
+        true = with_places_of_results(true, results)
     predicted = read_results(results, true, truth, task, protocol.classes, protocol.max_boxes)
     return predicted, true
 
