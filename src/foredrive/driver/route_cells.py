@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from foredrive.driving.speed_rule import FRONT_M
+from foredrive.geometry.precision import full_precision
 from foredrive.geometry.projection import project
 from foredrive.geometry.se3 import inverse_se3, transform_points
 from foredrive.scene import CameraRig
@@ -103,10 +104,9 @@ def sample_cameras(
     # A point counts if it is in the image and the image exists
     inside = (inside & image_valid[..., None]).flatten(0, 1)
     size_wh = uv.new_tensor([rig.size_hw[1], rig.size_hw[0]])
-    # Pixels to grid_sample's range; what lies outside is masked by `seen`
-    place = (2 * uv / size_wh - 1).clamp(-2, 2).flatten(0, 1)
-    read = F.grid_sample(
-        features.flatten(0, 1).float(), place[:, :, None], align_corners=False, padding_mode="border"
-    )[..., 0]
+    with full_precision(features.flatten(0, 1), uv) as (maps, uv):
+        # Pixels to grid_sample's range; what lies outside is masked by `seen`
+        place = (2 * uv / size_wh - 1).clamp(-2, 2).flatten(0, 1)[:, :, None]
+        read = F.grid_sample(maps, place, align_corners=False, padding_mode="border")[..., 0]
     seen = inside[:, None].to(read)
     return torch.cat([read * seen, seen], dim=1).view(b, cameras, channels + 1, -1)

@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from foredrive.driver.eyes import blacked, seen_frames
 from foredrive.driver.route_cells import line_cells, route_cells
 from foredrive.driver.sight import RouteReader, Sight
+from foredrive.geometry.precision import full_precision
 from foredrive.geometry.se3 import compose_se3, inverse_se3, transform_points
 from foredrive.methods.blocks.lifting import lift_frames
 from foredrive.methods.nemo import Nemo, NemoConfig
@@ -109,12 +110,12 @@ class VolumeEyes(nn.Module):
         size_m = spec.voxel_m * points.new_tensor(spec.shape_zyx[::-1])
         read = []
         for t in range(volumes.shape[1]):
-            # Metres to grid_sample's range in the volume
-            place = 2 * (transform_points(T_frame_now[:, t], points) - lower) / size_m - 1
-            inside = (place.abs() < 1).all(-1)
-            values = F.grid_sample(
-                volumes[:, t].float(), place.clamp(-2, 2)[:, :, None, None], align_corners=False
-            )[..., 0, 0]
+            with full_precision(volumes[:, t], transform_points(T_frame_now[:, t], points)) as (volume, at_m):
+                # Metres to grid_sample's range in the volume
+                place = 2 * (at_m - lower) / size_m - 1
+                inside = (place.abs() < 1).all(-1)
+                where = place.clamp(-2, 2)[:, :, None, None]
+                values = F.grid_sample(volume, where, align_corners=False)[..., 0, 0]
             both = torch.cat([values, inside[:, None].to(values)], dim=1)
             both = both.unflatten(-1, (count, *cells.shape[1:3])).permute(0, 2, 1, 3, 4)
             read.append(both.flatten(1, 2))

@@ -1,11 +1,16 @@
 """Geometry within bfloat16 autocast: positions, rays and poses stay exact."""
 
+import ast
 import dataclasses
+import math
 from collections.abc import Callable
+from pathlib import Path
 
 import pytest
 import torch
+from torch import nn
 
+import foredrive
 from foredrive.geometry.se3 import compose_se3, exp_se3, inverse_se3, transform_points
 from foredrive.methods.blocks.lift_splat import LiftSplatConfig, LiftSplatEncoder
 from foredrive.methods.blocks.lifting import project_to_cameras
@@ -13,6 +18,9 @@ from foredrive.methods.blocks.training_rays import thinned_rays
 from foredrive.methods.driveworld.planes import warp_plane
 from foredrive.scene import Clip, Example, VoxelSpec
 from foredrive.sensors import camera_rays
+from foredrive.tasks.detection.proposals import CentreHead
+from foredrive.tasks.heads.plane import Plane, PlanePyramid, cell_middles
+from foredrive.tasks.occupancy.instances_head import InstanceHead, InstanceHeadConfig
 
 SPEC = VoxelSpec(lower_m=(-25.6, -25.6, -2.0), voxel_m=0.8, shape_zyx=(8, 64, 64))
 BF16 = torch.autocast("cpu", torch.bfloat16)
@@ -74,3 +82,78 @@ def test_poses_and_what_they_move_are_exact() -> None:
     assert torch.equal(moved, transform_points(T, points))
     assert torch.equal(carried, warp_plane(plane, T[None], SPEC))
     assert (compose_se3(inverse_se3(T), T) - torch.eye(4)).abs().max() < 1e-5
+
+
+FAR = VoxelSpec(lower_m=(-50.0, -50.0, -1.0), voxel_m=0.4, shape_zyx=(4, 250, 250))
+"""Places 50 m away are rounded to a quarter of a metre in bfloat16."""
+PLACES_M = torch.rand(1, 300, 2, generator=torch.Generator().manual_seed(0)) * 98 - 49
+
+
+def ramp(width: int = 1) -> Plane:
+    """A plane whose features are x, in metres."""
+    x = cell_middles(FAR.lower_m[:2], FAR.voxel_m, FAR.shape_zyx[1:])[:, 0].view(FAR.shape_zyx[1:])
+    return Plane(x.expand(1, width, -1, -1).contiguous(), FAR.lower_m[:2], FAR.voxel_m)
+
+
+def pyramid(width: int = 16) -> PlanePyramid:
+    return PlanePyramid(FAR, channels=4, width=width, max_cells=64, past=True)
+
+
+def test_planes_are_read_where_the_points_are() -> None:
+    halves = dataclasses.replace(ramp(), features=ramp().features.bfloat16())
+    with BF16:
+        read, rounded = ramp().at(PLACES_M), halves.at(PLACES_M)
+    assert (read[..., 0] - PLACES_M[..., 0]).abs().max() < 1e-3
+    assert torch.equal(rounded, dataclasses.replace(halves, features=halves.features.float()).at(PLACES_M))
+    assert torch.equal(halves.middle_m, ramp().middle_m)
+
+
+def test_planes_of_other_key_frames_are_moved_exactly() -> None:
+    """Under autocast cells moved by up to 0.35 m."""
+    T = exp_se3(torch.tensor([[2.3, 0.1, 0.0, 0.0, 0.0, 0.07]]))
+    planes = pyramid()
+    head = InstanceHead(planes, InstanceHeadConfig(steps=1))
+    head.pixels = nn.Sequential(nn.Identity())
+    query = torch.zeros(1, 1, planes.width)
+
+    def moved() -> tuple[torch.Tensor, torch.Tensor]:
+        with torch.no_grad():
+            past = planes._moved(ramp().features, T)
+            return past, head(query, ramp(16), [ramp(16)], T[:, None]).pixels
+
+    exact = moved()
+    with BF16:
+        assert all(torch.equal(a, b) for a, b in zip(moved(), exact, strict=True))
+    # By hand, in the middle of the plane: x of the past is 2.3 m ahead, and turned
+    x, y = cell_middles(FAR.lower_m[:2], FAR.voxel_m, FAR.shape_zyx[1:]).view(250, 250, 2)[120, 90].tolist()
+    expected = math.cos(0.07) * x - math.sin(0.07) * y + float(T[0, 0, 3])
+    assert float(exact[0][0, 0, 120, 90]) == pytest.approx(expected, abs=1e-3)
+
+
+def test_centres_lie_where_their_cells_do() -> None:
+    head = CentreHead(8, classes=2)
+    with torch.no_grad():
+        head.out.weight.zero_()
+        head.out.bias.zero_()
+        with BF16:
+            centres = head(ramp(8))
+    assert torch.equal(centres.xy[0].flatten(0, 1), ramp().middle_m)
+
+
+def test_every_sampling_is_in_full_precision() -> None:
+    """Each call of grid_sample stands within `full_precision`, so that its places are not rounded."""
+    found, bare = 0, []
+    for path in sorted(Path(foredrive.__file__).parent.rglob("*.py")):
+        tree = ast.parse(path.read_text())
+        guarded = {
+            id(inner)
+            for node in ast.walk(tree)
+            if isinstance(node, ast.With) and "full_precision(" in ast.unparse(node.items[0])
+            for inner in ast.walk(node)
+        }
+        for node in ast.walk(tree):
+            if isinstance(node, ast.Call) and ast.unparse(node.func).endswith("grid_sample"):
+                found += 1
+                bare += [] if id(node) in guarded else [f"{path.name}:{node.lineno}"]
+    assert not bare
+    assert found >= 8

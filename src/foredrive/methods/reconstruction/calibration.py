@@ -18,6 +18,7 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
+from foredrive.geometry.precision import full_precision
 from foredrive.geometry.projection import project
 from foredrive.geometry.se3 import exp_se3, inverse_se3, transform_points
 from foredrive.methods.reconstruction.scene_graph import STATIC
@@ -318,7 +319,9 @@ def _scores(
     strength = views.strength[level]
     # ceil_mode lets the coarse cells cover a little more than the image: normalise by what they cover
     covered_wh = torch.tensor([strength.shape[-1], strength.shape[-2]]) * 2**level
-    sampled = F.grid_sample(strength, (2 * uv / covered_wh - 1)[:, None], align_corners=False)[:, :, 0]
+    with full_precision(strength, uv) as (strength, uv):
+        where = (2 * uv / covered_wh - 1)[:, None]
+        sampled = F.grid_sample(strength, where, align_corners=False)[:, :, 0]
     score = torch.zeros(len(views))
     # Beams side by side meet edges across u (kind 0), beams above each other edges across v (kind 1)
     for kind, belongs in enumerate((~views.horizontal, views.horizontal)):

@@ -164,7 +164,7 @@ def _cell_losses(centres: CentreMap, targets: AgentTargets, spec: VoxelSpec) -> 
     rows, columns = centres.z.shape
     lower = centres.xy.new_tensor(spec.lower_m[:2])
     cell_m = spec.voxel_m
-    state, label = targets.boxes.state.to(centres.z), targets.boxes.label
+    state, label = targets.boxes.state.to(centres.xy), targets.boxes.label
     middle = cell_middles(spec.lower_m[:2], cell_m, (rows, columns)).view(rows, columns, 2).to(lower)
     # The bump scales with the box, and covers the neighbouring cells at least
     spread = (SPREAD * state[:, 3:5].exp().mean(-1)).clamp_min(0.7 * cell_m)

@@ -9,7 +9,7 @@ from torch.nn import functional as F
 
 from foredrive.scene.record import Record
 from foredrive.tasks.detection.network import TYPICAL_LOG_LWH
-from foredrive.tasks.heads.plane import Plane, cell_middles
+from foredrive.tasks.heads.plane import Plane
 
 BOX_NUMBERS = (2, 1, 3, 2, 2)
 """Numbers of a cell's box: shift, height, size, heading, velocity."""
@@ -70,10 +70,9 @@ class CentreHead(nn.Module):
         logits, boxes = out[:, : self.classes], out[:, self.classes :].permute(0, 2, 3, 1)
         shift, z, size, heading, velocity = boxes.split(BOX_NUMBERS, dim=-1)
         # Boxes relative to the middle of their cell, in units of its edge
-        middle = cell_middles(plane.lower_m, plane.cell_m, (out.shape[2], out.shape[3])).to(out)
         return CentreMap(
             logits=logits,
-            xy=middle.view(*out.shape[2:], 2) + plane.cell_m * shift,
+            xy=plane.middle_m.view(*out.shape[2:], 2) + plane.cell_m * shift,
             z=z[..., 0],
             log_lwh=size + size.new_tensor(TYPICAL_LOG_LWH),
             heading=heading,

@@ -8,6 +8,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from foredrive.geometry.precision import full_precision
 from foredrive.scene import VoxelSpec
 from foredrive.scene.record import Record
 
@@ -28,9 +29,9 @@ class Plane(Record):
 
     @property
     def middle_m(self) -> Float[Tensor, "C 2"]:
-        """Return the middle of each of the `cells`."""
+        """Return the middle of each of the `cells`, in float32 whatever the features are."""
         rows, columns = self.features.shape[-2:]
-        return cell_middles(self.lower_m, self.cell_m, (rows, columns)).to(self.features)
+        return cell_middles(self.lower_m, self.cell_m, (rows, columns)).to(self.features.device)
 
     def share(self, points_m: Float[Tensor, "*n 2"]) -> Float[Tensor, "*n 2"]:
         """Return points of the ego frame as shares of the plane's extent, 0 to 1 inside."""
@@ -39,10 +40,14 @@ class Plane(Record):
         return (points_m - points_m.new_tensor(self.lower_m)) / extent_m
 
     def at(self, points_m: Float[Tensor, "b *n 2"]) -> Float[Tensor, "b *n W"]:
-        """Return the features at points of the ego frame, bilinear; they fall to 0 outside of the plane."""
-        # grid_sample has the borders of the plane at -1 and 1; one row of N points
-        where = (2 * self.share(points_m) - 1).flatten(1, -2)[:, None]
-        sampled = F.grid_sample(self.features, where.to(self.features), align_corners=False)
+        """Return the features at points of the ego frame, bilinear; they fall to 0 outside of the plane.
+
+        Points and features are read in full precision, also within autocast.
+        """
+        with full_precision(self.features, points_m) as (features, points_m):
+            # grid_sample has the borders of the plane at -1 and 1; one row of N points
+            where = (2 * self.share(points_m) - 1).flatten(1, -2)[:, None]
+            sampled = F.grid_sample(features, where, align_corners=False)
         return sampled[:, :, 0].mT.unflatten(1, points_m.shape[1:-1])
 
 
@@ -162,9 +167,8 @@ class PlanePyramid(nn.Module):
 
     def _moved(self, past: Float[Tensor, "b W y x"], T_past_now: Float[Tensor, "b 4 4"]) -> Tensor:
         """Read the plane of the past at the places of now's cells, 0 outside."""
-        middle = cell_middles(self.lower_m, self.cell_m, self.shape_yx).to(past)
-        # Places of now's cells in the past ego frame, rotated and shifted over the ground
-        moved = middle @ T_past_now[:, :2, :2].mT.to(past) + T_past_now[:, None, :2, 3].to(past)
+        middle = cell_middles(self.lower_m, self.cell_m, self.shape_yx).to(past.device)
+        moved = moved_over_ground(T_past_now, middle)
         return Plane(past, self.lower_m, self.cell_m).at(moved).mT.unflatten(-1, self.shape_yx)
 
 
@@ -172,6 +176,14 @@ def _convolution(width_in: int, width: int, stride: int = 1, size: int = 3) -> n
     return nn.Sequential(
         nn.Conv2d(width_in, width, size, stride=stride, padding=size // 2), nn.GroupNorm(8, width), nn.ReLU()
     )
+
+
+def moved_over_ground(
+    T_dst_src: Float[Tensor, "b 4 4"], points_m: Float[Tensor, "C 2"]
+) -> Float[Tensor, "b C 2"]:
+    """Return points of src in dst, in float32 and also within autocast; heights and tilts are left out."""
+    with full_precision(T_dst_src.float(), points_m) as (T, points):
+        return points @ T[:, :2, :2].mT + T[:, None, :2, 3]
 
 
 def cell_middles(

@@ -38,7 +38,7 @@ def instance_loss(
     # Cells whose middle is above the volume
     grid, wanted = truth.spec, _inside(truth.spec, spec)
     middle = cell_middles(grid.lower_m, grid.cell_m, grid.shape_yx).unflatten(0, grid.shape_yx)
-    middles = middle[wanted[0]][:, wanted[1]].to(instances.embedding)
+    middles = middle[wanted[0]][:, wanted[1]].to(instances.embedding.device)
     losses = []
     # Vehicles among the matched boxes, at steps that are annotated
     for item in boxes_valid.nonzero()[:, 0].tolist():

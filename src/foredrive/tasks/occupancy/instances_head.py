@@ -11,11 +11,12 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
+from foredrive.geometry.se3 import inverse_se3
 from foredrive.scene.boxes import VEHICLES
 from foredrive.scene.map_elements import PlaneSpec
 from foredrive.scene.record import Record
 from foredrive.tasks.detection.agents_head import AGENT_CLASSES, AgentSet
-from foredrive.tasks.heads.plane import Plane, PlanePyramid, cell_middles
+from foredrive.tasks.heads.plane import Plane, PlanePyramid, cell_middles, moved_over_ground
 
 MARGIN_M = 0.25
 """The truth's cells are about half a cell of 0.5 m larger than a box, on each side."""
@@ -98,12 +99,11 @@ class InstanceHead(nn.Module):
         """
         out = self.agent(query).unflatten(-1, (self.config.steps + 1, self.config.width + 1))
         seen = [self.pixels(now.features)]
-        middle = cell_middles(now.lower_m, now.cell_m, self.shape_yx).to(now.features)
-        T_later_now = torch.linalg.inv(T_now_later.to(now.features))
+        middle = cell_middles(now.lower_m, now.cell_m, self.shape_yx).to(now.features.device)
+        T_later_now = inverse_se3(T_now_later)
         for step, plane in enumerate(later):
-            T = T_later_now[:, step]
             # Places of now's cells in the ego frame of the imagined step
-            carried_xy = middle @ T[:, :2, :2].mT + T[:, None, :2, 3]
+            carried_xy = moved_over_ground(T_later_now[:, step], middle)
             moved = Plane(self.pixels(plane.features), plane.lower_m, plane.cell_m).at(carried_xy)
             seen.append(moved.mT.unflatten(-1, self.shape_yx))
         # Zeros leave the box at constant velocity as the only prior of steps that are not imagined
@@ -149,7 +149,7 @@ def instance_logits(
     plane = Plane(instances.pixels, instances.lower_m, instances.cell_m)
     pixels = plane.at(points_m.expand(count, -1, -1))
     # Scaled dot product of the agent's feature and the features of the pixels
-    product = torch.einsum("nsw,spw->nsp", embedding, pixels) / embedding.shape[-1] ** 0.5
+    product = torch.einsum("nsw,spw->nsp", embedding.to(pixels), pixels) / embedding.shape[-1] ** 0.5
     return instances.sharpness[rows][..., None] * inside + product
 
 
@@ -161,7 +161,7 @@ def instance_raster(instances: InstanceSet, agents: AgentSet, spec: PlaneSpec) -
     product of probability and score, as in UniAD: so two queries on one vehicle do not share its cells.
     """
     count = instances.embedding.shape[-2]
-    points = cell_middles(spec.lower_m, spec.cell_m, spec.shape_yx).to(instances.embedding)
+    points = cell_middles(spec.lower_m, spec.cell_m, spec.shape_yx).to(instances.embedding.device)
     raster = torch.zeros(len(instances.embedding), count, len(points), dtype=torch.long, device=points.device)
     is_vehicle = _IS_VEHICLE.to(points.device)
     for item in range(len(raster)):
