@@ -8,6 +8,7 @@ from foredrive.runs.search.towers import find_towers, unseen_text
 from foredrive.search.embedded import SENTENCE
 from foredrive.search.find import Found, Hit, find
 from foredrive.search.index import FrameIndex
+from foredrive.search.logic_words import logic_note
 from foredrive.search.query import Query
 from foredrive.search.resemblance import resembles
 from foredrive.search.target import example_target, text_target
@@ -39,8 +40,9 @@ def ask(index: FrameIndex, query: Query, towers: str | None = None, *, ensemble:
 
 
 def answer_notes(index: FrameIndex, query: Query, towers: str | None, result: Found) -> list[str]:
-    """Return lines that say why the hits of a query may be none."""
-    notes = []
+    """Return lines that say why the hits of a query may be none, or not what its text asks for."""
+    said = logic_note((query.text, query.image_text, query.lidar_text), query.where)
+    notes = [] if said is None else [said]
     if query.compares and result.hits:
         name, logs = towers or index.settings.towers, [hit.row.log for hit in result.hits]
         notes += [text] if (text := unseen_text(name, query.modality != "image", logs)) else []
