@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import shutil
 from pathlib import Path
 
 import pytest
@@ -9,10 +10,13 @@ import torch
 from torch import nn
 
 from foredrive.cli.main import main
-from foredrive.data import ClipDataset, LogPath, collate
+from foredrive.data import ClipDataset, LogPath, collate, find_logs
 from foredrive.errors import InputError
+from foredrive.geometry.se3 import matrix_from_yaw
 from foredrive.integrations.graph import GraphInputs
-from foredrive.runs import Run, export
+from foredrive.runs import Run, export, open_run
+from foredrive.runs.shipped import EMBEDDED, MODELS, run_folder, shipped_models
+from foredrive.runs.train.driver import is_driver
 from foredrive.runs.train.run import load_agent
 from foredrive.scene import Command
 
@@ -21,9 +25,22 @@ from foredrive.integrations.onnx import write_onnx  # noqa: E402
 
 
 @pytest.fixture(scope="module")
-def exported(trained: Run, log: LogPath, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def measured(trained: Run, tmp_path_factory: pytest.TempPathFactory) -> Run:
+    """The run with ego motion that continues measured poses: float64 inputs, for which onnxruntime has fewer
+    operators.
+    """
+    folder = tmp_path_factory.mktemp("measured") / "run"
+    shutil.copytree(trained.folder, folder)
+    config = (folder / "config.yaml").read_text()
+    assert "ego: predicted" in config
+    (folder / "config.yaml").write_text(config.replace("ego: predicted", "ego: measured"))
+    return open_run(folder)
+
+
+@pytest.fixture(scope="module")
+def exported(measured: Run, log: LogPath, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("export")
-    export.export_run(trained, [log], folder, clips=2)
+    export.export_run(measured, [log], folder, clips=2)
     return folder
 
 
@@ -52,12 +69,14 @@ def test_export_json_describes_the_model(exported: Path) -> None:
 
 
 def test_nothing_of_the_clip_it_was_traced_with_is_constant(
-    exported: Path, trained: Run, log: LogPath
+    exported: Path, measured: Run, log: LogPath
 ) -> None:
-    clip = collate([ClipDataset([log], trained.recipe.clips, None)[1]]).clip.observed()
+    clip = collate([ClipDataset([log], measured.recipe.clips, None)[1]]).clip.observed()
     lens = torch.tensor([-0.2, 0.03, 0.001, 0.002, 0.0])  # the log's cameras have none
+    turned = matrix_from_yaw(torch.tensor([0.2]), torch.tensor([[-3.0, 0.5, 0.1]])).double()
     other = dataclasses.replace(
         clip,
+        T_world_ego=torch.stack([clip.T_world_ego[:, -1] @ turned, clip.T_world_ego[:, -1]], dim=1),
         images=clip.images.flip(-1),
         image_valid=torch.tensor([[[True, False], [True, True]]]),
         rig=dataclasses.replace(
@@ -66,7 +85,7 @@ def test_nothing_of_the_clip_it_was_traced_with_is_constant(
         ego_speed_mps=torch.tensor([[8.0, 9.0]]),
         command=torch.tensor([Command.LEFT]),
     )
-    agent = load_agent(trained)
+    agent = load_agent(measured)
     session = onnxruntime.InferenceSession(exported / "model.onnx")
     inputs = GraphInputs.from_clip(other, agent)._asdict()
     said = session.run(None, {entry.name: inputs[entry.name].numpy() for entry in session.get_inputs()})
@@ -75,7 +94,29 @@ def test_nothing_of_the_clip_it_was_traced_with_is_constant(
     assert said[0] == pytest.approx(truth.plan.xy[:, 0].numpy(), abs=1e-4)
     for k, decoded in enumerate(truth.decoded):
         assert said[2][:, k] == pytest.approx(decoded.occupancy_logit.numpy(), abs=1e-4)
+    for k, belief in enumerate(truth.beliefs[1:], start=1):
+        assert belief.T_now_ego is not None
+        assert said[3][:, k] == pytest.approx(belief.T_now_ego.numpy(), abs=1e-4)
     assert (truth.plan.xy - before.plan.xy).abs().max() > 1e-2  # so that a constant would show
+
+
+@pytest.fixture(scope="module")
+def town_log(tmp_path_factory: pytest.TempPathFactory) -> LogPath:
+    """Eight seconds of a town, with all that the models that come along read."""
+    folder = tmp_path_factory.mktemp("town")
+    assert main(["record", "--town", "Town05", "--seconds", "8", "--seed", "3", "--out", str(folder)]) == 0
+    (found,) = find_logs(folder / "logs" / "town_test")
+    return found
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [name for name in shipped_models() if not is_driver(MODELS / name)])
+def test_models_that_come_along_are_exported(name: str, town_log: LogPath, tmp_path: Path) -> None:
+    run = open_run(run_folder(Path(EMBEDDED + name), tmp_path))
+    facts = export.export_run(run, [town_log], tmp_path / "out", clips=1)
+    for differences in facts["largest_difference"].values():
+        assert differences.pop("share_of_voxels_that_flip") <= 1e-3
+        assert all(difference < 1e-3 for difference in differences.values()), differences
 
 
 @pytest.mark.parametrize(("shape", "size"), [((1, 2, 2, 7, 9), (1, 4, 4)), ((1, 1, 5, 3, 3), (2, 2, 3))])

@@ -24,8 +24,9 @@ def continued_motion(frames: Frames, steps: int) -> Float[Tensor, "b F 4 4"]:
     Returns:
         The ego frame at t+k+1 -> the ego frame at t+k.
     """
-    # Motion since the last key frame, in the ego frame of then: translation and rotation vector
-    T_prev_now = inverse_se3(frames.T_now_ego[:, -2])
+    # Motion since the last key frame, in the ego frame of then: translation and rotation vector. Poses are
+    # relative to now, so float32 is enough; ONNX Runtime has no arc tangent in float64
+    T_prev_now = inverse_se3(frames.T_now_ego[:, -2].float())
     moved_m, turn_rad = T_prev_now[:, :3, 3], log_so3(T_prev_now[:, :3, :3])
     travelled_m = moved_m.norm(dim=-1, keepdim=True)
     # Direction and curve per metre; a standing vehicle has neither and starts straight ahead
@@ -44,4 +45,4 @@ def continued_motion(frames: Frames, steps: int) -> Float[Tensor, "b F 4 4"]:
     turned = exp_se3(torch.cat([torch.zeros_like(direction), curve], dim=-1)[:, None] * distance_m)
     translation = torch.zeros_like(turned)
     translation[..., :3, 3] = distance_m * direction[:, None]
-    return (turned + translation).float()
+    return turned + translation
