@@ -26,6 +26,20 @@ def test_a_map(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert (out / "report.html").read_text().count("<table") == 2
 
 
+def test_a_map_with_other_axes_is_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """A divider ahead of the vehicle, written with the axes of a lidar whose y points ahead."""
+    ahead = [[float(x), 0.1 * x] for x in range(0, 14)]
+    truth = {"GTs": [{"sample_token": "a", "vectors": [{"pts": ahead, "cls_name": "divider"}]}]}
+    flags = ["--truth", str(write(tmp_path / "truth.json", truth)), "--task", "map"]
+    for line, told in (([[-y, x] for x, y in ahead], True), (ahead, False)):
+        vectors = [{"pts": line, "cls_name": "divider", "confidence_level": 0.9}]
+        results = write(tmp_path / "r.json", {"results": [{"sample_token": "a", "vectors": vectors}]})
+        assert main(["score", str(results), *flags, "--out", str(tmp_path / "out")]) == 0
+        said = [text for text in caplog.messages if "with x and y swapped, then y reversed" in text]
+        assert len(said) == told
+        caplog.clear()
+
+
 def test_motion(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     results = write(tmp_path / "results.json", AGENTS)
     truth = write(tmp_path / "truth.json", TRUE_AGENTS)

@@ -1,6 +1,7 @@
 """`foredrive score --task occupancy`: the files it writes, and flags that do not go together."""
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import get_args
 
@@ -45,6 +46,37 @@ def test_a_summary_a_table_and_a_page(
     page = (tmp_path / "out" / "report.html").read_text()
     assert page.count("<table") == 3  # protocols, classes, all figures
     assert "driveable surface" in page
+
+
+@pytest.mark.parametrize(
+    ("turned", "words"),
+    [
+        (lambda labels: labels.swapaxes(0, 1), "x and y swapped"),
+        (lambda labels: labels[::-1], "x reversed"),
+        (lambda labels: labels[::-1, ::-1].swapaxes(0, 1), "x and y swapped, then x and y reversed"),
+        (lambda labels: labels, None),
+    ],
+)
+def test_voxels_with_other_axes_are_told(
+    turned: Callable[[np.ndarray], np.ndarray],
+    words: str | None,
+    folders: list[str],
+    tmp_path: Path,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    """A scene that looks different along each axis: a wall ahead, and a block on its left."""
+    true, seen = street(OCC3D_FREE, 11, 15), np.ones(XYZ, np.uint8)
+    true[:, :, :2] = OCC3D_FREE
+    true[20:60, 150:160, 2:10] = 16
+    write_truth(tmp_path / "other", "scene-0001", "f", semantics=true, mask_camera=seen, mask_lidar=seen)
+    results = write_result(tmp_path / "turned", "f", pred=turned(true)).parent
+    flags = ["--truth", str(tmp_path / "other"), "--out", str(tmp_path / "out"), "--task", "occupancy"]
+    assert main(["score", str(results), *flags]) == 0
+    told = [line for line in caplog.messages if "axes" in line]
+    assert len(told) == (0 if words is None else 1)
+    if words is not None:
+        assert f"{results}: its axes seem to be others: with {words}, the share of equal occupied" in told[0]
+        assert "would be 100 % instead of" in told[0]
 
 
 def test_every_task_has_its_function_and_its_tables() -> None:

@@ -11,7 +11,7 @@ from foredrive.engine.summary import Figures, write_summary
 from foredrive.errors import InputError
 from foredrive.runs.score.run import SUMMARY
 from foredrive.tasks.maps.files import read_maps
-from foredrive.tasks.maps.score import score_map_files
+from foredrive.tasks.maps.score import score_map_files, tell_if_map_is_turned
 from foredrive.tasks.motion.score import score_motion_results
 from foredrive.tasks.occupancy.files import find_voxels
 from foredrive.tasks.occupancy.log_results import holds_logs, score_against_logs
@@ -37,7 +37,9 @@ def score_occupancy(results: Path, truth: Path, poses: Path | None) -> Figures:
 def score_map(results: Path, truth: Path, poses: Path | None) -> Figures:
     """Return the figures of files of vector maps, see `tasks.maps`."""
     _check_no_poses("map", poses)
-    return score_map_files(read_maps(results, truth))
+    files = read_maps(results, truth)
+    tell_if_map_is_turned(files, results)
+    return score_map_files(files)
 
 
 def score_motion(results: Path, truth: Path, poses: Path | None) -> Figures:

@@ -29,6 +29,7 @@ from foredrive.tasks.occupancy.arrays import array_names, read_labels, read_velo
 from foredrive.tasks.occupancy.files import PREDICTED_NAMES
 from foredrive.tasks.occupancy.of_logs import LogVoxelCounts
 from foredrive.tasks.occupancy.protocols import GRID
+from foredrive.tasks.occupancy.turned import TurnedVoxels
 
 GRID_FILE = "grid.json"
 
@@ -85,6 +86,7 @@ def score_against_logs(results: Path, truth: Path, on_frame: Callable[[], None] 
         raise InputError(f"{results}: holds no LOG@T_US.npz")
     grid = read_grid(results)
     counts = LogVoxelCounts(grid.taxonomy, grid.spec)
+    turned = TurnedVoxels(results, free=len(VOXEL_CLASSES[grid.taxonomy]) - 1)
     without_velocity = 0
     for frame in log_frames(truth, files, results):
         labels, flow_mps = _read(files[frame.name], grid)
@@ -98,8 +100,10 @@ def score_against_logs(results: Path, truth: Path, on_frame: Callable[[], None] 
         if not bool(true.known.any()):
             raise InputError(f"{frame.log.path.folder} has no recorded voxels to judge frame {frame.name} by")
         counts.add(labels, flow_mps, true, read_rays(frame.log, frame.frame, grid.spec))
+        turned.add(labels, true.index.numpy(), (true.known & true.camera_mask).numpy())
         without_velocity += flow_mps is None
         on_frame()
+    turned.tell()
     figures: Figures = {"data_set": grid.taxonomy, "frames": len(files)}
     figures["frames_without_velocity"] = without_velocity
     return figures | {f"occupancy.{key}": value for key, value in counts.figures().items()}

@@ -23,6 +23,7 @@ from foredrive.tasks.detection.matching import mean_of_valid
 from foredrive.tasks.occupancy.files import VoxelFiles, VoxelFrame, read_frame
 from foredrive.tasks.occupancy.protocols import GRID, RAY_PROTOCOLS, VOXEL_PROTOCOLS, RayProtocol
 from foredrive.tasks.occupancy.semantic_scores import count_voxels, mean_iou, voxel_ious
+from foredrive.tasks.occupancy.turned import TurnedVoxels
 
 MAX_ELEVATION_RAD = 0.21
 
@@ -256,15 +257,20 @@ class VoxelCounts:
 def score_voxels(files: VoxelFiles, on_frame: Callable[[], None] = lambda: None) -> Figures:
     """Return the figures over all frames, under `occupancy.PROTOCOL.`; NaN where nothing could be counted.
 
-    `on_frame` is called after each frame. Without poses there are no figures of rays.
+    `on_frame` is called after each frame. Without poses there are no figures of rays. One line says so if the
+    results seem to have other axes.
     """
     counts, without_velocity = VoxelCounts(files.data_set), 0
+    folder = next(iter(files.results.values())).parent
+    turned = TurnedVoxels(folder, free=len(VOXEL_PROTOCOLS[files.data_set].classes) - 1)
     frames = (read_frame(files, token) for token in files.truth)
     # Frames are read ahead while earlier ones are counted
     for token, frame in zip(files.truth, prefetched(frames), strict=True):
         counts.add(frame, None if files.origins_m is None else files.origins_m[token])
+        turned.add(frame.predicted, frame.true, frame.seen_by_camera)
         without_velocity += not frame.states_velocity
         on_frame()
+    turned.tell()
     figures: Figures = {"data_set": files.data_set, "frames": len(files.truth)}
     if files.data_set == "openocc":
         figures["frames_without_velocity"] = without_velocity
