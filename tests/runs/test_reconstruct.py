@@ -165,7 +165,10 @@ def test_what_stands_is_there_for_other_viewers(run: Path) -> None:
     static = weights["actor"] == STATIC
     assert 0 < int(static.sum()) < len(static)
     written = PlyData.read(run / "static.ply")["vertex"]
-    assert np.array_equal(np.stack([written[axis] for axis in "xyz"], -1), weights["mean_m"][static].numpy())
+    mean_m = weights["mean_m"][static].numpy()
+    kept = np.isin(mean_m[:, 0], written["x"])  # all but those far beyond the others
+    assert kept.mean() > 0.9
+    assert np.array_equal(np.stack([written[axis] for axis in "xyz"], -1), mean_m[kept])
 
 
 def test_a_folder_with_another_run_is_refused(run: Path, log: LogPath, tmp_path: Path) -> None:

@@ -1,4 +1,7 @@
-"""An MCAP file of a log and of a run's predictions on it, which Foxglove and Rerun open."""
+"""An MCAP file of a log and of a run's predictions on it, in Foxglove's schemas.
+
+Rerun 0.41 draws images, sweeps and poses of it, but no boxes and no map, which are scene updates of Foxglove.
+"""
 
 from collections.abc import Callable
 from pathlib import Path

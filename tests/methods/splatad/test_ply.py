@@ -25,6 +25,8 @@ def test_a_file_holds_what_viewers_look_for(tmp_path: Path) -> None:
     lines = header.decode("ascii").splitlines()
     comments = [line for line in lines if line.startswith("comment ")]
     assert "antialiased" in comments[0]
+    assert any("z is up" in line for line in comments)
+    assert comments[-1] == "comment left out: 0 splats far beyond the others"
     assert lines[2] == "element vertex 2"  # SIBR's viewer takes the number from there
     assert [line for line in lines if line not in comments] == [
         *("ply", "format binary_little_endian 1.0", "element vertex 2"),
@@ -45,3 +47,13 @@ def test_a_file_holds_what_viewers_look_for(tmp_path: Path) -> None:
     assert torch.allclose(albedo, gaussians.feature[:, :3], atol=1e-6)
     rotations = torch.nn.functional.normalize(gaussians.quaternion, dim=-1)
     assert torch.allclose(column("rot_0", "rot_1", "rot_2", "rot_3"), rotations)
+
+
+def test_splats_far_beyond_the_scene_are_left_out(tmp_path: Path) -> None:
+    """Twenty along a street of 190 m, and one 18 km away, to which a viewer would fit its camera."""
+    means = [*([10.0 * n, 0.0, 1.0] for n in range(20)), [18_000.0, 0.0, 300.0]]
+    gaussians = graph_of(means, [STATIC] * len(means), two_actors()).content.preview(STATIC)
+    write_ply(gaussians, tmp_path / "scene.ply")
+    vertices = PlyData.read(tmp_path / "scene.ply")["vertex"]
+    assert vertices["x"].tolist() == [10.0 * n for n in range(20)]
+    assert b"comment left out: 1 splats far beyond the others" in (tmp_path / "scene.ply").read_bytes()

@@ -4,8 +4,10 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from jaxtyping import Bool, Float
 from numpy.lib.recfunctions import unstructured_to_structured
 from plyfile import PlyData, PlyElement
+from torch import Tensor
 
 from foredrive.files import atomic_path
 from foredrive.methods.splatad import Gaussians
@@ -22,16 +24,24 @@ _COLUMNS = (
 _COMMENTS = [
     "opacity: logit, for renderers that lower it as they widen small splats by 0.3 px^2 (antialiased)",
     "colour: albedo alone, without the decoders; f_rest is 0",
+    "axes: metres, z is up; viewers that take -y for up show it on its side until it is turned",
 ]
+FAR = 4.0
+"""Splats farther from the middle than so many times the distance that 90 % keep are left out: sky and stray
+splats kilometres away, to which viewers would fit their camera."""
 
 
 def write_ply(gaussians: Gaussians, path: Path) -> None:
     """Write centres, rotations, scales, opacities and albedo. The file cannot hold the effect of decoders.
 
     Opacities assume compensation (`project_camera`): in viewers that widen small splats without it, far
-    surfaces look denser and thin things thicker.
+    surfaces look denser and thin things thicker. Splats `FAR` beyond the others are left out, which a comment
+    counts.
     """
     gaussians = gaussians.map_tensors(lambda tensor: tensor.detach().cpu())
+    near = _near(gaussians.mean_m)
+    left_out = f"left out: {int((~near).sum())} splats far beyond the others"
+    gaussians = gaussians[near]
     columns = [
         gaussians.mean_m,
         torch.zeros_like(gaussians.mean_m),
@@ -46,5 +56,14 @@ def write_ply(gaussians: Gaussians, path: Path) -> None:
     rows = unstructured_to_structured(table, np.dtype([(name, "<f4") for name in _COLUMNS]))
     with atomic_path(path) as temporary:
         # The first published viewer reads the number of splats from the third line, so comments come later.
-        vertices = PlyElement.describe(rows, "vertex", comments=_COMMENTS)
+        vertices = PlyElement.describe(rows, "vertex", comments=[*_COMMENTS, left_out])
         PlyData([vertices], byte_order="<").write(temporary)
+
+
+def _near(mean_m: Float[Tensor, "n 3"]) -> Bool[Tensor, "n"]:
+    """Return which splats are part of the scene that 90 % of them make."""
+    if not len(mean_m):
+        return torch.zeros(0, dtype=torch.bool)
+    distance_m = (mean_m - mean_m.median(dim=0).values).norm(dim=-1)
+    # NumPy's quantile takes any number of values
+    return distance_m <= FAR * float(np.quantile(distance_m.numpy(), 0.9))
