@@ -166,7 +166,7 @@ def _arrow_texts(state: tuple[Any, ...]) -> Any:
     return array
 
 
-def _bytearray(content: bytes = b"", encoding: str = "latin1") -> bytearray:
+def _bytearray(content: bytes | str = b"", encoding: str = "latin1") -> bytearray:
     """Return bytes. A number would be the size of empty ones."""
     return bytearray(_encode(content, encoding) if isinstance(content, str) else memoryview(content))
 

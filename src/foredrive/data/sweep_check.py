@@ -120,7 +120,7 @@ def _shift(
     E, distances_m = np.eye(4), []
     for reach_m in (*_REACH_M, _REACH_M[0]):
         moved = points @ E[:3, :3].T + E[:3, 3]
-        apart_m, row = tree.query(moved, distance_upper_bound=reach_m)
+        apart_m, row = map(np.asarray, tree.query(moved, distance_upper_bound=reach_m))
         matched = np.isfinite(apart_m)
         matched[matched] &= flat[row[matched]]
         if matched.sum() < _MIN_POINTS // 3:

@@ -82,15 +82,14 @@ def index_bag(bag: Bag, topics: BagTopics) -> BagIndex:
 
 def _set_on_one_clock(index: BagIndex, pose: str | None) -> None:
     """Compare the clocks of images, points, poses and transforms, and correct their stamps."""
-    rows: dict[str, list[Stamp] | list[Placed]] = {**index.stamps}
-    if pose is not None and index.posed:
-        rows[pose] = index.posed
+    placed_by_name = {} if pose is None or not index.posed else {pose: index.posed}
     by_child: dict[str, list[Placed]] = {}
     for one in index.placed:
         if not one.fixed:
             by_child.setdefault(f"transforms of {one.child}", []).append(one)
     # A single transform holds for all times
-    rows |= {name: placed for name, placed in by_child.items() if len(placed) > 1}
+    placed_by_name |= {name: placed for name, placed in by_child.items() if len(placed) > 1}
+    rows: dict[str, list[Stamp] | list[Placed]] = {**index.stamps, **placed_by_name}
     streams = {
         name: Stream(
             *(np.array([getattr(row, key) for row in many], np.int64) for key in ("t_us", "recorded_us"))
@@ -108,7 +107,7 @@ def _set_on_one_clock(index: BagIndex, pose: str | None) -> None:
             ]
             index.stamps[name] = list(itertools.compress(stamps, clock.kept))
             continue
-        placed = [replace(one, t_us=t_us) for one, t_us in zip(rows[name], times_us, strict=True)]  # type: ignore[type-var]
+        placed = [replace(one, t_us=t_us) for one, t_us in zip(placed_by_name[name], times_us, strict=True)]
         kept = list(itertools.compress(placed, clock.kept))
         if name == pose:
             index.posed = kept
