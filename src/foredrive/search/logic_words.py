@@ -92,13 +92,13 @@ def logic_note(texts: Iterable[str | None], where: str | None) -> str | None:
 
     The line has the condition that says the same, if the noun is that of a column that `where` does not name.
     """
-    found = [condition for text in texts if text is not None for condition in _conditions(text)]
-    columns = [condition for condition in found if condition is not None]
+    conditions = [condition for text in texts if text is not None for condition in _conditions(text)]
+    columns = [condition for condition in conditions if condition is not None]
     if where is not None and columns:
         columns = [condition for condition in columns if condition.split()[0] not in where]
         if not columns:
             return None
-    if not found:
+    if not conditions:
         return None
     said = f': --where "{" AND ".join(dict.fromkeys(columns))}"' if columns else ", where there is a column"
     return f"negation and numbers in a text are not understood by the towers; --where says them{said}"

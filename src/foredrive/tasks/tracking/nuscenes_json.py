@@ -206,11 +206,11 @@ def with_places_of_results(truth: ObjectTruth, path: Path) -> ObjectTruth:
     ego, unfiltered = truth.ego.copy(), 0
     not_empty = set(truth.boxes.frame.tolist())
     for n in np.flatnonzero(np.isnan(ego[:, 0])).tolist():
-        found = by_frame.get(truth.names[n], ())
-        place = _place(found, f"{path}: frame {truth.names[n]}")
+        stated = by_frame.get(truth.names[n], ())
+        place = _place(stated, f"{path}: frame {truth.names[n]}")
         if place is not None:
             ego[n] = place
-        elif found or n in not_empty:
+        elif stated or n in not_empty:
             unfiltered += 1
     if unfiltered:
         _log.warning(
