@@ -1,6 +1,7 @@
 """Short logs from virtual egos: what is in them, and that equal seeds give equal bytes."""
 
 import dataclasses
+import functools
 import math
 import shutil
 from pathlib import Path
@@ -163,26 +164,28 @@ def _nearest_person(log: Log, frame: int, seconds: float) -> tuple[float, float]
     A person's middle is inside of the box of the vehicle, a coarser test than that of the package.
     """
     centre, size = log.ego_box
-    half = 0.5 * torch.from_numpy(size[:2])
-    met_s, nearest_m = math.inf, math.inf
+    shares, met_s, nearest_m = np.linspace(0, 1, 26), math.inf, math.inf
     for later in range(frame, min(frame + round(seconds / 0.5), len(log) - 1)):
-        boxes = [read_boxes(log, number) or pytest.fail("no boxes") for number in (later, later + 1)]
-        kinds = torch.tensor([int(Category.BICYCLE), int(Category.PEDESTRIAN)])
-        persons = [torch.isin(boxes[k].category, kinds) for k in (0, 1)]
-        ids = [each.track_id[chosen].tolist() for each, chosen in zip(boxes, persons, strict=True)]
-        for track in set(ids[0]) & set(ids[1]):
-            at = [each.centre[each.track_id == track][0, :2].double() for each in boxes]
-            for share in np.linspace(0, 1, 26):
-                t_us = (1 - share) * log.t_us[later] + share * log.t_us[later + 1]
-                T = torch.from_numpy(log.poses_at(np.array([t_us]))[0][0])
-                world = [torch.from_numpy(log.T_world_ego[later + k]) for k in (0, 1)]
-                xy = [world[k][:2, :2] @ at[k] + world[k][:2, 3] for k in (0, 1)]
-                now = T[:2, :2].T @ ((1 - share) * xy[0] + share * xy[1] - T[:2, 3])
-                beyond = ((now - torch.from_numpy(centre[:2])).abs() - half).clamp_min(0).norm()
-                nearest_m = min(nearest_m, float(beyond))
-                if float(beyond) == 0.0:
-                    met_s = min(met_s, 0.5 * (later - frame + share))
+        T_world_ego, _ = log.poses_at(np.interp(shares, (0, 1), log.t_us[later : later + 2]))
+        first, second = (_persons(log, number) for number in (later, later + 1))
+        for track in set(first) & set(second):
+            xy = (1 - shares)[:, None] * first[track] + shares[:, None] * second[track]
+            now = np.einsum("sji,sj->si", T_world_ego[:, :2, :2], xy - T_world_ego[:, :2, 3])
+            beyond_m = np.linalg.norm(np.maximum(np.abs(now - centre[:2]) - 0.5 * size[:2], 0), axis=-1)
+            nearest_m = min(nearest_m, float(beyond_m.min()))
+            if (beyond_m == 0).any():
+                met_s = min(met_s, 0.5 * (later - frame + float(shares[beyond_m == 0][0])))
     return met_s, nearest_m
+
+
+@functools.cache
+def _persons(log: Log, frame: int) -> dict[int, np.ndarray]:
+    """World places of people and cyclists by their tracks."""
+    boxes = read_boxes(log, frame) or pytest.fail("no boxes")
+    chosen = torch.isin(boxes.category, torch.tensor([int(Category.BICYCLE), int(Category.PEDESTRIAN)]))
+    T = log.T_world_ego[frame]
+    xyz = boxes.centre[chosen].double().numpy() @ T[:3, :3].T + T[:3, 3]
+    return dict(zip(boxes.track_id[chosen].tolist(), xyz[:, :2], strict=True))
 
 
 def test_a_world_model_learns_from_past_now_and_what_comes(logs: list[LogPath]) -> None:
