@@ -144,7 +144,7 @@ def _block(values: Any, placement: Any, ndim: int) -> Any:
     return _unpickle_block(_plain_values(values), placement, ndim)
 
 
-def _text_type(storage: str = "pyarrow", na_value: Any = np.nan) -> pd.StringDtype:
+def _text_type(storage: str = "pyarrow", na_value: Any = np.nan) -> "pd.StringDtype":
     return pd.StringDtype(storage, na_value)
 
 
