@@ -8,6 +8,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import shapely
+import shapely.affinity
 import torch
 from file_digests import digests
 from miniature import miniature
@@ -156,6 +158,59 @@ def test_no_demonstration_leads_through_anybody(logs: list[LogPath]) -> None:
         assert clips.demonstration(index)[1].valid.any() == valid
     assert through > 0
     assert clips.touching >= through
+
+
+@pytest.mark.slow
+def test_no_future_of_200_logs_touches_anybody(tmp_path: Path) -> None:
+    """The outlines are compared every 0.05 s by shapely, without the package's own test of contact."""
+    rig = camera_rig((8, 12))
+    sensors = SensorSuite(dataclasses.replace(rig[[0]], names=rig.names[:1]), None)
+    towns = ("Town01", "Town05")
+    paths = [path for town in towns for path in record_virtual_egos(town, 0, 100, tmp_path, sensors)]
+    clips, touched = ClipDataset(paths, ClipConfig(1, 0, (8, 12), GRID), None), 0
+    for index in range(len(clips)):
+        number, frames = clips.frames_of(index)
+        meets = _outlines_meet(clips.logs[number], frames[1], seconds=3.0)
+        assert not (meets and clips.demonstration(index)[1].valid.any())
+        touched += meets
+    assert len(clips) == 200 * (IMAGES - 1)
+    assert touched > 100
+
+
+def _outlines_meet(log: Log, frame: int, seconds: float) -> bool:
+    """Whether the vehicle's outline meets one of a box, both between key frames at constant velocity."""
+    centre, size = log.ego_box
+    shares = np.linspace(0, 1, 11)
+    for later in range(frame, min(frame + round(seconds / 0.5), len(log) - 1)):
+        T_world_ego, _ = log.poses_at(np.interp(shares, (0, 1), log.t_us[later : later + 2]))
+        first, second = (_outlines(log, number) for number in (later, later + 1))
+        for track in set(first) & set(second):
+            (xyz, yaw, box_m), (xyz_after, yaw_after, _) = first[track], second[track]
+            turn = (yaw_after - yaw + math.pi) % (2 * math.pi) - math.pi
+            for share, T in zip(shares, T_world_ego, strict=True):
+                place = xyz + share * (xyz_after - xyz)
+                if np.abs(place - T[:3, 3]).max() > 12.0 or abs(place[2] - T[2, 3]) > 2.5:
+                    continue
+                own = _outline(T[:3, :3] @ centre + T[:3, 3], math.atan2(T[1, 0], T[0, 0]), size)
+                if own.intersects(_outline(place, yaw + share * turn, box_m)):
+                    return True
+    return False
+
+
+def _outline(centre_m: np.ndarray, yaw: float, size_m: np.ndarray) -> shapely.Polygon:
+    flat = shapely.box(*(-0.5 * size_m[:2]), *(0.5 * size_m[:2]))
+    turned = shapely.affinity.rotate(flat, yaw, (0, 0), use_radians=True)
+    return shapely.affinity.translate(turned, *centre_m[:2])
+
+
+@functools.cache
+def _outlines(log: Log, frame: int) -> dict[int, tuple[np.ndarray, float, np.ndarray]]:
+    """Return world place, yaw and size of each box by its track."""
+    boxes, T = read_boxes(log, frame) or pytest.fail("no boxes"), log.T_world_ego[frame]
+    xyz = boxes.centre.double().numpy() @ T[:3, :3].T + T[:3, 3]
+    yaw = boxes.yaw.double().numpy() + math.atan2(T[1, 0], T[0, 0])
+    rows = zip(boxes.track_id.tolist(), xyz, yaw.tolist(), boxes.size_lwh.double().numpy(), strict=True)
+    return {track: row for track, *row in rows}
 
 
 def _nearest_person(log: Log, frame: int, seconds: float) -> tuple[float, float]:

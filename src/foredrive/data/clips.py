@@ -94,15 +94,18 @@ class ClipDataset(Dataset[Example]):
 
     @functools.cached_property
     def touching(self) -> int:
-        """Number of clips whose driven path is no demonstration, because the vehicle touches somebody.
+        """Number of clips without a future to learn from, because the vehicle touches somebody in it.
+
+        Clips whose future is an expert's plan do not count.
 
         Raises:
-            InputError: boxes cannot be read.
+            InputError: boxes or a plan cannot be read.
         """
-        horizon_s = self.config.horizon_steps * self.config.horizon_dt_s
         nows = self._clip_frames[:, self.config.past_frames].tolist()
-        by_log = zip(self._clip_logs.tolist(), nows, strict=True)
-        return sum(not demonstrates(self.logs[number], frame, horizon_s) for number, frame in by_log)
+        by_log = [(self.logs[number], now) for number, now in zip(self._clip_logs, nows, strict=True)]
+        return sum(
+            not self._demonstrates(log, now) and self._expert_plan(log, now) is None for log, now in by_log
+        )
 
     @functools.cached_property
     def left_out(self) -> dict[str, int]:
@@ -222,14 +225,20 @@ class ClipDataset(Dataset[Example]):
 
     def _future(self, log: Log, now: int) -> Trajectory:
         steps, dt_s = self.config.horizon_steps, self.config.horizon_dt_s
-        plan = read_expert_plan(log, now) if self.config.future_source == "expert" else None
-        if plan is None:
-            driven = log.driven_future(now, steps, dt_s)
-            if demonstrates(log, now, steps * dt_s):
-                return driven
-            # Nobody learns from a drive through somebody, or is measured by it
-            return dataclasses.replace(driven, valid=torch.zeros_like(driven.valid))
-        return _at_times(plan, dt_s * np.arange(1, steps + 1))
+        if (plan := self._expert_plan(log, now)) is not None:
+            return _at_times(plan, dt_s * np.arange(1, steps + 1))
+        driven = log.driven_future(now, steps, dt_s)
+        if self._demonstrates(log, now):
+            return driven
+        # Nobody learns from a drive through somebody, or is measured by it
+        return dataclasses.replace(driven, valid=torch.zeros_like(driven.valid))
+
+    def _expert_plan(self, log: Log, now: int) -> Trajectory | None:
+        return read_expert_plan(log, now) if self.config.future_source == "expert" else None
+
+    def _demonstrates(self, log: Log, now: int) -> bool:
+        """Return whether the driven future shows how to drive."""
+        return demonstrates(log, now, self.config.horizon_steps * self.config.horizon_dt_s)
 
     def clip(self, index: int) -> Clip:
         """Read one clip without its labels.

@@ -1,6 +1,6 @@
 """Contacts of the recording vehicle with boxes of its log: a drive through somebody demonstrates nothing."""
 
-import functools
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import shapely
@@ -10,12 +10,14 @@ from foredrive.data.boxes import Tracks, read_tracks
 from foredrive.data.logs import Log
 from foredrive.data.truth.agent_futures import MAX_GAP_S, box_corners_xy, in_order_of_tracks
 
-STEP_SHARES = np.linspace(0.0, 1.0, 6)
+STEP_SHARES = np.linspace(0.0, 1.0, 11)
 """Times at which contact is tested, as shares of the time between two observations of a track."""
 NEAR_M, LEVEL_M = 30.0, 2.5
 """Largest distance from the vehicle along one axis, and above or below it, of boxes that are tested, m."""
 BEFORE_S = 2.0
 """A future demonstrates nothing if it ends less than this before a contact: a driver would brake by then."""
+_contact_us: WeakKeyDictionary[Log, Int64[np.ndarray, "_"]] = WeakKeyDictionary()
+"""Times of contact of each opened log, which go with the log."""
 
 
 def demonstrates(log: Log, frame: int, horizon_s: float) -> bool:
@@ -26,12 +28,13 @@ def demonstrates(log: Log, frame: int, horizon_s: float) -> bool:
     Raises:
         InputError: the boxes cannot be read.
     """
-    contact_us = contact_times(log)
+    if log not in _contact_us:
+        _contact_us[log] = contact_times(log)
+    contact_us = _contact_us[log]
     first, end = log.t_us[frame], log.t_us[frame] + (horizon_s + BEFORE_S) * 1e6
     return not bool(((contact_us >= first) & (contact_us <= end)).any())
 
 
-@functools.lru_cache(maxsize=256)
 def contact_times(log: Log) -> Int64[np.ndarray, "_"]:
     """Return the times at which the vehicle's box overlaps a box of the log from above, µs, in no order.
 
