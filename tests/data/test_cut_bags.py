@@ -17,7 +17,7 @@ from foredrive.data.formats.bag_proposal import propose_topics
 from foredrive.data.formats.bag_topics import topics_file
 from foredrive.data.formats.convert import convert
 from foredrive.data.logs import Log
-from foredrive.data.notices import read_notices
+from foredrive.data.notices import collecting, read_notices, write_notices
 from foredrive.errors import InputError
 
 
@@ -52,16 +52,27 @@ def test_a_cut_mcap_gives_its_whole_messages_and_says_so(tmp_path: Path) -> None
     assert "cut.mcap: the recording was cut off; " in read_notices(path.folder)[0]
 
 
-def test_a_damaged_chunk_of_a_cut_mcap_costs_itself_alone(tmp_path: Path) -> None:
+@pytest.mark.parametrize("cut", [True, False])
+def test_a_damaged_chunk_of_an_mcap_costs_itself_alone_and_is_named(cut: bool, tmp_path: Path) -> None:
     file = tmp_path / "drive.mcap"
     made_bags.write_mcap_of_ros1(file)
+    with open_bag(file) as bag:
+        complete = [(message.topic, message.recorded_s) for message in bag.read(list(bag.topics))]
     content = bytearray(file.read_bytes())
     second = content.index(b"zstd", content.index(b"zstd") + 4) + 40
     content[second : second + 8] = b"\xff" * 8
-    file.write_bytes(content[:-100])
-    with open_bag(file) as bag:
-        last_s = max(message.recorded_s for message in bag.read(list(bag.topics)))
-    assert last_s > made_bags.START_NS * 1e-9 + 0.5
+    file.write_bytes(content[:-100] if cut else content)
+    with open_bag(file) as bag, collecting():
+        rest = [(message.topic, message.recorded_s) for message in bag.read(list(bag.topics))]
+        list(bag.read(list(bag.topics)))  # a second pass, as for images
+        write_notices(tmp_path)
+    lost = [row for row in complete if row not in rest]
+    assert [row for row in complete if row not in lost] == rest
+    assert 0 < len(lost) < 0.4 * len(complete)
+    assert rest[-1][1] > lost[-1][1]
+    (line,) = (line for line in read_notices(tmp_path) if "damaged" in line)
+    first_s, last_s = (f"{lost[k][1]:.3f}" for k in (0, -1))
+    assert line.startswith(f"drive.mcap: damaged chunks, left out: 1 (recorded at {first_s} to {last_s} s: ")
 
 
 @pytest.mark.parametrize("name", ["drive.bag", "drive.bag.active"])

@@ -9,7 +9,7 @@ import contextlib
 import contextvars
 import json
 import logging
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -23,14 +23,13 @@ _log = logging.getLogger(__name__)
 
 @dataclass
 class _Notices:
-    """Places and their number by subject and text, in the order of their first occurrence."""
+    """Places by subject and text, in the order of their first occurrence."""
 
-    count: dict[tuple[str, str], int] = field(default_factory=dict)
-    places: dict[tuple[str, str], list[str]] = field(default_factory=dict)
+    places: dict[tuple[str, str], dict[str, None]] = field(default_factory=dict)
 
     def lines(self) -> list[str]:
         """Return one line for each subject and text."""
-        return [_line(*key, self.places[key], number) for key, number in self.count.items()]
+        return [_line(*key, places) for key, places in self.places.items()]
 
 
 _collected: contextvars.ContextVar[_Notices | None] = contextvars.ContextVar("notices", default=None)
@@ -42,17 +41,16 @@ def note(subject: str, text: str, place: str = "") -> None:
     Args:
         subject: topic, camera, file or kind of data that the notice is about.
         text: what happened. With places it is a plural noun, such as "unreadable messages, left out".
-        place: where it happened once. Notices of equal subject and text are counted, and a few places named.
+        place: where it happened once. Places of equal subject and text are counted, and a few named. A place
+            that is noted again, as by a second pass over a file, counts once.
     """
     notices = _collected.get()
     if notices is None:
-        _log.warning("%s", _line(subject, text, [place] if place else [], 1))
+        _log.warning("%s", _line(subject, text, [place] if place else []))
         return
-    key = (subject, text)
-    notices.count[key] = notices.count.get(key, 0) + 1
-    places = notices.places.setdefault(key, [])
-    if place and len(places) < EXAMPLES:
-        places.append(place)
+    places = notices.places.setdefault((subject, text), {})
+    if place:
+        places[place] = None
 
 
 @contextlib.contextmanager
@@ -68,7 +66,7 @@ def collecting() -> Iterator[None]:
 def write_notices(folder: Path) -> None:
     """Write the notices collected so far into the folder of a log. Without any there is no file."""
     notices = _collected.get()
-    if notices is not None and notices.count:
+    if notices is not None and notices.places:
         (folder / FILE).write_text(json.dumps(notices.lines(), indent=1, ensure_ascii=False) + "\n")
 
 
@@ -90,8 +88,8 @@ def read_notices(folder: Path) -> list[str]:
     return lines
 
 
-def _line(subject: str, text: str, places: list[str], number: int) -> str:
+def _line(subject: str, text: str, places: Collection[str]) -> str:
     if not places:
         return f"{subject}: {text}"
-    more = [f"{number - len(places)} more"] if number > len(places) else []
-    return f"{subject}: {text}: {number} ({'; '.join([*places, *more])})"
+    more = [f"{len(places) - EXAMPLES} more"] if len(places) > EXAMPLES else []
+    return f"{subject}: {text}: {len(places)} ({'; '.join([*list(places)[:EXAMPLES], *more])})"

@@ -1,4 +1,4 @@
-"""What is whole in a ROS 1 bag without an index, as a recorder that was cut off leaves it (`.bag.active`).
+"""Reader of ROS 1 bags without an index, as a recorder that was cut off leaves them (`.bag.active`).
 
 The format is ROS' "Bag format 2.0": records of a header and data, each behind its length. Chunks are records
 that hold records; the last one of a bag that was not closed has no length yet, so its records follow it.
@@ -23,10 +23,10 @@ _Found = tuple[str, str, int, bytes]
 
 
 def open_rest(path: Path) -> Bag:
-    """Return the whole messages of a ROS 1 bag that has no index.
+    """Open a ROS 1 bag that has no index, with the messages that are whole.
 
     Raises:
-        InputError: there are none.
+        InputError: no message is whole.
     """
     counts: Counter[tuple[str, str]] = Counter()
     last_ns = 0
@@ -74,10 +74,10 @@ def _of_records(stream: io.BufferedIOBase, connections: dict[bytes, tuple[str, s
 def _of_chunk(
     entries: dict[str, bytes], stream: io.BufferedIOBase, connections: dict[bytes, tuple[str, str]]
 ) -> Iterator[_Found]:
-    """Yield the messages of a chunk. One that cannot be unpacked is passed over with a notice."""
+    """Yield the messages of a chunk, or note that it cannot be unpacked."""
     import lz4.frame
 
-    size = stream.read(4)
+    start, size = stream.tell(), stream.read(4)
     data = stream.read(int.from_bytes(size, "little")) if len(size) == 4 else b""
     unpack = {b"bz2": bz2.decompress, b"lz4": lz4.frame.decompress}.get(
         entries.get("compression", b""), bytes
@@ -85,7 +85,7 @@ def _of_chunk(
     try:
         unpacked = unpack(data) if data else b""
     except (OSError, RuntimeError, ValueError, EOFError) as error:
-        note("chunks", "damaged, left out", f"{len(data)} bytes: {error}")
+        note("chunks", "damaged, left out", f"{len(data)} bytes from {start} on: {error}")
         return
     yield from _of_records(io.BytesIO(unpacked), connections)
 

@@ -1,6 +1,7 @@
 """MCAP files of ROS 1, ROS 2 and Foxglove (protocol buffers and JSON), closed or cut off."""
 
 import functools
+import heapq
 import importlib
 import importlib.util
 import json
@@ -25,7 +26,7 @@ from foredrive.data.notices import note
 from foredrive.errors import InputError
 
 if TYPE_CHECKING:
-    from mcap.records import Channel, Schema
+    from mcap.records import Channel, ChunkIndex, Schema
     from mcap.records import Message as Record
 
     Found = tuple[Schema | None, Channel, Record]
@@ -40,14 +41,15 @@ class _File:
     channels: "dict[int, Channel]"
     counts: Counter[int]
     """Number of messages by channel."""
-    indexed: bool
-    """Whether a summary says where the messages are."""
+    chunks: "Sequence[ChunkIndex]" = ()
+    """Chunks by their summary. Without any, the file is read from its start."""
 
 
 def open_mcap(paths: Sequence[Path]) -> Bag:
     """Return what MCAP files hold, one after the other.
 
     A file without a summary is read from its start. If it was cut off, it gives the messages that are whole.
+    A damaged chunk is left out with a notice.
 
     Raises:
         InputError: a file holds no whole message, or a package is missing.
@@ -91,7 +93,7 @@ def _indexed(path: Path) -> _File | None:
             return None
         counts = Counter(summary.statistics.channel_message_counts)
         if set(counts) <= set(summary.channels):
-            return _File(path, summary.schemas, summary.channels, counts, indexed=True)
+            return _File(path, summary.schemas, summary.channels, counts, summary.chunk_indexes)
     return None
 
 
@@ -101,18 +103,25 @@ def _scanned(path: Path) -> _File:
     Raises:
         InputError: it holds no whole message.
     """
-    content = _File(path, {}, {}, Counter(), indexed=False)
-    last_ns, ends = 0, [False]
-    for schema, channel, record in _records(path, ends):
-        content.channels[channel.id] = channel
-        if schema is not None:
-            content.schemas[schema.id] = schema
-        content.counts[channel.id] += 1
-        last_ns = max(last_ns, record.log_time)
-    count = sum(content.counts.values())
+    from mcap.records import Channel, Footer, Schema
+
+    content = _File(path, {}, {}, Counter())
+    last_ns, ends = 0, False
+    for record in _records(path):
+        if isinstance(record, Schema):
+            content.schemas[record.id] = record
+        elif isinstance(record, Channel):
+            content.channels[record.id] = record
+        elif isinstance(record, Footer):
+            ends = True
+        else:
+            content.counts[record.channel_id] += 1
+            last_ns = max(last_ns, record.log_time)
+    # A channel may be described behind its messages alone, where the chunk that opened it is damaged
+    count = sum(content.counts[number] for number in content.channels)
     if not count:
         raise InputError(f"{path}: no whole message in it; it is no MCAP file, or was cut off at its start")
-    if not ends[0]:
+    if not ends:
         note(
             path.name,
             f"the recording was cut off; {count} whole messages were read, to {last_ns * 1e-9:.3f} s",
@@ -121,59 +130,66 @@ def _scanned(path: Path) -> _File:
 
 
 def _messages(file: _File, names: Collection[str]) -> "Iterator[Found]":
-    if not file.indexed:
-        yield from (parts for parts in _records(file.path, []) if parts[1].topic in names)
-        return
-    from mcap.reader import make_reader
+    """Yield the messages of topics: in the order of time by a summary, else in that of the file."""
+    wanted = {number for number, channel in file.channels.items() if channel.topic in names}
+    for record in _sorted_records(file, wanted) if file.chunks else _records(file.path):
+        if getattr(record, "channel_id", None) in wanted:
+            channel = file.channels[record.channel_id]
+            yield file.schemas.get(channel.schema_id), channel, record
 
+
+def _sorted_records(file: _File, wanted: Collection[int]) -> Iterator[Any]:
+    """Yield the messages of the chunks that hold wanted channels, in the order of time."""
+    from mcap.data_stream import ReadDataStream
+    from mcap.records import Chunk, Message
+
+    # Messages of chunks that overlap in time wait here for each other
+    waiting: list[tuple[int, int, int, Message]] = []
     with file.path.open("rb") as opened:
-        yield from make_reader(opened).iter_messages(topics=list(names))
+        for index in sorted(file.chunks, key=lambda chunk: chunk.message_start_time):
+            if index.message_index_offsets and set(wanted).isdisjoint(index.message_index_offsets):
+                continue
+            while waiting and waiting[0][0] < index.message_start_time:
+                yield heapq.heappop(waiting)[-1]
+            opened.seek(index.chunk_start_offset + 9)  # behind the kind and the length of the record
+            for number, record in enumerate(_opened(Chunk.read(ReadDataStream(opened)), file.path)):
+                if isinstance(record, Message) and record.channel_id in wanted:
+                    heapq.heappush(waiting, (record.log_time, index.chunk_start_offset, number, record))
+    while waiting:
+        yield heapq.heappop(waiting)[-1]
 
 
-def _records(path: Path, ends: list[bool]) -> "Iterator[Found]":
-    """Yield the whole messages of a file from its start.
-
-    Args:
-        path: the file.
-        ends: its first entry becomes True if the file ends as it should.
-    """
-    from mcap.records import Channel, Chunk, Footer, Schema
-    from mcap.records import Message as Record
+def _records(path: Path) -> Iterator[Any]:
+    """Yield the schemas, channels and messages of a file from its start, and its footer if it has one."""
+    from mcap.records import Channel, Chunk, Footer, Message, Schema
     from mcap.stream_reader import StreamReader
 
-    schemas: dict[int, Schema] = {}
-    channels: dict[int, Channel] = {}
-
-    def parts(file: Any) -> Iterator[Any]:
-        # Chunks are opened here, so that a damaged one costs itself alone
-        for outer in StreamReader(file, emit_chunks=True).records:
-            if isinstance(outer, Chunk):
-                with suppress(Exception):
-                    yield from _opened(outer)
-            else:
-                yield outer
-
     with path.open("rb") as file, suppress(Exception):
-        for record in parts(file):
-            if isinstance(record, Schema):
-                schemas[record.id] = record
-            elif isinstance(record, Channel):
-                channels[record.id] = record
-            elif isinstance(record, Record) and record.channel_id in channels:
-                channel = channels[record.channel_id]
-                yield schemas.get(channel.schema_id), channel, record
-            elif isinstance(record, Footer):
-                ends[:1] = [True]
+        for record in StreamReader(file, emit_chunks=True).records:
+            if isinstance(record, Chunk):
+                yield from _opened(record, path)
+            elif isinstance(record, Schema | Channel | Message | Footer):
+                yield record
 
 
-def _opened(chunk: Any) -> Iterator[Any]:
-    """Yield schemas, channels and messages of a chunk, up to where it is cut."""
+def _opened(chunk: Any, path: Path) -> Iterator[Any]:
+    """Yield the schemas, channels and messages of a chunk. A damaged one is noted, and costs itself alone."""
+    try:
+        yield from _unpacked(chunk)
+    except Exception as error:  # of the compression, and of any record
+        span = " to ".join(f"{ns * 1e-9:.3f}" for ns in (chunk.message_start_time, chunk.message_end_time))
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        note(path.name, "damaged chunks, left out", f"recorded at {span} s: {reason}")
+
+
+def _unpacked(chunk: Any) -> Iterator[Any]:
+    """Yield the records of a chunk, up to where it is cut."""
     from mcap.opcode import Opcode
     from mcap.records import Channel, Schema
     from mcap.records import Message as Record
     from mcap.stream_reader import get_chunk_data_stream
 
-    stream, size = get_chunk_data_stream(chunk)
+    stream, size = get_chunk_data_stream(chunk, validate_crc=True)
     while stream.count < size:
         opcode, length = stream.read1(), stream.read8()
         if stream.count + length > size:
