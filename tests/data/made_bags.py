@@ -6,11 +6,18 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import yaml
 from PIL import Image
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from foredrive.data.formats.bag_proposal import propose_topics
+from foredrive.data.formats.bag_topics import topics_file
+from foredrive.data.formats.convert import convert
+from foredrive.data.logs import Log
+from foredrive.data.notices import read_notices
 
 START_NS = 1_700_000_000_000_000_000
 SPEED_MPS, TURN_RADPS, FRAMES, PERIOD_NS = 10.0, 0.5, 5, 100_000_000
@@ -205,13 +212,14 @@ def write_ros1(path: Path) -> None:
 
 
 Recording = list[tuple[str, int, Any]]
+Change = Callable[[Messages, Recording], Recording]
 
 
 def write_ros2(
     path: Path,
     storage: StoragePlugin = StoragePlugin.SQLITE3,
     skip: tuple[str, ...] = (),
-    change: Callable[[Messages, Recording], Recording] = lambda made, recording: recording,
+    change: Change = lambda made, recording: recording,
 ) -> None:
     """Write the recording, without the topics of `skip`, as `change` makes it."""
     messages = Messages(2)
@@ -224,6 +232,18 @@ def write_ros2(
             if topic not in opened:
                 opened[topic] = writer.add_connection(topic, kind, typestore=messages.store)
             writer.write(opened[topic], t_ns, messages.store.serialize_cdr(message, kind))
+
+
+def converted(folder: Path, change: Change, **topics: object) -> tuple[Log, list[str]]:
+    """Return the log of a changed recording, and its notices."""
+    bag = folder / "drive"
+    write_ros2(bag, change=change)
+    propose_topics(bag, topics_file(bag))
+    if topics:
+        written = yaml.safe_load(topics_file(bag).read_text())
+        topics_file(bag).write_text(yaml.safe_dump(written | topics))
+    (path,) = convert(bag, "rosbag", folder / "out")
+    return Log(path), read_notices(path.folder)
 
 
 def write_mcap_of_ros1(path: Path) -> None:

@@ -1,4 +1,4 @@
-"""The clocks of a bag's topics, compared by the times at which one recorder received their messages.
+"""Comparison of the clocks of a bag's topics, by the times at which one recorder received their messages.
 
 The difference of header stamp and recorder's time is about constant for a topic: the offset of its clock,
 less the delay until the recorder has the message. Topics of one clock differ by their delays alone.
@@ -22,7 +22,7 @@ LATE_S = 10.0
 _LOST_S = 10.0
 """Single stamps that differ by more from those of their topic are wrong."""
 _KNOWN_S = (37.0, 18.0, 19.0)
-"""By how much TAI and GPS are ahead of UTC since 2017, and TAI of GPS."""
+"""Known differences of clocks, s: TAI is ahead of UTC since 2017, GPS of UTC, and TAI of GPS."""
 _ZONE_S = 900.0
 """Time zones differ by multiples of this."""
 
@@ -85,7 +85,7 @@ def _is_unset(t_us: Int64[np.ndarray, "N"]) -> bool:
 
 
 def _offset_s(stream: Stream) -> float | None:
-    """Return by how much the stamps are ahead of the recorder's times, or None if that is not constant."""
+    """Return the time by which stamps are ahead of the recorder's times, s, or None if it is not constant."""
     if _is_unset(stream.t_us):
         return None
     off_s = (stream.t_us - stream.recorded_us) * 1e-6
@@ -121,7 +121,7 @@ def _recorded(name: str, stream: Stream, common_s: float | None) -> Int64[np.nda
 
 
 def _correction_s(name: str, ahead_s: float) -> float:
-    """Return what is subtracted from the stamps of a topic that are ahead of the others, and say so."""
+    """Return the time by which the stamps of a topic are put back, s, and note it."""
     if abs(ahead_s) <= SAME_S:
         return 0.0
     way = "ahead of" if ahead_s > 0 else "behind"
@@ -138,7 +138,7 @@ def _correction_s(name: str, ahead_s: float) -> float:
 
 
 def _known_s(ahead_s: float) -> float | None:
-    """Return the usual difference of two clocks that is this one but for delays, or None."""
+    """Return the known difference of two clocks that equals this one but for delays, s, or None."""
     for known_s in (*_KNOWN_S, *(-known for known in _KNOWN_S)):
         if abs(ahead_s - known_s) <= SAME_S:
             return known_s

@@ -1,4 +1,4 @@
-"""What a bag holds: its topics and messages, and the decoders of ROS messages.
+"""Topics and messages of a bag, and the decoders of ROS messages.
 
 ROS messages are read by the definitions that come with `rosbags`, not by those embedded in a bag, from which
 `rosbags` would generate code.
@@ -32,13 +32,13 @@ KINDS = {
 
 @dataclass(frozen=True)
 class Message:
-    """One message as it lies in a bag."""
+    """One message of a bag, not yet decoded."""
 
     topic: str
     recorded_s: float
-    """When the recorder received it, s. The stamp of what it measured is in its content."""
+    """Time at which the recorder received it, s. The time of measurement is in its content."""
     decode: Callable[[], Any]
-    """Returns its content; raises an error of any class if the message is damaged."""
+    """Returns its content. Raises an error of any class if the message is damaged."""
 
 
 @dataclass(frozen=True)
@@ -49,11 +49,11 @@ class Topic:
     type: str
     count: int
     unread: str | None = None
-    """Why its messages cannot be decoded, or None if they can."""
+    """Reason why its messages cannot be decoded, or None if they can."""
 
     @property
     def kind(self) -> str | None:
-        """Return what its messages hold, or None for a type that is not read."""
+        """Return its kind of sensor data, or None for a type that is not read."""
         return KINDS.get(self.type) if self.unread is None else None
 
 
@@ -80,7 +80,7 @@ def joined_topics(parts: Iterable[Topic]) -> dict[str, Topic]:
 
 @functools.cache
 def ros_decoder(version: Literal[1, 2]) -> Callable[[bytes, str], Any]:
-    """Return what decodes the bytes of a message of ROS 1 or 2, given its type."""
+    """Return the function that decodes a message of ROS 1 or 2 from its bytes and type."""
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
     types = get_typestore(Stores.ROS1_NOETIC if version == 1 else Stores.LATEST)

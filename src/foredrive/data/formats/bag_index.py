@@ -1,4 +1,4 @@
-"""A first pass over a bag: stamps, transforms and calibrations, before any image or sweep is decoded."""
+"""Stamps, transforms and calibrations of a bag, from a first pass before images and sweeps are decoded."""
 
 import functools
 import itertools
@@ -23,13 +23,14 @@ from foredrive.data.formats.guard import PartReader
 
 
 class Stamp(NamedTuple):
-    """When one message was measured."""
+    """Time of one message."""
 
     number: int
     """Position of the message in its topic."""
     t_us: int
+    """Time of measurement."""
     recorded_us: int
-    """When the recorder received it."""
+    """Time at which the recorder received it."""
 
 
 @dataclass
@@ -41,7 +42,7 @@ class BagIndex:
     placed: list[Placed] = field(default_factory=list)
     """All transforms."""
     stamps: dict[str, list[Stamp]] = field(default_factory=dict)
-    """Of each readable message, by topic."""
+    """Stamps of the readable messages, by topic."""
     first: dict[str, Any] = field(default_factory=dict)
     """First readable message of each topic of images, points and calibrations."""
 
@@ -51,7 +52,7 @@ class BagIndex:
 
 
 def index_bag(bag: Bag, topics: BagTopics) -> BagIndex:
-    """Read the stamps, transforms and calibrations of a bag. Stamps are those of one clock (`bag_clocks`).
+    """Read the stamps, transforms and calibrations of a bag, with all stamps on one clock (`bag_clocks`).
 
     Raises:
         InputError: no message of a topic can be read, or stamps are not set and there is no clock.

@@ -12,7 +12,7 @@ from foredrive.errors import InputError
 
 _NUMPY_OF_ROS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 _NUMPY_OF_FOXGLOVE = {1: "u1", 2: "i1", 3: "u2", 4: "i2", 5: "u4", 6: "i4", 7: "f4", 8: "f8"}
-"""PointField.datatype and PackedElementField.NumericType."""
+"""Types of numbers, by the codes of ROS' PointField and of Foxglove's PackedElementField."""
 
 _INTENSITY, _CHANNEL = ("intensity", "i", "reflectivity"), ("ring", "channel", "line", "laser_id")
 _TIMES = ("t", "time", "timestamp", "time_stamp", "offset_time", "time_offset")
@@ -35,7 +35,7 @@ class Calibration:
     dist: Float64[np.ndarray, "5"]
     size_hw: tuple[int, int]
     R_optical_cam: Float64[np.ndarray, "3 3"] = field(default_factory=lambda: np.eye(3))
-    """From the axes of the images to those of the optical frame: rectified images are turned."""
+    """Rotation from the axes of the images to the optical frame; only rectified images are turned."""
     offset_m: float = 0.0
     """Distance to another camera in whose frame P is, as of the right one of a pair. It is not used."""
 
@@ -46,9 +46,9 @@ class Cloud:
 
     xyz_m: Float64[np.ndarray, "N 3"]
     intensity: Float64[np.ndarray, "N"] | None
-    """As stored."""
+    """Intensities as stored."""
     times: Shaped[np.ndarray, "N"] | None
-    """As stored; `seconds_since_stamp` knows their unit and origin."""
+    """Times as stored; `seconds_since_stamp` converts them."""
     channel: Float64[np.ndarray, "N"] | None
 
 
@@ -64,7 +64,7 @@ class Placed:
     fixed: bool = False
     """Whether it holds for all times (`is_static`)."""
     recorded_us: int = 0
-    """When the recorder received its message."""
+    """Time at which the recorder received its message."""
 
 
 def stamp_us(message: Any) -> int:
@@ -91,7 +91,7 @@ def read_calibration(message: Any, rectified: bool = False) -> Calibration:
             distortion, and R turns the camera's axes to theirs. Else K and D hold, those of the raw images.
 
     Raises:
-        InputError: it is none, or its lens is not OpenCV's with five coefficients.
+        InputError: it has no camera matrix, or its lens is not OpenCV's with five coefficients.
     """
     k, d, r, p = (
         np.array(getattr(message, name if hasattr(message, name) else name.upper()), np.float64)
@@ -122,7 +122,7 @@ def read_calibration(message: Any, rectified: bool = False) -> Calibration:
 
 
 def _rectification(r: Float64[np.ndarray, "_"]) -> Float64[np.ndarray, "3 3"]:
-    """Return the rotation from rectified to camera axes. R of a CameraInfo is its inverse; zeros are none."""
+    """Return the rotation from rectified to camera axes: the inverse of a CameraInfo's R, if it is set."""
     if r.size != 9 or not r.any():
         return np.eye(3)
     R = r.reshape(3, 3)
@@ -172,9 +172,11 @@ def cloud_pose(message: Any) -> Float64[np.ndarray, "4 4"]:
     return _matrix(pose.position, pose.orientation)
 
 
-# Fields of arbitrary types at arbitrary offsets, as numpy's structured arrays
 def _cells(message: Any) -> np.ndarray:
-    """Return the points of a cloud as a structured array, row by row."""
+    """Return the points of a cloud as a structured array, row by row.
+
+    Its fields have the types and offsets that the message names.
+    """
     data = bytes(message.data)
     if hasattr(message, "point_step"):
         step, width, height = int(message.point_step), int(message.width), int(message.height)

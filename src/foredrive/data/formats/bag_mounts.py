@@ -1,4 +1,4 @@
-"""Where the sensors of a bag are on the vehicle, at the time of each message."""
+"""Poses of the sensors of a bag on the vehicle, at the time of each message."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -13,21 +13,21 @@ from foredrive.data.formats.frame_tree import FrameTree
 from foredrive.data.notices import note
 
 USUAL_POSITION_M = (0.0, 0.0, 1.8)
-"""Of a lidar on a roof, in the ego frame."""
+"""Position of a lidar on a roof, ego frame, m."""
 _T_BODY_OPTICAL = np.array([[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]], np.float64)
-"""From a camera's optical axes (x right, y down, z ahead) to those of its body (x ahead, y left, z up)."""
+"""Transform from a camera's optical axes (x right, y down, z ahead) to its body's (x ahead, y left, z up)."""
 _UPRIGHT = 0.8
 """A frame is upright if its axis z has this share of the vehicle's, which is within 37 degrees."""
 
 
 @dataclass(frozen=True)
 class Mounts:
-    """Where sensors are on the vehicle at the time of each of their messages."""
+    """Poses of sensors on the vehicle at the times of their messages."""
 
     tree: FrameTree
     ego_frame: str
     T_ego_origin: Float64[np.ndarray, "4 4"]
-    """From the log's ego frame to that of the bag."""
+    """Transform from the log's ego frame to that of the bag."""
 
     def at(self, sensor: str, t_us: Int64[np.ndarray, "N"]) -> Float64[np.ndarray, "N 4 4"]:
         """Return T_ego_sensor at times."""
@@ -37,7 +37,7 @@ class Mounts:
         return np.linalg.inv(self.T_ego_origin) @ np.broadcast_to(T, (len(t_us), 4, 4))
 
     def given(self, mount: Mount) -> Float64[np.ndarray, "4 4"]:
-        """Return the T_ego_sensor of the YAML."""
+        """Return T_ego_sensor by a mount of the YAML."""
         T = np.eye(4)
         T[:3, :3] = Rotation.from_quat(mount.quaternion_wxyz, scalar_first=True).as_matrix()
         T[:3, 3] = mount.position_m
@@ -76,7 +76,10 @@ class Mounts:
         return lidar.mount is None and not on_board and self.tree.moves(self.ego_frame, frame)
 
     def position_m(self, lidar: LidarTopic, first: Any, t_us: int) -> tuple[float, float, float]:
-        """Return where the beams of a lidar begin: of a cloud in the world, above the axle."""
+        """Return the place where the beams of a lidar begin, ego frame, m.
+
+        A cloud in the world has lost it: it is then `USUAL_POSITION_M`.
+        """
         if self.is_registered(lidar, first):
             text = f"its frame {lidar.frame or frame_of(first)} does not move with {self.ego_frame}"
             note(
