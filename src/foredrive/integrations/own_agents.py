@@ -31,6 +31,8 @@ from foredrive.errors import InputError
 from foredrive.scene import Clip, Trajectory
 
 NAVSIM, PYTHON = "navsim:", "python:"
+_INSTALLED = ("site-packages", "dist-packages")
+"""Names of the folders of installed packages."""
 
 
 @dataclass(frozen=True)
@@ -83,7 +85,7 @@ def files_of(agent: str) -> list[Path]:
     """Return the files that decide what an agent does, in a fixed order.
 
     They are its own file, the files beside it that these import, also in functions, and those that its
-    arguments name. Installed packages are left out.
+    arguments name. Of installed packages only the agent's own counts.
 
     Raises:
         InputError: there is no such class.
@@ -93,21 +95,31 @@ def files_of(agent: str) -> list[Path]:
     if agent.startswith(NAVSIM):
         # The folder in which the imports of a module begin is above all packages of its name
         file = Path(inspect.getfile(sys.modules[place]))
-        root = file.parents[place.count(".") + (file.name == "__init__.py")]
+        root = file.parents[place.count(".") + (file.name == "__init__.py")].absolute()
+        todo = [file.absolute(), *_modules(root, place)]
+        below = root / place.partition(".")[0] if root.name in _INSTALLED else root
     else:
-        file, root = Path(place), Path(place).parent
-    files, todo = list[Path](), [file.absolute()]
+        root = below = Path(place).absolute().parent
+        todo = [Path(place).absolute()]
+    files = list[Path]()
     while todo:
         if (path := todo.pop()) not in files:
             files.append(path)
-            todo += _imported(path, root.absolute())
+            todo += (module for module in _imported(path, root) if module.is_relative_to(below))
     named = (Path(value) for value in arguments.values() if isinstance(value, str))
     return sorted(files) + sorted(path.absolute() for path in named if path.is_file())
 
 
 def _imported(file: Path, root: Path) -> Iterator[Path]:
-    """Yield the files below a folder that a Python file imports from there."""
-    for node in ast.walk(ast.parse(file.read_bytes())):
+    """Yield the files below a folder that a Python file imports from there.
+
+    A file that is no Python imports nothing: an import that fails may be one that the agent does without.
+    """
+    try:
+        tree = ast.parse(file.read_bytes())
+    except (SyntaxError, ValueError):
+        return
+    for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             names, base = [alias.name for alias in node.names], root
         elif isinstance(node, ast.ImportFrom):
@@ -118,9 +130,15 @@ def _imported(file: Path, root: Path) -> Iterator[Path]:
         else:
             continue
         for name in names:
-            path = base.joinpath(*name.split("."))
-            candidates = (path.with_suffix(".py"), path / "__init__.py")
-            yield from (module for module in candidates if name and module.is_file())
+            yield from _modules(base, name)
+
+
+def _modules(base: Path, name: str) -> Iterator[Path]:
+    """Yield the file of a module below a folder, and those of the packages that are imported on its way."""
+    path = base
+    for part in name.split(".") if name else ():
+        path /= part
+        yield from (module for module in (path.with_suffix(".py"), path / "__init__.py") if module.is_file())
 
 
 def own_agent(agent: str) -> "OwnAgent":
