@@ -24,11 +24,19 @@ from foredrive.engine.summary import read_summary
 from foredrive.errors import InputError
 from foredrive.files import atomic_path
 from foredrive.runs.drive.agent_inputs import inputs_of
-from foredrive.runs.drive.agents import AGENTS, agent_digest
+from foredrive.runs.drive.agents import AGENTS
 from foredrive.runs.drive.in_towns import TownRoutes
 from foredrive.runs.drive.records import read_drive, summarise
 from foredrive.runs.drive.route_source import job_of
-from foredrive.runs.drive.suite import DriveJob, DriveSuite, SuiteResult, drive_one, drive_suite, folder_of
+from foredrive.runs.drive.suite import (
+    DriveJob,
+    DriveSuite,
+    SuiteResult,
+    agent_digest,
+    drive_one,
+    drive_suite,
+    folder_of,
+)
 from foredrive.runs.train.run import Run
 from foredrive.scene import VoxelSpec
 from foredrive.scene.conditions import CONDITIONS, carla_weather, conditions_of_weather

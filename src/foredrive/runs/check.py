@@ -11,7 +11,7 @@ from foredrive.data.lidar import frames_with_lidar
 from foredrive.data.log_check import Finding, LogCheck, check_log
 from foredrive.data.logs import Log
 from foredrive.errors import InputError
-from foredrive.methods.reconstruction.calibration import spread_along_path
+from foredrive.methods.reconstruction.sweep_edges import spread_along_path
 from foredrive.methods.reconstruction.tracks import read_tracks
 from foredrive.methods.reconstruction.views import camera_views, ego_twists, sweep_views
 from foredrive.runs.reconstruction.calibration_check import calibration_findings

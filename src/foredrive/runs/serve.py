@@ -14,7 +14,8 @@ from foredrive.integrations.remote.planner_server import PlannerNeeds, PlannerSe
 from foredrive.integrations.remote.render_server import RenderService
 from foredrive.json_server import Answer
 from foredrive.runs.drive.agent_inputs import inputs_of
-from foredrive.runs.drive.agents import make_agent, require_alpasim
+from foredrive.runs.drive.agents import make_agent
+from foredrive.runs.drive.remote_agents import require_alpasim
 from foredrive.runs.reconstruction.reconstruction_run import open_reconstruction, open_run_log
 from foredrive.runs.reconstruction.trust import trust_of
 

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from foredrive.methods.reconstruction.calibration import sweep_edges
+from foredrive.methods.reconstruction.sweep_edges import sweep_edges
 from foredrive.methods.reconstruction.tracks import ActorTracks
 from foredrive.methods.reconstruction.views import SweepView
 from foredrive.scene import LidarSweep

@@ -6,8 +6,9 @@ import pytest
 import torch
 
 from foredrive.geometry.projection import project
-from foredrive.methods.reconstruction.calibration import CalibrationViews, SweepEdges, calibration_views
+from foredrive.methods.reconstruction.calibration import CalibrationViews, calibration_views
 from foredrive.methods.reconstruction.lens_fit import best_camera_lens
+from foredrive.methods.reconstruction.sweep_edges import SweepEdges
 from foredrive.methods.reconstruction.views import CameraView
 from foredrive.runs.reconstruction.calibration_check import _camera_findings, best_camera_rotation
 

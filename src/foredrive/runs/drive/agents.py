@@ -3,14 +3,13 @@
 The modules of an agent are imported when it is built, so that the table can be read at once.
 """
 
-import importlib.util
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from foredrive.errors import InputError
-from foredrive.files import digest_of
+from foredrive.runs.drive import remote_agents
 
 if TYPE_CHECKING:
     from foredrive.scene import Agent
@@ -152,42 +151,10 @@ def _build_of_log(setup: AgentSetup) -> "Agent":
     raise AssertionError("`in_reconstruction` builds the agents that follow a log")
 
 
-def _build_http(setup: AgentSetup) -> "Agent":
-    from foredrive.integrations.remote.json_http import read_address
-    from foredrive.integrations.remote.planner_client import HttpPlanner
-
-    cameras, lidar = setup.sees != "lidar", setup.sees in ("lidar", "both")
-    return HttpPlanner(read_address(setup.agent, "http"), setup.clock, cameras=cameras, lidar=lidar)
-
-
-def _build_grpc(setup: AgentSetup) -> "Agent":
-    require_alpasim()
-    from foredrive.integrations.remote.alpasim_client import GrpcDriver
-    from foredrive.integrations.remote.json_http import read_address
-
-    return GrpcDriver(read_address(setup.agent, "grpc"), setup.clock)
-
-
 def _build_own(setup: AgentSetup) -> "Agent":
     from foredrive.integrations.own_agents import own_agent
 
     return own_agent(setup.agent)
-
-
-def _check_http(agent: str) -> None:
-    from foredrive.integrations.remote.json_http import read_address
-    from foredrive.integrations.remote.planner_client import check_planner
-
-    check_planner(read_address(agent, "http"))
-
-
-def _check_grpc(agent: str) -> None:
-    require_alpasim()
-    from foredrive.integrations.remote.alpasim_client import check_driver
-    from foredrive.integrations.remote.json_http import read_address
-    from foredrive.integrations.remote.planner_client import ALIVE_S
-
-    check_driver(read_address(agent, "grpc"), ALIVE_S)
 
 
 @dataclass(frozen=True)
@@ -282,18 +249,18 @@ AGENTS: tuple[AgentKind, ...] = (
         "http://",
         "a planner in another process, behind neuro-ncap's model server protocol; ?timeout=S behind the "
         "address changes the 60 s in which it has to answer",
-        _build_http,
+        remote_agents.build_http,
         "HOST:PORT",
         "remote",
-        ready=_check_http,
+        ready=remote_agents.check_http,
     ),
     AgentKind(
         "grpc://",
         "a driver in another process, behind AlpaSim's contract",
-        _build_grpc,
+        remote_agents.build_grpc,
         "HOST:PORT",
         "remote",
-        ready=_check_grpc,
+        ready=remote_agents.check_grpc,
     ),
     AgentKind(
         "python:",
@@ -347,24 +314,6 @@ def absolute_name(agent: str) -> str:
     return str(Path(agent).absolute()) if Path(agent).is_dir() else agent
 
 
-def agent_digest(agent: str) -> str | None:
-    """Return a digest of an agent's code and weights; None if the package or another process has them.
-
-    Raises:
-        InputError: there is no such agent.
-    """
-    kind, argument = find_agent(agent)
-    if kind.sensors == "declared":
-        from foredrive.integrations.own_agents import files_of
-
-        return digest_of(files_of(agent))
-    if kind.argument != "RUN":
-        return None
-    from foredrive.runs.shipped import run_digest
-
-    return run_digest(agent_folder(agent, argument))
-
-
 def is_foreign(agent: str) -> bool:
     """Return whether an agent is of another program, so that it is tried before the first drive."""
     return find_agent(agent)[0].sensors in ("remote", "declared")
@@ -408,16 +357,6 @@ def make_agent(
 def is_remote(agent: str) -> bool:
     """Return whether an agent is in another process. It remembers the frames that it was sent."""
     return find_agent(agent)[0].sensors == "remote"
-
-
-def require_alpasim() -> None:
-    """Check that AlpaSim's contract is installed.
-
-    Raises:
-        InputError: it is not.
-    """
-    if importlib.util.find_spec("carla_driver_interface") is None:
-        raise InputError("AlpaSim's driver contract is missing: pip install 'foredrive[alpasim]'")
 
 
 def check_ready(agent: str) -> None:

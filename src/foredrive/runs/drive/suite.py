@@ -30,10 +30,11 @@ from foredrive.engine.folder import DRIVES, SUITE, SUMMARY, RunFolder
 from foredrive.engine.interrupts import start_fork_server
 from foredrive.engine.summary import write_summary
 from foredrive.errors import InputError
-from foredrive.files import atomic_path, together
-from foredrive.runs.drive.agents import agent_digest, check_ready, is_foreign
+from foredrive.files import atomic_path, digest_of, together
+from foredrive.runs.drive.agents import agent_folder, check_ready, find_agent, is_foreign
 from foredrive.runs.drive.preflight import try_agent
 from foredrive.runs.drive.records import read_drive, read_suite, summarise, write_drive
+from foredrive.runs.shipped import run_digest
 from foredrive.scene import Agent, Simulator
 
 AGENT_SHA256, ROUTES_SHA256 = "agent_sha256", "routes_sha256"
@@ -257,6 +258,22 @@ def drive_one(job: DriveJob, suite: DriveSuite, out: Path, threads: int | None =
     )
     write_drive(_file(out, job), record)
     return read_drive(_file(out, job))
+
+
+def agent_digest(agent: str) -> str | None:
+    """Return a digest of an agent's code and weights; None if the package or another process has them.
+
+    Raises:
+        InputError: there is no such agent.
+    """
+    kind, argument = find_agent(agent)
+    if kind.sensors == "declared":
+        from foredrive.integrations.own_agents import files_of
+
+        return digest_of(files_of(agent))
+    if kind.argument != "RUN":
+        return None
+    return run_digest(agent_folder(agent, argument))
 
 
 def folder_of(suite: DriveSuite, out: Path) -> RunFolder:

@@ -7,17 +7,16 @@ from dataclasses import dataclass
 from foredrive.methods.reconstruction.calibration import (
     CalibrationViews,
     OffsetFit,
-    SweepEdges,
     agreement,
     best_camera_delay,
     best_camera_rotation,
     best_lidar_translation,
     calibration_views,
     mean_shift_rad,
-    sweep_edges,
     with_images_from,
 )
 from foredrive.methods.reconstruction.lens_fit import best_camera_lens
+from foredrive.methods.reconstruction.sweep_edges import SweepEdges, sweep_edges
 from foredrive.methods.reconstruction.tracks import ActorTracks
 from foredrive.methods.reconstruction.views import CameraView, SweepView
 

@@ -1,0 +1,56 @@
+"""Agents in other processes: their clients, and the check that they are alive."""
+
+import importlib.util
+from typing import TYPE_CHECKING
+
+from foredrive.errors import InputError
+
+if TYPE_CHECKING:
+    from foredrive.runs.drive.agents import AgentSetup
+    from foredrive.scene import Agent
+
+
+def require_alpasim() -> None:
+    """Check that AlpaSim's contract is installed.
+
+    Raises:
+        InputError: it is not.
+    """
+    if importlib.util.find_spec("carla_driver_interface") is None:
+        raise InputError("AlpaSim's driver contract is missing: pip install 'foredrive[alpasim]'")
+
+
+def build_http(setup: "AgentSetup") -> "Agent":
+    """Build the client of a planner behind neuro-ncap's protocol."""
+    from foredrive.integrations.remote.json_http import read_address
+    from foredrive.integrations.remote.planner_client import HttpPlanner
+
+    cameras, lidar = setup.sees != "lidar", setup.sees in ("lidar", "both")
+    return HttpPlanner(read_address(setup.agent, "http"), setup.clock, cameras=cameras, lidar=lidar)
+
+
+def build_grpc(setup: "AgentSetup") -> "Agent":
+    """Build the client of a driver behind AlpaSim's contract."""
+    require_alpasim()
+    from foredrive.integrations.remote.alpasim_client import GrpcDriver
+    from foredrive.integrations.remote.json_http import read_address
+
+    return GrpcDriver(read_address(setup.agent, "grpc"), setup.clock)
+
+
+def check_http(agent: str) -> None:
+    """Wait for a planner. Raise `InputError` if it does not answer."""
+    from foredrive.integrations.remote.json_http import read_address
+    from foredrive.integrations.remote.planner_client import check_planner
+
+    check_planner(read_address(agent, "http"))
+
+
+def check_grpc(agent: str) -> None:
+    """Wait for a driver. Raise `InputError` if it does not answer."""
+    require_alpasim()
+    from foredrive.integrations.remote.alpasim_client import check_driver
+    from foredrive.integrations.remote.json_http import read_address
+    from foredrive.integrations.remote.planner_client import ALIVE_S
+
+    check_driver(read_address(agent, "grpc"), ALIVE_S)
