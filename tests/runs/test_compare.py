@@ -259,6 +259,30 @@ def test_suites_of_several_seeds_are_one_agent(tmp_path: Path) -> None:
     assert found.differences["driving_score_1_0"]["seeing"].mean == pytest.approx(100 / 3)
 
 
+def test_the_report_says_what_its_intervals_are_over(tmp_path: Path) -> None:
+    """Of one folder each over routes; a second training of one agent counts in its ability alone."""
+    ten: Given = {(str(k), 0): (0.1 * k, [], DONE) for k in range(10)}
+    one, two, other = (str(suite(tmp_path / name, ten)) for name in ("one", "two", "other"))
+    single = compare([read_agent(one), read_agent(other)], resamples=10)
+    mixed = compare([read_agent(f"a={one},{two}"), read_agent(other)], resamples=10)
+    both = compare([read_agent(f"a={one},{two}"), read_agent(f"b={other},{two}")], resamples=10)
+    for found, differences, ratings in (
+        (single, "routes,", "routes."),
+        (mixed, "routes,", "routes and trainings."),
+        (both, "routes and trainings,", "routes and trainings."),
+    ):
+        assert f"Intervals of 95 % over {differences}" in " ".join(means_table(found).notes)
+        assert f"Intervals of 95 % over {ratings}" in " ".join(ranking_table(found).notes)
+
+
+def test_the_file_of_a_suite_is_read_once(tmp_path: Path) -> None:
+    folders = [suite(tmp_path / name, SEEING, seed=seed) for seed, name in enumerate(("a", "b"))]
+    agents = [read_agent(str(folder)) for folder in folders]
+    for folder in folders:
+        (folder / "suite.json").unlink()
+    assert compare(agents, resamples=10).unlike == ("seed (0 or 1)",)
+
+
 def test_other_traffic_is_told(tmp_path: Path) -> None:
     one = suite(tmp_path / "day", SEEING, seed=0, conditions=None)
     other = suite(tmp_path / "night", SEEING, seed=1, conditions="night")

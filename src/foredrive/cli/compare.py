@@ -21,8 +21,9 @@ def compare(
     """Rank agents, and compare them drive by drive: scores, progress and infractions with paired intervals.
 
     The ranking is by an item-response model of all drives; those that failed count for nothing. Intervals are
-    of a bootstrap over routes, those of differences for drives with the same route and repetition. The routes
-    that separate the agents most are listed first.
+    over routes, and over trainings where an agent has several folders; the report says which. Those of
+    differences are for drives with the same route and repetition. The routes that separate the agents most
+    are listed first.
 
     Args:
         runs: Folders of `foredrive drive`; the first is the one that the others are compared with. Without

@@ -44,10 +44,11 @@ def means_table(comparison: Comparison) -> Table:
             cells.append(number(mean, digits))
             cells.append(_difference(metric, comparison.differences[metric][agent.name], digits))
         rows.append(Row(cells))
+    over = f"Intervals of 95 % over {comparison.differences_over}, paired by route"
     intervals = (
         NO_INTERVAL
         if len(comparison.routes) < LEAST_ROUTES
-        else "Intervals of 95 % (paired bootstrap over routes); coloured where the interval leaves out 0."
+        else f"{over}; coloured where the interval leaves out 0."
     )
     notes = [
         f"Drives that all agents have: {len(comparison.keys)}, on {len(comparison.routes)} routes. "
@@ -89,7 +90,7 @@ def ranking_table(comparison: Comparison) -> Table:
     notes = [
         "By an item-response model of all drives of each agent: the logit of an expected score is the "
         "ability minus the difficulty of the route. Drives in which the agent itself failed count for "
-        "nothing. " + (NO_INTERVAL if few else "Intervals of 95 % over routes.")
+        "nothing. " + (NO_INTERVAL if few else f"Intervals of 95 % over {comparison.ratings_over}.")
     ]
     return Table(columns, [Section([Row(cells) for _, cells in rows])], "Ranking", notes)
 

@@ -3,7 +3,7 @@
 import dataclasses
 import os
 import statistics
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -47,6 +47,8 @@ class ComparedAgent:
 
     name: str
     folders: tuple[Path, ...]
+    suites: tuple[Mapping[str, object], ...]
+    """The description of each folder."""
     drives: Mapping[Key, DriveRecord]
 
     @property
@@ -101,6 +103,21 @@ class Comparison:
     rated_routes: tuple[str, ...]
     """The routes of the difficulties."""
 
+    @property
+    def differences_over(self) -> str:
+        """Return in words what the intervals of differences are over."""
+        return _over(self.keys)
+
+    @property
+    def ratings_over(self) -> str:
+        """Return in words what the intervals of abilities and ranks are over."""
+        return _over(key for agent in self.agents for key in agent.driven())
+
+
+def _over(keys: Iterable[Key]) -> str:
+    """Return "routes", and "trainings" where drives are of several folders of an agent."""
+    return "routes and trainings" if len({place for _, place, _ in keys}) > 1 else "routes"
+
 
 def values_of(drive: DriveRecord) -> dict[str, float]:
     """Return the values of a drive that are compared, see `METRICS`."""
@@ -151,19 +168,20 @@ def read_agent(given: str) -> ComparedAgent:
     name, equals, rest = given.partition("=")
     folders = tuple(Path(part) for part in (rest if equals else given).split(","))
     drives: dict[Key, DriveRecord] = {}
+    suites = list[Mapping[str, object]]()
     for place, folder in enumerate(folders):
         files = sorted((folder / DRIVES).glob("*.json"))
         if not files:
             raise InputError(f"{folder}: no drives to compare (no {DRIVES}/*.json)")
+        suites.append(read_suite(folder))
         for file in files:
             drive = read_drive(file)
-            drives[_route_name(folder, drive), place, drive.score.repetition] = drive
-    return ComparedAgent(name if equals else folders[0].absolute().name, folders, drives)
+            drives[_route_name(suites[-1], drive), place, drive.score.repetition] = drive
+    return ComparedAgent(name if equals else folders[0].absolute().name, folders, tuple(suites), drives)
 
 
-def _route_name(folder: Path, drive: DriveRecord) -> str:
+def _route_name(suite: Mapping[str, object], drive: DriveRecord) -> str:
     """Return the id of a drive's route; in towns with the town and the set, since sets share their ids."""
-    suite = read_suite(folder)
     if drive.town is None:
         return drive.score.route
     of = str(suite.get("routes"))
@@ -295,6 +313,8 @@ def figures_of(comparison: Comparison) -> dict[str, float | int | str | None]:
         "drives": len(comparison.keys),
         "routes": len(comparison.routes),
         "left_out": comparison.left_out,
+        "differences_over": comparison.differences_over,
+        "ratings_over": comparison.ratings_over,
         "unlike": ", ".join(comparison.unlike) or None,
     }
     for agent in comparison.agents:
@@ -344,10 +364,9 @@ def _happened(agent: ComparedAgent, keys: Sequence[Key]) -> str:
 
 def _unlike(agents: Sequence[ComparedAgent]) -> tuple[str, ...]:
     """Return the settings in which folders at the same place among those of their agents differ."""
-    suites = [[read_suite(folder) for folder in agent.folders] for agent in agents]
     unlike = []
     for setting in SAME_WORLD:
-        for of_place in zip(*suites, strict=False):
+        for of_place in zip(*(agent.suites for agent in agents), strict=False):
             values = {str(suite.get(setting)) for suite in of_place}
             if len(values) > 1:
                 unlike.append(f"{setting} ({' or '.join(sorted(values))})")
