@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -26,8 +27,8 @@ from foredrive.runs.drive.in_towns import TownRoutes
 from foredrive.runs.drive.records import read_drive, write_drive
 from foredrive.runs.improve.choosing import STRATEGIES, Moments, Request, choose
 from foredrive.runs.improve.failures import Failure, counted, failures_of, logs_before
-from foredrive.runs.improve.loop import MOMENTS, RUN, Loop
-from foredrive.runs.improve.records import Improvement, LoopResult, Round, score_of
+from foredrive.runs.improve.loop import MOMENTS, RUN, Loop, folder_of
+from foredrive.runs.improve.records import Improvement, JudgedLogs, LoopResult, Round, score_of
 from foredrive.runs.reconstruction.reconstruction_run import open_run_log
 from foredrive.runs.train.driver import open_driver, train_driver
 from foredrive.search.rows import IndexRow
@@ -296,6 +297,47 @@ def test_a_loop_goes_on_and_has_other_moments_in_the_next_round(
     # The pool has fewer moments than two more rounds would need
     ended = Loop(asked, out).run(9)
     assert ended.ended == "the pool is used up"
+
+
+def write_log(folder: Path, boxes: str) -> LogPath:
+    folder.mkdir(exist_ok=True)
+    for name, text in (("sync", "times"), ("box_detections_se3", boxes)):
+        (folder / f"{name}.arrow").write_text(text)
+    return LogPath(folder, folder)
+
+
+@pytest.mark.parametrize("changed", ["weights", "routes", "held_out", "boxes", "nothing"])
+def test_a_loop_is_of_its_run_and_routes_by_their_contents(
+    changed: str, routes: Path, tmp_path: Path
+) -> None:
+    """A folder of another version is refused, and a folder of the same one goes on."""
+    start, files = tmp_path / "start", [tmp_path / "searched.xml", tmp_path / "held_out.xml"]
+    start.mkdir()
+    (start / "config.yaml").write_text("recipe")
+    weights = start / "model.safetensors"
+    weights.write_bytes(b"1")
+    for file in files:
+        file.write_text(routes.read_text())
+    log = write_log(tmp_path / "log", "one")
+    searched = JudgedLogs((log,)) if changed == "boxes" else TownRoutes(str(files[0]))
+    asked = Improvement(start, (), (), searched, TownRoutes(str(files[1])))
+    assert not folder_of(asked, tmp_path / "out").check()
+    with folder_of(asked, tmp_path / "out").claimed():
+        pass
+    longer = routes.read_text() + "<!-- changed -->"
+    changes: dict[str, tuple[str, Callable[[], object]]] = {
+        "weights": (f"the rounds of another version of {start}", lambda: weights.write_bytes(b"2")),
+        "routes": (f"the rounds of another version of {files[0]}", lambda: files[0].write_text(longer)),
+        "held_out": (f"the rounds of another version of {files[1]}", lambda: files[1].write_text(longer)),
+        "boxes": ("the rounds of another version of the judging logs", lambda: write_log(log.folder, "two")),
+    }
+    if changed == "nothing":
+        assert folder_of(asked, tmp_path / "out").check()
+        return
+    message, change = changes[changed]
+    change()
+    with pytest.raises(InputError, match=f"holds {message}; choose another folder"):
+        folder_of(asked, tmp_path / "out").check()
 
 
 def judged(number: int, *infractions: Infraction) -> Round:

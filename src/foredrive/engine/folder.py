@@ -93,6 +93,18 @@ class RunFolder:
                 )
 
 
+def by_contents(noted: Mapping[str, object], what: str, contents: Mapping[str, str]) -> dict[str, object]:
+    """Return a request for `RunFolder.wanted`, with the digests of files apart from all else.
+
+    Args:
+        noted: the request as it is stored.
+        what: completes the message where other entries differ.
+        contents: completes the message for each entry that is a digest.
+    """
+    others = {key: value for key, value in noted.items() if key not in contents}
+    return {what: others, **{text: noted.get(key) for key, text in contents.items()}}
+
+
 @contextlib.contextmanager
 def held(folder: Path) -> Iterator[None]:
     """Keep other processes from writing to a folder; create it if it does not exist.

@@ -26,7 +26,7 @@ from foredrive.driving.faults import NO_FAULTS, Faults
 from foredrive.driving.faulty_agent import FaultyAgent
 from foredrive.driving.ncap.outcome import SafetyResult
 from foredrive.engine.fan_out import fan_out, reason
-from foredrive.engine.folder import DRIVES, SUITE, SUMMARY, RunFolder
+from foredrive.engine.folder import DRIVES, SUITE, SUMMARY, RunFolder, by_contents
 from foredrive.engine.interrupts import start_fork_server
 from foredrive.engine.summary import write_summary
 from foredrive.errors import InputError
@@ -285,11 +285,8 @@ def folder_of(suite: DriveSuite, out: Path) -> RunFolder:
     }
 
     def fixed(noted: Mapping[str, object]) -> dict[str, object]:
-        others = {key: value for key, value in noted.items() if key not in (*grows, *contents)}
-        return {
-            "the drives of another suite": others,
-            **{what: noted.get(key) for key, what in contents.items()},
-        }
+        kept = {key: value for key, value in noted.items() if key not in grows}
+        return by_contents(kept, "the drives of another suite", contents)
 
     def noted_there() -> dict[str, object] | None:
         # Drives that failed are driven again, so they hold nothing

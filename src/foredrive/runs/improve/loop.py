@@ -17,11 +17,12 @@ import numpy as np
 from foredrive.data.clip_list import ListedClip, clip_list, write_clip_list
 from foredrive.data.clips import ClipDataset
 from foredrive.data.log_paths import LogPath, find_logs
-from foredrive.engine.folder import DRIVES, RunFolder
+from foredrive.engine.folder import DRIVES, RunFolder, by_contents
 from foredrive.engine.interrupts import start_fork_server
 from foredrive.errors import InputError
 from foredrive.files import atomic_path
 from foredrive.runs.drive.in_towns import TownRoutes
+from foredrive.runs.drive.suite import AGENT_SHA256, ROUTES_SHA256
 from foredrive.runs.improve.choosing import ANEW, Moments, Request, before_failure, choose
 from foredrive.runs.improve.detectors import DetectorPupil
 from foredrive.runs.improve.drivers import DriverPupil
@@ -30,6 +31,7 @@ from foredrive.runs.improve.pupil import Means, Pupil
 from foredrive.runs.improve.records import Answer, Improvement, Judged, JudgedLogs, LoopResult, Round
 from foredrive.runs.open_clips import open_clips
 from foredrive.runs.progress import Progress, silent
+from foredrive.runs.shipped import run_digest
 from foredrive.search.find import Hit
 from foredrive.search.index import FrameIndex
 
@@ -44,42 +46,64 @@ MOMENTS, FAILURES, INDEX, RUN, JUDGED, LOOP = (
 STRIDE_S = 0.5
 ANEW_SEED = 10_000
 """Distance of the seeds of drives that are made anew from those of the routes, per round."""
+_SOURCES = {ROUTES_SHA256: "routes", "held_out_sha256": "held_out"}
+"""Entries of a loop's file: the digests of sources, and the sources."""
 SHOWN = 3
 """Chosen moments that are shown for each failure."""
 CLIP_S = 0.01
 """Half the length of the part of a log that holds one key frame, s."""
 
 
-def _folder(improvement: Improvement, out: Path) -> RunFolder:
-    wanted = {"another loop": _noted(improvement)}
+def folder_of(improvement: Improvement, out: Path) -> RunFolder:
+    """Return the folder of a loop. It belongs to one version of the first run and of the routes."""
+    noted = _noted(improvement)
+    contents = {
+        key: f"the rounds of another version of {name}" for key, name in _by_contents(improvement).items()
+    }
+
+    def fixed(noted: Mapping[str, object]) -> dict[str, object]:
+        return by_contents(noted, "another loop", contents)
 
     def read() -> dict[str, object] | None:
         if not (out / LOOP).is_file():
             return None
         try:
-            return {"another loop": json.loads((out / LOOP).read_text())}
-        except ValueError as error:
+            return fixed(dict(json.loads((out / LOOP).read_text())))
+        except (ValueError, TypeError) as error:
             raise InputError(f"{out / LOOP}: not the description of a loop: {error}") from error
 
     def write() -> None:
         with atomic_path(out / LOOP) as temporary:
-            temporary.write_text(json.dumps(_noted(improvement), indent=1) + "\n")
+            temporary.write_text(json.dumps(noted, indent=1) + "\n")
 
-    return RunFolder(out, wanted, read, write)
+    return RunFolder(out, fixed(noted), read, write)
 
 
-def _noted(improvement: Improvement) -> object:
-    routes = {
-        name: None if source is None else dict(source.noted())
-        for name, source in (("routes", improvement.routes), ("held_out", improvement.held_out))
-    }
+def _by_contents(improvement: Improvement) -> dict[str, str]:
+    """Return the entries of a loop's file that are digests, and whose."""
+    sources = (source for source in (improvement.routes, improvement.held_out) if source is not None)
+    names = [str(source.noted().get("routes", "the judging logs")) for source in sources]
+    return {AGENT_SHA256: str(improvement.start), **dict(zip(_SOURCES, names, strict=False))}
+
+
+def _noted(improvement: Improvement) -> dict[str, object]:
+    routes: dict[str, object] = {AGENT_SHA256: run_digest(improvement.start)}
+    for (digest, name), source in zip(
+        _SOURCES.items(), (improvement.routes, improvement.held_out), strict=True
+    ):
+        fields = None if source is None else dict(source.noted())
+        routes[digest] = None if fields is None else fields.pop(ROUTES_SHA256, None)
+        routes[name] = fields
     logs = {
         name: [[str(log.folder), list(log.parts_s)] for log in of_kind]
         for name, of_kind in (("pool", improvement.pool), ("logs", improvement.logs))
     }
     others = ("strategy", "budget", "settings", "keep_best", "seed")
     plain = {"start": str(improvement.start), **routes, **logs}
-    return json.loads(json.dumps(plain | {name: getattr(improvement, name) for name in others}))
+    noted: dict[str, object] = json.loads(
+        json.dumps(plain | {name: getattr(improvement, name) for name in others})
+    )
+    return noted
 
 
 class Loop:
@@ -130,7 +154,7 @@ class Loop:
         self.of.check()
         self.pupil.check()
         self.pupil.check_pool(self.pool.logs)  # before the folder is there
-        with _folder(self.of, self.out).claimed():
+        with folder_of(self.of, self.out).claimed():
             start_fork_server(preload=TownRoutes.__module__)
             self.say(f"pool: {len(self.moments)} moments of {len(self.of.pool)} logs")
             if not self.of.logs:

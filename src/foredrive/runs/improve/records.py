@@ -10,10 +10,15 @@ from foredrive.data.log_paths import LogPath
 from foredrive.driving.drive_record import DriveRecord
 from foredrive.driving.ncap.outcome import BEST
 from foredrive.errors import InputError
+from foredrive.files import digest_of
 from foredrive.runs.drive.in_reconstruction import ReconstructedRoutes
 from foredrive.runs.drive.in_towns import TownRoutes
+from foredrive.runs.drive.suite import ROUTES_SHA256
 from foredrive.runs.improve.failures import Failure
 from foredrive.search.find import Hit
+
+_TRUTH = ("sync", "ego_state_se3", "box_detections_se3")
+"""Files of a log that decide what a detector should see, and when."""
 
 
 @dataclass(frozen=True)
@@ -23,8 +28,12 @@ class JudgedLogs:
     logs: tuple[LogPath, ...]
 
     def noted(self) -> Mapping[str, object]:
-        """Return the logs for JSON."""
-        return {"logs": [[str(log.folder), list(log.parts_s)] for log in self.logs]}
+        """Return the logs for JSON, with a digest of their annotations, times and poses."""
+        truth = [log.folder / f"{name}.arrow" for log in self.logs for name in _TRUTH]
+        return {
+            "logs": [[str(log.folder), list(log.parts_s)] for log in self.logs],
+            ROUTES_SHA256: digest_of(file for file in truth if file.is_file()),
+        }
 
 
 @dataclass(frozen=True)
