@@ -7,7 +7,8 @@ training. Programs are forked from one that has imported the package, so that mo
 verb's own work and not of its imports.
 
 `bad_inputs` counts the tests of damaged files that pass: one line that names the file, no traceback, no
-hang.
+hang. `field_cases` counts the inputs and situations from public reports whose test runs
+(`tests/field_cases.toml`), `field_cases_silent` those whose test fails: they go in wrong without a line.
 
 Folders are made in runs/faults.
 """
@@ -21,7 +22,8 @@ import re
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable
+import tomllib
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -64,6 +66,8 @@ BAD_INPUTS = (
     "tests/data/test_safe_pickle.py",
     "tests/end_to_end/test_bad_input.py",
 )
+FIELD_CASES = Path("tests/field_cases.toml")
+"""The test of each case by its name."""
 PRELUDE = """
 import foredrive.runs.drive.recording, foredrive.runs.drive.suite, foredrive.runs.drive.in_towns
 import foredrive.runs.convert, foredrive.runs.train.run, foredrive.runs.reconstruction.reconstruct
@@ -197,17 +201,34 @@ def _server() -> ProgramServer:
 
 def bad_inputs(seed: int) -> dict[str, float]:
     """Return the number of tests of damaged files and of bad input, and how many of them fail."""
-    done = subprocess.run(
-        [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", *BAD_INPUTS],
-        stdout=subprocess.PIPE,
-        text=True,
-        check=False,
-    )
-    told = {what: int(number) for number, what in re.findall(r"(\d+) (passed|failed|error)", done.stdout)}
+    told = {
+        what: int(number) for number, what in re.findall(r"(\d+) (passed|failed|error)", _tested(BAD_INPUTS))
+    }
     if not told:
-        raise InputError(f"pytest does not say how many tests passed (exit code {done.returncode})")
+        raise InputError("pytest does not say how many tests passed")
     failed = told.get("failed", 0) + told.get("error", 0)
     return {"bad_inputs": float(told.get("passed", 0)), "bad_inputs_failed": float(failed)}
+
+
+def field_cases(seed: int) -> dict[str, float]:
+    """Return the number of cases whose tests run, and of those whose tests do not all pass."""
+    cases = tomllib.loads(FIELD_CASES.read_text())
+    printed = _tested(["-rpfE", *sorted({f"tests/{test}" for test in cases.values()})])
+    # A parametrised test has several results, of which a skipped one is none
+    results: dict[str, set[str]] = {}
+    for result, test in re.findall(r"^(PASSED|FAILED|ERROR) tests/([^\s\[]+)", printed, re.MULTILINE):
+        results.setdefault(test, set()).add(result)
+    ran = [results[test] for test in cases.values() if test in results]
+    return {
+        "field_cases": float(len(ran)),
+        "field_cases_silent": float(sum(of_case != {"PASSED"} for of_case in ran)),
+    }
+
+
+def _tested(arguments: Sequence[str]) -> str:
+    """Run pytest, and return what it prints."""
+    command = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", *arguments]
+    return subprocess.run(command, stdout=subprocess.PIPE, text=True, check=False).stdout
 
 
 def _recording(seconds: float) -> tuple[str, ...]:
@@ -264,6 +285,7 @@ BENCHMARK = Benchmark(
         "evaluate": _kills_of(evaluate),
         "train driveworld_tiny": _kills_of(lambda: train("driveworld_tiny")),
         "bad inputs": bad_inputs,
+        "field cases": field_cases,
     },
     seeds=(0,),
     config={
