@@ -1,7 +1,8 @@
 """Agreement of drives in a reconstruction with those in the town: figures of pairs, with intervals.
 
-Intervals hold 95 %. They are percentiles over draws of whole tests with replacement: the agents of one test
-meet the same actor.
+Intervals hold 95 %. They are percentiles over draws of whole places with replacement: what comes at one place
+at several times, to all agents, is alike. Where all outcomes agree, draws have no spread: kappa has no
+interval then, and agreement the exact one (Clopper and Pearson 1934), as if pairs were independent.
 """
 
 from collections.abc import Sequence
@@ -29,23 +30,35 @@ def agreement(pairs: Sequence[Pair]) -> dict[str, float]:
         return figures
     figures |= {"tests": float(len({pair.test for pair in whole}))} | _values(whole)
     rng = np.random.default_rng(0)
-    by_test: dict[str, list[Pair]] = {}
+    by_place: dict[str, list[Pair]] = {}
     for pair in whole:
-        by_test.setdefault(pair.test, []).append(pair)
-    tests = list(by_test.values())
-    if len(tests) < 2:
+        by_place.setdefault(place_of(pair.test), []).append(pair)
+    places = list(by_place.values())
+    figures["places"] = float(len(places))
+    if len(places) < 2:
         return figures
     drawn: dict[str, list[float]] = {}
     for _ in range(RESAMPLES):
-        chosen = rng.integers(len(tests), size=len(tests))
-        sample = [pair for index in chosen for pair in tests[index]]
+        chosen = rng.integers(len(places), size=len(places))
+        sample = [pair for index in chosen for pair in places[index]]
         for name, value in _values(sample).items():
             drawn.setdefault(name, []).append(value)
     for name, values in drawn.items():
         # A figure that many draws do not have, for want of spread, has no interval
         if name in figures and len(values) >= 0.9 * RESAMPLES:
             figures[f"{name}_low"], figures[f"{name}_high"] = map(float, np.quantile(values, (0.025, 0.975)))
+    if figures["collision_agreement"] == 1.0:
+        exact = stats.binomtest(len(whole), len(whole)).proportion_ci(0.95, "exact")
+        figures["collision_agreement_low"], figures["collision_agreement_high"] = exact.low, exact.high
+        for end in ("low", "high"):
+            figures.pop(f"kappa_{end}", None)
     return figures | control_variate(scores_of(whole), rng)
+
+
+def place_of(test: str) -> str:
+    """Return where and when in a log a test begins: its name is TOWN/KIND-SCENE_STARTs_IMPACTs_SPEEDmps."""
+    town, _, label = test.partition("/")
+    return f"{town}/{'_'.join(label.partition('-')[2].split('_')[:-2])}"
 
 
 def scores_of(pairs: Sequence[Pair]) -> Float64[np.ndarray, "P 2"]:

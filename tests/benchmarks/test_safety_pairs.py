@@ -61,18 +61,35 @@ def test_the_majority_is_that_of_other_tests() -> None:
     assert majority_agreement(pairs[2:]) == 0.0
 
 
-def test_intervals_draw_whole_tests() -> None:
-    """Both agents of a test agree or both disagree, so that half of ten tests is known as ten coins are."""
+def test_intervals_draw_whole_places() -> None:
+    """All pairs of a place agree or all disagree, so that half of ten places is known as ten coins are."""
     pairs = [
-        Pair("side", agent, f"test {number}", driven("collided", 1.0), driven(end, 1.0))
+        Pair(
+            "side",
+            agent,
+            f"T/side-a_{number}s_{impact_s}s_3mps",
+            driven("collided", 1.0),
+            driven(end, 1.0),
+        )
         for number, end in enumerate(["collided", "passed"] * 5)
         for agent in ("a", "b")
+        for impact_s in (2, 3)
     ]
     figures = agreement(pairs)
     assert figures["collision_agreement"] == 0.5
     low, high = (figures[f"collision_agreement_{end}"] for end in ("low", "high"))
     # Binomial with 10 draws: 2.5 % and 97.5 % at 0.2 and 0.8; with 20 draws they would be 0.3 and 0.7
     assert (low, high) == (pytest.approx(0.2, abs=0.01), pytest.approx(0.8, abs=0.01))
+
+
+def test_where_all_pairs_agree_the_bound_is_exact() -> None:
+    """68 of 68: the share p of which all 68 agree in 2.5 % of cases is 0.025 ** (1 / 68)."""
+    ends = [driven("collided", 1.0), driven("passed", 5.0)] * 34
+    figures = agreement([Pair("side", "a", str(number), end, end) for number, end in enumerate(ends)])
+    assert (figures["kappa"], figures["places"]) == (1.0, 68.0)
+    assert not {"kappa_low", "kappa_high"} & figures.keys()
+    assert figures["collision_agreement_low"] == pytest.approx(0.025 ** (1 / 68))
+    assert figures["collision_agreement_high"] == 1.0
 
 
 def test_the_reconstruction_reduces_the_error_of_few_true_drives() -> None:

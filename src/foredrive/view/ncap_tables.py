@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 
 from foredrive.driving.ncap.aggregation import Interval, SafetyFigures, TestedRun, aggregate
+from foredrive.tasks.bootstrap import LEAST_ROUTES
 from foredrive.view.table import Cell, Column, Row, Section, Table, Value, number, words
 
 COLUMNS = (
@@ -32,7 +33,8 @@ def safety_table(runs: Sequence[TestedRun], left_out: Mapping[str, str]) -> Tabl
     """
     scenarios, kinds, overall = aggregate(runs)
     notes = [
-        "score: 0 to 5; in brackets 95 % intervals over runs; score by progress: mean of their product",
+        f"score: 0 to 5; in brackets 95 % intervals: of a scenario over its runs, of kinds over places, from "
+        f"{LEAST_ROUTES} on; score by progress: mean of their product",
         "impact speed: share of the reference speed, of runs with a collision; TTC: median of the smallest "
         "time to collision of each run",
         "trusted: share of the key frames in which the reconstruction expects good images; untrusted: runs "
@@ -72,5 +74,7 @@ def _row(name: str, of: SafetyFigures, is_strong: bool = False) -> Row:
 def _interval(of: Interval | None, digits: int, factor: float = 1.0) -> str:
     if of is None:
         return number(None)
-    mean, low, high = (number(factor * value, digits) for value in (of.mean, of.low, of.high))
-    return f"{mean} [{low}, {high}]"
+    mean = number(factor * of.mean, digits)
+    if of.low is None or of.high is None:
+        return mean
+    return f"{mean} [{number(factor * of.low, digits)}, {number(factor * of.high, digits)}]"

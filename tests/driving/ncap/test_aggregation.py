@@ -11,11 +11,16 @@ from foredrive.view.ncap_tables import safety_table
 
 
 def run(
-    scenario: str, kind: Threat, score: float | None, outcome: Outcome, progress: float = 0.5
+    scenario: str,
+    kind: Threat,
+    score: float | None,
+    outcome: Outcome,
+    progress: float = 0.5,
+    place: str | None = None,
 ) -> TestedRun:
     impact = 10.0 * (1 - score / 4.0) if outcome is Outcome.COLLIDED and score is not None else None
     result = SafetyResult(kind, outcome, impact, None if impact is None else 3.0, 10.0, score, progress)
-    return TestedRun(scenario, result, 0.5, 0.8)
+    return TestedRun(scenario, place or scenario, result, 0.5, 0.8)
 
 
 RUNS = [
@@ -50,18 +55,51 @@ def test_each_scenario_and_each_kind_has_the_same_weight() -> None:
     assert Threat.FRONTAL not in kinds
 
 
-def test_intervals_hold_the_runs_of_a_scenario_and_only_those() -> None:
-    """Scenarios without spread have intervals of one point, however much they differ from each other."""
-    same = [run(name, Threat.SIDE, score, Outcome.COLLIDED) for name, score in (("a", 1.0), ("b", 3.0)) * 2]
-    _, _, overall = aggregate(same)
+def test_intervals_draw_places() -> None:
+    """Runs that are all alike at their place say as little of other places as one of them."""
+    scores = [0.0, 4.0] * 8
+    once = [run(f"{k}", Threat.SIDE, score, Outcome.COLLIDED) for k, score in enumerate(scores)]
+    _, _, overall = aggregate(once)
     assert overall.score is not None
-    assert (overall.score.low, overall.score.mean, overall.score.high) == (2.0, 2.0, 2.0)
-    spread = [run("a", Threat.SIDE, score, Outcome.COLLIDED) for score in (0.0, 4.0) * 8]
-    _, _, overall = aggregate(spread)
-    assert overall.score is not None
-    assert 0.5 < overall.score.low < 1.5
-    assert 2.5 < overall.score.high < 3.5
-    assert aggregate(spread) == aggregate(spread)
+    low, high = overall.score.low, overall.score.high
+    assert low is not None
+    assert high is not None
+    # The standard error of 16 places is 0.5
+    assert (low, high) == (pytest.approx(1.0, abs=0.3), pytest.approx(3.0, abs=0.3))
+    _, _, again = aggregate(once * 5)
+    assert again.score == overall.score
+    assert aggregate(once) == aggregate(once)
+
+
+def test_scenarios_of_one_place_are_drawn_together() -> None:
+    """All that is tested at 10 places ends alike there, so several kinds and times tell no more."""
+
+    def suite(times: int, kinds: tuple[Threat, ...]) -> list[TestedRun]:
+        return [
+            run(f"{kind}{p}{time}", kind, 4.0 * (p % 2), Outcome.COLLIDED, place=f"{p}")
+            for p in range(10)
+            for kind in kinds
+            for time in range(times)
+        ]
+
+    alone = aggregate(suite(1, (Threat.SIDE,)))[2].score
+    assert alone == aggregate(suite(3, (Threat.SIDE,)))[2].score
+    of_all = aggregate(suite(2, tuple(Threat)))[2].score
+    assert alone is not None
+    assert of_all is not None
+    assert (of_all.low, of_all.high) == (pytest.approx(alone.low), pytest.approx(alone.high))
+
+
+def test_a_scenario_has_an_interval_over_its_runs_and_few_places_none() -> None:
+    runs = [run("a", Threat.SIDE, score, Outcome.COLLIDED) for score in (0.0, 4.0) * 8]
+    scenarios, kinds, overall = aggregate(runs)
+    score = scenarios["a"].score
+    assert score is not None
+    assert score.low is not None
+    assert 0.5 < score.low < 1.5
+    for of in (kinds[Threat.SIDE], overall):
+        assert of.score is not None
+        assert (of.score.mean, of.score.low, of.score.high) == (2.0, None, None)
 
 
 def test_the_table_names_failures_and_what_is_left_out() -> None:
@@ -70,7 +108,7 @@ def test_the_table_names_failures_and_what_is_left_out() -> None:
     assert any("side-x" in note for note in table.notes)
     text = [str(cell) for cell in table.sections[2].rows[0].cells]
     assert text[0] == "mean of 2 kinds"
-    assert text[3].startswith("2.25 [")
+    assert text[3] == "2.25"  # three places have no interval
 
 
 def test_a_failed_run_changes_no_mean() -> None:

@@ -9,9 +9,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Bool, Float64
 
 from foredrive.driving.ncap.outcome import Outcome, SafetyResult
 from foredrive.driving.replay.threats import Threat
+from foredrive.tasks.bootstrap import LEAST_ROUTES
 
 RESAMPLES, LEVEL = 2000, 0.95
 
@@ -24,6 +26,8 @@ class TestedRun:
 
     scenario: str
     """Label of the scenario."""
+    place: str
+    """Where and when in a log it begins; scenarios of several kinds may share it."""
     result: SafetyResult
     near_s: float | None
     """Smallest time to collision at the key frames, s. None if all move apart."""
@@ -35,11 +39,11 @@ class TestedRun:
 
 @dataclass(frozen=True)
 class Interval:
-    """A mean and its percentile interval."""
+    """A mean and its percentile interval. Bounds are None where too little can be drawn."""
 
     mean: float
-    low: float
-    high: float
+    low: float | None
+    high: float | None
 
 
 @dataclass(frozen=True)
@@ -74,9 +78,10 @@ def aggregate(
 ) -> tuple[dict[str, SafetyFigures], dict[Threat, SafetyFigures], SafetyFigures]:
     """Return the figures of each scenario, of each kind that was tested, and of all kinds.
 
-    Intervals hold 95 %. They are found by drawing the runs of each scenario with replacement. The scenarios
-    are kept, because a suite is a fixed set of them. A scenario of which all runs failed has no share in
-    means, as in neuro-ncap.
+    Intervals hold 95 %. Those of a scenario are found by drawing its runs with replacement. Those of kinds
+    and of all draw places with all their scenarios and runs: what is tested at one place is alike. There are
+    none of fewer than `LEAST_ROUTES` places. A scenario of which all runs failed has no share in means, as in
+    neuro-ncap.
     """
     rng = np.random.default_rng(seed)
     # Runs by scenario, scenarios by kind; both in the order in which they occur
@@ -88,7 +93,7 @@ def aggregate(
         if kind in set(kind_of.values())
     }
     return (
-        {name: _figures({kind_of[name]: {name: of}}, rng) for name, of in by_scenario.items()},
+        {name: _figures({kind_of[name]: {name: of}}, rng, one=True) for name, of in by_scenario.items()},
         {kind: _figures({kind: of}, rng) for kind, of in by_kind.items()},
         _figures(by_kind, rng),
     )
@@ -102,7 +107,7 @@ Groups = dict[Threat, dict[str, list[TestedRun]]]
 """Runs by kind and by scenario."""
 
 
-def _figures(groups: Groups, rng: np.random.Generator) -> SafetyFigures:
+def _figures(groups: Groups, rng: np.random.Generator, *, one: bool = False) -> SafetyFigures:
     runs = [run for of_kind in groups.values() for of in of_kind.values() for run in of]
     outcomes = [run.result.outcome for run in runs]
     near = [run.near_s for run in runs if run.near_s is not None and run.result.score is not None]
@@ -111,8 +116,8 @@ def _figures(groups: Groups, rng: np.random.Generator) -> SafetyFigures:
         failed=outcomes.count(Outcome.FAILED),
         left_way=outcomes.count(Outcome.LEFT_WAY),
         stopped_short=outcomes.count(Outcome.STOPPED_SHORT),
-        score=_interval(groups, lambda run: run.result.score, rng),
-        collision_rate=_interval(groups, _collided, rng),
+        score=_interval(groups, lambda run: run.result.score, rng, one=one),
+        collision_rate=_interval(groups, _collided, rng, one=one),
         progress=_mean(groups, lambda run: None if run.result.score is None else run.result.progress),
         score_progress=_mean(groups, lambda run: run.result.score_progress),
         relative_impact_speed=_relative_impact(runs),
@@ -158,18 +163,44 @@ def _mean(groups: Groups, value: Callable[[TestedRun], float | None]) -> float |
 
 
 def _interval(
-    groups: Groups, value: Callable[[TestedRun], float | None], rng: np.random.Generator
+    groups: Groups, value: Callable[[TestedRun], float | None], rng: np.random.Generator, *, one: bool
 ) -> Interval | None:
-    values, mean = _values(groups, value), _mean(groups, value)
+    """Return a mean with its interval: of one scenario over its runs, else over places."""
+    mean = _mean(groups, value)
     if mean is None:
         return None
-    # Bootstrap: draw the runs of each scenario again, and average as above
-    resampled = np.mean(
-        [
-            np.mean([of[rng.integers(0, len(of), (RESAMPLES, len(of)))].mean(1) for of in of_kind], axis=0)
-            for of_kind in values
-        ],
-        axis=0,
-    )
+    if one:
+        (runs,) = _values(groups, value)[0]
+        resampled = runs[rng.integers(0, len(runs), (RESAMPLES, len(runs)))].mean(1)
+    else:
+        means, kinds, places = _scenario_means(groups, value)
+        if len(places) < LEAST_ROUTES:
+            return Interval(mean, None, None)
+        # How often each place is drawn is the weight of its scenarios within their kinds
+        weight = rng.multinomial(len(places), np.full(len(places), 1 / len(places)), RESAMPLES) @ places
+        of_kinds = [
+            (weight[:, kind] @ means[kind]) / np.maximum(weight[:, kind].sum(1), 1e-9) for kind in kinds
+        ]
+        drawn = np.stack([weight[:, kind].sum(1) > 0 for kind in kinds])
+        # A kind of which no place is drawn has no share in that draw
+        resampled = (np.stack(of_kinds) * drawn).sum(0) / drawn.sum(0)
     low, high = np.quantile(resampled, [(1 - LEVEL) / 2, (1 + LEVEL) / 2])
     return Interval(mean, float(low), float(high))
+
+
+def _scenario_means(
+    groups: Groups, value: Callable[[TestedRun], float | None]
+) -> tuple[Float64[np.ndarray, "S"], Bool[np.ndarray, "K S"], Float64[np.ndarray, "P S"]]:
+    """Return the mean of each scenario that has one, and the scenarios of each kind and of each place."""
+    rows = [
+        (kind, runs[0].place, float(np.mean(values)))
+        for kind, of_kind in groups.items()
+        for runs in of_kind.values()
+        if (values := [of_run for run in runs if (of_run := value(run)) is not None])
+    ]
+    kinds, places, means = (np.array(column) for column in zip(*rows, strict=True))
+    return (
+        means.astype(float),
+        np.unique(kinds)[:, None] == kinds,
+        (np.unique(places)[:, None] == places).astype(float),
+    )

@@ -12,6 +12,7 @@ from pydantic import TypeAdapter, ValidationError
 from foredrive.driving.bench2drive import Bench2DriveDrive, bench2drive_figures, succeeds
 from foredrive.driving.drive_record import DriveRecord
 from foredrive.driving.ncap.aggregation import TestedRun, aggregate
+from foredrive.driving.replay.threats import Threat
 from foredrive.driving.scores import score_suite
 from foredrive.driving.time_to_collision import NEAR_COLLISION_S
 from foredrive.engine.folder import SUITE
@@ -132,6 +133,7 @@ def tested_runs(drives: Sequence[DriveRecord]) -> list[TestedRun]:
     return [
         TestedRun(
             drive.score.route,
+            _place_of(drive.score.route, drive.threat.kind),
             drive.threat,
             min((seconds for seconds in drive.nearest_s if seconds is not None), default=None),
             drive.comfort.comfortable_share if drive.comfort else None,
@@ -140,6 +142,11 @@ def tested_runs(drives: Sequence[DriveRecord]) -> list[TestedRun]:
         for drive in drives
         if drive.threat is not None
     ]
+
+
+def _place_of(scenario: str, kind: Threat) -> str:
+    """Return where and when a scenario begins, by its name: KIND-PLACE, or PLACE_KIND with a variation."""
+    return scenario.removeprefix(f"{kind}-").partition(f"_{kind}")[0]
 
 
 def _threat_figures(drives: Sequence[DriveRecord]) -> Figures:
