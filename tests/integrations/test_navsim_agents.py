@@ -13,10 +13,10 @@ from small_drives import PAST, one_example
 
 from foredrive.errors import InputError
 from foredrive.integrations.navsim import records
-from foredrive.integrations.navsim.agent import IMAGE_HW, input_of, plan_by_navsim
+from foredrive.integrations.navsim.agent import IMAGE_HW, NavsimPlanner
 from foredrive.integrations.own_agents import Needs, needs_of, own_agent
 from foredrive.runs.drive.agent_inputs import rig_of
-from foredrive.scene import Clip, LidarSweep
+from foredrive.scene import Clip, Command, LidarSweep
 
 pytestmark = pytest.mark.usefixtures("navsim")
 
@@ -85,7 +85,8 @@ def navsim_clip() -> Clip:
 
 def test_a_clip_becomes_navsims_input() -> None:
     agent, clip = Stitching(), navsim_clip()
-    given = input_of(agent, clip)
+    NavsimPlanner(agent).plan(clip)
+    given = agent.given
     poses = np.stack([status.ego_pose for status in given.ego_statuses])
     np.testing.assert_allclose(poses[-1], 0, atol=1e-6)
     T_now = np.linalg.inv(clip.T_world_ego[-1].numpy()) @ clip.T_world_ego.numpy()
@@ -113,14 +114,36 @@ def test_a_clip_becomes_navsims_input() -> None:
     assert points[4].tolist() == [0, 1, 2, 0]
 
 
+def test_each_key_frame_has_the_command_of_its_time() -> None:
+    """Frames before the drive have its first one. Another drive has a memory of its own."""
+    agent, whole = Stitching(), navsim_clip()
+    planner, now = NavsimPlanner(agent), 3
+    T_step = torch.eye(4, dtype=whole.T_world_ego.dtype)
+    T_step[0, 3] = 2.0
+    T = [whole.T_world_ego[0]]
+    for _ in range(7):
+        T.append(T[-1] @ T_step)
+    names = []
+    for step, command in enumerate((Command.LEFT, Command.STRAIGHT, Command.RIGHT, Command.RIGHT)):
+        poses = torch.stack(T[step : step + 4])
+        clip = dataclasses.replace(whole, T_world_ego=poses, command=torch.tensor(int(command)))
+        planner.plan(clip)
+        rows = [status.driving_command.argmax() for status in agent.given.ego_statuses]
+        names.append("".join("LSRU"[row] for row in rows))
+    assert names == ["LLLL", "LLLS", "LLSR", "LSRR"]
+    unknown = dataclasses.replace(whole, command_valid=torch.tensor(False))
+    NavsimPlanner(agent).plan(unknown)
+    assert agent.given.ego_statuses[now].driving_command.tolist() == [0, 0, 0, 1]
+
+
 def test_navsims_poses_become_points_of_half_seconds() -> None:
     t_s = 0.5 * np.arange(1, 7)
-    points = plan_by_navsim(Stitching(), navsim_clip())
+    points = NavsimPlanner(Stitching()).plan(navsim_clip())
     np.testing.assert_allclose(points, np.stack([t_s**2, -t_s], axis=1), atol=1e-5)
     brief = Stitching()
     brief._trajectory_sampling = records.TrajectorySampling(num_poses=40, interval_length=0.05)
     with pytest.raises(InputError, match=r"a plan of 2 s; plans are of 3 s or more"):
-        plan_by_navsim(brief, navsim_clip())
+        NavsimPlanner(brief).plan(navsim_clip())
 
 
 def test_a_navsim_agent_declares_its_sensors(monkeypatch: pytest.MonkeyPatch) -> None:

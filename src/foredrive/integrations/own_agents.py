@@ -148,10 +148,9 @@ def own_agent(agent: str) -> "OwnAgent":
         InputError: there is no such class, or it cannot be made.
     """
     if agent.startswith(NAVSIM):
-        from foredrive.integrations.navsim.agent import plan_by_navsim
+        from foredrive.integrations.navsim.agent import NavsimPlanner
 
-        planner = _instance(agent)
-        return OwnAgent(agent, functools.partial(plan_by_navsim, planner), needs_of(agent))
+        return OwnAgent(agent, NavsimPlanner(_instance(agent)).plan, needs_of(agent))
     instance = _instance(agent) if hasattr(_made_by(agent)[0], "reset") else _make(agent)
     if hasattr(instance, "reset"):
         instance.reset()

@@ -143,8 +143,12 @@ def test_a_plan_is_followed_by_the_regulator() -> None:
 
 
 def test_the_past_is_that_of_the_log() -> None:
+    """14 states, as in the devkit (`_calculate_history_comfort`), which drops the one before now."""
     past = past_motion(logged(SPEED), 3.0)
-    assert len(past.yaw_rad) == 15
+    assert len(past.yaw_rad) == 14
+    # 3.0 m/s from x = 0: two steps of 0.1 s before 3 s, and 1.5 s before
+    end_m = np.array([logged(SPEED).state_at(t_s).x_m for t_s in (1.5, 2.8)])
+    np.testing.assert_allclose(past.xy_m[[0, -1], 0], end_m, atol=1e-6)
     np.testing.assert_allclose(past.speed_mps, SPEED, atol=0.02)
     np.testing.assert_allclose(past.acceleration_mps2, 0.0, atol=0.2)
 

@@ -23,7 +23,7 @@ def history_comfort(past: EgoMotion, ego: EgoMotion, body: EgoBody) -> float:
     """Return HC: 1 if acceleration, jerk and turning stay within nuPlan's bounds, else 0.
 
     Args:
-        past: the vehicle until one step before the first of `ego`. It may have no steps.
+        past: the vehicle before `ego`, with the same steps. It may have none.
     """
     whole = ego.after(past)
     along = _smoothed(_along_mps2(whole, body))

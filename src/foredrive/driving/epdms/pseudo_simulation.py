@@ -244,8 +244,11 @@ def simulated(plan: Trajectory, state: BicycleState) -> EgoMotion:
 
 
 def past_motion(drive: LoggedDrive, start_s: float) -> EgoMotion:
-    """Return the logged vehicle until one step before a time."""
-    times = start_s - STEP_S * np.arange(round(PAST_S / STEP_S), 0, -1)
+    """Return the logged vehicle before a time: 14 states, from 1.5 s to two steps before.
+
+    The devkit leaves out the state one step before, and joins the others to the plan as if it were there.
+    """
+    times = start_s - STEP_S * np.arange(round(PAST_S / STEP_S), 1, -1)
     return motion_of([drive.state_at(t_s) for t_s in times.tolist()])
 
 

@@ -1,11 +1,13 @@
 """An agent of NAVSIM's interface, driven by Foredrive: clips become its input, its poses a plan."""
 
 import sys
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int64
 
 from foredrive.driving.observation import FRAME_DT_S, HORIZON_STEPS
 from foredrive.errors import InputError
@@ -32,14 +34,41 @@ def sensors_of(agent: Any) -> tuple[tuple[str, ...], bool]:
     return tuple(f"P{name.upper()}" for name in asked if name.startswith("cam_")), "lidar_pc" in asked
 
 
-def plan_by_navsim(agent: Any, clip: Clip) -> Float[np.ndarray, "T 2"]:
+@dataclass(eq=False)
+class NavsimPlanner:
+    """An agent of NAVSIM's interface in one drive. It remembers the commands of the drive.
+
+    A clip has the command of now alone, and NAVSIM's input that of each key frame.
+    """
+
+    agent: Any
+    _commands: dict[bytes, Int64[np.ndarray, "4"]] = field(default_factory=dict, init=False)
+    """Commands by the poses at which they were given."""
+
+    def plan(self, clip: Clip) -> Float[np.ndarray, "T 2"]:
+        """Return the points of the agent's plan, see `plan_by_navsim`."""
+        poses = [T.tobytes() for T in clip.T_world_ego.numpy()]
+        self._commands[poses[clip.now]] = now = _command_of(clip)
+        # Key frames before the drive have the first command that is known
+        first = next((self._commands[pose] for pose in poses if pose in self._commands), now)
+        return plan_by_navsim(self.agent, clip, [self._commands.get(pose, first) for pose in poses])
+
+
+def plan_by_navsim(
+    agent: Any, clip: Clip, commands: Sequence[Int64[np.ndarray, "4"]]
+) -> Float[np.ndarray, "T 2"]:
     """Return the points of an agent's plan at multiples of 0.5 s, linear between its poses.
+
+    Args:
+        agent: an object of NAVSIM's interface.
+        clip: what it sees.
+        commands: NAVSIM's command at each key frame.
 
     Raises:
         InputError: the plan is shorter than 3 s.
     """
     with torch.no_grad():
-        answer = agent.compute_trajectory(input_of(agent, clip))
+        answer = agent.compute_trajectory(input_of(agent, clip, commands))
     dt_s = float(answer.trajectory_sampling.interval_length)
     xy = np.concatenate([np.zeros((1, 2)), np.asarray(answer.poses, dtype=np.float64)[:, :2]])
     t_s, wanted_s = dt_s * np.arange(len(xy)), FRAME_DT_S * np.arange(1, HORIZON_STEPS + 1)
@@ -48,15 +77,18 @@ def plan_by_navsim(agent: Any, clip: Clip) -> Float[np.ndarray, "T 2"]:
     return np.stack([np.interp(wanted_s, t_s, xy[:, axis]) for axis in range(2)], axis=1)
 
 
-def input_of(agent: Any, clip: Clip) -> Any:
+def _command_of(clip: Clip) -> Int64[np.ndarray, "4"]:
+    command = np.zeros(len(COMMANDS) + 1, dtype=np.int64)
+    command[COMMANDS.index(Command(int(clip.command))) if clip.command_valid else -1] = 1
+    return command
+
+
+def input_of(agent: Any, clip: Clip, commands: Sequence[Int64[np.ndarray, "4"]]) -> Any:
     """Return a clip of four key frames as NAVSIM's `AgentInput`.
 
     nuPlan's merged lidar is in the ego frame, so `sensor2lidar` is the place of a camera in the ego frame.
     """
     records, config = sys.modules[RECORDS], vars(agent.get_sensor_config())
-    command = np.zeros(len(COMMANDS) + 1, dtype=int)
-    place = COMMANDS.index(Command(int(clip.command))) if clip.command_valid else -1
-    command[place] = 1
     T_now = torch.linalg.inv(clip.T_world_ego[clip.now]) @ clip.T_world_ego
     yaw, speed = torch.atan2(T_now[:, 1, 0], T_now[:, 0, 0]), clip.ego_speed_mps.double()
     statuses, cameras, lidars = [], [], []
@@ -72,7 +104,7 @@ def input_of(agent: Any, clip: Clip) -> Any:
                 ego_pose=np.array(pose, dtype=np.float32),
                 ego_velocity=np.array([speed[frame], 0.0], dtype=np.float32),
                 ego_acceleration=np.array([gain, float(speed[frame]) * turn_rate], dtype=np.float32),
-                driving_command=command,
+                driving_command=commands[frame],
             )
         )
         shown = {
