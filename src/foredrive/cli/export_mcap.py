@@ -20,8 +20,7 @@ def export_mcap(
     """Write a log as an MCAP file of Foxglove's schemas, with a run's plans if one is named.
 
     The file has images, calibrations, sweeps, boxes, the map, poses and the driven path; with a run also the
-    plan and the predicted occupancy. The schemas are Foxglove's; Rerun 0.41 draws no boxes and no map of
-    them.
+    plan and the predicted occupancy. The schemas are Foxglove's; for Rerun see `export rerun`.
 
     Args:
         log: A log, or a data root with one log.

@@ -26,6 +26,7 @@ from foredrive.cli.export import export
 from foredrive.cli.export_mcap import export_mcap
 from foredrive.cli.export_ncore import export_ncore
 from foredrive.cli.export_nuscenes import export_nuscenes
+from foredrive.cli.export_rerun import export_rerun
 from foredrive.cli.fetch import fetch_av2
 from foredrive.cli.imagine import imagine
 from foredrive.cli.improve import improve
@@ -103,6 +104,7 @@ VERBS: dict[str, Callable[..., Any]] = {
     "export mcap": export_mcap,
     "export ncore": export_ncore,
     "export nuscenes": export_nuscenes,
+    "export rerun": export_rerun,
     "view": view,
     "bench": bench,
 }
