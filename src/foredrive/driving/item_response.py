@@ -199,7 +199,9 @@ def _fit(drives: _Drives) -> tuple[Float64[np.ndarray, "P"], float]:
         likely = integral.posterior[drives.route]
         squared = ((drives.score[:, None] - integral.expected) ** 2 * likely).sum()
         of_answers = (integral.expected * (1 - integral.expected) * likely).sum()
-        before, weight = weight, float(np.clip(of_answers / max(squared, 1e-12), 1.0, MAX_WEIGHT))
+        # Each value that is fitted takes away a degree of freedom
+        freedom = max(1.0 - len(values) / len(drives.score), 0.0)
+        before, weight = weight, float(np.clip(freedom * of_answers / max(squared, 1e-12), 1.0, MAX_WEIGHT))
         if abs(weight - before) < _WEIGHED * before:
             break
     return values, weight
