@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from foredrive.data import Box, CameraSpec, Points, find_logs, write_log
 from foredrive.data.log_check import LogCheck, check_log
+from foredrive.data.mosaic_check import has_pattern
 from foredrive.view.check_table import check_table
 
 FRAMES, SPEED_MPS = 20, 6.0
@@ -114,6 +115,15 @@ def looking(axis: str, degrees: float) -> list[CameraSpec]:
     return [dataclasses.replace(CAMERA, T_ego_cam=T)]
 
 
+def mosaic(image: np.ndarray) -> np.ndarray:
+    """What a sensor behind filters red, green, green, blue measures, taken for a grey image."""
+    grey = image[..., 1].copy()
+    grey[::2, ::2], grey[1::2, 1::2] = image[::2, ::2, 0], image[1::2, 1::2, 2]
+    return np.repeat(grey[..., None], 3, axis=-1)
+
+
+COLOURFUL = np.array([200, 110, 40]) + np.random.default_rng(0).integers(0, 30, (*SIZE_HW, 3))
+MOSAICS = [mosaic(np.roll(COLOURFUL, 2 * frame, axis=1).astype(np.uint8)) for frame in range(FRAMES)]
 STRETCHED = np.array([[1, 1, 1], [1, 1.05, 1], [1, 1, 1]], np.float32)
 LIFTED = moved(DRIVE["sweeps"], lambda xyz_m: xyz_m + np.array([0, 0, 0.9]))
 SIDEWAYS = DRIVE["T_world_ego"] @ np.array([[0.0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
@@ -170,6 +180,7 @@ FAST = [[Box("car", 3, (11.0, 2.0, 0.75), (4.0, 2.0, 1.5), 0.0, (90.0, 0.0))]] *
         ),
         ({"image_t_s": {"front": TIMES_S + 0.4}}, "front", r"exposed up to 0\.400 s .* another clock"),
         ({"image_t_s": {"front": TIMES_S * 1.03}}, "front", r"its time varies by 0\.0\d+ s"),
+        ({"images": {"front": MOSAICS}}, "front", "grey images have the pattern of a colour filter"),
         ({"boxes": FAR}, "boxes", "12 of 12 sampled boxes within 25 m have no lidar point"),
         ({"boxes": FAST}, "boxes", "1 tracks move at up to 90 m/s"),
     ],
@@ -178,6 +189,19 @@ def test_a_fault_is_found(changed: dict[str, Any], subject: str, text: str, tmp_
     findings = checked(tmp_path, **changed).findings
     told = [finding.text for finding in findings if finding.subject == subject]
     assert any(re.search(text, each) for each in told), findings
+
+
+def test_grey_images_and_noise_are_no_mosaics() -> None:
+    """Smooth and random grey images, stripes along one axis, a flat image, and a mosaic in colour."""
+    noise = np.random.default_rng(1).integers(0, 256, (40, 60))
+    smooth = np.cumsum(noise - 127, axis=1) // 8 % 256
+    stripes = np.tile([[0], [200]], (20, 60))
+    for grey in (noise, smooth, stripes, np.full((40, 60), 90)):
+        assert not has_pattern(np.repeat(grey[..., None], 3, axis=-1).astype(np.uint8))
+    coloured = MOSAICS[0].copy()
+    assert has_pattern(coloured)
+    coloured[..., 2] //= 2
+    assert not has_pattern(coloured)
 
 
 def test_a_gap_of_several_streams_is_one_finding(tmp_path: Path) -> None:

@@ -1,5 +1,6 @@
 """A check of a log: its content, and problems in it."""
 
+import contextlib
 import functools
 import itertools
 from collections.abc import Callable, Iterator, Sequence
@@ -16,6 +17,7 @@ from foredrive.data.ego_path import MAX_GAP_S
 from foredrive.data.lidar import frames_with_lidar, read_sweep
 from foredrive.data.log_paths import LogPath
 from foredrive.data.logs import Log
+from foredrive.data.mosaic_check import is_mosaic
 from foredrive.data.notices import read_notices
 from foredrive.data.sweep_check import shifted_sweeps
 from foredrive.errors import InputError
@@ -276,6 +278,10 @@ def _images(log: Log) -> Iterator[Finding]:
             text = f"{sum(frozen)} of {len(frozen)} sampled images do not change while driving"
             yield Finding("problem", name, text)
         yield from _clock(name, np.array(offset_s), log.period_s)
+        with contextlib.suppress(InputError):  # told above
+            if all(is_mosaic(log, int(frame), camera) for frame in frames[[0, len(frames) // 2]]):
+                text = "its grey images have the pattern of a colour filter: a mosaic that was not decoded"
+                yield Finding("problem", name, text)
 
 
 def _clock(name: str, offset_s: Float[np.ndarray, "N"], period_s: float) -> Iterator[Finding]:
