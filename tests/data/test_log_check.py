@@ -125,6 +125,12 @@ def mosaic(image: np.ndarray) -> np.ndarray:
 COLOURFUL = np.array([200, 110, 40]) + np.random.default_rng(0).integers(0, 30, (*SIZE_HW, 3))
 MOSAICS = [mosaic(np.roll(COLOURFUL, 2 * frame, axis=1).astype(np.uint8)) for frame in range(FRAMES)]
 STRETCHED = np.array([[1, 1, 1], [1, 1.05, 1], [1, 1, 1]], np.float32)
+EVERY_TENTH = [np.arange(len(one.xyz_m))[:, None] % 10 == 0 for one in DRIVE["sweeps"]]
+MISREAD = [
+    dataclasses.replace(one, xyz_m=np.where(tenth, one.xyz_m - [0, 0, 40.0], one.xyz_m))
+    for one, tenth in zip(DRIVE["sweeps"], EVERY_TENTH, strict=True)
+]
+DOWNHILL = moved(DRIVE["sweeps"], lambda xyz_m: xyz_m - [0, 0, 0.15] * np.abs(xyz_m[:, :1]))
 LIFTED = moved(DRIVE["sweeps"], lambda xyz_m: xyz_m + np.array([0, 0, 0.9]))
 SIDEWAYS = DRIVE["T_world_ego"] @ np.array([[0.0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
 TIPPED = DRIVE["T_world_ego"] @ np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
@@ -181,6 +187,7 @@ FAST = [[Box("car", 3, (11.0, 2.0, 0.75), (4.0, 2.0, 1.5), 0.0, (90.0, 0.0))]] *
         ({"image_t_s": {"front": TIMES_S + 0.4}}, "front", r"exposed up to 0\.400 s .* another clock"),
         ({"image_t_s": {"front": TIMES_S * 1.03}}, "front", r"its time varies by 0\.0\d+ s"),
         ({"images": {"front": MOSAICS}}, "front", "grey images have the pattern of a colour filter"),
+        ({"sweeps": MISREAD}, "lidar", r"(9|10|11)% of the points are far below the ground"),
         ({"boxes": FAR}, "boxes", "12 of 12 sampled boxes within 25 m have no lidar point"),
         ({"boxes": FAST}, "boxes", "1 tracks move at up to 90 m/s"),
     ],
@@ -189,6 +196,11 @@ def test_a_fault_is_found(changed: dict[str, Any], subject: str, text: str, tmp_
     findings = checked(tmp_path, **changed).findings
     told = [finding.text for finding in findings if finding.subject == subject]
     assert any(re.search(text, each) for each in told), findings
+
+
+def test_points_of_a_steep_road_are_not_below_the_ground(tmp_path: Path) -> None:
+    texts = [finding.text for finding in checked(tmp_path, sweeps=DOWNHILL).findings]
+    assert not any("below the ground" in text for text in texts)
 
 
 def test_grey_images_and_noise_are_no_mosaics() -> None:

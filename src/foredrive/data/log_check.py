@@ -19,7 +19,7 @@ from foredrive.data.log_paths import LogPath
 from foredrive.data.logs import Log
 from foredrive.data.mosaic_check import is_mosaic
 from foredrive.data.notices import read_notices
-from foredrive.data.sweep_check import shifted_sweeps
+from foredrive.data.sweep_check import MAX_BURIED_SHARE, buried_share, shifted_sweeps
 from foredrive.errors import InputError
 from foredrive.geometry.projection import project
 from foredrive.geometry.se3 import inverse_se3, transform_points
@@ -297,7 +297,7 @@ def _clock(name: str, offset_s: Float[np.ndarray, "N"], period_s: float) -> Iter
 
 def _sweeps(log: Log) -> Iterator[Finding]:
     """Find empty sweeps and boxes, missing point times, and a ground that does not fit the ego frame."""
-    ground_m, empty, untimed, read = [], 0, 0, 0
+    ground_m, buried, empty, untimed, read = [], [], 0, 0, 0
     near, bare = 0, 0
     for frame in _sampled(frames_with_lidar(log)):
         try:
@@ -313,6 +313,7 @@ def _sweeps(log: Log) -> Iterator[Finding]:
             empty += 1
             continue
         untimed += not bool(sweep.dt_s.any())
+        buried.append(buried_share(sweep.points_ego.numpy()))
         level_m = _ground_level(sweep.points_ego.numpy())
         ground_m += [] if level_m is None else [level_m]
         close, without = _boxes_without_points(log, int(frame), loaded[0])
@@ -324,6 +325,9 @@ def _sweeps(log: Log) -> Iterator[Finding]:
         yield Finding("note", "lidar", text)
     if ground_m and abs(np.median(ground_m)) > MAX_GROUND_M:
         text = f"the ground is at z = {np.median(ground_m):.2f} m in the ego frame, which should stand on it"
+        yield Finding("problem", "lidar", text)
+    if buried and np.median(buried) > MAX_BURIED_SHARE:
+        text = f"{np.median(buried):.0%} of the points are far below the ground: were rows or fields misread?"
         yield Finding("problem", "lidar", text)
     for text in shifted_sweeps(log):
         yield Finding("problem", "lidar", text)

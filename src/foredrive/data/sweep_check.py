@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float, Float64
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
@@ -24,6 +24,9 @@ PAIRS, MIN_SHIFTED = 6, 2
 """Pairs that are looked at, and the number that have to be shifted for a report: a third of them at least."""
 MAX_SHIFT_M, MAX_SHIFT_SHARE = 0.08, 0.03
 """Shifts are reported that are larger than the first number plus this share of the way."""
+BURIED_M, STEEPEST = 1.0, 0.25
+"""Points are below any road that are lower than this, and than a road that falls by this share."""
+MAX_BURIED_SHARE = 0.03
 _NEAR_M = (2.5, 30.0)
 _CELL_M, _MAX_POINTS, _MIN_POINTS = 0.3, 4000, 300
 _REACH_M = (1.5, 1.5, 1.0, 1.0, 0.7, 0.7, 0.5, 0.5, 0.5, 0.5)
@@ -76,6 +79,12 @@ def shifted_sweeps(log: Log) -> Iterator[str]:
     left_deg, up_deg = (math.degrees(math.atan2(-moved_m[axis], way_m)) for axis in (1, 2))
     turned = f"a lidar that should be turned by {left_deg:.1f}° to the left and {up_deg:.1f}° up"
     yield f"{text}, as of {turned}, or of poses or a clock that are off"
+
+
+def buried_share(points_m: Float[np.ndarray, "N 3"]) -> float:
+    """Return the share of points in the ego frame that are far below any road: cells that were misread."""
+    distance_m = np.hypot(points_m[:, 0], points_m[:, 1])
+    return float((points_m[:, 2] < -BURIED_M - STEEPEST * distance_m).mean())
 
 
 def _pairs(log: Log) -> list[tuple[int, int]]:
