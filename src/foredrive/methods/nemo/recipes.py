@@ -62,7 +62,7 @@ def nemo_tiny() -> NemoRecipe:
             channels=32,
             occupancy_hidden=32,
         ),
-        planner=PlannerConfig(width=128, layers=3, heads=4, pool=(2, 4, 4), final_norm=True),
+        planner=PlannerConfig(width=128, layers=3, heads=4, pool=(2, 4, 4)),
         pretrain=NemoStage(
             schedule=Schedule(batch_size=4, lr=3e-3, steps=500, warmup_steps=40, workers=1),
             weights=dataclasses.replace(few_steps, wpts=0.0, recon=2.0, occ=1.0),
@@ -189,7 +189,7 @@ def nemo_base() -> NemoRecipe:
             channels=64,
             occupancy_hidden=64,
         ),
-        planner=PlannerConfig(width=256, layers=3, heads=8, pool=(4, 8, 8), final_norm=True),
+        planner=PlannerConfig(width=256, layers=3, heads=8, pool=(4, 8, 8)),
         pretrain=NemoStage(
             schedule=schedule,
             weights=NemoWeights(wpts=0.0, recon=1.0, occ=1.0, over_frames="sum"),
