@@ -23,7 +23,6 @@ from foredrive.tasks.detection.few_queries import FewQueriesDecoderLayer
 from foredrive.tasks.heads.heads import TaskHeadsConfig
 from foredrive.tasks.heads.scene_tokens import Attended, SceneTokens
 
-
 SHORTEST_M, LONGEST_M = 4.0, 200.0
 """Wavelengths of the initial places of rows and columns, m."""
 
@@ -324,7 +323,9 @@ class VolumePlanner(nn.Module):
         # 32 bits also under automatic mixed precision: the plan is in metres
         with full_precision(past, speeds_mps) as (poses, speeds):
             target = target if self.target else None
-            status = status_vector(poses[..., :3], speeds, command, command_valid, target)
+            status = status_vector(
+                poses[..., :3], speeds, command, command_valid, target, rates=self.ego_mlp.rates
+            )
             return self.ego_mlp(status)[..., :2], self.ego_mlp.standardised(status)
 
     def _fuse(

@@ -31,8 +31,8 @@ def instance_loss(
 ) -> Float[Tensor, ""]:
     """Return cross-entropy plus Dice of the masks of all matched vehicles and steps; 0 without any.
 
-    Each vehicle that matches an agent's box nearby has its cells of the truth as the mask, at all steps that the log
-    annotates. Cells outside of the volume's plane do not count. Of the others each item takes those of one
+    Each vehicle that matches an agent's box nearby has its cells of the truth as the mask, at all steps that
+    the log annotates. Cells outside of the volume's plane do not count. Of the others each item takes those of one
     row and one column in `STRIDE`, starting at another one than its neighbours in the batch.
     """
     # Cells whose middle is above the volume
