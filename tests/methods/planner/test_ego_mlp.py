@@ -1,13 +1,14 @@
 """Ego status: what a vehicle knows of itself."""
 
 import dataclasses
+import math
 
 import pytest
 import torch
 from small_drives import drives
 
 from foredrive.errors import InputError
-from foredrive.methods.planner.ego_mlp import ego_speeds, ego_status
+from foredrive.methods.planner.ego_mlp import ego_motion, ego_speeds, ego_status, motion_rates
 from foredrive.scene import Command
 from foredrive.scene.clip import TARGET
 
@@ -36,6 +37,21 @@ def test_the_ego_status_by_hand() -> None:
     assert ego_status(clip, past_frames=0, target=True)[0].tolist() == [2.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]
     with pytest.raises(InputError, match="needs 5 frames before now"):
         ego_status(clip, past_frames=5)
+
+
+def test_rates_by_hand() -> None:
+    """A left curve that is driven faster and faster, and a vehicle that stands and whose pose trembles."""
+    poses = torch.tensor([[[-4.0, 0.3, -0.2], [-2.0, 0.1, -0.1]], [[-0.01, 0.0, 0.0], [-0.01, 0.0, 0.02]]])
+    speeds = torch.tensor([[3.0, 4.0, 5.0], [0.0, 0.0, 0.0]])
+    curvature = 0.1 / math.hypot(2.0, 0.1)
+    curve, stands = motion_rates(poses, speeds)
+    expected = torch.tensor([1.0, 1.0, 0.1, 0.1, curvature, 25.0, 5.0, 5 * curvature])
+    torch.testing.assert_close(curve, expected)
+    torch.testing.assert_close(stands, torch.tensor([0.0, 0.0, 0.02, -0.02, 0.0, 0.0, 0.0, 0.0]))
+    clip = drives(1).clip
+    status = ego_status(clip, 2, rates=True)
+    torch.testing.assert_close(status[:, -8:], motion_rates(*ego_motion(clip, 2)))
+    torch.testing.assert_close(status[:, :-8], ego_status(clip, 2))
 
 
 def test_the_status_does_not_depend_on_where_in_the_world_one_is() -> None:

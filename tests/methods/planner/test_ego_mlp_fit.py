@@ -12,22 +12,25 @@ from foredrive.methods.planner.ego_mlp import EgoMLP, EgoMLPConfig
 from foredrive.methods.planner.ego_mlp_fit import EgoMLPFit, StatusDemonstrations, fit_ego_mlp, read_status
 
 
-def fitted(data: StatusDemonstrations, *, steps: int, past_frames: int = 2, seed: int = 0) -> EgoMLP:
+def fitted(
+    data: StatusDemonstrations, *, steps: int, past_frames: int = 2, seed: int = 0, rates: bool = False
+) -> EgoMLP:
     fit = EgoMLPFit(steps=steps, seed=seed)
-    return fit_ego_mlp(EgoMLPConfig(), data, fit, past_frames=past_frames, dt_s=0.5)
+    return fit_ego_mlp(EgoMLPConfig(rates=rates), data, fit, past_frames=past_frames, dt_s=0.5)
 
 
-def test_the_ego_mlp_learns_what_the_status_gives_away() -> None:
+@pytest.mark.parametrize("rates", [False, True])
+def test_the_ego_mlp_learns_what_the_status_gives_away(rates: bool) -> None:
     # Vehicles on circles: the past says exactly what comes next.
-    data = read_status([drives(*range(100)).clip], past_frames=2)
-    model = fitted(data, steps=300)
+    data = read_status([drives(*range(100)).clip], past_frames=2, rates=rates)
+    model = fitted(data, steps=300, rates=rates)
     test = drives(*range(200, 240))
     observed, driven = test.clip.observed(), test.clip.future.xy
     error_m = (model.act(observed).xy - driven).norm(dim=-1).mean()
     straight_m = (ConstantVelocity(6, 0.5).act(observed).xy - driven).norm(dim=-1).mean()
     assert error_m < 0.5 * straight_m
-    again = fitted(data, steps=300)
-    other = fitted(data, steps=300, seed=1)
+    again = fitted(data, steps=300, rates=rates)
+    other = fitted(data, steps=300, seed=1, rates=rates)
     assert torch.equal(again.act(observed).xy, model.act(observed).xy)
     assert not torch.equal(other.act(observed).xy, model.act(observed).xy)
 

@@ -113,7 +113,8 @@ def test_sequences_are_read_and_judged_at_their_last_frames() -> None:
     single = heads(volumes)
     torch.testing.assert_close(sequences.instances.pixels, single.instances.pixels[[1, 3]])
 
-    found = agents([(2.0, 2.0, 0.3, 4.0)])
+    x, y = sequences.agents[-1].boxes.mean[1, 0, :2].tolist()  # beside a query: far ones teach no mask
+    found = agents([(x, y, 0.3, 4.0)])
     truth = TaskTruth(instances=truth_of(found)[[0] * 4])
     boxes = boxes_of(found)[[0] * 4]
     for annotated, trains in (([True, False, True, False], False), ([False, True, False, False], True)):
@@ -216,6 +217,14 @@ def test_every_cell_is_judged_by_one_of_four_items(row: int, column: int) -> Non
 
     differs = [new != old for new, old in zip(losses(changed), losses(truth.track_id), strict=True)]
     assert sum(differs) == 1
+
+
+@pytest.mark.parametrize(("off_m", "trains"), [(3.0, True), (5.0, False)])
+def test_a_box_far_from_its_vehicle_learns_no_mask(off_m: float, trains: bool) -> None:
+    found, true = agents([(2.0 + off_m, 2.0, 0.3, 4.0)]), agents([(2.0, 2.0, 0.3, 4.0)])
+    valid, matching = torch.tensor([True]), MatchingLossConfig()
+    loss = instance_loss(untrained(1), found, boxes_of(true), valid, truth_of(true), SPEC, matching)
+    assert bool(loss > 0) is trains
 
 
 def test_pedestrians_and_frames_without_annotation_train_nothing() -> None:

@@ -108,7 +108,7 @@ def nemo_town() -> NemoRecipe:
         planner=dataclasses.replace(
             tiny.planner,
             history=1,
-            ego_mlp=EgoMLPConfig(),
+            ego_mlp=EgoMLPConfig(rates=True),
             path=PathCorrectionConfig(distances_m=along_m, width=64, hidden=32),
         ),
         path=PathFit(),

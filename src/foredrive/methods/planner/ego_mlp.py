@@ -11,6 +11,9 @@ from foredrive.geometry.se3 import compose_se3, inverse_se3, yaw_from_matrix
 from foredrive.scene import Clip, Command, Trajectory
 from foredrive.scene.clip import TARGET
 
+CURVED_M = 0.3
+"""Least length of a step that has a curvature, m."""
+
 
 def ego_speeds(clip: Clip) -> Float[Tensor, "b T"]:
     """Return the speeds at all key frames, m/s. Unknown ones follow from the pose before (at first, after).
@@ -46,17 +49,18 @@ def ego_motion(clip: Clip, past_frames: int) -> tuple[Float[Tensor, "b P 3"], Fl
     return poses.float(), ego_speeds(clip.observed())[:, frames]
 
 
-def ego_status(clip: Clip, past_frames: int, *, target: bool = False) -> Float[Tensor, "b S"]:
+def ego_status(
+    clip: Clip, past_frames: int, *, target: bool = False, rates: bool = False
+) -> Float[Tensor, "b S"]:
     """Return the ego status at now: `ego_motion` and the command as one-hot (zeros where unknown).
-
-    Accelerations are implied by the speeds.
 
     Args:
         target: append `route_target`.
+        rates: append `motion_rates`.
     """
     poses, speeds = ego_motion(clip, past_frames)
     target_xy1 = route_target(clip) if target else None
-    return status_vector(poses, speeds, clip.command, clip.command_valid, target_xy1)
+    return status_vector(poses, speeds, clip.command, clip.command_valid, target_xy1, rates=rates)
 
 
 def route_target(clip: Clip) -> Float[Tensor, "b 3"]:
@@ -72,12 +76,35 @@ def status_vector(
     command: Int[Tensor, "b"],
     command_valid: Bool[Tensor, "b"],
     target: Float[Tensor, "b 3"] | None = None,
+    *,
+    rates: bool = False,
 ) -> Float[Tensor, "b S"]:
-    """Return the numbers of `ego_status` in order. `route_target` comes last, if given."""
+    """Return the numbers of `ego_status` in order: `route_target` and `motion_rates` come last, if any."""
     # An unknown command is all zeros
     one_hot = nn.functional.one_hot(command.long(), len(Command)) * command_valid[:, None]
-    status = torch.cat([poses.flatten(1), speeds, one_hot.to(speeds)], dim=-1)
-    return status if target is None else torch.cat([status, target.to(status)], dim=-1)
+    columns = [poses.flatten(1), speeds, one_hot.to(speeds)]
+    columns += [] if target is None else [target.to(speeds)]
+    return torch.cat(columns + ([motion_rates(poses, speeds)] if rates else []), dim=-1)
+
+
+def motion_rates(poses: Float[Tensor, "b P 3"], speeds: Float[Tensor, "b P+1"]) -> Float[Tensor, "b 2*P+4"]:
+    """Return changes of speed and heading, and what braking and turning distances depend on.
+
+    These are the change of speed (m/s) and of yaw (rad) from each key frame to the next, the curvature of the
+    last step (1/m), the squared speed at now, and the speed times its last change and times the curvature.
+    """
+    faster_mps = speeds.diff(dim=1)
+    # The pose at now is the identity
+    yaw = torch.cat([poses[..., 2], torch.zeros_like(speeds[:, :1])], dim=1)
+    travelled_m = poses[:, -1, :2].norm(dim=-1)
+    turned = yaw.diff(dim=1)
+    # The curve of a step that hardly moves is noise
+    curvature = torch.where(travelled_m > CURVED_M, turned[:, -1] / travelled_m.clamp_min(CURVED_M), 0.0)
+    now_mps = speeds[:, -1]
+    products = torch.stack(
+        [curvature, now_mps.square(), now_mps * faster_mps[:, -1], now_mps * curvature], dim=-1
+    )
+    return torch.cat([faster_mps, turned, products], dim=-1)
 
 
 @dataclass(frozen=True)
@@ -86,6 +113,9 @@ class EgoMLPConfig:
 
     hidden: int = 512
     """Width of both hidden layers (512 in the paper)."""
+    rates: bool = False
+    """Also read `motion_rates`, if there are frames before now. They follow from poses and speeds, but those
+    are nearly collinear: without the rates the perceptron needs many more steps to use them."""
 
 
 class EgoMLP(nn.Module):
@@ -117,10 +147,11 @@ class EgoMLP(nn.Module):
         target: bool = False,
     ) -> None:
         super().__init__()
-        hidden = config.hidden
+        hidden, self.rates = config.hidden, config.rates and past_frames > 0
         self.past_frames, self.horizon_steps, self.dt_s = past_frames, horizon_steps, dt_s
         self.target = target
-        inputs, outputs = 4 * past_frames + 1 + len(Command) + 3 * target, 3 * horizon_steps
+        inputs = 4 * past_frames + 1 + len(Command) + 3 * target + self.rates * (2 * past_frames + 4)
+        outputs = 3 * horizon_steps
         self.layers = nn.Sequential(
             nn.Linear(inputs, hidden),
             nn.ReLU(),
@@ -146,7 +177,8 @@ class EgoMLP(nn.Module):
     @torch.no_grad()
     def act(self, observation: Clip) -> Trajectory:
         """Return the plan from now on."""
-        plan = self(ego_status(observation, self.past_frames, target=self.target))[:, None]  # [b, 1, T, 3]
+        status = ego_status(observation, self.past_frames, target=self.target, rates=self.rates)
+        plan = self(status)[:, None]  # [b, 1, T, 3]
         return Trajectory(
             xy=plan[..., :2],
             yaw=plan[..., 2],

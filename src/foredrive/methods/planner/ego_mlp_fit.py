@@ -38,18 +38,21 @@ class StatusDemonstrations(Record):
     valid: Bool[Tensor, "N T"]
 
 
-def read_status(clips: Iterable[Clip], past_frames: int, *, target: bool = False) -> StatusDemonstrations:
+def read_status(
+    clips: Iterable[Clip], past_frames: int, *, target: bool = False, rates: bool = False
+) -> StatusDemonstrations:
     """Return ego status and driven future of batches of clips.
 
     Args:
         clips: batches.
         past_frames: key frames before now in the ego status.
         target: whether the ego status includes the target point of the route.
+        rates: whether it includes `motion_rates`.
 
     Raises:
         InputError: there are no clips.
     """
-    rows = [_demonstrations(clip, past_frames, target) for clip in clips]
+    rows = [_demonstrations(clip, past_frames, target, rates) for clip in clips]
     if not rows:
         raise InputError("the training set is empty")
     return StatusDemonstrations(
@@ -59,10 +62,11 @@ def read_status(clips: Iterable[Clip], past_frames: int, *, target: bool = False
     )
 
 
-def _demonstrations(clip: Clip, past_frames: int, target: bool) -> StatusDemonstrations:
+def _demonstrations(clip: Clip, past_frames: int, target: bool, rates: bool) -> StatusDemonstrations:
     future = clip.future
+    status = ego_status(clip, past_frames, target=target, rates=rates and past_frames > 0)
     driven = torch.cat([future.xy[:, 0], future.yaw[:, 0, :, None]], dim=-1)
-    return StatusDemonstrations(ego_status(clip, past_frames, target=target), driven, future.valid[:, 0])
+    return StatusDemonstrations(status, driven, future.valid[:, 0])
 
 
 def fit_ego_mlp(

@@ -1,6 +1,7 @@
 """The temporal attention planner (NeMo §3.3, eq. 12–14)."""
 
 import copy
+import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -21,6 +22,9 @@ from foredrive.scene import Command, Trajectory, VoxelSpec
 from foredrive.tasks.detection.few_queries import FewQueriesDecoderLayer
 from foredrive.tasks.heads.heads import TaskHeadsConfig
 from foredrive.tasks.heads.scene_tokens import Attended, SceneTokens
+
+SHORTEST_M, LONGEST_M = 4.0, 200.0
+"""Wavelengths of the initial places of rows and columns, m."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,8 +60,8 @@ class PlannerConfig:
     """Dropout of the decoder. It has one query: whatever is dropped is missing from the whole plan, and with
     0.1 it never learns to find a cell of the plane."""
     final_norm: bool = False
-    """Normalise the output of the decoder, as pre-norm decoders do. False in runs from before there was a
-    choice."""
+    """Normalise the output of the decoder, as pre-norm decoders do. What depends on the scene is small beside
+    the learned query at first, and this makes it smaller: with it, rates of 0.003 learn nothing."""
     speed_scale_mps: float = 10.0
     """Scale by which speeds are divided, m/s."""
     past_scale_m: float = 5.0
@@ -67,6 +71,19 @@ class PlannerConfig:
     step_scale_m: float = 1.0
     """Length of a step for an output of 1, m. With outputs of order 1, the last layer does not have to grow
     first."""
+
+
+def sinusoidal_places(count: int, step_m: float, width: int) -> Float[Tensor, "N C"]:
+    """Return sines and cosines of equidistant positions with a root mean square of 1.
+
+    The features of a plane are normalised to the same size: places of 0.02 would be lost beside them. Waves
+    of 4 to 200 m change little from one cell to the next, so attention that prefers a place prefers its
+    surroundings too.
+    """
+    position_m = step_m * (torch.arange(count) - 0.5 * (count - 1))
+    length_m = LONGEST_M * (SHORTEST_M / LONGEST_M) ** torch.linspace(0, 1, (width + 1) // 2)
+    phase = 2 * math.pi * position_m[:, None] / length_m
+    return math.sqrt(2) * torch.cat([phase.sin(), phase.cos()], dim=-1)[:, :width]
 
 
 class FutureAttention(nn.Module):
@@ -157,10 +174,10 @@ class VolumePlanner(nn.Module):
             nn.Linear(width, width),
             nn.LayerNorm(width),
         )
-        # Learned place of each row and column, since attention itself knows no positions. They are as large
-        # as the features, which `fold` normalises: places of 0.02 are lost beside them
-        self.row = nn.Parameter(torch.randn(ny, 1, width))
-        self.column = nn.Parameter(torch.randn(1, nx, width))
+        # Learned place of each row and column, since attention itself knows no positions
+        row, column = (sinusoidal_places(count, spec.voxel_m, width // 2) for count in (ny, nx))
+        self.row = nn.Parameter(F.pad(row, (0, width - width // 2))[:, None])
+        self.column = nn.Parameter(F.pad(column, (width - width // 2, 0))[None])
         self.command = nn.Embedding(len(Command) + 1, width)  # the last entry: unknown command
         # Speed and its flag, 4 numbers per past frame, and x, y and flag of the target
         inputs = 2 + 4 * config.history + 3 * config.target
@@ -306,7 +323,9 @@ class VolumePlanner(nn.Module):
         # 32 bits also under automatic mixed precision: the plan is in metres
         with full_precision(past, speeds_mps) as (poses, speeds):
             target = target if self.target else None
-            status = status_vector(poses[..., :3], speeds, command, command_valid, target)
+            status = status_vector(
+                poses[..., :3], speeds, command, command_valid, target, rates=self.ego_mlp.rates
+            )
             return self.ego_mlp(status)[..., :2], self.ego_mlp.standardised(status)
 
     def _fuse(

@@ -37,8 +37,9 @@ def fit_baselines(
     clips, target = dataclasses.replace(recipe.clips.judged, tasks=None), recipe.planner.target
     dataset = ClipDataset(logs, clips, cache_dir, images=False)
     loader = DataLoader(dataset, batch_size=16, collate_fn=collate)
-    prior, status = read_training_set(loader, clips.future_frames + 1, past_frames, target=target)
     sizes = recipe.planner.ego_mlp or EgoMLPConfig()
+    read = {"target": target, "rates": sizes.rates}
+    prior, status = read_training_set(loader, clips.future_frames + 1, past_frames, **read)
     mlp = fit_ego_mlp(
         sizes, status, recipe.ego_mlp, past_frames=past_frames, dt_s=clips.horizon_dt_s, target=target
     )
@@ -91,7 +92,7 @@ class Baselines(nn.Module):
 
 
 def read_training_set(
-    loader: Iterable[Example], frames: int, past_frames: int, *, target: bool = False
+    loader: Iterable[Example], frames: int, past_frames: int, *, target: bool = False, rates: bool = False
 ) -> tuple[OccupancyPrior, StatusDemonstrations]:
     """Read the training data of the baselines in one pass; images are not used.
 
@@ -100,6 +101,7 @@ def read_training_set(
         frames: number of key frames in the occupancy prior: now and the future ones.
         past_frames: number of past frames in the ego status.
         target: whether the ego status contains the route target.
+        rates: whether it contains the rates of motion.
 
     Raises:
         InputError: there are no batches.
@@ -114,6 +116,6 @@ def read_training_set(
             prior.add(labels)
             yield example.clip
 
-    status = read_status(clips(), past_frames, target=target)
+    status = read_status(clips(), past_frames, target=target, rates=rates)
     assert prior is not None
     return prior, status

@@ -14,7 +14,7 @@ from foredrive.ops.masked import masked_mean
 from foredrive.scene import Boxes, VoxelSpec
 from foredrive.scene.task_truth import TaskTruth
 from foredrive.tasks.detection.agents_head import AGENT_CLASSES, AgentSet
-from foredrive.tasks.detection.losses import MatchingLossConfig, matched_loss
+from foredrive.tasks.detection.losses import MatchingLossConfig, matched_loss, near_pairs
 from foredrive.tasks.detection.proposals import CentreMap
 from foredrive.tasks.heads.plane import cell_middles
 from foredrive.tasks.heads.targets import AgentTargets, agent_targets
@@ -146,7 +146,8 @@ def agent_losses(
             terms["queries"].append(matched_loss(predicted.boxes, targets.boxes, query, match, weights.boxes))
             # Velocity, attribute and motion are trained at the last layer only
             if number == len(layers) - 1:
-                for name, value in _matched_terms(predicted, targets, query, match).items():
+                near = near_pairs(predicted.boxes, targets.boxes, query, match)
+                for name, value in _matched_terms(predicted, targets, *near).items():
                     terms[name].append(value)
                 owner = owners(query, match, targets.track_id, count)
     if last.future_xy is None:
@@ -195,7 +196,7 @@ def _cell_losses(centres: CentreMap, targets: AgentTargets, spec: VoxelSpec) -> 
 def _matched_terms(
     predicted: AgentSet, targets: AgentTargets, query: Tensor, match: Tensor
 ) -> dict[str, Float[Tensor, ""]]:
-    """Return the losses of velocity, attribute and motion of one item's matched queries."""
+    """Return the losses of velocity, attribute and motion of one item's near pairs."""
     true_velocity = targets.velocity[match]
     known = true_velocity.isfinite().all(-1)
     off = (predicted.velocity[query] - torch.where(known[:, None], true_velocity, 0.0)).abs().sum(-1)

@@ -18,6 +18,10 @@ from foredrive.tasks.detection.network import BoxSet
 STATE_SCALE = (1.0, 1.0, 1.0, 0.3, 0.3, 0.3)
 """Errors of this size, in m and log m, have equal weight."""
 
+TAUGHT_M = 4.0
+"""A matched box whose centre is farther from its object than this learns only to come nearer: its velocity,
+attribute, motion and mask would be read from a place where the object is not."""
+
 Loss = Callable[[BoxSet, LabelledBoxes], Float[Tensor, ""]]
 """The loss of one frame: `matching_loss` or `set_loss`."""
 
@@ -144,3 +148,12 @@ def best_matching(
     column = torch.as_tensor(best_assignment(cost, unmatched).column)
     match = (column >= 0).nonzero()[:, 0]
     return column[match].to(predicted.mean.device), match.to(predicted.mean.device)
+
+
+def near_pairs(
+    predicted: BoxSet, truth: LabelledBoxes, query: Int[Tensor, "n"], match: Int[Tensor, "n"]
+) -> tuple[Int[Tensor, "_n"], Int[Tensor, "_n"]]:
+    """Return the matched pairs that are at most `TAUGHT_M` apart over ground."""
+    apart_m = (predicted.mean[query, :2].detach() - truth.state[match, :2].to(predicted.mean)).norm(dim=-1)
+    near = apart_m <= TAUGHT_M
+    return query[near], match[near]

@@ -19,7 +19,9 @@ from foredrive.tasks.heads.plane import Plane, PlanePyramid, Planes, cell_middle
 class MapHeadConfig:
     """Sizes of a `MapHead`. The defaults are for towns on two cores."""
 
-    elements: int = 20
+    elements: int = 50
+    """Lines that are looked for, as many as in MapTR. Frames have about ten, but each line begins at one of
+    these, and few of a small number are near."""
     points: int = 10
     """Points of an element."""
     kinds: int = 3

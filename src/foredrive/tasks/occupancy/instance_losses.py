@@ -8,7 +8,7 @@ from foredrive.scene import Boxes, VoxelSpec
 from foredrive.scene.boxes import VEHICLES
 from foredrive.scene.map_elements import InstanceRaster, PlaneSpec
 from foredrive.tasks.detection.agents_head import AGENT_CLASSES, AgentSet
-from foredrive.tasks.detection.losses import MatchingLossConfig, best_matching
+from foredrive.tasks.detection.losses import MatchingLossConfig, best_matching, near_pairs
 from foredrive.tasks.heads.plane import cell_middles
 from foredrive.tasks.heads.targets import agent_targets
 from foredrive.tasks.occupancy.instances_head import InstanceSet, instance_logits
@@ -31,8 +31,8 @@ def instance_loss(
 ) -> Float[Tensor, ""]:
     """Return cross-entropy plus Dice of the masks of all matched vehicles and steps; 0 without any.
 
-    Each vehicle that matches an agent's box has its cells of the truth as the mask, at all steps that the log
-    annotates. Cells outside of the volume's plane do not count. Of the others each item takes those of one
+    Each vehicle that matches an agent's box nearby has its cells of the truth as the mask, at all steps that
+    the log annotates. Cells outside of the volume's plane do not count. Of the others each item takes those of one
     row and one column in `STRIDE`, starting at another one than its neighbours in the batch.
     """
     # Cells whose middle is above the volume
@@ -43,7 +43,8 @@ def instance_loss(
     # Vehicles among the matched boxes, at steps that are annotated
     for item in boxes_valid.nonzero()[:, 0].tolist():
         targets = agent_targets(boxes[item], None, spec, 0)
-        query, match = best_matching(agents[item].boxes, targets.boxes, matching)
+        found = agents[item].boxes
+        query, match = near_pairs(found, targets.boxes, *best_matching(found, targets.boxes, matching))
         vehicle = torch.isin(targets.boxes.label[match], _VEHICLE_LABELS.to(match.device))
         steps = truth.valid[item]
         query, track_id = query[vehicle], targets.track_id[match[vehicle]]
