@@ -32,8 +32,8 @@ def instance_loss(
     """Return cross-entropy plus Dice of the masks of all matched vehicles and steps; 0 without any.
 
     Each vehicle that matches an agent's box nearby has its cells of the truth as the mask, at all steps that
-    the log annotates. Cells outside of the volume's plane do not count. Of the others each item takes those of one
-    row and one column in `STRIDE`, starting at another one than its neighbours in the batch.
+    the log annotates. Cells outside of the volume's plane do not count. Of the others each item takes
+    those of one row and one column in `STRIDE`, starting at another one than its neighbours in the batch.
     """
     # Cells whose middle is above the volume
     grid, wanted = truth.spec, _inside(truth.spec, spec)
@@ -43,8 +43,8 @@ def instance_loss(
     # Vehicles among the matched boxes, at steps that are annotated
     for item in boxes_valid.nonzero()[:, 0].tolist():
         targets = agent_targets(boxes[item], None, spec, 0)
-        found = agents[item].boxes
-        query, match = near_pairs(found, targets.boxes, *best_matching(found, targets.boxes, matching))
+        predicted = agents[item].boxes
+        query, match = near_pairs(predicted, targets.boxes, *best_matching(predicted, targets.boxes, matching))
         vehicle = torch.isin(targets.boxes.label[match], _VEHICLE_LABELS.to(match.device))
         steps = truth.valid[item]
         query, track_id = query[vehicle], targets.track_id[match[vehicle]]
