@@ -43,8 +43,8 @@ def instance_loss(
     # Vehicles among the matched boxes, at steps that are annotated
     for item in boxes_valid.nonzero()[:, 0].tolist():
         targets = agent_targets(boxes[item], None, spec, 0)
-        predicted = agents[item].boxes
-        query, match = near_pairs(predicted, targets.boxes, *best_matching(predicted, targets.boxes, matching))
+        sets = agents[item].boxes, targets.boxes
+        query, match = near_pairs(*sets, *best_matching(*sets, matching))
         vehicle = torch.isin(targets.boxes.label[match], _VEHICLE_LABELS.to(match.device))
         steps = truth.valid[item]
         query, track_id = query[vehicle], targets.track_id[match[vehicle]]
