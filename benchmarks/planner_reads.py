@@ -1,0 +1,248 @@
+"""Use of what a planner could see: `foredrive bench planner-reads`.
+
+The true map, boxes and lights, drawn from above, replace the features of a world model. Egos come from many
+windows of traffic in six towns, and are judged in two others. A blind twin has the same size, steps and data,
+and planes of zeros.
+"""
+
+import dataclasses
+import functools
+import math
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import torch
+from rich.progress import track
+from torch import Tensor, nn
+
+from benchmarks.common.study import work_folder
+from benchmarks.common.true_planes import CHANNELS, HORIZON, PAST, SPEC, TruePlanes, joined, true_planes
+from foredrive.engine.bench import Benchmark
+from foredrive.methods.planner.ego_mlp import EgoMLP, EgoMLPConfig, status_vector
+from foredrive.methods.planner.ego_mlp_fit import EgoMLPFit, StatusDemonstrations, fit_ego_mlp
+from foredrive.methods.planner.path_correction import PathCorrection, PathCorrectionConfig, PathSamples
+from foredrive.methods.planner.path_fit import PathDemonstrations, PathFit, fit_path
+from foredrive.methods.planner.planner import PlannerConfig, VolumePlanner
+from foredrive.runs.drive.recording import EgosPlan
+from foredrive.runs.recipes.known import find_recipe
+from foredrive.scene import VoxelSpec
+from foredrive.tasks.bootstrap import bootstrap_mean
+
+WORK = work_folder(Path("runs/planner_reads"))
+RECIPE = find_recipe("nemo_town")
+DT_S = RECIPE.clips.horizon_dt_s
+TRAIN_TOWNS = ("Town01", "Town02", "Town04", "Town06", "Town07", "Town10HD")
+TEST_TOWNS = ("Town03", "Town05")
+"""Towns that no arm is trained in. Architectures were chosen on them, with other seeds of traffic."""
+TRAIN_SEEDS, TEST_SEEDS, EGOS = tuple(range(2000, 2008)), tuple(range(3000, 3006)), 80
+"""Seeds of traffic, and virtual egos of each town and seed."""
+EGO_FIT = EgoMLPFit(steps=4000)
+READ = PathCorrectionConfig(
+    distances_m=(3.0, 6.0, 9.0, 12.0, 15.0, 18.0, 22.0, 26.0, 30.0, 36.0),
+    lateral_m=(-4.0, -2.0, 0.0, 2.0, 4.0),
+    width=128,
+    hidden=48,
+    dropout=0.3,
+)
+READ_FIT = PathFit(steps=6000, lr=2e-3, weight_decay=0.5)
+FEW, FEW_BATCH = 64, 16
+"""Number of demonstrations that a planner has to learn by heart, and of a step."""
+COARSE = dataclasses.replace(
+    SPEC, voxel_m=2 * SPEC.voxel_m, shape_zyx=(1, *(n // 2 for n in SPEC.shape_zyx[1:]))
+)
+"""Grid of the decoder, which attends to every cell."""
+CELL_SPEC = VoxelSpec(lower_m=(-16.0, -24.0, -1.5), voxel_m=4.0, shape_zyx=(1, 12, 14))
+CELL_CHANNELS, CELL_BATCH = 8, 16
+
+
+# --- one lit cell -------------------------------------------------------------------------------------------
+
+
+def lit_cells(generator: torch.Generator) -> tuple[Tensor, Tensor]:
+    """Return noise with one lit cell of 168, and its place at a quarter of the distance, m."""
+    volume = 0.5 * torch.randn(CELL_BATCH, CELL_CHANNELS, *CELL_SPEC.shape_zyx, generator=generator)
+    cell = torch.randint(math.prod(CELL_SPEC.shape_zyx), (CELL_BATCH,), generator=generator)
+    volume.flatten(2)[torch.arange(CELL_BATCH), 0, cell] += 4.0
+    return volume, 0.25 * CELL_SPEC.centres_m()[0, ..., :2].reshape(-1, 2)[cell]
+
+
+def cell_error_m(seed: int, steps: int = 600, lr: float = 3e-3) -> float:
+    """Train the planner as published to name the lit cell; return the error of the last hundred steps, m.
+
+    Always naming the mean is 5 m off.
+    """
+    torch.manual_seed(seed)
+    config = PlannerConfig(width=64, layers=3, heads=4, pool=(1, 1, 1), future="none")
+    planner = VolumePlanner(config, CELL_SPEC, channels=CELL_CHANNELS, horizon_steps=HORIZON, dt_s=DT_S)
+    optimizer = torch.optim.AdamW(planner.parameters(), lr=lr)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, steps)
+    generator, known = torch.Generator().manual_seed(seed), torch.ones(CELL_BATCH, dtype=torch.bool)
+    still = torch.zeros(CELL_BATCH)
+    status = still.long(), known, still, known, torch.zeros(CELL_BATCH, 0, 4)
+    errors_m = []
+    for _ in range(steps):
+        volume, place_m = lit_cells(generator)
+        error_m = (planner(volume, None, *status).xy[:, 0, -1] - place_m).norm(dim=-1).mean()
+        optimizer.zero_grad()
+        error_m.backward()
+        optimizer.step()
+        schedule.step()
+        errors_m.append(float(error_m.detach()))
+    return float(np.mean(errors_m[-100:]))
+
+
+# --- virtual egos -------------------------------------------------------------------------------------------
+
+
+@functools.cache
+def egos() -> tuple[TruePlanes, TruePlanes]:
+    """Return the egos to train on, once more mirrored, and those to judge by."""
+    parts = []
+    for towns, seeds in ((TRAIN_TOWNS, TRAIN_SEEDS), (TEST_TOWNS, TEST_SEEDS)):
+        plans = [EgosPlan(town, seed, EGOS, ()) for seed in seeds for town in towns]
+        planes = [true_planes(plan, RECIPE.clips, WORK) for plan in track(plans, description="true planes")]
+        parts.append(joined(planes))
+    train, test = parts
+    return joined([train, train.mirrored()]), test
+
+
+def status_of(planes: TruePlanes) -> Tensor:
+    """Return the ego status with rates of motion."""
+    return status_vector(planes.poses, planes.speeds, planes.command, planes.command_valid, rates=True)
+
+
+@functools.cache
+def ego_mlp() -> EgoMLP:
+    """Return the ego-only MLP that the planners correct and are judged against."""
+    train, _ = egos()
+    valid = torch.ones(train.driven.shape[:2], dtype=torch.bool)
+    data = StatusDemonstrations(status_of(train), train.driven, valid)
+    return fit_ego_mlp(EgoMLPConfig(rates=True), data, EGO_FIT, past_frames=PAST, dt_s=DT_S)
+
+
+@torch.no_grad()
+def demonstrations(reads: PathCorrection, planes: TruePlanes, *, blind: bool) -> PathDemonstrations:
+    """Sample the planes along the plans of the ego-only MLP."""
+    rows = []
+    for chosen in torch.arange(len(planes.window)).split(512):
+        part = planes.map_tensors(lambda tensor, rows=chosen: tensor[rows])
+        status = status_of(part)
+        planned_xy = ego_mlp()(status)[..., :2]
+        samples = reads.sample(part.volumes() * (not blind), planned_xy)
+        rows.append((*samples, ego_mlp().standardised(status), planned_xy, part.driven[..., :2]))
+    columns = [torch.cat(parts) for parts in zip(*rows, strict=True)]
+    return PathDemonstrations(*columns, torch.ones(planes.driven.shape[:2], dtype=torch.bool))
+
+
+@torch.no_grad()
+def errors_m(reads: PathCorrection, data: PathDemonstrations) -> tuple[np.ndarray, np.ndarray]:
+    """Return the mean distance to the driven path of each corrected plan, and of each plan of the MLP."""
+    change = reads(PathSamples(data.values, data.positions_m), data.status)
+    own, rival = (
+        (xy - data.driven_xy).norm(dim=-1).mean(-1).double().numpy()
+        for xy in (data.planned_xy + change.cumsum(dim=1), data.planned_xy)
+    )
+    return own, rival
+
+
+def read_along(blind: bool) -> Callable[[int], dict[str, float]]:
+    """Return an arm that reads along the MLP's plan."""
+
+    def measure(seed: int) -> dict[str, float]:
+        train, test = egos()
+        torch.manual_seed(seed)
+        status = ego_mlp().status_mean.shape[0]
+        reads = PathCorrection(READ, SPEC, channels=CHANNELS, status=status, steps=HORIZON)
+        data = demonstrations(reads, train, blind=blind)
+        fit_path(reads, data, READ_FIT, seed)
+        own, rival = errors_m(reads, demonstrations(reads, test, blind=blind))
+        # Whole windows of traffic are drawn, because their egos see the same
+        windows = [str(window) for window in test.window.tolist()]
+        gain = bootstrap_mean(100 * (rival - own) / rival.mean(), windows, np.random.default_rng(seed))
+        return {
+            "l2_m": float(own.mean()),
+            "ego_mlp_l2_m": float(rival.mean()),
+            "train_l2_m": float(errors_m(reads, data)[0].mean()),
+            "held_out_gain_pct": gain.mean,
+            "held_out_gain_pct_low": gain.low,
+            "held_out_gain_pct_high": gain.high,
+            "windows": float(len(set(windows))),
+            "clips": float(len(own)),
+            "demonstrations": float(len(train.window) / 2),
+        }
+
+    return measure
+
+
+# --- few demonstrations -------------------------------------------------------------------------------------
+
+
+class Decoder(nn.Module):
+    """The planner as published, on true planes after two convolutions."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        hidden = 32
+        self.see = nn.Sequential(
+            nn.Conv2d(CHANNELS, hidden, 4, stride=2, padding=1),
+            nn.ReLU(),
+            nn.Conv2d(hidden, hidden, 3, padding=1),
+        )
+        config = dataclasses.replace(
+            RECIPE.planner, future="none", pool=(1, 1, 1), path=None, history=PAST, width=64
+        )
+        self.planner = VolumePlanner(config, COARSE, channels=hidden, horizon_steps=HORIZON, dt_s=DT_S)
+        self.planner.ego_mlp = ego_mlp()
+
+    def forward(self, planes: TruePlanes, sight: float) -> Tensor:
+        """Return the waypoints; with a `sight` of 0 the planes are blacked."""
+        volume = self.see(sight * planes.volumes()[:, :, 0])[:, :, None]
+        past = torch.cat([planes.poses, planes.speeds[:, :-1, None]], dim=-1)
+        known = torch.ones_like(planes.command_valid)
+        status = planes.command, planes.command_valid, planes.speeds[:, -1], known, past
+        return self.planner(volume, None, *status).xy[:, 0]
+
+
+def few(seed: int, steps: int = 1500, lr: float = 1e-3) -> dict[str, float]:
+    """Learn `FEW` demonstrations by heart, seeing and blind; then black the planes of the one that sees."""
+    train, _ = egos()
+    chosen = torch.randperm(len(train.window), generator=torch.Generator().manual_seed(seed))[:FEW]
+    learned, figures = train.map_tensors(lambda tensor: tensor[chosen]), dict[str, float]()
+    for name, sight in (("blind_demonstrations_l2_m", 0.0), ("demonstrations_l2_m", 1.0)):
+        torch.manual_seed(seed)
+        model = Decoder()
+        optimizer = torch.optim.AdamW((p for p in model.parameters() if p.requires_grad), lr=lr)
+        schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, lr, total_steps=steps, pct_start=0.1)
+        draws = torch.Generator().manual_seed(seed)
+        for _ in track(range(steps), description=name):
+            rows = torch.randperm(FEW, generator=draws)[:FEW_BATCH]
+            loss = _error_m(model, learned.map_tensors(lambda tensor, rows=rows: tensor[rows]), sight)
+            optimizer.zero_grad()
+            loss.backward()
+            optimizer.step()
+            schedule.step()
+        for figure, shown in ((name, sight), ("blacked_demonstrations_l2_m", 0.0)):
+            with torch.no_grad():
+                figures[figure] = float(_error_m(model, learned, shown))
+    return figures
+
+
+def _error_m(model: Decoder, planes: TruePlanes, sight: float) -> Tensor:
+    return (model(planes, sight) - planes.driven[..., :2]).norm(dim=-1).mean()
+
+
+BENCHMARK = Benchmark(
+    question="How much of what a planner could see reaches its plan?",
+    arms={
+        "decoder_cell": lambda seed: {"cell_error_m": cell_error_m(seed)},
+        "decoder_few": few,
+        "path": read_along(blind=False),
+        "path_blind": read_along(blind=True),
+    },
+    config={
+        "clips": dataclasses.asdict(RECIPE.clips),
+        "towns": [TRAIN_TOWNS, TEST_TOWNS, TRAIN_SEEDS, TEST_SEEDS, EGOS],
+        "fits": [dataclasses.asdict(value) for value in (EGO_FIT, READ, READ_FIT)],
+    },
+)
