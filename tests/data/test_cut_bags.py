@@ -75,6 +75,18 @@ def test_a_damaged_chunk_of_an_mcap_costs_itself_alone_and_is_named(cut: bool, t
     assert line.startswith(f"drive.mcap: damaged chunks, left out: 1 (recorded at {first_s} to {last_s} s: ")
 
 
+def test_a_recording_without_a_whole_chunk_is_one_line(tmp_path: Path) -> None:
+    file = tmp_path / "drive.mcap"
+    made_bags.write_mcap_of_ros1(file)
+    propose_topics(file, topics_file(file))
+    first, *others = file.read_bytes().split(b"zstd")
+    chunks = len(others) // 2  # the summary names the compression of each once more
+    damaged = [part[:40] + b"\xff" * 8 + part[48:] for part in others[:chunks]]
+    file.write_bytes(b"zstd".join([first, *damaged, *others[chunks:]]))
+    with pytest.raises(InputError, match=r": none of its messages can be read; the recording is damaged$"):
+        convert(file, "rosbag", tmp_path / "out")
+
+
 @pytest.mark.parametrize("name", ["drive.bag", "drive.bag.active"])
 def test_a_ros1_bag_that_was_not_closed_gives_its_whole_messages(name: str, tmp_path: Path) -> None:
     made_bags.write_ros1(tmp_path / "whole.bag")

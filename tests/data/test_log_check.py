@@ -198,6 +198,13 @@ def test_a_fault_is_found(changed: dict[str, Any], subject: str, text: str, tmp_
     assert any(re.search(text, each) for each in told), findings
 
 
+def test_a_vehicle_that_stops_hard_was_not_interpolated(tmp_path: Path) -> None:
+    T = np.tile(np.eye(4), (FRAMES, 1, 1))
+    T[1:, 0, 3] = np.cumsum([0.2, 0.15, 0.09, 0.04, *[0.0] * 11, 0.04, 0.09, 0.15, 0.2])
+    texts = [finding.text for finding in checked(tmp_path, T_world_ego=T, sweeps=None).findings]
+    assert not any("straight line" in text for text in texts)
+
+
 def test_points_of_a_steep_road_are_not_below_the_ground(tmp_path: Path) -> None:
     texts = [finding.text for finding in checked(tmp_path, sweeps=DOWNHILL).findings]
     assert not any("below the ground" in text for text in texts)

@@ -280,9 +280,17 @@ def test_files_that_decide_what_a_planner_does(tmp_path: Path) -> None:
     }
     for name, text in texts.items():
         (tmp_path / name).write_text(text)
-    found = files_of(f"python:{tmp_path / 'planner.py'}:Planner?w={tmp_path / 'weights.pt'}&n=3")
-    named = [str(file.relative_to(tmp_path)) for file in found]
-    assert named == ["parts/__init__.py", "parts/net.py", "parts/sizes.py", "planner.py", "weights.pt"]
+    agent = f"python:{tmp_path / 'planner.py'}:Planner"
+    code = ["parts/__init__.py", "parts/net.py", "parts/sizes.py", "planner.py"]
+
+    def named(arguments: str) -> list[str]:
+        return [str(file.relative_to(tmp_path)) for file in files_of(f"{agent}?{arguments}")]
+
+    assert named(f"w={tmp_path / 'weights.pt'}&n=3") == [*code, "weights.pt"]
+    (tmp_path / "model" / "shards").mkdir(parents=True)
+    (tmp_path / "model" / "shards" / "1.safetensors").write_text("1")
+    assert named(f"w={tmp_path / 'model'}&n=3") == [*code, "model/shards/1.safetensors"]
+    assert named(f"w={Path.cwd()}&n=.") == code
 
 
 def test_packages_on_the_way_and_files_that_are_no_python_count(tmp_path: Path) -> None:

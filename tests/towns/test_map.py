@@ -4,10 +4,13 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from py123d.datatypes import Lane, RoadEdge
+from scipy.spatial import cKDTree
 
 from foredrive.errors import InputError
 from foredrive.towns.map import town_map
 from foredrive.towns.map.junction_heights import level_junction
+from foredrive.towns.map.map_objects import map_objects
 from foredrive.towns.map.town_map import MarkingKind, StopZoneKind, StripKind, TownMap, load_town_map
 
 
@@ -66,6 +69,24 @@ def test_heights_follow_the_road_where_later_lane_sections_begin(town_of: Callab
     for lane in town.lanes:
         for name in lane.successor_ids:
             assert lanes[name].centreline_xyz[0, 2] == pytest.approx(lane.centreline_xyz[-1, 2], abs=0.05)
+
+
+@pytest.mark.parametrize("name", ["Town04", "Town07"])
+def test_the_map_of_logs_has_the_heights_of_the_roads(name: str, town_of: Callable[[str], TownMap]) -> None:
+    """Town04 has hills and bridges, Town07 junctions whose roads differ by .4 m before they are levelled."""
+    town, items = town_of(name), list(map_objects(name))
+    written = {item.object_id: item for item in items if isinstance(item, Lane)}
+    for lane in town.lanes:
+        item = written[lane.lane_id]
+        for line, xyz in (
+            (item.centerline, lane.centreline_xyz),
+            (item.left_boundary, lane.left_boundary_xyz),
+            (item.right_boundary, lane.right_boundary_xyz),
+        ):
+            np.testing.assert_allclose(line.array, xyz, atol=1e-3)
+    borders = cKDTree(np.concatenate([strip.outline_xyz for strip in town.strips]))
+    edges = np.concatenate([item.polyline.array for item in items if isinstance(item, RoadEdge)])
+    assert borders.query(edges)[0].max() < 1.0  # samples are 1 m apart
 
 
 def test_crossing_roads_of_a_junction_agree_on_their_height() -> None:

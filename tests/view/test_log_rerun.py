@@ -255,3 +255,16 @@ def test_what_does_not_fit_is_told(
     with pytest.raises(InputError, match="a reconstruction of another log than flat_train/flat"):
         write(path, tmp_path / "log.rrd", None, open_reconstruction(small_run.folder))
     assert not (tmp_path / "log.rrd").exists()
+
+
+def test_a_full_disk_is_one_line_and_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    rerun = pytest.importorskip("rerun")
+    path = write_log(tmp_path / "data", frames=FRAMES)
+
+    def flush(stream: Any) -> None:
+        raise RuntimeError("File-writer thread shut down prematurely")
+
+    monkeypatch.setattr(rerun.RecordingStream, "flush", flush)
+    with pytest.raises(InputError, match=r"log\.rrd: Rerun cannot write it; is the disk full\?"):
+        write(path, tmp_path / "log.rrd")
+    assert [file.name for file in tmp_path.iterdir()] == ["data"]

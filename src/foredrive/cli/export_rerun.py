@@ -1,6 +1,7 @@
 """`foredrive export rerun`."""
 
 import importlib.util
+import os
 from pathlib import Path
 from typing import Annotated
 
@@ -38,6 +39,7 @@ def export_rerun(
     if run is not None:
         run = check_run(run)
 
+    os.environ.setdefault("RUST_LOG", "off")  # Rerun's own lines about a full disk
     with importing():
         from foredrive.runs import open_run
         from foredrive.runs.reconstruction.reconstruction_run import open_reconstruction

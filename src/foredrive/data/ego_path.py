@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 MAX_GAP_S = 1.0
 """Maximum time between poses for interpolation."""
-_STANDS_M, _STANDS_RAD = 0.1, np.deg2rad(1.0)
+STANDS_M, _STANDS_RAD = 0.1, np.deg2rad(1.0)
 """A vehicle that moves and turns by less between two poses stands, however far apart they are."""
 
 
@@ -44,5 +44,5 @@ def in_holes(
     between = (at_us[after - 1] < t_us) & (t_us < at_us[after])
     step = np.linalg.inv(T[after - 1]) @ T[after]
     turned_rad = np.arccos(((np.trace(step[:, :3, :3], axis1=1, axis2=2) - 1) / 2).clip(-1, 1))
-    moved = (np.linalg.norm(step[:, :3, 3], axis=1) > _STANDS_M) | (turned_rad > _STANDS_RAD)
+    moved = (np.linalg.norm(step[:, :3, 3], axis=1) > STANDS_M) | (turned_rad > _STANDS_RAD)
     return between & moved & (at_us[after] - at_us[after - 1] > MAX_GAP_S * 1e6)

@@ -13,7 +13,7 @@ from jaxtyping import Float, Float64
 
 from foredrive.data.boxes import read_boxes, read_tracks, with_counted_points
 from foredrive.data.cameras import pinhole_cameras, read_camera
-from foredrive.data.ego_path import MAX_GAP_S
+from foredrive.data.ego_path import MAX_GAP_S, STANDS_M
 from foredrive.data.lidar import frames_with_lidar, read_sweep
 from foredrive.data.log_paths import LogPath
 from foredrive.data.logs import Log
@@ -201,13 +201,16 @@ def _straight_holes(log: Log) -> Iterator[Finding]:
     t_s = (log.t_us - log.t_us[0]) * 1e-6
     if len(log) < 5:
         return
-    velocity = np.diff(log.T_world_ego[:, :3, 3], axis=0) / np.diff(t_s)[:, None]
+    place_m = log.T_world_ego[:, :3, 3]
+    velocity = np.diff(place_m, axis=0) / np.diff(t_s)[:, None]
     change = np.linalg.norm(np.diff(velocity, axis=0), axis=-1)
     # Runs of steps with equal velocities, between two changes
     ends = [-1, *np.flatnonzero(change > EVEN_MPS).tolist(), len(change)]
     for before, after in itertools.pairwise(ends):
         first, last = before + 1, after + 1
         lasts_s = float(t_s[last] - t_s[first])
+        if np.linalg.norm(place_m[last] - place_m[first]) <= STANDS_M:
+            continue
         jerks = [float(change[row]) for row in (before, after) if 0 <= row < len(change)]
         if lasts_s > MAX_GAP_S and last - first > 2 and jerks and min(jerks) > JERK_MPS:
             text = f"from {t_s[first]:.2f} to {t_s[last]:.2f} s the path is a straight line at one speed,"

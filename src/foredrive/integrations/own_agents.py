@@ -85,7 +85,7 @@ def files_of(agent: str) -> list[Path]:
     """Return the files that decide what an agent does, in a fixed order.
 
     They are its own file, the files beside it that these import, also in functions, and those that its
-    arguments name. Of installed packages only the agent's own counts.
+    arguments name, or that lie in folders they name. Of installed packages only the agent's own counts.
 
     Raises:
         InputError: there is no such class.
@@ -106,8 +106,11 @@ def files_of(agent: str) -> list[Path]:
         if (path := todo.pop()) not in files:
             files.append(path)
             todo += (module for module in _imported(path, root) if module.is_relative_to(below))
-    named = (Path(value) for value in arguments.values() if isinstance(value, str))
-    return sorted(files) + sorted(path.absolute() for path in named if path.is_file())
+    named = [Path(value).absolute() for value in arguments.values() if isinstance(value, str)]
+    # Of a folder around the present one, which may get results, nothing counts
+    folders = [path for path in named if path.is_dir() and not Path.cwd().is_relative_to(path)]
+    named += [path for folder in folders for path in folder.rglob("*")]
+    return sorted(files) + sorted(path for path in named if path.is_file())
 
 
 def _imported(file: Path, root: Path) -> Iterator[Path]:

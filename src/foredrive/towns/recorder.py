@@ -9,8 +9,7 @@ import numpy as np
 import torch
 from jaxtyping import Float64, Int
 from py123d.api.map.arrow.arrow_id_utils import ToIntMapping
-from py123d.datatypes import BaseMapObject, Lane, LaneGroup, TrafficLightStatus
-from py123d.parser.opendrive.opendrive_map_parser import OpenDriveMapParser
+from py123d.datatypes import TrafficLightStatus
 from rich.progress import track
 from torch import Tensor
 
@@ -35,8 +34,9 @@ from foredrive.towns.labels.semantics import (
     z_depth,
 )
 from foredrive.towns.labels.visibility import is_point_visible
+from foredrive.towns.map.map_objects import map_objects
 from foredrive.towns.map.names import TEST_TOWNS
-from foredrive.towns.map.town_map import MAP_FOLDER, TownMap, load_town_map
+from foredrive.towns.map.town_map import TownMap, load_town_map
 from foredrive.towns.sensing.capture import SensorSuite
 from foredrive.towns.traffic.expert import DriveSnapshot, ExpertDrive
 from foredrive.towns.traffic.traffic import Traffic
@@ -144,18 +144,7 @@ def record(
 
 def write_town_map(town: str, out: Path) -> Path:
     """Write the town's map, once for all of its logs, and return the folder of the maps."""
-    return write_map(_map_objects(town), town, out)
-
-
-def _map_objects(town: str) -> Iterator[BaseMapObject]:
-    """Yield the town's map as py123d parses it, but in an order that does not depend on the hashes of
-    strings."""
-    for item in OpenDriveMapParser(MAP_FOLDER / f"{town}.xodr.gz").iter_map_objects():
-        if isinstance(item, Lane | LaneGroup):
-            # py123d collects these ids in sets, whose order differs from run to run
-            item.predecessor_ids.sort()
-            item.successor_ids.sort()
-        yield item
+    return write_map(map_objects(town), town, out)
 
 
 def traffic_light_states(town: TownMap, lights: Int[np.ndarray, "Z"]) -> dict[int, TrafficLightStatus]:

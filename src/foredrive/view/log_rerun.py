@@ -62,8 +62,8 @@ def write_log_rerun(
         The entities in the file.
 
     Raises:
-        InputError: the log cannot be read, it lacks the cameras of the run, or the reconstruction is of
-            another log.
+        InputError: the log cannot be read, it lacks the cameras of the run, the reconstruction is of another
+            log, or the file cannot be written.
     """
     if file.suffix != ".rrd":
         raise InputError(f"{file}: the name must end in .rrd")
@@ -92,7 +92,10 @@ def write_log_rerun(
                 splats.show((content.t_us - int(log.t_us[0])) * 1e-6)
             tick()
         writer.stream.send_blueprint(_blueprint(writer.cameras))
-        writer.stream.flush()
+        try:
+            writer.stream.flush()
+        except RuntimeError as error:  # the reason is in Rerun's own log alone
+            raise InputError(f"{file}: Rerun cannot write it; is the disk full?") from error
         writer.stream.disconnect()
     return sorted(writer.entities)
 

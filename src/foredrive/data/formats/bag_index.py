@@ -20,6 +20,7 @@ from foredrive.data.formats.bag_messages import (
 from foredrive.data.formats.bag_topics import BagTopics, is_rectified_camera
 from foredrive.data.formats.frame_tree import FrameTree
 from foredrive.data.formats.guard import PartReader
+from foredrive.errors import InputError
 
 
 class Stamp(NamedTuple):
@@ -77,6 +78,8 @@ def index_bag(bag: Bag, topics: BagTopics) -> BagIndex:
     # Every wanted topic needs at least one readable message
     for topic in sorted(names - tf):
         readers[topic].check()
+        if not numbers[topic]:
+            raise InputError(f"{topic}: none of its messages can be read; the recording is damaged")
     _set_on_one_clock(index, topics.pose)
     return index
 
