@@ -204,7 +204,7 @@ class VolumePlanner(nn.Module):
         )
         self.decoder = nn.ModuleList([copy.deepcopy(layer) for _ in range(config.layers)])  # as in torch
         self.final_norm = nn.LayerNorm(width) if config.final_norm else nn.Identity()
-        # Without the norm, the learned query soon turns most rectifiers off for all scenes; leaky ones recover
+        # Without the norm, the learned query turns most rectifiers off for all scenes; leaky ones recover
         bend = nn.ReLU() if config.final_norm else nn.LeakyReLU(0.1)
         self.waypoints = nn.Sequential(nn.Linear(width, width), bend, nn.Linear(width, 2 * horizon_steps))
         if self.ego_mlp is not None:  # the MLP's plan is good already: start from no correction
