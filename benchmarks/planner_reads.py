@@ -48,9 +48,7 @@ READ = PathCorrectionConfig(
 READ_FIT = PathFit(steps=6000, lr=2e-3, weight_decay=0.5)
 FEW, FEW_BATCH = 64, 16
 """Number of demonstrations that a planner has to learn by heart, and of a step."""
-COARSE = dataclasses.replace(
-    SPEC, voxel_m=2 * SPEC.voxel_m, shape_zyx=(1, *(n // 2 for n in SPEC.shape_zyx[1:]))
-)
+COARSE = VoxelSpec(SPEC.lower_m, 2 * SPEC.voxel_m, (1, 16, 18))
 """Grid of the decoder, which attends to every cell."""
 CELL_SPEC = VoxelSpec(lower_m=(-16.0, -24.0, -1.5), voxel_m=4.0, shape_zyx=(1, 12, 14))
 CELL_CHANNELS, CELL_BATCH = 8, 16
@@ -126,13 +124,14 @@ def demonstrations(reads: PathCorrection, planes: TruePlanes, *, blind: bool) ->
     """Sample the planes along the plans of the ego-only MLP."""
     rows = []
     for chosen in torch.arange(len(planes.window)).split(512):
-        part = planes.map_tensors(lambda tensor, rows=chosen: tensor[rows])
+        part = planes[chosen]
         status = status_of(part)
         planned_xy = ego_mlp()(status)[..., :2]
         samples = reads.sample(part.volumes() * (not blind), planned_xy)
         rows.append((*samples, ego_mlp().standardised(status), planned_xy, part.driven[..., :2]))
-    columns = [torch.cat(parts) for parts in zip(*rows, strict=True)]
-    return PathDemonstrations(*columns, torch.ones(planes.driven.shape[:2], dtype=torch.bool))
+    values, positions_m, status, planned_xy, driven_xy = map(torch.cat, zip(*rows, strict=True))
+    valid = torch.ones(planned_xy.shape[:2], dtype=torch.bool)
+    return PathDemonstrations(values, positions_m, status, planned_xy, driven_xy, valid)
 
 
 @torch.no_grad()
@@ -208,7 +207,7 @@ def few(seed: int, steps: int = 1500, lr: float = 1e-3) -> dict[str, float]:
     """Learn `FEW` demonstrations by heart, seeing and blind; then black the planes of the one that sees."""
     train, _ = egos()
     chosen = torch.randperm(len(train.window), generator=torch.Generator().manual_seed(seed))[:FEW]
-    learned, figures = train.map_tensors(lambda tensor: tensor[chosen]), dict[str, float]()
+    learned, figures = train[chosen], dict[str, float]()
     for name, sight in (("blind_demonstrations_l2_m", 0.0), ("demonstrations_l2_m", 1.0)):
         torch.manual_seed(seed)
         model = Decoder()
@@ -217,7 +216,7 @@ def few(seed: int, steps: int = 1500, lr: float = 1e-3) -> dict[str, float]:
         draws = torch.Generator().manual_seed(seed)
         for _ in track(range(steps), description=name):
             rows = torch.randperm(FEW, generator=draws)[:FEW_BATCH]
-            loss = _error_m(model, learned.map_tensors(lambda tensor, rows=rows: tensor[rows]), sight)
+            loss = _error_m(model, learned[rows], sight)
             optimizer.zero_grad()
             loss.backward()
             optimizer.step()
