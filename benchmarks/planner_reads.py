@@ -65,7 +65,7 @@ def lit_cells(generator: torch.Generator) -> tuple[Tensor, Tensor]:
     return volume, 0.25 * CELL_SPEC.centres_m()[0, ..., :2].reshape(-1, 2)[cell]
 
 
-def cell_error_m(seed: int, steps: int = 600, lr: float = 3e-3) -> float:
+def cell_error_m(seed: int, steps: int = 1000, lr: float = 3e-3) -> float:
     """Train the planner as published to name the lit cell; return the error of the last hundred steps, m.
 
     Always naming the mean is 5 m off.
