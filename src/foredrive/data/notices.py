@@ -9,7 +9,7 @@ import contextlib
 import contextvars
 import json
 import logging
-from collections.abc import Collection, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -23,34 +23,39 @@ _log = logging.getLogger(__name__)
 
 @dataclass
 class _Notices:
-    """Places by subject and text, in the order of their first occurrence."""
+    """Places and their number by subject and text, in the order of their first occurrence."""
 
-    places: dict[tuple[str, str], dict[str, None]] = field(default_factory=dict)
+    count: dict[tuple[str, str], int] = field(default_factory=dict)
+    places: dict[tuple[str, str], list[str]] = field(default_factory=dict)
 
     def lines(self) -> list[str]:
         """Return one line for each subject and text."""
-        return [_line(*key, places) for key, places in self.places.items()]
+        return [_line(*key, self.places[key], number) for key, number in self.count.items()]
 
 
 _collected: contextvars.ContextVar[_Notices | None] = contextvars.ContextVar("notices", default=None)
 
 
-def note(subject: str, text: str, place: str = "") -> None:
+def note(subject: str, text: str, place: str = "", *, once: bool = False) -> None:
     """Add a notice to those of the current conversion.
 
     Args:
         subject: topic, camera, file or kind of data that the notice is about.
         text: what happened. With places it is a plural noun, such as "unreadable messages, left out".
-        place: where it happened once. Places of equal subject and text are counted, and a few named. A place
-            that is noted again, as by a second pass over a file, counts once.
+        place: where it happened once. Notices of equal subject and text are counted, and a few places named.
+        once: a place that is named already, as by an earlier pass over a file, does not count again.
     """
     notices = _collected.get()
     if notices is None:
-        _log.warning("%s", _line(subject, text, [place] if place else []))
+        _log.warning("%s", _line(subject, text, [place] if place else [], 1))
         return
-    places = notices.places.setdefault((subject, text), {})
-    if place:
-        places[place] = None
+    key = (subject, text)
+    if once and place in notices.places.get(key, []):
+        return
+    notices.count[key] = notices.count.get(key, 0) + 1
+    places = notices.places.setdefault(key, [])
+    if place and len(places) < EXAMPLES:
+        places.append(place)
 
 
 @contextlib.contextmanager
@@ -66,7 +71,7 @@ def collecting() -> Iterator[None]:
 def write_notices(folder: Path) -> None:
     """Write the notices collected so far into the folder of a log. Without any there is no file."""
     notices = _collected.get()
-    if notices is not None and notices.places:
+    if notices is not None and notices.count:
         (folder / FILE).write_text(json.dumps(notices.lines(), indent=1, ensure_ascii=False) + "\n")
 
 
@@ -88,8 +93,8 @@ def read_notices(folder: Path) -> list[str]:
     return lines
 
 
-def _line(subject: str, text: str, places: Collection[str]) -> str:
+def _line(subject: str, text: str, places: list[str], number: int) -> str:
     if not places:
         return f"{subject}: {text}"
-    more = [f"{len(places) - EXAMPLES} more"] if len(places) > EXAMPLES else []
-    return f"{subject}: {text}: {len(places)} ({'; '.join([*list(places)[:EXAMPLES], *more])})"
+    more = [f"{number - len(places)} more"] if number > len(places) else []
+    return f"{subject}: {text}: {number} ({'; '.join([*places, *more])})"

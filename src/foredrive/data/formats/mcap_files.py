@@ -179,7 +179,7 @@ def _opened(chunk: Any, path: Path) -> Iterator[Any]:
     except Exception as error:  # of the compression, and of any record
         span = " to ".join(f"{ns * 1e-9:.3f}" for ns in (chunk.message_start_time, chunk.message_end_time))
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        note(path.name, "damaged chunks, left out", f"recorded at {span} s: {reason}")
+        note(path.name, "damaged chunks, left out", f"recorded at {span} s: {reason}", once=True)
 
 
 def _unpacked(chunk: Any) -> Iterator[Any]:
