@@ -221,6 +221,7 @@ def few(seed: int, steps: int = 1500, lr: float = 1e-3) -> dict[str, float]:
             loss.backward()
             optimizer.step()
             schedule.step()
+        # The second figure is written last for the model that sees
         for figure, shown in ((name, sight), ("blacked_demonstrations_l2_m", 0.0)):
             with torch.no_grad():
                 figures[figure] = float(_error_m(model, learned, shown))

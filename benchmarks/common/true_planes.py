@@ -1,4 +1,4 @@
-"""The true surroundings of virtual egos, drawn from above: what a planner could see at best."""
+"""True surroundings of virtual egos, drawn from above: the most that a planner could see."""
 
 import dataclasses
 import shutil
@@ -16,6 +16,7 @@ from torch import Tensor
 
 from foredrive.data import ClipConfig, ClipDataset, LogPath
 from foredrive.data.truth.affordances import read_stop_lines
+from foredrive.errors import InputError
 from foredrive.files import atomic_path
 from foredrive.methods.planner.ego_mlp import ego_motion
 from foredrive.runs.drive.recording import EgosPlan, record_egos
@@ -47,7 +48,7 @@ _IN_BOX = (13, 5)
 
 @dataclass(frozen=True)
 class TruePlanes(Record):
-    """What N virtual egos had around them, knew of themselves, and did."""
+    """True surroundings, ego status and driven future of N virtual egos."""
 
     planes: Int8[Tensor, "N K Y X"]
     poses: Float[Tensor, "N P 3"]
@@ -89,7 +90,7 @@ def true_planes(plan: EgosPlan, clips: ClipConfig, folder: Path) -> TruePlanes:
         root = folder / plan.town
         logs, failed = record_egos([plan], root, CAMERA, 1)
         if failed:
-            raise RuntimeError(next(iter(failed.values())))
+            raise InputError(next(iter(failed.values())))
         drawn = read_planes(logs, clips)
         file.parent.mkdir(parents=True, exist_ok=True)
         fields = {field.name: getattr(drawn, field.name) for field in dataclasses.fields(drawn)}

@@ -1,4 +1,4 @@
-"""What virtual egos had around them, drawn from above."""
+"""Tests of the true surroundings of virtual egos, drawn from above."""
 
 import dataclasses
 import math

@@ -17,7 +17,7 @@ from foredrive.data.formats.bag_proposal import propose_topics
 from foredrive.data.formats.bag_topics import topics_file
 from foredrive.data.formats.convert import convert
 from foredrive.data.logs import Log
-from foredrive.data.notices import collecting, read_notices, write_notices
+from foredrive.data.notices import collecting, note, read_notices, write_notices
 from foredrive.errors import InputError
 
 
@@ -28,6 +28,19 @@ def counted(bag: Bag) -> dict[str, int]:
         message.decode()
         counts[message.topic] += 1
     return counts
+
+
+@pytest.mark.parametrize(("once", "count"), [(True, 7), (False, 14)])
+def test_a_second_pass_counts_places_anew_unless_they_count_once(
+    once: bool, count: int, tmp_path: Path
+) -> None:
+    """There are more places than a notice names."""
+    with collecting():
+        for place in (*range(7), *range(7)):
+            note("drive.mcap", "damaged chunks, left out", f"{place} s", once=once)
+        write_notices(tmp_path)
+    (notice,) = read_notices(tmp_path)
+    assert notice.startswith(f"drive.mcap: damaged chunks, left out: {count} (0 s; ")
 
 
 def test_a_ros1_recording_in_mcap_is_the_same_as_its_bag(tmp_path: Path) -> None:

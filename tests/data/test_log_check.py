@@ -116,7 +116,7 @@ def looking(axis: str, degrees: float) -> list[CameraSpec]:
 
 
 def mosaic(image: np.ndarray) -> np.ndarray:
-    """What a sensor behind filters red, green, green, blue measures, taken for a grey image."""
+    """Return the grey image of a sensor behind filters red, green, green, blue."""
     grey = image[..., 1].copy()
     grey[::2, ::2], grey[1::2, 1::2] = image[::2, ::2, 0], image[1::2, 1::2, 2]
     return np.repeat(grey[..., None], 3, axis=-1)

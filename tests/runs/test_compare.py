@@ -260,7 +260,7 @@ def test_suites_of_several_seeds_are_one_agent(tmp_path: Path) -> None:
 
 
 def test_the_report_says_what_its_intervals_are_over(tmp_path: Path) -> None:
-    """Of one folder each over routes; a second training of one agent counts in its ability alone."""
+    """Intervals are over routes; a second training of one agent counts in its ability alone."""
     ten: Given = {(str(k), 0): (0.1 * k, [], DONE) for k in range(10)}
     one, two, other = (str(suite(tmp_path / name, ten)) for name in ("one", "two", "other"))
     single = compare([read_agent(one), read_agent(other)], resamples=10)

@@ -180,7 +180,7 @@ def test_no_future_of_200_logs_touches_anybody(tmp_path: Path) -> None:
 
 @functools.cache
 def _outlines_meet(log: Log, frame: int) -> bool:
-    """Whether the vehicle's outline meets a box before the next key frame, both at constant velocity."""
+    """Return whether the vehicle meets a box before the next key frame, both at constant velocity."""
     centre, size = log.ego_box
     shares = np.linspace(0, 1, 11)
     T_world_ego, _ = log.poses_at(np.interp(shares, (0, 1), log.t_us[frame : frame + 2]))

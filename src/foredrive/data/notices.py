@@ -27,6 +27,8 @@ class _Notices:
 
     count: dict[tuple[str, str], int] = field(default_factory=dict)
     places: dict[tuple[str, str], list[str]] = field(default_factory=dict)
+    once: set[tuple[str, str, str]] = field(default_factory=set)
+    """Subject, text and place of what does not count again."""
 
     def lines(self) -> list[str]:
         """Return one line for each subject and text."""
@@ -43,15 +45,17 @@ def note(subject: str, text: str, place: str = "", *, once: bool = False) -> Non
         subject: topic, camera, file or kind of data that the notice is about.
         text: what happened. With places it is a plural noun, such as "unreadable messages, left out".
         place: where it happened once. Notices of equal subject and text are counted, and a few places named.
-        once: a place that is named already, as by an earlier pass over a file, does not count again.
+        once: do not count the place again, as in a second pass over a file.
     """
     notices = _collected.get()
     if notices is None:
         _log.warning("%s", _line(subject, text, [place] if place else [], 1))
         return
     key = (subject, text)
-    if once and place in notices.places.get(key, []):
-        return
+    if once:
+        if (*key, place) in notices.once:
+            return
+        notices.once.add((*key, place))
     notices.count[key] = notices.count.get(key, 0) + 1
     places = notices.places.setdefault(key, [])
     if place and len(places) < EXAMPLES:

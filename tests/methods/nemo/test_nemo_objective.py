@@ -218,7 +218,7 @@ def test_past_frames_without_gradients_change_no_loss(example: Example) -> None:
     # The motion is large enough that the loss depends on the past.
     whole, without = (
         objective_of(
-            dataclasses.replace(stage, imagined=ImaginationSampling(past_gradient=on)), motion_std=0.15
+            dataclasses.replace(stage, imagined=ImaginationSampling(past_gradient=on)), motion_std=0.3
         )
         for on in (True, False)
     )
@@ -231,7 +231,7 @@ def test_past_frames_without_gradients_change_no_loss(example: Example) -> None:
     past = dataclasses.replace(example.clip, images=example.clip.images.clone())
     past.images[:, 0] = 0
     changed = losses_of(without, dataclasses.replace(example, clip=past))["loss"]
-    assert not torch.isclose(changed, losses[1]["loss"], rtol=1e-5)  # the past is read
+    assert not torch.isclose(changed, losses[1]["loss"], rtol=1e-4)  # the past is read
 
 
 def test_a_planner_that_reads_imagined_frames_needs_them_of_every_item() -> None:

@@ -27,7 +27,7 @@ class TestedRun:
     scenario: str
     """Label of the scenario."""
     place: str
-    """Where and when in a log it begins; scenarios of several kinds may share it."""
+    """Log and time at which the scenario begins, which scenarios of several kinds may share."""
     result: SafetyResult
     near_s: float | None
     """Smallest time to collision at the key frames, s. None if all move apart."""
