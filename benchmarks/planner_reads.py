@@ -1,42 +1,56 @@
 """Use of what a planner could see: `foredrive bench planner-reads`.
 
-The true map, boxes and lights, drawn from above, replace the features of a world model. Egos come from many
-windows of traffic in six towns, and are judged in two others. A blind twin has the same size, steps and data,
-and planes of zeros.
+The arms `true` read the true map, boxes and lights, drawn from above, in place of the features of a world
+model. Egos come from many windows of traffic in six towns, and are judged in two others. A blind twin has the
+same size, steps and data, and features of zeros.
 """
 
 import dataclasses
 import functools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
+from jaxtyping import Int
 from rich.progress import track
 from torch import Tensor, nn
 
+from benchmarks import learning
 from benchmarks.common.study import work_folder
-from benchmarks.common.true_planes import CHANNELS, HORIZON, PAST, SPEC, TruePlanes, joined, true_planes
-from foredrive.engine.bench import Benchmark
+from benchmarks.common.true_planes import CHANNELS, HORIZON, PAST, SPEC, TruePlanes, joined, kept, read_planes
+from benchmarks.common.world_models import LEARNED_BY, LEARNED_BY_BOTH
+from foredrive.data import ClipDataset, LogPath, collate
+from foredrive.engine.bench import Benchmark, study_identity
+from foredrive.errors import InputError
 from foredrive.methods.planner.ego_mlp import EgoMLP, EgoMLPConfig, status_vector
 from foredrive.methods.planner.ego_mlp_fit import EgoMLPFit, StatusDemonstrations, fit_ego_mlp
 from foredrive.methods.planner.path_correction import PathCorrection, PathCorrectionConfig, PathSamples
 from foredrive.methods.planner.path_fit import PathDemonstrations, PathFit, fit_path
 from foredrive.methods.planner.planner import PlannerConfig, VolumePlanner
-from foredrive.runs.drive.recording import EgosPlan
+from foredrive.methods.recipe import with_occupancy_source
+from foredrive.runs.drive.recording import EgosPlan, record_egos
 from foredrive.runs.recipes.known import find_recipe
+from foredrive.runs.train.run import Run, load_agent, train_run
 from foredrive.scene import VoxelSpec
+from foredrive.scene.conditions import CONDITIONS
+from foredrive.sensors.rigs import SURROUND
 from foredrive.tasks.bootstrap import bootstrap_mean
 
-WORK = work_folder(Path("runs/planner_reads"))
+ROOT = Path("runs/planner_reads")
+WORK = work_folder(ROOT)
 RECIPE = find_recipe("nemo_town")
 DT_S = RECIPE.clips.horizon_dt_s
 TRAIN_TOWNS = ("Town01", "Town02", "Town04", "Town06", "Town07", "Town10HD")
 TEST_TOWNS = ("Town03", "Town05")
 """Towns that no arm is trained in. Architectures were chosen on them, with other seeds of traffic."""
-TRAIN_SEEDS, TEST_SEEDS, EGOS = tuple(range(2000, 2008)), tuple(range(3000, 3006)), 80
+TRAIN_SEEDS, TEST_SEEDS, EGOS = tuple(range(2000, 2005)), tuple(range(3000, 3006)), 80
 """Seeds of traffic, and virtual egos of each town and seed."""
+PRETRAINING_STEPS = 12_000
+Volumes = Callable[[TruePlanes], Tensor]
+BATCH = 8
 EGO_FIT = EgoMLPFit(steps=4000)
 READ = PathCorrectionConfig(
     distances_m=(3.0, 6.0, 9.0, 12.0, 15.0, 18.0, 22.0, 26.0, 30.0, 36.0),
@@ -93,16 +107,40 @@ def cell_error_m(seed: int, steps: int = 1000, lr: float = 3e-3) -> float:
 # --- virtual egos -------------------------------------------------------------------------------------------
 
 
+def train_logs(workers: int = 1) -> tuple[LogPath, ...]:
+    """Record the virtual egos to learn from that are missing; return them."""
+    return _recorded(TRAIN_TOWNS, TRAIN_SEEDS, workers)
+
+
+def test_logs(workers: int = 1) -> tuple[LogPath, ...]:
+    """Record the virtual egos to judge by that are missing; return them."""
+    return _recorded(TEST_TOWNS, TEST_SEEDS, workers)
+
+
+def _recorded(towns: Sequence[str], seeds: Sequence[int], workers: int) -> tuple[LogPath, ...]:
+    """Record virtual egos with images and exact occupancy. Every other seed has all conditions."""
+    plans = [
+        EgosPlan(town, seed, EGOS, tuple(CONDITIONS) if seed % 2 else (), occupancy=True)
+        for seed in seeds
+        for town in towns
+    ]
+    rig = SURROUND.of_size(RECIPE.clips.image_hw)
+    logs, failed = record_egos(plans, ROOT / "egos", rig, workers)
+    if failed:
+        raise InputError(f"{len(failed)} recordings failed: {next(iter(failed.values()))}")
+    return tuple(logs)
+
+
 @functools.cache
-def egos() -> tuple[TruePlanes, TruePlanes]:
-    """Return the egos to train on, once more mirrored, and those to judge by."""
-    parts = []
-    for towns, seeds in ((TRAIN_TOWNS, TRAIN_SEEDS), (TEST_TOWNS, TEST_SEEDS)):
-        plans = [EgosPlan(town, seed, EGOS, ()) for seed in seeds for town in towns]
-        planes = [true_planes(plan, RECIPE.clips, WORK) for plan in track(plans, description="true planes")]
-        parts.append(joined(planes))
-    train, test = parts
-    return joined([train, train.mirrored()]), test
+def train_egos() -> TruePlanes:
+    """Return the true surroundings of the egos to learn from."""
+    return kept(TruePlanes, WORK / "train.safetensors", lambda: read_planes(train_logs(), RECIPE.clips))
+
+
+@functools.cache
+def test_egos() -> TruePlanes:
+    """Return the true surroundings of the egos to judge by."""
+    return kept(TruePlanes, WORK / "test.safetensors", lambda: read_planes(test_logs(), RECIPE.clips))
 
 
 def status_of(planes: TruePlanes) -> Tensor:
@@ -113,25 +151,109 @@ def status_of(planes: TruePlanes) -> Tensor:
 @functools.cache
 def ego_mlp() -> EgoMLP:
     """Return the ego-only MLP that the planners correct and are judged against."""
-    train, _ = egos()
+    train = joined([train_egos(), train_egos().mirrored()])
     valid = torch.ones(train.driven.shape[:2], dtype=torch.bool)
     data = StatusDemonstrations(status_of(train), train.driven, valid)
     return fit_ego_mlp(EgoMLPConfig(rates=True), data, EGO_FIT, past_frames=PAST, dt_s=DT_S)
 
 
+# --- reading along the plan ---------------------------------------------------------------------------------
+
+
+class PathStudy(NamedTuple):
+    """Demonstrations of a correction along the plans of the ego-only MLP, and windows of those to judge by."""
+
+    spec: VoxelSpec
+    channels: int
+    train: PathDemonstrations
+    test: PathDemonstrations
+    windows: Int[Tensor, "N"]
+
+
 @torch.no_grad()
-def demonstrations(reads: PathCorrection, planes: TruePlanes, *, blind: bool) -> PathDemonstrations:
-    """Sample the planes along the plans of the ego-only MLP."""
+def demonstrations(planes: TruePlanes, reads: PathCorrection, volumes: Volumes) -> PathDemonstrations:
+    """Sample volumes along the plans of the ego-only MLP."""
     rows = []
-    for chosen in torch.arange(len(planes.window)).split(512):
+    for chosen in track(torch.arange(len(planes.window)).split(BATCH), description="sampling along plans"):
         part = planes[chosen]
         status = status_of(part)
         planned_xy = ego_mlp()(status)[..., :2]
-        samples = reads.sample(part.volumes() * (not blind), planned_xy)
-        rows.append((*samples, ego_mlp().standardised(status), planned_xy, part.driven[..., :2]))
-    values, positions_m, status, planned_xy, driven_xy = map(torch.cat, zip(*rows, strict=True))
-    valid = torch.ones(planned_xy.shape[:2], dtype=torch.bool)
-    return PathDemonstrations(values, positions_m, status, planned_xy, driven_xy, valid)
+        values, positions_m = reads.sample(volumes(part), planned_xy)
+        valid = torch.ones(planned_xy.shape[:2], dtype=torch.bool)
+        standardised, driven_xy = ego_mlp().standardised(status), part.driven[..., :2]
+        row = PathDemonstrations(values.half(), positions_m, standardised, planned_xy, driven_xy, valid)
+        rows.append(row)
+    return joined(rows)
+
+
+def _reads(spec: VoxelSpec, channels: int) -> PathCorrection:
+    status = ego_mlp().status_mean.shape[0]
+    return PathCorrection(READ, spec, channels=channels, status=status, steps=HORIZON)
+
+
+@functools.cache
+def true_study(*, blind: bool = False) -> PathStudy:
+    """Return demonstrations with the true surroundings, those to learn from once more mirrored."""
+    reads, train, test = _reads(SPEC, CHANNELS), train_egos(), test_egos()
+
+    def volumes(planes: TruePlanes) -> Tensor:
+        return planes.volumes() * (not blind)
+
+    seen = [demonstrations(of, reads, volumes) for of in (joined([train, train.mirrored()]), test)]
+    return PathStudy(SPEC, CHANNELS, *seen, test.window)
+
+
+@functools.cache
+def seen_study(*, images: bool = True) -> PathStudy:
+    """Return demonstrations with the volumes of a pre-trained NeMo, which has seen no image of the test egos.
+
+    Args:
+        images: False blacks them, for those to learn from and those to judge by.
+    """
+    spec, channels = RECIPE.clips.voxels, RECIPE.model.channels
+    reads, name = _reads(spec, channels), "seen" if images else "blacked"
+    sampled, windows = [], test_egos().window
+    for part, planes, logs in (("train", train_egos(), train_logs()), ("test", test_egos(), test_logs())):
+        volumes = SeenVolumes(logs, images=images)
+        # Later frames have no images
+        shown = planes[torch.tensor([key in volumes.clips for key in _keys(planes)])]
+        windows = shown.window
+        make = functools.partial(demonstrations, shown, reads, volumes)
+        sampled.append(kept(PathDemonstrations, WORK / f"{name}_{part}.safetensors", make))
+    return PathStudy(spec, channels, *sampled, windows)
+
+
+class SeenVolumes:
+    """Volumes of the clips of some logs, from the images.
+
+    Args:
+        logs: those of the planes.
+        images: False blacks them.
+    """
+
+    def __init__(self, logs: Sequence[LogPath], *, images: bool) -> None:
+        config = dataclasses.replace(RECIPE.clips, future_frames=0, future_images=False)
+        self.dataset = ClipDataset(logs, config, None, images=images)
+        frames = map(self.dataset.frames_of, range(len(self.dataset)))
+        self.clips = {(log, of_clip[config.past_frames]): clip for clip, (log, of_clip) in enumerate(frames)}
+        self.agent = load_agent(pretrained())
+
+    def __call__(self, planes: TruePlanes) -> Tensor:
+        """Return the volumes of the clips of some egos."""
+        clips = collate([self.dataset[self.clips[key]] for key in _keys(planes)]).clip
+        return self.agent.planner_volume(self.agent.rollout(clips.observed(), 0)[0])
+
+
+def _keys(planes: TruePlanes) -> list[tuple[int, int]]:
+    return list(zip(planes.log.tolist(), planes.now.tolist(), strict=True))
+
+
+def pretrained() -> Run:
+    """Pre-train the world model on the images and the exact occupancy of the egos to learn from."""
+    recipe = with_occupancy_source(learning.pretraining_alone(RECIPE, PRETRAINING_STEPS), "recorded")
+    config = {"recipe": dataclasses.asdict(recipe), "towns": [TRAIN_TOWNS, TRAIN_SEEDS, EGOS]}
+    folder = ROOT / "pretrained" / study_identity(config, (*LEARNED_BY_BOTH, *LEARNED_BY["nemo"]))
+    return train_run(recipe, train_logs(), folder, ROOT / "cache")
 
 
 @torch.no_grad()
@@ -145,30 +267,28 @@ def errors_m(reads: PathCorrection, data: PathDemonstrations) -> tuple[np.ndarra
     return own, rival
 
 
-def read_along(blind: bool) -> Callable[[int], dict[str, float]]:
+def read_along(study: Callable[[], PathStudy]) -> Callable[[int], dict[str, float]]:
     """Return an arm that reads along the MLP's plan."""
 
     def measure(seed: int) -> dict[str, float]:
-        train, test = egos()
+        spec, channels, train, test, window = study()
         torch.manual_seed(seed)
-        status = ego_mlp().status_mean.shape[0]
-        reads = PathCorrection(READ, SPEC, channels=CHANNELS, status=status, steps=HORIZON)
-        data = demonstrations(reads, train, blind=blind)
-        fit_path(reads, data, READ_FIT, seed)
-        own, rival = errors_m(reads, demonstrations(reads, test, blind=blind))
+        reads = _reads(spec, channels)
+        fit_path(reads, train, READ_FIT, seed)
+        own, rival = errors_m(reads, test)
         # Whole windows of traffic are drawn, because their egos see the same
-        windows = [str(window) for window in test.window.tolist()]
+        windows = [str(number) for number in window.tolist()]
         gain = bootstrap_mean(100 * (rival - own) / rival.mean(), windows, np.random.default_rng(seed))
         return {
             "l2_m": float(own.mean()),
             "ego_mlp_l2_m": float(rival.mean()),
-            "train_l2_m": float(errors_m(reads, data)[0].mean()),
+            "train_l2_m": float(errors_m(reads, train)[0].mean()),
             "held_out_gain_pct": gain.mean,
             "held_out_gain_pct_low": gain.low,
             "held_out_gain_pct_high": gain.high,
             "windows": float(len(set(windows))),
             "clips": float(len(own)),
-            "demonstrations": float(len(train.window) / 2),
+            "demonstrations": float(len(train.valid)),
         }
 
     return measure
@@ -205,7 +325,7 @@ class Decoder(nn.Module):
 
 def few(seed: int, steps: int = 1500, lr: float = 1e-3) -> dict[str, float]:
     """Learn `FEW` demonstrations by heart, seeing and blind; then black the planes of the one that sees."""
-    train, _ = egos()
+    train = train_egos()
     chosen = torch.randperm(len(train.window), generator=torch.Generator().manual_seed(seed))[:FEW]
     learned, figures = train[chosen], dict[str, float]()
     for name, sight in (("blind_demonstrations_l2_m", 0.0), ("demonstrations_l2_m", 1.0)):
@@ -237,11 +357,14 @@ BENCHMARK = Benchmark(
     arms={
         "decoder_cell": lambda seed: {"cell_error_m": cell_error_m(seed)},
         "decoder_few": few,
-        "path": read_along(blind=False),
-        "path_blind": read_along(blind=True),
+        "true": read_along(true_study),
+        "true_blind": read_along(functools.partial(true_study, blind=True)),
+        "seen": read_along(seen_study),
+        "seen_blacked": read_along(functools.partial(seen_study, images=False)),
     },
     config={
-        "clips": dataclasses.asdict(RECIPE.clips),
+        "recipe": dataclasses.asdict(RECIPE),
+        "pretraining_steps": PRETRAINING_STEPS,
         "towns": [TRAIN_TOWNS, TEST_TOWNS, TRAIN_SEEDS, TEST_SEEDS, EGOS],
         "fits": [dataclasses.asdict(value) for value in (EGO_FIT, READ, READ_FIT)],
     },

@@ -1,29 +1,28 @@
 """True surroundings of virtual egos, drawn from above: the most that a planner could see."""
 
 import dataclasses
-import shutil
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from operator import itemgetter
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 import torch
 import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int, Int8
+from rich.progress import track
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from foredrive.data import ClipConfig, ClipDataset, LogPath
+from foredrive.data.logs import Log
 from foredrive.data.truth.affordances import read_stop_lines
-from foredrive.errors import InputError
 from foredrive.files import atomic_path
 from foredrive.methods.planner.ego_mlp import ego_motion
-from foredrive.runs.drive.recording import EgosPlan, record_egos
 from foredrive.scene import Boxes, Category, Clip, Command, MapKind, VoxelSpec
 from foredrive.scene.record import Record
 from foredrive.scene.traffic_light import LightState
-from foredrive.sensors.rigs import SURROUND, RigPlan
 
 SPEC = VoxelSpec(lower_m=(-32.0, -32.0, -1.5), voxel_m=2.0, shape_zyx=(1, 32, 36))
 FINE = 2
@@ -41,9 +40,8 @@ PAST, HORIZON = 3, 6
 MAX_MPS = 10.0
 LEVELS = 64
 """Steps of a stored channel between 0 and 1."""
-CAMERA = RigPlan((4, 6), dict(list(SURROUND.cameras.items())[:1]))
-"""The recordings need no images, but a log has a camera."""
 _IN_BOX = (13, 5)
+R = TypeVar("R", bound=Record)
 
 
 @dataclass(frozen=True)
@@ -58,6 +56,10 @@ class TruePlanes(Record):
     command_valid: Bool[Tensor, "N"]
     driven: Float[Tensor, "N T 3"]
     """x, y (m), yaw (rad)."""
+    log: Int[Tensor, "N"]
+    """Number of the log of an ego."""
+    now: Int[Tensor, "N"]
+    """Number of the frame in its log."""
     window: Int[Tensor, "N"]
     """Number of the stretch of traffic that an ego is taken from: its egos see the same."""
 
@@ -77,27 +79,15 @@ class TruePlanes(Record):
         )
 
 
-def true_planes(plan: EgosPlan, clips: ClipConfig, folder: Path) -> TruePlanes:
-    """Return the planes of one town and seed from a file in `folder`; record and draw them if it is missing.
-
-    The logs are removed again: a plane takes a hundredth of their time to read.
-
-    Raises:
-        InputError: the recording failed.
-    """
-    file = folder / f"{plan.town}_{plan.seed}_{plan.count}.safetensors"
+def kept(kind: type[R], file: Path, make: Callable[[], R]) -> R:
+    """Return a record of tensors from a file; make it if it is missing."""
     if not file.is_file():
-        root = folder / plan.town
-        logs, failed = record_egos([plan], root, CAMERA, 1)
-        if failed:
-            raise InputError(next(iter(failed.values())))
-        drawn = read_planes(logs, clips)
+        made = make()
         file.parent.mkdir(parents=True, exist_ok=True)
-        fields = {field.name: getattr(drawn, field.name) for field in dataclasses.fields(drawn)}
+        fields = {field.name: getattr(made, field.name) for field in dataclasses.fields(made)}
         with atomic_path(file) as temporary:
             save_file({name: tensor.contiguous() for name, tensor in fields.items()}, temporary)
-        shutil.rmtree(root / "logs")
-    return TruePlanes(**load_file(file))
+    return kind(**load_file(file))
 
 
 def read_planes(logs: Sequence[LogPath], clips: ClipConfig) -> TruePlanes:
@@ -106,8 +96,8 @@ def read_planes(logs: Sequence[LogPath], clips: ClipConfig) -> TruePlanes:
         clips, past_frames=PAST, cameras=(), future_frames=0, future_images=False, map=True
     )
     dataset = ClipDataset(tuple(logs), config, None)
-    rows = []
-    for index in range(len(dataset)):
+    rows, windows = [], dict[tuple[str, int], int]()
+    for index in track(range(len(dataset)), description="true planes"):
         clip = dataset.clip(index)
         if not bool(clip.future.valid.all()):
             continue
@@ -125,23 +115,23 @@ def read_planes(logs: Sequence[LogPath], clips: ClipConfig) -> TruePlanes:
                 command=clip.command[None],
                 command_valid=clip.command_valid[None],
                 driven=torch.cat([clip.future.xy[0], clip.future.yaw[0, :, None]], dim=-1)[None],
-                window=torch.tensor([int(log.t_us[0])]),
+                log=torch.tensor([number]),
+                now=torch.tensor([frames[PAST]]),
+                window=torch.tensor([windows.setdefault(_window(log), len(windows))]),
             )
         )
-    drawn = _concatenated(rows)
-    return dataclasses.replace(drawn, window=drawn.window.unique(return_inverse=True)[1])
+    return joined(rows)
 
 
-def joined(parts: Sequence[TruePlanes]) -> TruePlanes:
-    """Return the egos of recordings that share no window."""
-    firsts = np.cumsum([0, *(int(part.window.max()) + 1 for part in parts)]).tolist()
-    numbered = zip(parts, firsts, strict=False)
-    return _concatenated([dataclasses.replace(part, window=part.window + first) for part, first in numbered])
+def _window(log: Log) -> tuple[str, int]:
+    """Return the recording of a log, without the number of its ego, and the beginning of its window."""
+    return log.path.name.rsplit("_", 1)[0], int(log.t_us[0])
 
 
-def _concatenated(parts: Sequence[TruePlanes]) -> TruePlanes:
-    names = [field.name for field in dataclasses.fields(TruePlanes)]
-    return TruePlanes(**{name: torch.cat([getattr(part, name) for part in parts]) for name in names})
+def joined(parts: Sequence[R]) -> R:
+    """Return the rows of several records of tensors."""
+    names = [field.name for field in dataclasses.fields(parts[0])]
+    return type(parts[0])(**{name: torch.cat([getattr(part, name) for part in parts]) for name in names})
 
 
 def draw(clip: Clip, stops: Sequence[tuple[LightState, Float[Tensor, "2 2"]]]) -> Float[Tensor, "K Y X"]:

@@ -34,7 +34,7 @@ FAR_M = 10_000.0
 """Rerun places things in single precision, so worlds that begin farther from their origin are moved there."""
 SAME_M = 0.01
 """A scene begins at the first pose of its log, to within this."""
-LINE_M, POINT_M, OCCUPIED_OPACITY = 0.05, 0.03, 0.6
+LINE_M, POINT_M, OCCUPIED_OPACITY = 0.05, 0.03, 0.3
 """Radii of lines and points, m, and the opacity of voxels."""
 
 
@@ -207,10 +207,12 @@ def _write_prediction(writer: _Rerun, content: FrameContent, spec: VoxelSpec) ->
         return
     _write_path(writer, plan, content.plan, palette.PLAN)
     zyx = content.occupied.nonzero().numpy()
+    # By height, so that the road differs from what stands on it
+    share = (zyx[:, 0] + 0.5) / spec.shape_zyx[0]
     voxels = rerun.VoxelGridMap(
         np.ascontiguousarray(zyx[:, ::-1], np.int32),  # x y z
         [spec.voxel_m] * 3,
-        colors=np.tile(palette.rgb255(palette.PLAN), (len(zyx), 1)),
+        colors=(255 * palette.HEIGHT_MAP(share)[:, :3]).astype(np.uint8),
         translation=spec.lower_m,
         opacity=OCCUPIED_OPACITY,
     )

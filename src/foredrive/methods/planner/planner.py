@@ -81,7 +81,7 @@ def sinusoidal_places(count: int, step_m: float, width: int) -> Float[Tensor, "N
     prefers its surroundings too.
     """
     position_m = step_m * (torch.arange(count) - 0.5 * (count - 1))
-    length_m = LONGEST_M * (SHORTEST_M / LONGEST_M) ** torch.linspace(0, 1, (width + 1) // 2)
+    length_m = torch.logspace(math.log10(LONGEST_M), math.log10(SHORTEST_M), (width + 1) // 2)
     phase = 2 * math.pi * position_m[:, None] / length_m
     return math.sqrt(2) * torch.cat([phase.sin(), phase.cos()], dim=-1)[:, :width]
 
