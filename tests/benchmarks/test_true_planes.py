@@ -8,28 +8,40 @@ import pytest
 import torch
 from small_drives import drives
 
-from benchmarks.common import true_planes
-from benchmarks.common.true_planes import LIGHTS, LINES, PAST, SPEC, TruePlanes, draw, joined
-from foredrive.runs.drive.recording import EgosPlan
+from benchmarks.common.true_planes import (
+    LIGHTS,
+    LINES,
+    PAST,
+    SPEC,
+    TruePlanes,
+    draw,
+    joined,
+    kept,
+    read_planes,
+)
+from foredrive.runs.drive.recording import EgosPlan, record_egos
 from foredrive.runs.recipes.known import find_recipe
 from foredrive.scene import Category, Command, MapKind, MapPatch
 from foredrive.scene.traffic_light import LightState
+from foredrive.sensors.rigs import SURROUND, RigPlan
 
-PLAN, CLIPS = EgosPlan("Town02", 7, 6, ()), find_recipe("nemo_town").clips
+PLANS = [EgosPlan("Town02", 7, 6, ()), EgosPlan("Town02", 8, 2, ())]
+RIG = RigPlan((4, 6), dict(list(SURROUND.cameras.items())[:1]))
+"""The planes need no images, but a log has a camera."""
 CENTRES, VEHICLES = LINES.index(MapKind.LANE_CENTRE), len(LINES) + len(LIGHTS)
 
 
 @pytest.fixture(scope="module")
-def egos(tmp_path_factory: pytest.TempPathFactory) -> tuple[TruePlanes, Path]:
-    folder = tmp_path_factory.mktemp("planes")
-    return true_planes.true_planes(PLAN, CLIPS, folder), folder
+def planes(tmp_path_factory: pytest.TempPathFactory) -> TruePlanes:
+    logs, failed = record_egos(PLANS, tmp_path_factory.mktemp("planes"), RIG, 1)
+    assert not failed
+    return read_planes(logs, find_recipe("nemo_town").clips)
 
 
-def test_lanes_lie_under_the_driven_path(egos: tuple[TruePlanes, Path]) -> None:
+def test_lanes_lie_under_the_driven_path(planes: TruePlanes) -> None:
     """Egos drive in lanes, along them, and so do their mirror images."""
-    planes, _ = egos
     assert len(planes.window) > 5
-    assert joined([planes, planes]).window.unique().tolist() == [0, 1]
+    assert planes.now.min() == PAST
     for seen in (planes, planes.mirrored()):
         assert beneath(seen, CENTRES).mean() > 0.2
         heading = seen.driven[..., 2]
@@ -69,8 +81,12 @@ def test_a_car_a_lane_and_a_light_by_hand() -> None:
     assert middle[red][:, 1].tolist() == [9.0] * int(red.sum())
 
 
-def test_commands_and_past_are_mirrored_too(egos: tuple[TruePlanes, Path]) -> None:
-    planes, _ = egos
+def test_egos_of_one_seed_see_the_same_traffic(planes: TruePlanes) -> None:
+    assert set(planes.log.tolist()) >= {0, 6}
+    assert torch.equal(planes.window, (planes.log >= 6).long())
+
+
+def test_commands_and_past_are_mirrored_too(planes: TruePlanes) -> None:
     mirrored = planes.mirrored()
     assert torch.equal(mirrored.mirrored().planes, planes.planes)
     left, right = int(Command.LEFT), int(Command.RIGHT)
@@ -79,11 +95,11 @@ def test_commands_and_past_are_mirrored_too(egos: tuple[TruePlanes, Path]) -> No
     assert planes.poses.shape[1:] == (PAST, 3)
 
 
-def test_planes_are_kept_and_logs_are_not(egos: tuple[TruePlanes, Path]) -> None:
-    planes, folder = egos
-    assert not list(folder.rglob("sync.arrow"))
-    again = true_planes.true_planes(PLAN, CLIPS, folder)
-    assert torch.equal(again.planes, planes.planes)
+def test_planes_are_kept(planes: TruePlanes, tmp_path: Path) -> None:
+    file = tmp_path / "kept" / "planes.safetensors"
+    for makes in (lambda: joined([planes, planes]), pytest.fail):
+        again = kept(TruePlanes, file, makes)
+        assert torch.equal(again.planes, torch.cat([planes.planes, planes.planes]))
 
 
 def beneath(planes: TruePlanes, channel: int) -> torch.Tensor:

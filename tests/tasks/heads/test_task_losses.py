@@ -5,6 +5,11 @@ import math
 import pytest
 import torch
 
+from foredrive.scene import Attribute
+from foredrive.sets import LabelledBoxes
+from foredrive.tasks.detection.agents_head import AGENT_CLASSES, AgentSet
+from foredrive.tasks.detection.losses import matched_loss
+from foredrive.tasks.detection.network import BoxSet
 from foredrive.tasks.maps.losses import equivalent_orders, map_element_losses, sigmoid_focal_loss
 from foredrive.tasks.motion.losses import motion_losses
 from foredrive.tasks.occupancy.semantic_losses import (
@@ -124,3 +129,25 @@ def test_rasters_of_items_without_a_map_train_nothing() -> None:
     wrong = torch.cat([logits[:1], -logits[1:]])
     assert raster_loss(wrong, layers, torch.tensor([True, False])).item() == pytest.approx(0, abs=1e-6)
     assert raster_loss(wrong, layers, both).item() > 1
+
+
+def test_scores_are_the_odds_of_the_data() -> None:
+    """A query that is a car in two of ten frames learns a score of 0.2, though empty queries weigh less."""
+    logits = torch.zeros(1, len(AGENT_CLASSES) + 1, requires_grad=True)
+    mean, heading = torch.zeros(1, 6), torch.tensor([[0.0, 1.0]])
+    boxes = BoxSet(logits, mean, torch.zeros(1, 6), heading, torch.zeros(1))
+    car = LabelledBoxes(torch.tensor([0]), mean.double(), torch.zeros(1).double())
+    one = torch.tensor([0])
+    optimizer = torch.optim.Adam([logits], lr=0.1)
+    for _ in range(300):
+        loss = sum(
+            matched_loss(boxes, truth, row, row)
+            for truth, row in [(car, one)] * 2 + [(car[one[:0]], one[:0])] * 8
+        )
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+    agents = AgentSet(boxes, torch.zeros(1, 2), torch.zeros(1, len(Attribute)))
+    score, label = agents.best_class()
+    assert score.item() == pytest.approx(0.2, abs=0.01)
+    assert label.item() == 0

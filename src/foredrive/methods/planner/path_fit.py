@@ -38,12 +38,15 @@ class PathDemonstrations(Record):
 
 
 def fit_path(correction: PathCorrection, data: PathDemonstrations, fit: PathFit, seed: int) -> None:
-    """Fit the correction by L1 on the waypoints, and store means and spreads that standardise its inputs."""
+    """Fit the correction by L1 on the waypoints, and store the means and the spread that standardise inputs.
+
+    All features have the same spread, so that one that is nearly always 0 is not blown up.
+    """
     data = data.to(correction.mean.device)
-    # One mean and spread per feature, over all demonstrations, distances and offsets
+    # A mean for each feature, over all demonstrations, distances and offsets, and a spread for all
     values = data.values.float()
     correction.mean.copy_(values.mean(dim=(0, 1, 2)))
-    correction.std.copy_(values.std(dim=(0, 1, 2)) + 1e-3)
+    correction.std.fill_(values.var(dim=(0, 1, 2)).mean().sqrt() + 1e-3)
     correction.requires_grad_(True)  # joint training disables it
 
     def loss(rows: Tensor) -> Tensor:

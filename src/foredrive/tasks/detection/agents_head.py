@@ -1,5 +1,6 @@
 """The head of road users: a set of boxes with velocity, attribute and motion."""
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Literal
@@ -12,6 +13,7 @@ from foredrive.errors import InputError
 from foredrive.scene import Attribute, Category
 from foredrive.scene.agents import Agents
 from foredrive.scene.record import Record
+from foredrive.tasks.detection.losses import NO_OBJECT_WEIGHT
 from foredrive.tasks.detection.network import LOG_STD_RANGE, BoxSet
 from foredrive.tasks.detection.proposals import CentreHead, CentreMap, Proposals, best_proposals
 from foredrive.tasks.heads.decoder import DecoderConfig, PlaceEmbedding, QueryDecoderLayer
@@ -46,7 +48,7 @@ class CarriedConfig:
     """Share of its rank that a carried query keeps at least from frame to frame."""
     reach_m: float = 2.0
     """Maximum distance of the proposal at which a carried agent goes on from where it is expected."""
-    born: float = 0.1
+    born: float = 0.01
     """Minimum score at which a query gets an identity, and minimum rank at which it keeps it."""
     frames: int = 4
     """Key frames of a training sequence, at least 2."""
@@ -84,6 +86,18 @@ class AgentSet(Record):
     query: Float[Tensor, "*b Q W"] | None = None
     """Features of each query; those after the last layer alone."""
 
+    def best_class(self) -> tuple[Float[Tensor, "*b Q"], Int[Tensor, "*b Q"]]:
+        """Return the probability of each query's most probable class, and the class.
+
+        Queries without an object weigh `NO_OBJECT_WEIGHT` in the loss, so the logits learn odds that are too
+        high by its inverse. Here they are multiplied by it.
+        """
+        logits = self.boxes.logits.clone()
+        # The last logit stands for "no object" and is no class
+        logits[..., -1] -= math.log(NO_OBJECT_WEIGHT)
+        score, label = logits.softmax(dim=-1)[..., :-1].max(dim=-1)
+        return score, label
+
     def agents(self, dt_s: float) -> Agents:
         """Return the most probable class of each query, with its probability as the score.
 
@@ -91,8 +105,7 @@ class AgentSet(Record):
             dt_s: time between the steps of the futures.
         """
         mean, heading = self.boxes.mean, self.boxes.heading
-        # The last logit stands for "no object" and is no class
-        score, label = self.boxes.logits.softmax(dim=-1)[..., :-1].max(dim=-1)
+        score, label = self.best_class()
         categories = torch.tensor([int(kind) for kind in AGENT_CLASSES], device=label.device)
         return Agents(
             centre=mean[..., :3],

@@ -18,6 +18,8 @@ from foredrive.tasks.detection.network import BoxSet
 STATE_SCALE = (1.0, 1.0, 1.0, 0.3, 0.3, 0.3)
 """Errors of this size, in m and log m, have equal weight."""
 
+NO_OBJECT_WEIGHT = 0.1
+"""Weight of queries without an object in the loss of classes: most queries have none."""
 TAUGHT_M = 4.0
 """A matched box whose centre is farther from its object than this learns only to come nearer: its velocity,
 attribute, motion and mask would be read from a place where the object is not."""
@@ -32,7 +34,7 @@ class MatchingLossConfig:
 
     box_score: Literal["likelihood", "energy"] = "likelihood"
     """Score that trains the state of matched boxes."""
-    no_object_weight: float = 0.1
+    no_object_weight: float = NO_OBJECT_WEIGHT
     box_weight: float = 0.5
     heading_weight: float = 0.5
     likelihood_weight: float = 0.1
@@ -74,7 +76,6 @@ def matched_loss(
     # Queries without an object have the last class, "no object"
     target = torch.full(predicted.logits.shape[:1], classes, device=predicted.logits.device)
     target[query] = truth.label[match].long()
-    # Most queries have no object, so these weigh less
     weight = torch.where(target == classes, config.no_object_weight, 1.0)
     entropy = (F.cross_entropy(predicted.logits, target, reduction="none") * weight).sum()
     state, scale = truth.state[match].to(predicted.mean), predicted.mean.new_tensor(STATE_SCALE)

@@ -165,8 +165,7 @@ def instance_raster(instances: InstanceSet, agents: AgentSet, spec: PlaneSpec) -
     raster = torch.zeros(len(instances.embedding), count, len(points), dtype=torch.long, device=points.device)
     is_vehicle = _IS_VEHICLE.to(points.device)
     for item in range(len(raster)):
-        # The last logit stands for "no object"
-        score, label = agents.boxes.logits[item].softmax(dim=-1)[..., :-1].max(dim=-1)
+        score, label = agents[item].best_class()
         rows = ((score >= MIN_SCORE) & is_vehicle[label]).nonzero()[:, 0]
         if len(rows):
             probability = instance_logits(instances[item], agents[item], rows, points).sigmoid()

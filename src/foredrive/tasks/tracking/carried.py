@@ -69,8 +69,7 @@ def lineage_of(predicted: AgentSet, carried: CarriedAgents | None, decay: float)
     The rank is the score. Carried queries keep at least `decay` times their rank, so that an agent that is
     hidden for a moment is not lost (SparseDrive, Sun et al. 2024: its instance bank).
     """
-    # Score without "no object"
-    score = predicted.boxes.logits.detach().softmax(dim=-1)[..., :-1].amax(dim=-1)
+    score = predicted.best_class()[0].detach()
     source = torch.full_like(score, NEW, dtype=torch.long)
     if carried is None:
         return Lineage(source, score)

@@ -58,7 +58,7 @@ class AgentFollower:
         output = perceive(carried)
         assert output.agents is not None
         assert output.lineage is not None
-        score = output.agents[-1].boxes.logits.softmax(dim=-1)[..., :-1].amax(dim=-1)
+        score = output.agents[-1].best_class()[0]
         # Identities of the frame before, by query
         old = torch.full_like(output.lineage.source, -1) if before is None else before.track_id
         seen = score >= self.config.born

@@ -10,7 +10,7 @@ from foredrive.scene import Boxes, Category
 from foredrive.scene.agents import Agents
 from foredrive.tasks.tracking.object_rows import ObjectRows, make_rows
 
-MIN_SCORE = 0.01
+MIN_SCORE = 0.001
 """Detections with a lower score are left out. They change no figure by more than this."""
 
 Pose = Float64[ndarray, "4 4"]
