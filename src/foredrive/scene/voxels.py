@@ -27,6 +27,16 @@ class VoxelSpec:
         x, y, z = self.lower_m
         return (x + nx * self.voxel_m, y + ny * self.voxel_m, z + nz * self.voxel_m)
 
+    def covers(self, points_m: Float[Tensor, "*n _D"]) -> Bool[Tensor, "*n"]:
+        """Return whether points of the ego frame are inside of the grid as seen from above.
+
+        Args:
+            points_m: x, y and any further coordinates.
+        """
+        xy = points_m[..., :2]
+        lower, upper = (xy.new_tensor(corner[:2]) for corner in (self.lower_m, self.upper_m))
+        return ((xy >= lower) & (xy < upper)).all(dim=-1)
+
     def centres_m(self, device: torch.device | str = "cpu") -> Float[Tensor, "Z Y X 3"]:
         """Return the voxel centres in the ego frame, m. The last dimension is x y z."""
         axes = [

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from rich.console import Console
 
 from foredrive.engine.summary import Summary
-from foredrive.tasks.evaluation.metric import PRIOR, EvaluationContext
+from foredrive.tasks.evaluation.metric import CEILING, PRIOR, EvaluationContext
 from foredrive.tasks.occupancy.scores import ABOVE_GROUND_M
 from foredrive.tasks.planning.protocols import HORIZON_NAMES, PROTOCOLS
 from foredrive.view.table import (
@@ -216,11 +216,14 @@ def task_table(summary: Summary) -> Table | None:
             keys = (f"{metric.name}.{figure.key}", f"{metric.name}.{figure.key}.{figure.baseline}")
             if keys[0] in summary or keys[1] in summary:
                 own, beside = (number(summary.get(key), figure.digits) for key in keys)
-                row = Row((figure.title, own, _baseline(figure.baseline), beside))
+                ceiling = summary.get(f"{keys[0]}.{CEILING}")
+                most = "" if ceiling is None else number(ceiling, figure.digits)
+                row = Row((figure.title, own, _baseline(figure.baseline), beside, most))
                 rows.setdefault(metric.title, []).append(row)
     sections = [Section(of_metric, title) for title, of_metric in rows.items()]
     left = Column(align="left")
-    columns = [left, Column("this model"), Column("baseline", align="left"), Column("its figure")]
+    named = [Column("this model"), Column("baseline", align="left"), Column("its figure")]
+    columns = [left, *named, Column("ceiling of the grid")]
     return Table(columns, sections, "Tasks at now") if sections else None
 
 

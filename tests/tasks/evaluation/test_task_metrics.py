@@ -112,6 +112,34 @@ def test_the_truth_as_detections(example: Example) -> None:
     assert found["car_ap_2m_30m.true"] == 4
 
 
+def above(example: Example, lower_m: tuple[float, float], shape_yx: tuple[int, int]) -> Example:
+    """The example on another grid of 1 m."""
+    spec = VoxelSpec((*lower_m, -1.0), 1.0, (2, *shape_yx))
+    return dataclasses.replace(example, occupancy=dataclasses.replace(example.occupancy, spec=spec))
+
+
+def test_no_more_than_what_the_grid_holds_can_be_detected(example: Example) -> None:
+    """The car at x = 10 m is above the grid, that at 20 m is not: precision is 1 up to a recall of 0.5."""
+    small = above(example, (-4.0, -8.0), (16, 16))
+    found = figures(DetectionMetric, Prediction(agents=perfect_agents(small)), small)
+    car = pytest.approx(0.4 / 0.9, abs=0.01)
+    assert found["car_ap_2m_30m.ceiling"] == car
+    assert 10 * found["nuscenes.map.ceiling"] - 1 == car
+    assert found["car_ap_2m_30m"] == pytest.approx(1)
+
+
+def test_no_more_than_what_the_grid_holds_can_be_mapped(example: Example) -> None:
+    """All of the crossing is above the grid, a half of the divider, and nothing of the boundary."""
+    assert example.truth is not None
+    assert example.truth.elements is not None
+    lines = MapLines(example.truth.elements.vertices, example.truth.elements.kind, torch.full((2, 3), 0.9))
+    for lower_m, shape_yx, ceiling in (((-30.0, -10.0), (20, 60), 1.0), ((0.0, -9.0), (18, 20), 1 / 3)):
+        grid = above(example, lower_m, shape_yx)
+        found = figures(MapLinesMetric, Prediction(map_lines=lines), grid)
+        assert found["maptr.map.ceiling"] == pytest.approx(ceiling)
+        assert found["maptr.map"] == pytest.approx(1)
+
+
 def test_detections_three_metres_off_are_none_within_two(example: Example) -> None:
     agents = perfect_agents(example)
     off = dataclasses.replace(agents, centre=agents.centre + torch.tensor([3.0, 0.0, 0.0]))
@@ -168,8 +196,7 @@ def test_maps_above_the_voxels_are_counted_alone_too(example: Example) -> None:
     """Voxels lie above the columns 2 to 4: what is wrong elsewhere does not count there."""
     assert example.truth is not None
     assert example.truth.raster is not None
-    spec = VoxelSpec(lower_m=(-2.0, -4.0, -1.0), voxel_m=1.0, shape_zyx=(2, 8, 3))
-    small = dataclasses.replace(example, occupancy=dataclasses.replace(example.occupancy, spec=spec))
+    small = above(example, (-2.0, -4.0), (8, 3))
     shown = example.truth.raster.layers.float()
     shown[:, 3, :, 5:] = 0
     masks = figures(MapRasterMetric, Prediction(map_layers=shown), small)

@@ -250,6 +250,8 @@ def test_figures_stand_beside_boxes_that_drive_on_or_stay(make_example: Callable
     for name in ("iou_near", "iou_far", "vpq_near", "vpq_far"):
         assert figures[f"uniad.{name}_pct"] == figures[f"uniad.{name}_pct.constant_velocity"] == 100
         assert 0 < float(figures[f"uniad.{name}_pct.persistence"]) < 100
+    # One of the two vehicles is above the voxels
+    assert figures["uniad.vpq_far_pct.ceiling"] == pytest.approx(100 / 1.5)
     assert figures["uniad.frames_counted"] == 1
     half = dataclasses.replace(truth, valid=truth.valid.clone())
     half.valid[0, -1] = False

@@ -6,7 +6,7 @@ import numpy as np
 
 from foredrive.scene import Example
 from foredrive.tasks.detection.protocols import CLASSES, DETECTION_PROTOCOLS, evaluate_detections
-from foredrive.tasks.evaluation.metric import EvaluationContext, Figures, Shown
+from foredrive.tasks.evaluation.metric import CEILING, EvaluationContext, Figures, Shown
 from foredrive.tasks.evaluation.predictor import Part, Prediction
 from foredrive.tasks.tracking.in_world import agent_rows, box_rows, likely, stacked
 from foredrive.tasks.tracking.object_rows import ObjectRows, Region
@@ -24,6 +24,7 @@ CAR_30M = dataclasses.replace(
 class DetectionMetric:
     """Keys: `nuscenes.map`, `nuscenes.nds`, `nuscenes.ate_m`, `vad.map`, `car_ap_2m_30m`, `frames_counted`.
 
+    `nuscenes.map.ceiling` and `car_ap_2m_30m.ceiling` are those of the true boxes above the clips' voxels.
     Frames without annotation do not count. Boxes are compared in the world frame, as in files of results.
     Figures that need a value that no true box has, such as an attribute, are None.
     """
@@ -40,6 +41,8 @@ class DetectionMetric:
     def __init__(self, context: EvaluationContext) -> None:
         self._found: list[ObjectRows] = []
         self._true: list[ObjectRows] = []
+        self._above: list[ObjectRows] = []
+        """True boxes above the voxels."""
 
     def update(self, prediction: Prediction, truth: Example) -> None:
         """Add b clips."""
@@ -50,23 +53,31 @@ class DetectionMetric:
             # World coordinates, as in files of results
             pose = clip.T_world_ego[item, clip.now].cpu().numpy()
             self._found.append(agent_rows(likely(prediction.agents[item]), pose, frame, CLASSES))
-            self._true.append(box_rows(clip.boxes[item, clip.now], pose, frame, CLASSES))
+            boxes = clip.boxes[item, clip.now]
+            self._true.append(box_rows(boxes, pose, frame, CLASSES))
+            # Boxes without a point do not count, so finding them would be wrong
+            shown = boxes.valid & truth.occupancy.spec.covers(boxes.centre) & (boxes.num_points != 0)
+            self._above.append(box_rows(dataclasses.replace(boxes, valid=shown), pose, frame, CLASSES))
 
     def result(self) -> Figures:
         """Return the figures over all annotated frames."""
         if not self._true:
             return {"frames_counted": 0}
-        predicted, true = stacked(self._found), stacked(self._true)
+        predicted, true, above = stacked(self._found), stacked(self._true), stacked(self._above)
+        above = dataclasses.replace(above, score=np.ones(len(above)))
         # Baseline: no detections at all
         none = np.zeros(0, dtype=np.int64)
         nothing, racks, lacks = predicted[none], true[none], lacking(true)
         out = detection_figures(predicted, true, racks, lacks)
         empty = detection_figures(nothing, true, racks, lacks)
-        for key in ("map", "nds"):
-            out |= {f"{name}.{key}.nothing_detected": empty[f"{name}.{key}"] for name in DETECTION_PROTOCOLS}
+        best = detection_figures(above, true, racks, lacks)
+        for name in DETECTION_PROTOCOLS:
+            out |= {f"{name}.{key}.nothing_detected": empty[f"{name}.{key}"] for key in ("map", "nds")}
+            out[f"{name}.map.{CEILING}"] = best[f"{name}.map"]
         # Label 0 is the first class, cars
-        cars = [rows[rows.label == 0] for rows in (predicted, true)]
-        figures = evaluate_detections(cars[0], cars[1], racks, CAR_30M).by_class["car"]
-        out |= {"car_ap_2m_30m": figures.ap[2.0] if figures.true else float("nan")}
+        cars = true[true.label == 0]
+        for rows, suffix in ((predicted, ""), (above, f".{CEILING}")):
+            found = evaluate_detections(rows[rows.label == 0], cars, racks, CAR_30M).by_class["car"]
+            out[f"car_ap_2m_30m{suffix}"] = found.ap[2.0] if found.true else float("nan")
         out["car_ap_2m_30m.nothing_detected"] = 0.0
-        return out | {"car_ap_2m_30m.true": figures.true, "frames_counted": len(self._true)}
+        return out | {"car_ap_2m_30m.true": found.true, "frames_counted": len(self._true)}

@@ -32,6 +32,8 @@ class EvaluationContext:
 PRIOR, STEADY = "best_constant", "constant_velocity"
 """Baselines of several metrics, as the last part of their keys: the fixed answer that scores best on the
 training logs, and road users that go on as they drive."""
+CEILING = "ceiling"
+"""Last part of the key of what the truth above the model's grid scores: more cannot be found there."""
 
 
 @dataclass(frozen=True)

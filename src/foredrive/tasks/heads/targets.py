@@ -51,10 +51,8 @@ def agent_targets(boxes: Boxes, futures: AgentFutures | None, spec: VoxelSpec, s
     nuScenes counts neither in training nor in evaluation. Without futures, no step is valid.
     """
     # Road users above the grid, of a detected class, with at least one lidar point or an unknown number
-    lower, upper = (boxes.centre.new_tensor(corner[:2]) for corner in (spec.lower_m, spec.upper_m))
-    inside = ((boxes.centre[:, :2] >= lower) & (boxes.centre[:, :2] < upper)).all(-1)
     label = _LABELS.to(boxes.category.device)[boxes.category]
-    kept = boxes.valid & inside & (label >= 0) & (boxes.num_points != 0)
+    kept = boxes.valid & spec.covers(boxes.centre) & (label >= 0) & (boxes.num_points != 0)
     # Log sizes need positive sizes
     state = torch.cat([boxes.centre, boxes.size_lwh.clamp_min(1e-2).log()], dim=-1)
     count = int(kept.sum())

@@ -8,13 +8,15 @@ nuscenes_e2e_dataset.py, which sums intersections and unions over the data set.
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Int
+import shapely
+from jaxtyping import Bool, Float64, Int
 from numpy import ndarray
 
 from foredrive.scene import Example, VoxelSpec
-from foredrive.scene.map_elements import ElementKind, PlaneSpec, RasterLayer
-from foredrive.tasks.evaluation.metric import PRIOR, EvaluationContext, Figures, Shown
+from foredrive.scene.map_elements import ElementKind, RasterLayer
+from foredrive.tasks.evaluation.metric import CEILING, PRIOR, EvaluationContext, Figures, Shown
 from foredrive.tasks.evaluation.predictor import Part, Prediction
+from foredrive.tasks.heads.plane import cell_middles
 from foredrive.tasks.maps.lines import CLASSES, LineSet
 from foredrive.tasks.maps.precision import mean_precision, score_maps
 from foredrive.tasks.maps.protocols import PROTOCOLS, Area
@@ -68,6 +70,7 @@ AREA: Area = "60x30"
 class MapLinesMetric:
     """Keys: `maptr.map`, `maptr.ap_divider`, `streammapnet.map` and so on; `lines.frames_counted`.
 
+    `maptr.map.ceiling` is that of the true lines cut to the clips' voxels, the longest part of each.
     Protocols that follow identities are left out. Frames without a map do not count.
     """
 
@@ -79,6 +82,8 @@ class MapLinesMetric:
     def __init__(self, context: EvaluationContext) -> None:
         self._found: list[tuple[int, int, ndarray, float]] = []
         self._true: list[tuple[int, int, ndarray, float]] = []
+        self._above: list[tuple[int, int, ndarray, float]] = []
+        """Parts of true lines above the voxels."""
         self._frames = 0
 
     def update(self, prediction: Prediction, truth: Example) -> None:
@@ -93,8 +98,12 @@ class MapLinesMetric:
             self._found += [(self._frames, kind, line, score) for kind, line, score in rows]
             for number, kind in enumerate(elements.kind[item].tolist()):
                 if kind in CLASSES:
-                    line = elements.vertices[item, number, elements.valid[item, number]]
-                    self._true.append((self._frames, kind, line.double().cpu().numpy(), 1.0))
+                    line = (
+                        elements.vertices[item, number, elements.valid[item, number]].double().cpu().numpy()
+                    )
+                    self._true.append((self._frames, kind, line, 1.0))
+                    part = _part_above(line, truth.occupancy.spec)
+                    self._above += [] if part is None else [(self._frames, kind, part, 1.0)]
             self._frames += 1
 
     def result(self) -> Figures:
@@ -102,7 +111,7 @@ class MapLinesMetric:
         if not self._frames:
             return {}
         # Frames are numbered over all batches
-        predicted, true = _line_set(self._found), _line_set(self._true)
+        predicted, true, above = map(_line_set, (self._found, self._true, self._above))
         out: Figures = {}
         for name, protocol in PROTOCOLS.items():
             if protocol.identity:
@@ -110,11 +119,19 @@ class MapLinesMetric:
             scores = score_maps(predicted, true, protocol, AREA)
             out[f"{name}.map"] = mean_precision(scores, protocol)
             out[f"{name}.map.nothing_detected"] = 0.0
+            out[f"{name}.map.{CEILING}"] = mean_precision(score_maps(above, true, protocol, AREA), protocol)
             out |= {
                 f"{name}.ap_{ElementKind(kind).name.lower()}": predicted.ap
                 for kind, predicted in scores.items()
             }
         return out | {"lines.frames_counted": self._frames}
+
+
+def _part_above(line: Float64[ndarray, "V 2"], voxels: VoxelSpec) -> Float64[ndarray, "_ 2"] | None:
+    """Return the longest part of a line above a voxel grid; None if there is none."""
+    cut = shapely.box(*voxels.lower_m[:2], *voxels.upper_m[:2]).intersection(shapely.LineString(line))
+    parts = [part for part in shapely.get_parts(cut) if part.length > 0]
+    return shapely.get_coordinates(max(parts, key=lambda part: part.length)) if parts else None
 
 
 def _line_set(rows: list[tuple[int, int, ndarray, float]]) -> LineSet:
@@ -157,7 +174,10 @@ class MapRasterMetric:
         if self._prior is not None:
             shown[f".{PRIOR}"] = self._prior.cpu().expand(len(true), -1, -1, -1).numpy()
         # All cells, and those above the voxels, which a model with a small grid can see
-        areas = {"uniad": np.array(True), "uniad_covered": _covered(raster.spec, truth.occupancy.spec)}
+        spec = raster.spec
+        middle_m = cell_middles(spec.lower_m, spec.cell_m, spec.shape_yx)
+        covered = truth.occupancy.spec.covers(middle_m).view(spec.shape_yx).numpy()
+        areas = {"uniad": np.array(True), "uniad_covered": covered}
         for suffix, mask in shown.items():
             for area, cells in areas.items():
                 counts, key = count_raster(mask & cells, true & cells), (area, suffix)
@@ -171,13 +191,3 @@ class MapRasterMetric:
             out |= {f"{area}.{key}{suffix}": value for key, value in raster_figures(counts).items()}
             out["raster.frames_counted"] = counts.frames
         return out
-
-
-def _covered(raster: PlaneSpec, voxels: VoxelSpec) -> Bool[ndarray, "H W"]:
-    """Return the cells of a raster whose middles lie above a voxel grid."""
-    inside = []
-    for axis, (lower_m, size) in enumerate(zip(raster.lower_m, raster.shape_yx[::-1], strict=True)):
-        middle_m = lower_m + (np.arange(size) + 0.5) * raster.cell_m
-        inside.append((middle_m >= voxels.lower_m[axis]) & (middle_m < voxels.upper_m[axis]))
-    # Rows are y, columns x
-    return inside[1][:, None] & inside[0]

@@ -15,12 +15,13 @@ from torch import Tensor
 from foredrive.data.truth.raster import fill_polygon
 from foredrive.errors import InputError
 from foredrive.geometry.boxes import box_corners
-from foredrive.scene import Example
+from foredrive.scene import Example, VoxelSpec
 from foredrive.scene.agents import Agents
 from foredrive.scene.boxes import VEHICLES
 from foredrive.scene.map_elements import InstanceRaster
-from foredrive.tasks.evaluation.metric import STEADY, EvaluationContext, Figures, Shown
+from foredrive.tasks.evaluation.metric import CEILING, STEADY, EvaluationContext, Figures, Shown
 from foredrive.tasks.evaluation.predictor import Part, Prediction
+from foredrive.tasks.heads.plane import cell_middles
 from foredrive.tasks.occupancy.protocols import UNIAD_INSTANCES, InstanceProtocol
 
 
@@ -178,7 +179,8 @@ class InstanceMetric:
     """Keys: `uniad.iou_near_pct`, `uniad.vpq_far_pct`, `….constant_velocity`, `….persistence`.
 
     The baselines draw the same detections as boxes, moved at their predicted velocity, or left where they
-    are. Frames without annotated future are skipped, as in UniAD; those at the start of a drive count here.
+    are. `….ceiling` is that of the true vehicles with a cell above the clips' voxels now. Frames without
+    annotated future are skipped, as in UniAD; those at the start of a drive count here.
     """
 
     name = "occupancy"
@@ -206,6 +208,7 @@ class InstanceMetric:
         for name, moves in ((STEADY, 1.0), (PERSISTENCE, 0.0)):
             drawn = [drawn_boxes(agents[item], true, moves) for item in range(len(true.valid))]
             shown[f".{name}"] = torch.from_numpy(np.stack(drawn))
+        shown[f".{CEILING}"] = seen_above(true, truth.occupancy.spec)
         past = UNIAD_INSTANCES.past_frames
         for suffix, raster in shown.items():
             for name, counts in count_rasters(raster, true, past, UNIAD_INSTANCES).items():
@@ -220,6 +223,18 @@ class InstanceMetric:
             out[f"uniad.iou_{name}_pct{suffix}"] = 100 * counts.iou
             out[f"uniad.vpq_{name}_pct{suffix}"] = 100 * counts.vpq
         return out | {"uniad.frames_counted": self._frames}
+
+
+def seen_above(true: InstanceRaster, voxels: VoxelSpec) -> Int[Tensor, "b S Y X"]:
+    """Return the vehicles that have a cell above a voxel grid now, with all of their cells."""
+    spec = true.spec
+    middle_m = cell_middles(spec.lower_m, spec.cell_m, spec.shape_yx)
+    above = voxels.covers(middle_m).view(spec.shape_yx)
+    shown = torch.zeros_like(true.track_id)
+    for item, now in enumerate(true.track_id[:, 0]):
+        known = torch.isin(true.track_id[item], now[above].unique())
+        shown[item] = true.track_id[item] * known
+    return shown
 
 
 def drawn_boxes(agents: Agents, like: InstanceRaster, moves: float) -> Int[ndarray, "S Y X"]:
