@@ -48,7 +48,7 @@ TEST_TOWNS = ("Town03", "Town05")
 """Towns that no arm is trained in. Architectures were chosen on them, with other seeds of traffic."""
 TRAIN_SEEDS, TEST_SEEDS, EGOS = tuple(range(2000, 2003)), tuple(range(3000, 3004)), 80
 """Seeds of traffic, and virtual egos of each town and seed."""
-PRETRAINING_STEPS = 12_000
+PRETRAINING_STEPS = 3200
 Volumes = Callable[[TruePlanes], Tensor]
 BATCH = 8
 EGO_FIT = EgoMLPFit(steps=4000)

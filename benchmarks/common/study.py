@@ -187,7 +187,7 @@ def study_figures(summary: Mapping[str, Any]) -> dict[str, float]:
         "l2_m": f"{headline}.l2_avg_m",
         "collision_pct": f"{headline}.collision_avg_pct",
     }
-    for scope in ("", "above_ground."):
+    for scope in ("", "above_ground.", "moving.", "standing."):
         prefixes = (f"occupancy.{scope}iou_", f"occupancy.{scope}spread_")
         kept |= {key.removeprefix("occupancy."): key for key in summary if key.startswith(prefixes)}
     kept |= {key: key for key in summary if key.startswith(("flow.", *TASK_FIGURES))}

@@ -97,6 +97,7 @@ BASELINES = {
     "carried_copy": "ego-compensated persistence",
     "continued_copy": "persistence, motion continued",
     "best_constant": "the best constant",
+    "ceiling": "ceiling",
     "greedy_association": "greedy association",
 }
 """Endings of keys that name a baseline, in the glossary's words."""

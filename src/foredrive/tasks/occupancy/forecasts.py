@@ -7,13 +7,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
+import torch.nn.functional as F
 from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
 from foredrive.geometry.se3 import transform_points
 from foredrive.scene import VoxelGrid, VoxelSpec
 from foredrive.scene.record import Record
-from foredrive.tasks.occupancy.scores import OccupancyCounts, count_occupancy
+from foredrive.tasks.occupancy.scores import MOVING_MPS, OccupancyCounts, count_occupancy
 
 
 def ego_compensated(
@@ -36,6 +37,57 @@ def ego_compensated(
     # The index of outside voxels is 0 and is masked below
     flat = ((index[..., 2] * ny + index[..., 1]) * nx + index[..., 0]).where(inside, 0)
     return (occupied.flatten(1).gather(1, flat) & inside).view(occupied.shape)
+
+
+def carried_by_flow(
+    occupied: Bool[Tensor, "b Z Y X"],
+    flow_mps: Float[Tensor, "b 3 Z Y X"],
+    T_src_dst: Float64[Tensor, "b 4 4"],
+    after_s: Float64[Tensor, "b"],
+    spec: VoxelSpec,
+) -> Bool[Tensor, "b Z Y X"]:
+    """Return the occupancy from another pose after some time, if each voxel goes on at its velocity.
+
+    Args:
+        occupied, T_src_dst, spec: as of `ego_compensated`.
+        flow_mps: velocity over ground of the content of each voxel, in the axes of src.
+        after_s: time since src.
+    """
+    moves = occupied & (flow_mps.norm(dim=1) > MOVING_MPS)
+    carried = ego_compensated(occupied & ~moves, T_src_dst, spec)
+    item, z, y, x = moves.nonzero().unbind(-1)
+    # Eight points of each moving voxel, so that a turned grid has no holes
+    corner = torch.cartesian_prod(*3 * [torch.tensor([-0.25, 0.25], device=item.device)]) * spec.voxel_m
+    start = spec.centres_m(item.device)[z, y, x] + after_s[item, None] * flow_mps[item, :, z, y, x]
+    points = start[:, None].double() + corner.double()
+    place = transform_points(torch.linalg.inv(T_src_dst)[item], points)
+    index = ((place - place.new_tensor(spec.lower_m)) / spec.voxel_m).floor().long()
+    inside = ((index >= 0) & (index < index.new_tensor(spec.shape_zyx[::-1]))).all(-1)
+    x, y, z = index[inside].unbind(-1)
+    carried[item[:, None].expand_as(inside)[inside], z, y, x] = True
+    return carried
+
+
+def swept_by_motion(
+    moving: Bool[Tensor, "b F Z Y X"], T_now_ego: Float64[Tensor, "b F 4 4"], spec: VoxelSpec
+) -> Bool[Tensor, "b F Z Y X"]:
+    """Return the voxels of each frame that moving things fill from now to then, and those next to them.
+
+    Args:
+        moving: occupied voxels that move, each frame in its own ego frame.
+        T_now_ego: poses of the frames relative to now.
+        spec: of the grids.
+    """
+    swept = []
+    for k in range(moving.shape[1]):
+        before = [
+            ego_compensated(moving[:, j], torch.linalg.inv(T_now_ego[:, j]) @ T_now_ego[:, k], spec)
+            for j in range(k + 1)
+        ]
+        filled = torch.stack(before).any(dim=0)
+        # Neighbours count: what is found a voxel beside them is wrong
+        swept.append(F.max_pool3d(filled.float(), 3, stride=1, padding=1) > 0)
+    return torch.stack(swept, dim=1)
 
 
 @dataclass(frozen=True)

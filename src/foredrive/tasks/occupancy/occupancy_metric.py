@@ -6,12 +6,19 @@ from torch import Tensor
 
 from foredrive.errors import InputError
 from foredrive.geometry.se3 import inverse_se3
-from foredrive.scene import Clip, Example, VoxelSpec, last_frames
+from foredrive.scene import Clip, Example, VoxelGrid, VoxelSpec, last_frames
 from foredrive.scene.ego_motion import continued_motion
-from foredrive.tasks.evaluation.metric import PRIOR, EvaluationContext, Figures, Shown, labels_from_now
+from foredrive.tasks.evaluation.metric import (
+    CEILING,
+    PRIOR,
+    EvaluationContext,
+    Figures,
+    Shown,
+    labels_from_now,
+)
 from foredrive.tasks.evaluation.predictor import Part, Prediction
-from foredrive.tasks.occupancy.forecasts import ego_compensated
-from foredrive.tasks.occupancy.scores import OccupancyCounts, above_ground, count_occupancy
+from foredrive.tasks.occupancy.forecasts import carried_by_flow, ego_compensated, swept_by_motion
+from foredrive.tasks.occupancy.scores import MOVING_MPS, OccupancyCounts, above_ground, count_occupancy
 
 PERSISTENCE, EGO_COMPENSATED, CONTINUED = ".copy", ".carried_copy", ".continued_copy"
 """Suffixes of persistence: the predicted present in place of the future, the same moved along the driven
@@ -22,7 +29,10 @@ PERSISTENT = (PERSISTENCE, EGO_COMPENSATED, CONTINUED)
 class OccupancyMetric:
     """IoU, precision and recall over all voxels and over those above the ground; IoU alone of persistence.
 
-    Keys: `iou_now`, `above_ground.iou_now.best_constant`, `iou_future_1s.copy` and so on.
+    Keys: `iou_now`, `above_ground.iou_now.best_constant`, `iou_future_1s.copy` and so on. `moving.iou_now`
+    is over the voxels above the ground that moving things fill until then, and their neighbours, `standing.`
+    over the others. `….ceiling` is the true present, moved along with its true flow and the driven path: the
+    best that a forecast can do which moves the present. It needs exact occupancy.
     """
 
     name = "occupancy"
@@ -49,22 +59,31 @@ class OccupancyMetric:
         labels = labels_from_now(truth.occupancy, clip, frames)
         if not self._regions:
             self._begin(labels.spec, frames)
+        flow = labels_from_now(truth.flow, clip, frames)
+        # Driven poses relative to now
+        T_world_ego = clip.T_world_ego[:, clip.now : clip.now + frames]
+        T_now_ego = inverse_se3(T_world_ego[:, :1]) @ T_world_ego
         shown = {"": predicted}
         if frames > 1:
-            # Driven poses relative to now
-            T_world_ego = clip.T_world_ego[:, clip.now : clip.now + frames]
-            T_now_ego = inverse_se3(T_world_ego[:, :1]) @ T_world_ego
             shown[PERSISTENCE] = predicted[:, :1].expand_as(predicted)
             shown[EGO_COMPENSATED] = _moved(predicted[:, 0], T_now_ego, labels.spec)
             # A clip without past frames has no measured motion to continue
             if clip.now > 0:
-                T_now_ego = _continued_path(clip, frames - 1)
-                shown[CONTINUED] = _moved(predicted[:, 0], T_now_ego, labels.spec)
-        # All voxels, and those above the ground
-        for scope, region in self._regions.items():
+                continued = _continued_path(clip, frames - 1)
+                shown[CONTINUED] = _moved(predicted[:, 0], continued, labels.spec)
+            if bool(labels.known[:, 0].all()):
+                t_s = clip.t_s[:, clip.now : clip.now + frames].double()
+                shown[f".{CEILING}"] = _carried(labels, flow, T_now_ego, t_s - t_s[:, :1])
+        # What moves, and what stands
+        moving = (labels.values[:, :, 0] > 0.5) & flow.known & (flow.values.norm(dim=2) > MOVING_MPS)
+        swept = swept_by_motion(moving, T_now_ego, labels.spec)
+        above = above_ground(labels.spec).to(swept.device)
+        regions = {**self._regions, "moving.": above & swept, "standing.": above & ~swept}
+        for scope, region in regions.items():
+            priors = {}
             if scope in self._priors:
-                shown[f".{PRIOR}"] = self._priors[scope][0].to(predicted.device).expand_as(predicted)
-            for suffix, occupied in shown.items():
+                priors[f".{PRIOR}"] = self._priors[scope][0].to(predicted.device).expand_as(predicted)
+            for suffix, occupied in (shown | priors).items():
                 counts = count_occupancy(occupied, labels, region)
                 key = (scope, suffix)
                 self._counts[key] = self._counts[key] + counts if key in self._counts else counts
@@ -86,7 +105,7 @@ class OccupancyMetric:
         for (scope, suffix), counts in self._counts.items():
             names = self._context.frame_names(len(counts.iou))
             # Persistence at now is the prediction itself and is left out
-            persists = suffix in PERSISTENT
+            persists = suffix in (*PERSISTENT, f".{CEILING}")
             for kind in ("iou",) if persists else ("iou", "precision", "recall"):
                 for name, value in zip(names, getattr(counts, kind).tolist(), strict=True):
                     if not (persists and name == "now"):
@@ -103,6 +122,21 @@ def _moved(
 ) -> Bool[Tensor, "b F Z Y X"]:
     """Return the present occupancy as seen from F poses."""
     frames = [ego_compensated(now, T_now_ego[:, k], spec) for k in range(T_now_ego.shape[1])]
+    return torch.stack(frames, dim=1)
+
+
+def _carried(
+    labels: VoxelGrid,
+    flow: VoxelGrid,
+    T_now_ego: Float64[Tensor, "b F 4 4"],
+    after_s: Float64[Tensor, "b F"],
+) -> Bool[Tensor, "b F Z Y X"]:
+    """Return the true present as seen from F poses at later times, moved along with its true flow."""
+    now, velocity = labels.values[:, 0, 0] > 0.5, flow.values[:, 0]
+    frames = [
+        carried_by_flow(now, velocity, T_now_ego[:, k], after_s[:, k], labels.spec)
+        for k in range(T_now_ego.shape[1])
+    ]
     return torch.stack(frames, dim=1)
 
 

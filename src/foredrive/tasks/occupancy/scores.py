@@ -58,7 +58,7 @@ class OccupancyCounts(Record):
 
 
 def count_occupancy(
-    predicted: Bool[Tensor, "b F Z Y X"], labels: VoxelGrid, region: Bool[Tensor, "Z Y X"] | None = None
+    predicted: Bool[Tensor, "b F Z Y X"], labels: VoxelGrid, region: Bool[Tensor, "*_r Z Y X"] | None = None
 ) -> OccupancyCounts:
     """Compare predicted occupancy with labels [b F 1 Z Y X] on known voxels, of `region` only if given."""
     occupied = labels.values[:, :, 0] > 0.5
