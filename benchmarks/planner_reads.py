@@ -48,7 +48,6 @@ TEST_TOWNS = ("Town03", "Town05")
 """Towns that no arm is trained in. Architectures were chosen on them, with other seeds of traffic."""
 TRAIN_SEEDS, TEST_SEEDS, EGOS = tuple(range(2000, 2003)), tuple(range(3000, 3004)), 80
 """Seeds of traffic, and virtual egos of each town and seed."""
-PRETRAINING_STEPS = 3200
 Volumes = Callable[[TruePlanes], Tensor]
 BATCH = 8
 EGO_FIT = EgoMLPFit(steps=4000)
@@ -255,7 +254,9 @@ def _keys(planes: TruePlanes) -> list[tuple[int, int]]:
 
 def pretrained() -> Run:
     """Pre-train the world model on the images and the exact occupancy of the egos to learn from."""
-    recipe = with_occupancy_source(learning.pretraining_alone(RECIPE, PRETRAINING_STEPS), "recorded")
+    assert RECIPE.pretrain is not None
+    steps = RECIPE.pretrain.schedule.steps
+    recipe = with_occupancy_source(learning.pretraining_alone(RECIPE, steps), "recorded")
     config = {"recipe": dataclasses.asdict(recipe), "towns": [TRAIN_TOWNS, TRAIN_SEEDS, EGOS]}
     folder = ROOT / "pretrained" / study_identity(config, (*LEARNED_BY_BOTH, *LEARNED_BY["nemo"]))
     return train_run(recipe, logs_to_learn(), folder, ROOT / "cache")
@@ -369,7 +370,6 @@ BENCHMARK = Benchmark(
     },
     config={
         "recipe": dataclasses.asdict(RECIPE),
-        "pretraining_steps": PRETRAINING_STEPS,
         "towns": [TRAIN_TOWNS, TEST_TOWNS, TRAIN_SEEDS, TEST_SEEDS, EGOS],
         "fits": [dataclasses.asdict(value) for value in (EGO_FIT, READ, READ_FIT)],
     },
