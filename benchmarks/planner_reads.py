@@ -2,7 +2,8 @@
 
 The arms `true` read the true map, boxes and lights, drawn from above, in place of the features of a world
 model. Egos come from many windows of traffic in six towns, and are judged in two others. A blind twin has the
-same size, steps and data, and features of zeros.
+same size, steps and data, and features of zeros. `seen` reads the volume of the shipped NeMo, which was
+trained on images of Town03 too; `seen_blacked` sees black images.
 """
 
 import dataclasses
@@ -14,26 +15,24 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Int
 from rich.progress import track
 from torch import Tensor, nn
 
-from benchmarks import learning
 from benchmarks.common.study import work_folder
 from benchmarks.common.true_planes import CHANNELS, HORIZON, PAST, SPEC, TruePlanes, joined, kept, read_planes
-from benchmarks.common.world_models import LEARNED_BY, LEARNED_BY_BOTH
-from foredrive.data import ClipDataset, LogPath, collate
-from foredrive.engine.bench import Benchmark, study_identity
+from foredrive.data import ClipDataset, LogPath
+from foredrive.data.batches import stack_records
+from foredrive.engine.bench import Benchmark
 from foredrive.errors import InputError
 from foredrive.methods.planner.ego_mlp import EgoMLP, EgoMLPConfig, status_vector
 from foredrive.methods.planner.ego_mlp_fit import EgoMLPFit, StatusDemonstrations, fit_ego_mlp
 from foredrive.methods.planner.path_correction import PathCorrection, PathCorrectionConfig, PathSamples
 from foredrive.methods.planner.path_fit import PathDemonstrations, PathFit, fit_path
 from foredrive.methods.planner.planner import PlannerConfig, VolumePlanner
-from foredrive.methods.recipe import with_occupancy_source
 from foredrive.runs.drive.recording import EgosPlan, record_egos
 from foredrive.runs.recipes.known import find_recipe
-from foredrive.runs.train.run import Run, load_agent, train_run
+from foredrive.runs.shipped import run_folder
+from foredrive.runs.train.run import Run, load_agent, open_run
 from foredrive.scene import VoxelSpec
 from foredrive.scene.conditions import CONDITIONS
 from foredrive.sensors.rigs import SURROUND
@@ -48,6 +47,7 @@ TEST_TOWNS = ("Town03", "Town05")
 """Towns that no arm is trained in. Architectures were chosen on them, with other seeds of traffic."""
 TRAIN_SEEDS, TEST_SEEDS, EGOS = tuple(range(2000, 2003)), tuple(range(3000, 3004)), 80
 """Seeds of traffic, and virtual egos of each town and seed."""
+SHIPPED = Path("embedded:nemo_town")
 Volumes = Callable[[TruePlanes], Tensor]
 BATCH = 8
 EGO_FIT = EgoMLPFit(steps=4000)
@@ -166,8 +166,8 @@ class PathStudy(NamedTuple):
     channels: int
     train: PathDemonstrations
     test: PathDemonstrations
-    windows: Int[Tensor, "N"]
-    """Windows of those to judge by."""
+    judged: TruePlanes
+    """The egos to judge by."""
 
 
 @torch.no_grad()
@@ -200,66 +200,58 @@ def true_study(*, blind: bool = False) -> PathStudy:
         return planes.volumes() * (not blind)
 
     learned, judged = (demonstrations(of, reads, volumes) for of in (joined([train, train.mirrored()]), test))
-    return PathStudy(SPEC, CHANNELS, learned, judged, test.window)
+    return PathStudy(SPEC, CHANNELS, learned, judged, test)
 
 
 @functools.cache
 def seen_study(*, images: bool = True) -> PathStudy:
-    """Return demonstrations with the volumes of a pre-trained NeMo, which has seen no image of the test egos.
+    """Return demonstrations with the volumes of the shipped NeMo.
 
     Args:
         images: False blacks them, for those to learn from and those to judge by.
     """
-    spec, channels = RECIPE.clips.voxels, RECIPE.model.channels
-    reads, name = _reads(spec, channels), "seen" if images else "blacked"
-    sampled, windows = list[PathDemonstrations](), egos_to_judge().window
-    for part, planes, logs in (
-        ("train", egos_to_learn(), logs_to_learn()),
-        ("test", egos_to_judge(), logs_to_judge()),
-    ):
-        volumes = SeenVolumes(logs, images=images)
+    run = open_run(run_folder(SHIPPED, WORK / "models"))
+    spec, channels = run.recipe.clips.voxels, run.recipe.model.channels
+    reads = _reads(spec, channels)
+
+    def sampled(
+        name: str, egos: TruePlanes, logs: Sequence[LogPath]
+    ) -> tuple[PathDemonstrations, TruePlanes]:
+        volumes = SeenVolumes(run, logs, images=images)
         # Later frames have no images
-        shown = planes[torch.tensor([key in volumes.clips for key in _keys(planes)])]
-        windows = shown.window
+        shown = egos[torch.tensor([key in volumes.clips for key in _keys(egos)])]
+        file = WORK / f"{'seen' if images else 'blacked'}_{name}.safetensors"
         make = functools.partial(demonstrations, shown, reads, volumes)
-        sampled.append(kept(PathDemonstrations, WORK / f"{name}_{part}.safetensors", make))
-    learned, judged = sampled
-    return PathStudy(spec, channels, learned, judged, windows)
+        return kept(PathDemonstrations, file, make), shown
+
+    learned, _ = sampled("train", egos_to_learn(), logs_to_learn())
+    return PathStudy(spec, channels, learned, *sampled("test", egos_to_judge(), logs_to_judge()))
 
 
 class SeenVolumes:
     """Volumes of the clips of some logs, from the images.
 
     Args:
+        run: of a NeMo.
         logs: those of the planes.
         images: False blacks them.
     """
 
-    def __init__(self, logs: Sequence[LogPath], *, images: bool) -> None:
-        config = dataclasses.replace(RECIPE.clips, future_frames=0, future_images=False)
+    def __init__(self, run: Run, logs: Sequence[LogPath], *, images: bool) -> None:
+        config = dataclasses.replace(run.recipe.clips, future_frames=0, future_images=False)
         self.dataset = ClipDataset(logs, config, None, images=images)
         frames = map(self.dataset.frames_of, range(len(self.dataset)))
         self.clips = {(log, of_clip[config.past_frames]): clip for clip, (log, of_clip) in enumerate(frames)}
-        self.agent = load_agent(pretrained())
+        self.agent = load_agent(run)
 
     def __call__(self, planes: TruePlanes) -> Tensor:
         """Return the volumes of the clips of some egos."""
-        clips = collate([self.dataset[self.clips[key]] for key in _keys(planes)]).clip
-        return self.agent.planner_volume(self.agent.rollout(clips.observed(), 0)[0])
+        clip = stack_records([self.dataset.clip(self.clips[key]) for key in _keys(planes)])
+        return self.agent.planner_volume(self.agent.rollout(clip.observed(), 0)[0])
 
 
 def _keys(planes: TruePlanes) -> list[tuple[int, int]]:
     return list(zip(planes.log.tolist(), planes.now.tolist(), strict=True))
-
-
-def pretrained() -> Run:
-    """Pre-train the world model on the images and the exact occupancy of the egos to learn from."""
-    assert RECIPE.pretrain is not None
-    steps = RECIPE.pretrain.schedule.steps
-    recipe = with_occupancy_source(learning.pretraining_alone(RECIPE, steps), "recorded")
-    config = {"recipe": dataclasses.asdict(recipe), "towns": [TRAIN_TOWNS, TRAIN_SEEDS, EGOS]}
-    folder = ROOT / "pretrained" / study_identity(config, (*LEARNED_BY_BOTH, *LEARNED_BY["nemo"]))
-    return train_run(recipe, logs_to_learn(), folder, ROOT / "cache")
 
 
 @torch.no_grad()
@@ -277,15 +269,20 @@ def read_along(study: Callable[[], PathStudy]) -> Callable[[int], dict[str, floa
     """Return an arm that reads along the MLP's plan."""
 
     def measure(seed: int) -> dict[str, float]:
-        spec, channels, train, test, window = study()
+        spec, channels, train, test, egos = study()
         torch.manual_seed(seed)
         reads = _reads(spec, channels)
         fit_path(reads, train, READ_FIT, seed)
         own, rival = errors_m(reads, test)
         # Whole windows of traffic are drawn, because their egos see the same
-        windows = [str(number) for number in window.tolist()]
+        windows = [str(number) for number in egos.window.tolist()]
         gain = bootstrap_mean(100 * (rival - own) / rival.mean(), windows, np.random.default_rng(seed))
-        return {
+        by_town = {}
+        for number, town in enumerate(TEST_TOWNS):
+            # Each seed has the logs of one town after those of the other
+            of_town = (egos.log // EGOS % len(TEST_TOWNS) == number).numpy()
+            by_town[f"gain_pct_{town}"] = float(100 * (1 - own[of_town].mean() / rival[of_town].mean()))
+        return by_town | {
             "l2_m": float(own.mean()),
             "ego_mlp_l2_m": float(rival.mean()),
             "train_l2_m": float(errors_m(reads, train)[0].mean()),
