@@ -11,7 +11,7 @@ from PIL import Image, ImageOps
 from foredrive.data.batches import stack_records
 from foredrive.engine.folder import SUMMARY
 from foredrive.engine.metrics_log import read_metrics
-from foredrive.engine.summary import read_summary
+from foredrive.engine.summary import Summary, numbers, read_summary
 from foredrive.runs.demo import (
     DRIVER,
     TEXTS,
@@ -126,8 +126,24 @@ def show_shipped(demo: Demo) -> Section:
                 figures=_from_above(best),
                 columns="three",
             ),
-            Block("Its plans under five protocols", table=planning_overview(judged.summary)),
+            Block(
+                "Its plans under five protocols",
+                _plan_against_blind(judged.summary),
+                table=planning_overview(judged.summary),
+            ),
         ],
+    )
+
+
+def _plan_against_blind(summary: Summary) -> str:
+    """Say whether seeing made the plan better than that of the MLP, which sees nothing."""
+    own_m, blind_m = (numbers(summary)[f"planning.{who}uniad.l2_avg_m"] for who in ("", "ego_mlp."))
+    blind = f"those of the ego-only MLP, which sees nothing, are {blind_m:.2f} m off"
+    if own_m < blind_m:
+        return f"By UniAD's L2 they are {own_m:.2f} m off; {blind}."
+    return (
+        f"By UniAD's L2 they are {own_m:.2f} m off, which is no gain: {blind}. Most of a plan of three seconds "
+        "follows from the speed, and what the model sees corrects little."
     )
 
 
