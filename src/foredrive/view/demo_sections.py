@@ -142,8 +142,8 @@ def _plan_against_blind(summary: Summary) -> str:
     if own_m < blind_m:
         return f"By UniAD's L2 they are {own_m:.2f} m off; {blind}."
     return (
-        f"By UniAD's L2 they are {own_m:.2f} m off, which is no gain: {blind}. Most of a plan of three seconds "
-        "follows from the speed, and what the model sees corrects little."
+        f"By UniAD's L2 they are {own_m:.2f} m off, which is no gain: {blind}. Most of a plan of three "
+        "seconds follows from the speed, and what the model sees corrects little."
     )
 
 
