@@ -5,6 +5,7 @@ import math
 from dataclasses import dataclass
 from typing import Literal
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
@@ -80,10 +81,11 @@ def sinusoidal_places(count: int, step_m: float, width: int) -> Float[Tensor, "N
     waves, of `SHORTEST_M` to `LONGEST_M`, are longer than several cells, so attention that prefers a place
     prefers its surroundings too.
     """
-    position_m = step_m * (torch.arange(count) - 0.5 * (count - 1))
-    length_m = torch.logspace(math.log10(LONGEST_M), math.log10(SHORTEST_M), (width + 1) // 2)
-    phase = 2 * math.pi * position_m[:, None] / length_m
-    return math.sqrt(2) * torch.cat([phase.sin(), phase.cos()], dim=-1)[:, :width]
+    position_m = step_m * (np.arange(count) - 0.5 * (count - 1))
+    length_m = np.geomspace(LONGEST_M, SHORTEST_M, (width + 1) // 2)
+    phase = 2 * np.pi * position_m[:, None] / length_m
+    places = math.sqrt(2) * np.concatenate([np.sin(phase), np.cos(phase)], axis=-1)[:, :width]
+    return torch.tensor(places, dtype=torch.float32)
 
 
 class FutureAttention(nn.Module):
