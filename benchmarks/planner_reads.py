@@ -366,7 +366,7 @@ BENCHMARK = Benchmark(
         "seen_blacked": read_along(functools.partial(seen_study, images=False)),
     },
     config={
-        "recipe": dataclasses.asdict(RECIPE),
+        "clips": [RECIPE.clips.image_hw, RECIPE.clips.horizon_steps, DT_S],
         "towns": [TRAIN_TOWNS, TEST_TOWNS, TRAIN_SEEDS, TEST_SEEDS, EGOS],
         "fits": [dataclasses.asdict(value) for value in (EGO_FIT, READ, READ_FIT)],
     },

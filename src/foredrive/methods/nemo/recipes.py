@@ -97,7 +97,7 @@ def nemo_town() -> NemoRecipe:
         clips=dataclasses.replace(
             tiny.clips,
             now_stride_s=0.5,
-            voxels=VoxelSpec(lower_m=(-32.0, -32.0, -1.5), voxel_m=1.0, shape_zyx=(6, 64, 72)),
+            voxels=VoxelSpec(lower_m=(-16.0, -24.0, -1.5), voxel_m=1.0, shape_zyx=(6, 48, 56)),
         ),
         model=dataclasses.replace(
             tiny.model,
