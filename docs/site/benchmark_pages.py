@@ -39,6 +39,10 @@ DECIDING = {
     "ranking": "coverage_min coverage_mean coverage.2_agents_16_routes coverage.10_agents_56_routes",
     "real-to-sim": "real.occupancy.iou_now rendered.occupancy.iou_now real.occupancy.above_ground.iou_now "
     "rendered.occupancy.above_ground.iou_now real.planning.uniad.l2_avg_m rendered.planning.uniad.l2_avg_m",
+    "nemo-futures": "occupancy.moving.iou_now occupancy.moving.iou_future_1s "
+    "occupancy.moving.iou_future_1s.continued_copy occupancy.moving.iou_future_1s.ceiling "
+    "occupancy.standing.iou_future_1s occupancy.standing.iou_future_1s.continued_copy "
+    "occupancy.standing.iou_future_1s.ceiling share.moving_pct",
     "rebuild-compare": "computing_minutes psnr_db depth_median_sq_m2 chamfer_m2 psnr_3m_aside_db "
     "points.3m_aside.psnr_db",
     "rebuild-town": "held_out.psnr_db left_3m.psnr_db right_3m.psnr_db removed.changed.psnr_db "
