@@ -1,5 +1,6 @@
 """The sections of the demo's report. Each function does a step of `runs.demo` and shows its results."""
 
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -11,7 +12,7 @@ from PIL import Image, ImageOps
 from foredrive.data.batches import stack_records
 from foredrive.engine.folder import SUMMARY
 from foredrive.engine.metrics_log import read_metrics
-from foredrive.engine.summary import Summary, numbers, read_summary
+from foredrive.engine.summary import numbers, read_summary
 from foredrive.runs.demo import (
     DRIVER,
     TEXTS,
@@ -128,22 +129,23 @@ def show_shipped(demo: Demo) -> Section:
             ),
             Block(
                 "Its plans under five protocols",
-                _plan_against_blind(judged.summary),
+                _plan_against_blind(judged),
                 table=planning_overview(judged.summary),
             ),
         ],
     )
 
 
-def _plan_against_blind(summary: Summary) -> str:
-    """Say whether seeing made the plan better than that of the MLP, which sees nothing."""
-    own_m, blind_m = (numbers(summary)[f"planning.{who}uniad.l2_avg_m"] for who in ("", "ego_mlp."))
+def _plan_against_blind(judged: Judged) -> str:
+    """Say whether the plan is better than that of the MLP, which sees nothing."""
+    figures = numbers(judged.summary)
+    own_m, blind_m = (round(figures.get(f"planning.{who}{L2}", math.nan), 2) for who in ("", "ego_mlp."))
     blind = f"those of the ego-only MLP, which sees nothing, are {blind_m:.2f} m off"
     if own_m < blind_m:
         return f"By UniAD's L2 they are {own_m:.2f} m off; {blind}."
     return (
         f"By UniAD's L2 they are {own_m:.2f} m off, which is no gain: {blind}. Most of a plan of three "
-        "seconds follows from the speed, and what the model sees corrects little."
+        "seconds follows from the speed alone."
     )
 
 

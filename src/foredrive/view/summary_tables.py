@@ -28,7 +28,8 @@ ABOVE_NOTE = f"Above the ground: voxels more than {ABOVE_GROUND_M:g} m above it.
 BASELINES_NOTE = (
     "Occupancy prior: the fixed grid that scores best on the training logs. Persistence: the predicted "
     "present in place of the future. Ego-compensated persistence: the same, moved along the driven path, "
-    "which the model is not told. Persistence, motion continued: moved as if the vehicle went on as measured."
+    "which the model is not told. Persistence, motion continued: moved as if the vehicle went on as "
+    "measured. Ceiling of true motion: the true present, moved along with its true flow and the driven path."
 )
 FUTURES_NOTE = "Best and mean of K: sampled futures."
 BEST_NOTE = "Green: best of its column. The protocols differ: compare values of one column only."
@@ -39,13 +40,19 @@ INVALID_NOTE = (
 MODEL = ""
 AGENT_TITLES = {MODEL: "this model", "ego_mlp": "ego-only MLP"}
 WHENS = (*HORIZON_NAMES, "avg")
-SCOPE_TITLES = {"": "all voxels", "above_ground.": "above the ground"}
+SCOPE_TITLES = {
+    "": "all voxels",
+    "above_ground.": "above the ground",
+    "moving.": "above the ground, where things move",
+    "standing.": "above the ground, elsewhere",
+}
 OCCUPANCY_TITLES = {"iou": "IoU", "precision": "precision", "recall": "recall"}
 BASELINE_TITLES = {
     PRIOR: "occupancy prior",
     "copy": "persistence",
     "carried_copy": "ego-compensated persistence",
     "continued_copy": "persistence, motion continued",
+    CEILING: "ceiling of true motion",
 }
 """Titles of the baselines by their keys in summary.json."""
 _BASELINE = re.compile(r"occupancy\.iou_\w+\.(\w+)")
@@ -145,6 +152,8 @@ def occupancy_table(summary: Summary) -> Table | None:
     ]
     sections = []
     for scope, title in SCOPE_TITLES.items():
+        if f"occupancy.{scope}iou_{whens[0]}" not in summary:
+            continue
         rows = []
         for when in whens:
             iou = f"occupancy.{scope}iou_{when}"

@@ -44,7 +44,7 @@ class CarriedConfig:
 
     agents: int = 30
     """Number of queries that are carried on. That many fewer queries begin at proposals."""
-    decay: float = 0.6
+    decay: float = 0.36
     """Share of its rank that a carried query keeps at least from frame to frame."""
     reach_m: float = 2.0
     """Maximum distance of the proposal at which a carried agent goes on from where it is expected."""

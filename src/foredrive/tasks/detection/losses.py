@@ -34,7 +34,6 @@ class MatchingLossConfig:
 
     box_score: Literal["likelihood", "energy"] = "likelihood"
     """Score that trains the state of matched boxes."""
-    no_object_weight: float = NO_OBJECT_WEIGHT
     box_weight: float = 0.5
     heading_weight: float = 0.5
     likelihood_weight: float = 0.1
@@ -76,7 +75,7 @@ def matched_loss(
     # Queries without an object have the last class, "no object"
     target = torch.full(predicted.logits.shape[:1], classes, device=predicted.logits.device)
     target[query] = truth.label[match].long()
-    weight = torch.where(target == classes, config.no_object_weight, 1.0)
+    weight = torch.where(target == classes, NO_OBJECT_WEIGHT, 1.0)
     entropy = (F.cross_entropy(predicted.logits, target, reduction="none") * weight).sum()
     state, scale = truth.state[match].to(predicted.mean), predicted.mean.new_tensor(STATE_SCALE)
     mean, log_std, log_std_yaw = predicted.mean[query], predicted.log_std[query], predicted.log_std_yaw[query]

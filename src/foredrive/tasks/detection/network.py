@@ -49,7 +49,8 @@ class BoxSet(Record):
     def detections(self) -> Detections:
         """Return the boxes as `Detections`, which hold mean and covariance but no family.
 
-        Sine and cosine get the variance of the angle.
+        The existence is that of the logits, also where a loss taught odds that are too high
+        (`AgentSet.best_class`). Sine and cosine get the variance of the angle.
         """
         log_prob = self.logits.double().log_softmax(-1)
         # Probability that the query is any object

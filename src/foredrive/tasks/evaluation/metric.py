@@ -33,7 +33,8 @@ PRIOR, STEADY = "best_constant", "constant_velocity"
 """Baselines of several metrics, as the last part of their keys: the fixed answer that scores best on the
 training logs, and road users that go on as they drive."""
 CEILING = "ceiling"
-"""Last part of the key of what the truth above the model's grid scores: more cannot be found there."""
+"""Last part of the keys of what the truth itself scores under a limit of the model: above its grid, or moved
+along as it is now."""
 
 
 @dataclass(frozen=True)

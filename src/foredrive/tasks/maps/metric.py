@@ -70,7 +70,8 @@ AREA: Area = "60x30"
 class MapLinesMetric:
     """Keys: `maptr.map`, `maptr.ap_divider`, `streammapnet.map` and so on; `lines.frames_counted`.
 
-    `maptr.map.ceiling` is that of the true lines cut to the clips' voxels, the longest part of each.
+    `maptr.map.ceiling` is that of the true lines cut to the clips' voxels: the longest part of each, scored
+    by its share of the line. A head that guesses how lines go on may exceed it.
     Protocols that follow identities are left out. Frames without a map do not count.
     """
 
@@ -102,8 +103,8 @@ class MapLinesMetric:
                         elements.vertices[item, number, elements.valid[item, number]].double().cpu().numpy()
                     )
                     self._true.append((self._frames, kind, line, 1.0))
-                    part = _part_above(line, truth.occupancy.spec)
-                    self._above += [] if part is None else [(self._frames, kind, part, 1.0)]
+                    part, share = _part_above(line, truth.occupancy.spec)
+                    self._above += [(self._frames, kind, part, share)] if share > 0 else []
             self._frames += 1
 
     def result(self) -> Figures:
@@ -127,11 +128,14 @@ class MapLinesMetric:
         return out | {"lines.frames_counted": self._frames}
 
 
-def _part_above(line: Float64[ndarray, "V 2"], voxels: VoxelSpec) -> Float64[ndarray, "_ 2"] | None:
-    """Return the longest part of a line above a voxel grid; None if there is none."""
-    cut = shapely.box(*voxels.lower_m[:2], *voxels.upper_m[:2]).intersection(shapely.LineString(line))
-    parts = [part for part in shapely.get_parts(cut) if part.length > 0]
-    return shapely.get_coordinates(max(parts, key=lambda part: part.length)) if parts else None
+def _part_above(line: Float64[ndarray, "V 2"], voxels: VoxelSpec) -> tuple[Float64[ndarray, "_ 2"], float]:
+    """Return the longest part of a line above a voxel grid, and its share of the line's length."""
+    whole = shapely.LineString(line)
+    cut = shapely.box(*voxels.lower_m[:2], *voxels.upper_m[:2]).intersection(whole)
+    # Of a closed line, the parts before and after its first vertex belong together
+    parts = shapely.get_parts(shapely.line_merge(cut))
+    longest = max(parts, key=lambda part: part.length, default=shapely.LineString())
+    return shapely.get_coordinates(longest), longest.length / whole.length
 
 
 def _line_set(rows: list[tuple[int, int, ndarray, float]]) -> LineSet:

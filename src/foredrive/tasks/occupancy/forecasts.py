@@ -1,4 +1,4 @@
-"""Forecasts of occupancy: ego-compensated persistence, and several sampled futures."""
+"""Forecasts of occupancy: the present moved along the driven path or with its flow, and sampled futures."""
 
 import functools
 import itertools
@@ -55,23 +55,21 @@ def carried_by_flow(
     """
     moves = occupied & (flow_mps.norm(dim=1) > MOVING_MPS)
     carried = ego_compensated(occupied & ~moves, T_src_dst, spec)
-    item, z, y, x = moves.nonzero().unbind(-1)
-    # Eight points of each moving voxel, so that a turned grid has no holes
-    corner = torch.cartesian_prod(*3 * [torch.tensor([-0.25, 0.25], device=item.device)]) * spec.voxel_m
-    start = spec.centres_m(item.device)[z, y, x] + after_s[item, None] * flow_mps[item, :, z, y, x]
-    points = start[:, None].double() + corner.double()
-    place = transform_points(torch.linalg.inv(T_src_dst)[item], points)
-    index = ((place - place.new_tensor(spec.lower_m)) / spec.voxel_m).floor().long()
-    inside = ((index >= 0) & (index < index.new_tensor(spec.shape_zyx[::-1]))).all(-1)
-    x, y, z = index[inside].unbind(-1)
-    carried[item[:, None].expand_as(inside)[inside], z, y, x] = True
+    for item in moves.flatten(1).any(1).nonzero()[:, 0].tolist():
+        velocity = flow_mps[item].movedim(0, -1)
+        # The voxels of one thing have one velocity: its place in src is behind by what it moves
+        for one in velocity[moves[item]].unique(dim=0):
+            same = moves[item] & (velocity == one).all(dim=-1)
+            T_behind_src = torch.eye(4, dtype=T_src_dst.dtype, device=T_src_dst.device)
+            T_behind_src[:3, 3] = -after_s[item] * one
+            carried[item] |= ego_compensated(same[None], T_behind_src @ T_src_dst[item : item + 1], spec)[0]
     return carried
 
 
 def swept_by_motion(
     moving: Bool[Tensor, "b F Z Y X"], T_now_ego: Float64[Tensor, "b F 4 4"], spec: VoxelSpec
 ) -> Bool[Tensor, "b F Z Y X"]:
-    """Return the voxels of each frame that moving things fill from now to then, and those next to them.
+    """Return the voxels of each frame that moving things fill at the frames up to it, and those next to them.
 
     Args:
         moving: occupied voxels that move, each frame in its own ego frame.

@@ -30,9 +30,10 @@ class OccupancyMetric:
     """IoU, precision and recall over all voxels and over those above the ground; IoU alone of persistence.
 
     Keys: `iou_now`, `above_ground.iou_now.best_constant`, `iou_future_1s.copy` and so on. `moving.iou_now`
-    is over the voxels above the ground that moving things fill until then, and their neighbours, `standing.`
-    over the others. `….ceiling` is the true present, moved along with its true flow and the driven path: the
-    best that a forecast can do which moves the present. It needs exact occupancy.
+    is over the voxels above the ground that moving things fill at the frames up to then, and their
+    neighbours, `standing.` over the others; frames whose flow is unknown count in neither. `….ceiling` is the
+    true present, moved along with its true flow and the driven path: about the best that a forecast can do
+    which moves the present. It is given where all occupancy and its flow are known.
     """
 
     name = "occupancy"
@@ -45,6 +46,8 @@ class OccupancyMetric:
         self._regions: dict[str, Tensor | None] = {}
         self._priors: dict[str, tuple[Tensor, Tensor]] = {}
         self._counts: dict[tuple[str, str], OccupancyCounts] = {}
+        self._exact = True
+        """Whether all occupancy of the clips so far and its flow are known at now."""
 
     def update(self, prediction: Prediction, truth: Example) -> None:
         """Count hits and misses of b clips.
@@ -60,6 +63,7 @@ class OccupancyMetric:
         if not self._regions:
             self._begin(labels.spec, frames)
         flow = labels_from_now(truth.flow, clip, frames)
+        occupied = labels.values[:, :, 0] > 0.5
         # Driven poses relative to now
         T_world_ego = clip.T_world_ego[:, clip.now : clip.now + frames]
         T_now_ego = inverse_se3(T_world_ego[:, :1]) @ T_world_ego
@@ -71,20 +75,22 @@ class OccupancyMetric:
             if clip.now > 0:
                 continued = _continued_path(clip, frames - 1)
                 shown[CONTINUED] = _moved(predicted[:, 0], continued, labels.spec)
-            if bool(labels.known[:, 0].all()):
+            self._exact &= bool(labels.known[:, 0].all() & (flow.known | ~occupied)[:, 0].all())
+            if self._exact:
                 t_s = clip.t_s[:, clip.now : clip.now + frames].double()
                 shown[f".{CEILING}"] = _carried(labels, flow, T_now_ego, t_s - t_s[:, :1])
         # What moves, and what stands
-        moving = (labels.values[:, :, 0] > 0.5) & flow.known & (flow.values.norm(dim=2) > MOVING_MPS)
+        moving = occupied & flow.known & (flow.values.norm(dim=2) > MOVING_MPS)
         swept = swept_by_motion(moving, T_now_ego, labels.spec)
-        above = above_ground(labels.spec).to(swept.device)
+        annotated = flow.known.flatten(2).any(-1)[..., None, None, None]
+        above = above_ground(labels.spec).to(swept.device) & annotated
         regions = {**self._regions, "moving.": above & swept, "standing.": above & ~swept}
         for scope, region in regions.items():
             priors = {}
             if scope in self._priors:
                 priors[f".{PRIOR}"] = self._priors[scope][0].to(predicted.device).expand_as(predicted)
-            for suffix, occupied in (shown | priors).items():
-                counts = count_occupancy(occupied, labels, region)
+            for suffix, voxels in (shown | priors).items():
+                counts = count_occupancy(voxels, labels, region)
                 key = (scope, suffix)
                 self._counts[key] = self._counts[key] + counts if key in self._counts else counts
 
@@ -103,8 +109,10 @@ class OccupancyMetric:
         """Return the ratios of the sums, and the thresholds at which the prior is cut."""
         out: Figures = {}
         for (scope, suffix), counts in self._counts.items():
+            if suffix == f".{CEILING}" and not self._exact:
+                continue
             names = self._context.frame_names(len(counts.iou))
-            # Persistence at now is the prediction itself and is left out
+            # At now, persistence is the prediction itself, and the ceiling the truth: both are left out
             persists = suffix in (*PERSISTENT, f".{CEILING}")
             for kind in ("iou",) if persists else ("iou", "precision", "recall"):
                 for name, value in zip(names, getattr(counts, kind).tolist(), strict=True):

@@ -11,7 +11,8 @@ from foredrive.scene.agents import Agents
 from foredrive.tasks.tracking.object_rows import ObjectRows, make_rows
 
 MIN_SCORE = 0.001
-"""Detections with a lower score are left out. They change no figure by more than this."""
+"""Detections with a lower score are left out, which keeps files small. A class that is never more probable
+than this has no detections."""
 
 Pose = Float64[ndarray, "4 4"]
 
