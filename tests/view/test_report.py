@@ -330,6 +330,8 @@ def test_figures_of_tasks_stand_beside_their_baselines() -> None:
         ["UniAD, IoU of lanes", "0.250", "prior of the training logs", "0.125"],
     ]
     assert task_table({}) is None
+    limited = found | {"map.uniad.iou_lanes.ceiling": 0.5}
+    assert [row[4] for row in cells_of(task_table(limited))] == ["", "0.500"]
 
 
 def test_a_new_metric_shows_its_main_figures_without_an_edit_here(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -215,24 +215,33 @@ def image_table(summary: Summary) -> Table | None:
 
 
 def task_table(summary: Summary) -> Table | None:
-    """Compare the main figures that metrics state with their baselines."""
+    """Compare the main figures of metrics with their baselines and, where there are some, with ceilings."""
     from foredrive.tasks.evaluation.metrics import METRICS  # Imports PyTorch
 
-    rows: dict[str, list[Row]] = {}
+    rows: dict[str, list[list[str]]] = {}
     # Metrics are started only to read their names and titles; their settings have no effect here
     for metric in (start(EvaluationContext(frame_dt_s=1.0)) for start in METRICS):
         for figure in metric.shown:
-            keys = (f"{metric.name}.{figure.key}", f"{metric.name}.{figure.key}.{figure.baseline}")
-            if keys[0] in summary or keys[1] in summary:
-                own, beside = (number(summary.get(key), figure.digits) for key in keys)
-                ceiling = summary.get(f"{keys[0]}.{CEILING}")
+            key = f"{metric.name}.{figure.key}"
+            if key in summary or f"{key}.{figure.baseline}" in summary:
+                own, beside = (
+                    number(summary.get(name), figure.digits) for name in (key, f"{key}.{figure.baseline}")
+                )
+                ceiling = summary.get(f"{key}.{CEILING}")
                 most = "" if ceiling is None else number(ceiling, figure.digits)
-                row = Row((figure.title, own, _baseline(figure.baseline), beside, most))
+                row = [figure.title, own, _baseline(figure.baseline), beside, most]
                 rows.setdefault(metric.title, []).append(row)
-    sections = [Section(of_metric, title) for title, of_metric in rows.items()]
-    left = Column(align="left")
-    named = [Column("this model"), Column("baseline", align="left"), Column("its figure")]
-    columns = [left, *named, Column("ceiling of the grid")]
+    limited = any(row[-1] for of_metric in rows.values() for row in of_metric)
+    columns = [
+        Column(align="left"),
+        Column("this model"),
+        Column("baseline", align="left"),
+        Column("its figure"),
+        *([Column("ceiling of the grid")] if limited else []),
+    ]
+    sections = [
+        Section([Row(row[: len(columns)]) for row in of_metric], title) for title, of_metric in rows.items()
+    ]
     return Table(columns, sections, "Tasks at now") if sections else None
 
 
