@@ -77,7 +77,7 @@ class DetectionMetric:
         # Label 0 is the first class, cars
         cars = true[true.label == 0]
         for rows, suffix in ((predicted, ""), (above, f".{CEILING}")):
-            found = evaluate_detections(rows[rows.label == 0], cars, racks, CAR_30M).by_class["car"]
-            out[f"car_ap_2m_30m{suffix}"] = found.ap[2.0] if found.true else float("nan")
+            cars_figures = evaluate_detections(rows[rows.label == 0], cars, racks, CAR_30M).by_class["car"]
+            out[f"car_ap_2m_30m{suffix}"] = cars_figures.ap[2.0] if cars_figures.true else float("nan")
         out["car_ap_2m_30m.nothing_detected"] = 0.0
-        return out | {"car_ap_2m_30m.true": found.true, "frames_counted": len(self._true)}
+        return out | {"car_ap_2m_30m.true": cars_figures.true, "frames_counted": len(self._true)}
