@@ -3,7 +3,8 @@
 The arms `true` read the true map, boxes and lights, drawn from above, in place of the features of a world
 model. Egos come from many windows of traffic in six towns, and are judged in two others. `seen` reads the
 volume of the shipped NeMo, which was trained on images of Town03 too. A blind twin has the same size, steps
-and data, and features of zeros. All correct the plans of one ego-only MLP, which has learned from the same egos.
+and data, and features of zeros. All correct the plans of one ego-only MLP, which has learned from the same
+egos.
 """
 
 import dataclasses
