@@ -49,8 +49,7 @@ class PathCorrection(nn.Module):
     Columns of the volume are sampled at given distances on the path and beside it. The same inputs then mean
     the same place along the path whatever its curve, so braking for an obstacle in the lane is not learned
     anew for every cell of the plane. The columns can be stored, so that many thousand demonstrations train it
-    in seconds (`training.fit_path`). The thousand demonstrations of fine-tuning are too few
-    (`bench nemo-planning-limits`).
+    in seconds (`path_fit.fit_path`). `bench planner-reads` measures how much they gain.
 
     Args:
         config: sizes.
