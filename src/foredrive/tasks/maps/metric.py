@@ -132,7 +132,7 @@ def _part_above(line: Float64[ndarray, "V 2"], voxels: VoxelSpec) -> tuple[Float
     """Return the longest part of a line above a voxel grid, and its share of the line's length."""
     whole = shapely.LineString(line)
     cut = shapely.box(*voxels.lower_m[:2], *voxels.upper_m[:2]).intersection(whole)
-    # Of a closed line, the parts before and after its first vertex belong together
+    # Shapely 2.2 cuts a closed line at its first vertex too: those two parts belong together
     parts = shapely.get_parts(shapely.line_merge(cut))
     longest = max(parts, key=lambda part: part.length, default=shapely.LineString())
     return shapely.get_coordinates(longest), longest.length / whole.length
