@@ -36,13 +36,13 @@ DECIDING = {
     "ncap-transfer": "pairs collision_agreement kappa score_in_town score_in_rebuild score_correlation",
     "nemo-ablation": "l2_m ego_mlp.uniad.l2_avg_m collision_pct above_ground.iou_now",
     "nemo-base": "forward_cpu_s peak_gib fast.step_cpu_s fast.peak_gib speedup_over_reference",
-    "ranking": "coverage_min coverage_mean coverage.2_agents_16_routes coverage.10_agents_56_routes",
-    "real-to-sim": "real.occupancy.iou_now rendered.occupancy.iou_now real.occupancy.above_ground.iou_now "
-    "rendered.occupancy.above_ground.iou_now real.planning.uniad.l2_avg_m rendered.planning.uniad.l2_avg_m",
     "nemo-futures": "occupancy.moving.iou_now occupancy.moving.iou_future_1s "
     "occupancy.moving.iou_future_1s.continued_copy occupancy.moving.iou_future_1s.ceiling "
     "occupancy.standing.iou_future_1s occupancy.standing.iou_future_1s.continued_copy "
     "occupancy.standing.iou_future_1s.ceiling share.moving_pct",
+    "ranking": "coverage_min coverage_mean coverage.2_agents_16_routes coverage.10_agents_56_routes",
+    "real-to-sim": "real.occupancy.iou_now rendered.occupancy.iou_now real.occupancy.above_ground.iou_now "
+    "rendered.occupancy.above_ground.iou_now real.planning.uniad.l2_avg_m rendered.planning.uniad.l2_avg_m",
     "rebuild-compare": "computing_minutes psnr_db depth_median_sq_m2 chamfer_m2 psnr_3m_aside_db "
     "points.3m_aside.psnr_db",
     "rebuild-town": "held_out.psnr_db left_3m.psnr_db right_3m.psnr_db removed.changed.psnr_db "

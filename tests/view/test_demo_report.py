@@ -14,6 +14,7 @@ from foredrive.errors import InputError
 from foredrive.runs.demo import Demo, full_demo, quick_demo
 from foredrive.towns.map.names import TEST_TOWNS
 from foredrive.view.demo_report import Block, Outcome, Section, Step, do_steps, write_demo_report
+from foredrive.view.demo_sections import plan_against_blind
 from foredrive.view.demo_steps import STEPS
 from foredrive.view.html import MetricTile, Provenance, picture, stored_film
 
@@ -112,3 +113,13 @@ def test_a_film_goes_into_a_page_as_it_is(tmp_path: Path) -> None:
     film = stored_film(tmp_path / "film.webp", "a film")
     assert (film.width, film.height, film.caption) == (12, 8, "a film")
     assert film.source.startswith("data:image/webp;base64,")
+
+
+@pytest.mark.parametrize(
+    ("own_m", "said"), [(0.5, "are 0.50 m off; those"), (0.904, "no gain"), (1.2, "no gain")]
+)
+def test_the_page_says_whether_sight_made_the_plan_better(own_m: float, said: str) -> None:
+    """To the two digits that are shown, 0.904 m is not better than 0.90 m."""
+    summary = {"planning.uniad.l2_avg_m": own_m, "planning.ego_mlp.uniad.l2_avg_m": 0.90}
+    assert said in plan_against_blind(summary)
+    assert plan_against_blind({"planning.uniad.l2_avg_m": own_m}) == ""

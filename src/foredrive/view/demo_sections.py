@@ -12,7 +12,7 @@ from PIL import Image, ImageOps
 from foredrive.data.batches import stack_records
 from foredrive.engine.folder import SUMMARY
 from foredrive.engine.metrics_log import read_metrics
-from foredrive.engine.summary import numbers, read_summary
+from foredrive.engine.summary import Summary, numbers, read_summary
 from foredrive.runs.demo import (
     DRIVER,
     TEXTS,
@@ -129,17 +129,19 @@ def show_shipped(demo: Demo) -> Section:
             ),
             Block(
                 "Its plans under five protocols",
-                _plan_against_blind(judged),
+                plan_against_blind(judged.summary),
                 table=planning_overview(judged.summary),
             ),
         ],
     )
 
 
-def _plan_against_blind(judged: Judged) -> str:
-    """Say whether the plan is better than that of the MLP, which sees nothing."""
-    figures = numbers(judged.summary)
+def plan_against_blind(summary: Summary) -> str:
+    """Say whether the plan is better than that of the MLP, which sees nothing; "" if one was not judged."""
+    figures = numbers(summary)
     own_m, blind_m = (round(figures.get(f"planning.{who}{L2}", math.nan), 2) for who in ("", "ego_mlp."))
+    if math.isnan(own_m) or math.isnan(blind_m):
+        return ""
     blind = f"those of the ego-only MLP, which sees nothing, are {blind_m:.2f} m off"
     if own_m < blind_m:
         return f"By UniAD's L2 they are {own_m:.2f} m off; {blind}."

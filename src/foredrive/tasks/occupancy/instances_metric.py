@@ -232,8 +232,8 @@ def seen_above(true: InstanceRaster, voxels: VoxelSpec) -> Int[Tensor, "b S Y X"
     above = voxels.covers(middle_m).view(spec.shape_yx)
     shown = torch.zeros_like(true.track_id)
     for item, now in enumerate(true.track_id[:, 0]):
-        known = torch.isin(true.track_id[item], now[above].unique())
-        shown[item] = true.track_id[item] * known
+        vehicles = torch.isin(true.track_id[item], now[above].unique())
+        shown[item] = true.track_id[item] * vehicles
     return shown
 
 

@@ -47,7 +47,7 @@ class OccupancyMetric:
         self._priors: dict[str, tuple[Tensor, Tensor]] = {}
         self._counts: dict[tuple[str, str], OccupancyCounts] = {}
         self._exact = True
-        """Whether all occupancy of the clips so far and its flow are known at now."""
+        """True while all occupancy at now, and its flow, are known in every clip: the ceiling needs them."""
 
     def update(self, prediction: Prediction, truth: Example) -> None:
         """Count hits and misses of b clips.
