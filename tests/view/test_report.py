@@ -232,6 +232,19 @@ def test_occupancy_is_shown_against_the_occupancy_prior() -> None:
     assert len([row for row in rows if row[0] == "+500 ms"]) == 2
 
 
+def test_notes_say_what_is_in_the_table() -> None:
+    plain = {
+        f"occupancy.{scope}iou_{when}": 0.5
+        for scope in ("", "above_ground.")
+        for when in ("now", "future_1s")
+    }
+    moving = plain | {f"occupancy.{scope}iou_now": 0.5 for scope in ("moving.", "standing.")}
+    ceiling = moving | {"occupancy.iou_future_1s.ceiling": 0.75}
+    for summary, said in ((plain, [False, False]), (moving, [True, False]), (ceiling, [True, True])):
+        notes = " ".join(occupancy_table(summary).notes)
+        assert [part in notes for part in ("Where things move", "Ceiling of true motion")] == said
+
+
 def test_image_quality_now_and_later() -> None:
     assert cells_of(image_table(summary())) == [["now", "19.25", "0.500"], ["+500 ms", "18.00", DASH]]
 

@@ -28,8 +28,11 @@ ABOVE_NOTE = f"Above the ground: voxels more than {ABOVE_GROUND_M:g} m above it.
 BASELINES_NOTE = (
     "Occupancy prior: the fixed grid that scores best on the training logs. Persistence: the predicted "
     "present in place of the future. Ego-compensated persistence: the same, moved along the driven path, "
-    "which the model is not told. Persistence, motion continued: moved as if the vehicle went on as "
-    "measured. Ceiling of true motion: the true present, moved along with its true flow and the driven path."
+    "which the model is not told. Persistence, motion continued: moved as if the vehicle went on as measured."
+)
+CEILING_NOTE = "Ceiling of true motion: the true present, moved along with its true flow and the driven path."
+MOVING_NOTE = (
+    "Where things move: the voxels that they fill at one of the frames up to then, and those next to them."
 )
 FUTURES_NOTE = "Best and mean of K: sampled futures."
 BEST_NOTE = "Green: best of its column. The protocols differ: compare values of one column only."
@@ -166,6 +169,10 @@ def occupancy_table(summary: Summary) -> Table | None:
             rows.append(Row([time_title(when), *cells]))
         sections.append(Section(rows, title))
     notes = [ABOVE_NOTE, BASELINES_NOTE]
+    if CEILING in others:
+        notes.append(CEILING_NOTE)
+    if len(sections) == len(SCOPE_TITLES):
+        notes.append(MOVING_NOTE)
     # Other columns than baselines are best and mean of sampled futures
     if not set(others) <= BASELINE_TITLES.keys():
         notes.append(FUTURES_NOTE)
