@@ -5,8 +5,8 @@ random places and headings beside the logged way, and compared with the town's o
 predicts the errors in one town with weights fitted to the others; `fit` fits to all of them, and prints the
 weights that methods/reconstruction/trust.py holds. Towns are kept in runs/trust.
 
-Arms TOWN_sight use the weights as they are, on the reconstructions of `bench ncap` (seven cameras, twenty
-seconds, another recipe), and show what a moment that is not trusted means to those who look: how far off the
+Arms TOWN_sight use weights that were fitted to the five other towns, on the reconstructions of `bench ncap`
+(seven cameras, twenty seconds, another recipe), and show what a moment that is not trusted means to those who look: how far off the
 beams of the lidar are, and whether the shipped driver finds road users in the same places of its images as
 in the town's own ones.
 """
@@ -188,14 +188,19 @@ def fitted(towns: Sequence[Judged]) -> Float[Tensor, "D"]:
     return plain
 
 
+def weights_without(town: str) -> dict[str, float]:
+    """Return weights that were fitted to the other towns."""
+    others = [judged(other) for other in DRIVES if other != town]
+    return dict(zip(IMAGE_WEIGHTS, fitted(others).tolist(), strict=True))
+
+
 def of_town(town: str, _: int) -> dict[str, float]:
     """Return how well weights that were fitted to the other towns predict the errors in this one.
 
     The held-out frames calibrate the expectations to their log. What is nearly good loses 1 dB more.
     """
     own = judged(town)
-    fitted_to_others = fitted([judged(other) for other in DRIVES if other != town]).tolist()
-    weights = dict(zip(IMAGE_WEIGHTS, fitted_to_others, strict=True))
+    weights = weights_without(town)
     held = (own.pose[:, 1:] == 0).all(-1).numpy()
     true_db = np.array([psnr_of(error) for error in own.errors])
     features = [dict(zip(IMAGE_WEIGHTS, blocks.unbind(-1), strict=True)) for blocks in own.blocks]
@@ -254,8 +259,8 @@ def in_sight(town: str, _: int) -> dict[str, float]:
     folder = reconstructed_town(drive)
     opened, truth = open_reconstruction(folder), TownTruth(drive)
     driver, rng = driver_of(run_folder(DRIVER, WORK / "models")), np.random.default_rng(0)
-    rig, expected = camera_rig(None, 0.0, FRONT_TELE), trust_of(opened)
-    trust = NotedTrust(expected.scene, expected.views, expected.offset, expected.reference_db)
+    rig, expected = camera_rig(None, 0.0, FRONT_TELE), trust_of(opened, weights_without(town))
+    trust = NotedTrust.of(expected)
     graph, vehicle = opened.scene.graph, opened.vehicle
     rendered = ReconstructedRenderer(opened.scene, graph, vehicle.with_rig(rig), trust)
     sensors = SensorSuite(rig, drive.sensors.lidar)

@@ -101,6 +101,11 @@ class NotedTrust(Trust):
 
     noted_db: list[float] = field(default_factory=list)
 
+    @classmethod
+    def of(cls, trust: Trust) -> "NotedTrust":
+        """Return the expectations of a reconstruction, with nothing noted yet."""
+        return cls(trust.scene, trust.views, trust.offset, trust.reference_db, trust.weights)
+
     def psnr_db(self, graph: SceneGraph, images: Sequence[tuple[CameraView, RenderedImage]]) -> float:
         """Return the expected PSNR of the images of all cameras at one time together, dB; keep it."""
         self.noted_db.append(super().psnr_db(graph, images))
@@ -186,7 +191,7 @@ class PairedTests:
         lidar = self._place.vehicle.lidar if agent.lidar else None
         vehicle = self._place.vehicle.with_rig(camera_rig(None, 0.0, agent.rig))
         vehicle = dataclasses.replace(vehicle, lidar=lidar)
-        trust = NotedTrust(self._trust.scene, self._trust.views, self._trust.offset, self._trust.reference_db)
+        trust = NotedTrust.of(self._trust)
         shown: list[SceneGraph] = []
 
         def render(graph: SceneGraph) -> Renderer:

@@ -9,7 +9,7 @@ image is known for every pose (`benchmarks/trust.py`). Sweeps are not predicted.
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from statistics import fmean
 from typing import NamedTuple
 
@@ -370,6 +370,7 @@ class Trust:
     """Offset of `expected_errors`: this log differs from those of the fit."""
     reference_db: float
     """Expected PSNR along the logged way."""
+    weights: Mapping[str, float] = field(default_factory=lambda: IMAGE_WEIGHTS)
 
     @torch.no_grad()
     def block_errors(self, graph: SceneGraph, view: CameraView, image: RenderedImage) -> Float[Tensor, "h w"]:
@@ -381,7 +382,7 @@ class Trust:
             image: the rendered image.
         """
         features = image_features(self.views, self.scene.track_id, graph, view, image)
-        return expected_errors(features, self.offset).view(block_hw(view.size_hw))
+        return expected_errors(features, self.offset, self.weights).view(block_hw(view.size_hw))
 
     def psnr_db(self, graph: SceneGraph, images: Sequence[tuple[CameraView, RenderedImage]]) -> float:
         """Return the expected PSNR of the images of all cameras at one time together, dB."""

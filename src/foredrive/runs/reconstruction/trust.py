@@ -17,6 +17,7 @@ from foredrive.errors import InputError
 from foredrive.geometry.se3 import matrix_from_yaw
 from foredrive.methods.reconstruction.novel_views import novel_camera_view
 from foredrive.methods.reconstruction.trust import (
+    IMAGE_WEIGHTS,
     ObservedViews,
     Trust,
     expected_errors,
@@ -54,10 +55,14 @@ class TrustedPlace:
     trusted: bool
 
 
-def trust_of(opened: OpenedReconstruction) -> Trust:
+def trust_of(opened: OpenedReconstruction, weights: Mapping[str, float] = IMAGE_WEIGHTS) -> Trust:
     """Return what a finished reconstruction expects of its images. It takes some seconds for each camera.
 
     The expectations are shifted so that they agree with the held-out images of the log on average.
+
+    Args:
+        opened: the reconstruction.
+        weights: of `expected_errors`.
 
     Raises:
         InputError: the reconstruction is not finished, or has no cameras.
@@ -66,7 +71,7 @@ def trust_of(opened: OpenedReconstruction) -> Trust:
     if not (opened.folder / SUMMARY).is_file():
         raise InputError(f"{opened.folder}: not finished; continue it with `foredrive reconstruct`")
     trained_s, held_s = _frame_times(opened)
-    plain = Trust(scene, observe_views(scene, vehicle, trained_s), 0.0, 0.0)
+    plain = Trust(scene, observe_views(scene, vehicle, trained_s), 0.0, 0.0, weights)
     # Without held-out frames, the training frames are the reference, and their PSNR is not known
     compared_s = held_s or trained_s
     compared_s = compared_s[:: max(1, len(compared_s) // REFERENCE_FRAMES)]
@@ -75,8 +80,8 @@ def trust_of(opened: OpenedReconstruction) -> Trust:
     if isinstance(actual_db, float) and math.isfinite(actual_db):
         # The summary has the mean over single images, of each camera
         images = [image for frame in frames for image in frame]
-        offset = fitted_offset(images, actual_db)
-        expected_db = fmean(psnr_of(expected_errors(image, offset)) for image in images)
+        offset = fitted_offset(images, actual_db, weights)
+        expected_db = fmean(psnr_of(expected_errors(image, offset, weights)) for image in images)
         if abs(expected_db - actual_db) > CALIBRATED_DB:
             _log.warning(
                 "%s: trust says little here: %.1f dB are expected of the held-out images, which have %.1f dB",
@@ -122,7 +127,7 @@ def _features(trust: Trust, vehicle: LoggedVehicle, ego: EgoState) -> list[dict[
 
 def _psnr_db(trust: Trust, images: Sequence[Mapping[str, Float[Tensor, "N"]]]) -> float:
     """Return the expected PSNR of the images of all cameras at one time together, dB."""
-    return psnr_of(torch.cat([expected_errors(features, trust.offset) for features in images]))
+    return psnr_of(torch.cat([expected_errors(features, trust.offset, trust.weights) for features in images]))
 
 
 def expected_psnr_db(trust: Trust, vehicle: LoggedVehicle, ego: EgoState) -> float:
