@@ -59,11 +59,18 @@ class PlaneContext(nn.Module):
         fine = self.fine(self.down(plane))
         coarse = self.lateral(self.coarse(fine))
         merged = self.merged(fine + F.interpolate(coarse, size=fine.shape[-2:], mode="nearest"))
-        # Pixel shuffle turns 4 · Z · D channels at half resolution into Z · D at full resolution
-        change = F.pixel_shuffle(self.out(merged), 2)[..., :y, :x]
+        # The 4 · Z · D channels at half resolution are Z · D of each cell of 2 by 2, as in a pixel shuffle. The
+        # cells of the output come first here, so that the channels of a voxel stay together in memory.
+        assert self.out.bias is not None
+        weight, bias = (
+            of_out.unflatten(0, (z, d, 2, 2)).permute(2, 3, 0, 1, *range(4, of_out.dim() + 3)).flatten(0, 3)
+            for of_out in (self.out.weight, self.out.bias)
+        )
+        change = F.conv2d(merged, weight, bias).permute(0, 2, 3, 1).unflatten(-1, (2, 2, z, d))
+        change = change.permute(0, 5, 1, 3, 2, 4, 6).reshape(b, z, 2 * len(change[0]), -1, d)
         # An odd size was rounded up by the strided convolution: cut to the size of the volume above
-        change = change.permute(0, 2, 3, 1).view(b, y, x, z, d).permute(0, 4, 3, 1, 2)
-        return (volume + change).permute(0, 2, 3, 4, 1).contiguous().permute(0, 4, 1, 2, 3)
+        whole = volume.permute(0, 2, 3, 4, 1) + change[:, :, :y, :x].to(volume.dtype)
+        return whole.permute(0, 4, 1, 2, 3)
 
 
 def plane_context(config: PlaneContextConfig | None, spec: VoxelSpec, channels: int) -> nn.Module:
