@@ -4,7 +4,7 @@ import math
 
 import torch
 
-from foredrive.tasks.occupancy.losses import occupancy_bce, occupancy_loss, scene_class_affinity
+from foredrive.tasks.occupancy.losses import motion_emphasis, occupancy_bce, occupancy_loss, scene_class_affinity
 
 
 def grid(*values: float) -> torch.Tensor:
@@ -21,6 +21,21 @@ def test_occupied_voxels_weigh_more_where_asked() -> None:
     logit, occupied, known = grid(0.0, 0.0), grid(1, 0), grid(1, 1).bool()
     loss = occupancy_bce(logit, occupied, known, occupied_weight=3.0)
     torch.testing.assert_close(loss, torch.tensor(2 * math.log(2)))  # (3 + 1) / 2
+
+
+def test_what_moves_and_its_neighbours_weigh_more() -> None:
+    # Two clips of 1 x 3 x 5 cells: the first has a car at 5 m/s in a corner, the second one that stands, and
+    # one that moves where the flow is not known
+    flow_mps, known = torch.zeros(2, 3, 1, 3, 5), torch.ones(2, 1, 3, 5, dtype=torch.bool)
+    flow_mps[0, :2, 0, 0, 0] = torch.tensor([3.0, -4.0])
+    flow_mps[1, 0, 0, 1, 1], flow_mps[1, 1, 0, 2, 4] = 0.3, 5.0
+    known[1, 0, 2, 4] = False
+    emphasis = motion_emphasis(flow_mps, known, 4.0)
+    first = torch.ones(3, 5)
+    first[:2, :2] = 4.0
+    torch.testing.assert_close(emphasis, torch.stack([first, torch.ones(3, 5)])[:, None])
+    loss = occupancy_bce(torch.zeros(2, 1, 3, 5), known.float(), known, emphasis=emphasis)
+    torch.testing.assert_close(loss, torch.tensor(math.log(2) * (4 * 4 + 25) / 29))
 
 
 def test_affinity_by_hand() -> None:

@@ -17,7 +17,7 @@ from foredrive.methods.planner.agent import PlanningAgent
 from foredrive.methods.planner.planner import set_planner_trainable
 from foredrive.scene import Belief, Clip, Example
 from foredrive.tasks.heads.joint import TaskTerms
-from foredrive.tasks.occupancy.losses import occupancy_loss
+from foredrive.tasks.occupancy.losses import motion_emphasis, occupancy_loss
 from foredrive.tasks.planning.losses import ego_motion_loss, waypoint_loss
 
 
@@ -42,6 +42,8 @@ class NemoWeights:
     """Weight of the perceptual loss within the reconstruction (eq. 9)."""
     occupied: float = 1.0
     """Weight of occupied voxels within the BCE. Above the road, only a few percent are occupied."""
+    moving: float = 1.0
+    """Weight within the BCE of voxels that move and of those next to them. The paper weighs all equally."""
     future: float = 1.0
     """Weight of each imagined key frame relative to now. The paper weighs all equally."""
     ego: float = 0.0
@@ -138,6 +140,10 @@ class NemoObjective(nn.Module):
             frame, items = now + k, slice(len(belief.occupancy_logit))
             if weights.occ > 0:
                 # Occupancy of each frame against the labels of the same frame (eq. 10)
+                emphasis: Tensor | float = 1.0
+                if weights.moving != 1:
+                    flow, known = example.flow.values[items, frame], example.flow.known[items, frame]
+                    emphasis = motion_emphasis(flow, known, weights.moving)
                 losses["occ"] = losses["occ"] + share * occupancy_loss(
                     belief.occupancy_logit,
                     example.occupancy.values[items, frame, 0],
@@ -145,6 +151,7 @@ class NemoObjective(nn.Module):
                     scal_weight=weights.scal,
                     bce_weight=weights.bce,
                     occupied_weight=weights.occupied,
+                    emphasis=emphasis,
                 )
             if weights.recon > 0:
                 # Colour along the rays of each frame against its images (eq. 9)

@@ -6,6 +6,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from foredrive.ops.masked import masked_mean
+from foredrive.tasks.occupancy.scores import MOVING_MPS
 
 EPS = 1e-6
 
@@ -15,15 +16,25 @@ def occupancy_bce(
     occupied: Float[Tensor, "*b Z Y X"],
     known: Bool[Tensor, "*b Z Y X"],
     occupied_weight: float = 1.0,
+    emphasis: Float[Tensor, "*b Z Y X"] | float = 1.0,
 ) -> Float[Tensor, ""]:
     """Return the binary cross entropy averaged over the known voxels (eq. 10); 0 when none is known.
 
-    `occupied_weight` multiplies the terms of occupied voxels; eq. 10 has 1.
+    `occupied_weight` multiplies the terms of occupied voxels, `emphasis` each term; eq. 10 has 1.
     """
     # pos_weight multiplies the terms of occupied voxels
     weight = logit.new_tensor([occupied_weight])
     per_voxel = F.binary_cross_entropy_with_logits(logit, occupied, reduction="none", pos_weight=weight)
-    return masked_mean(per_voxel, known)
+    return masked_mean(emphasis * per_voxel, known)
+
+
+def motion_emphasis(
+    flow_mps: Float[Tensor, "b 3 Z Y X"], known: Bool[Tensor, "b Z Y X"], factor: float
+) -> Float[Tensor, "b Z Y X"]:
+    """Return `factor` for voxels whose content is known to move and for those next to them, 1 for others."""
+    moving = known & (flow_mps.norm(dim=1) > MOVING_MPS)
+    near = F.max_pool3d(moving.to(flow_mps.dtype), kernel_size=3, stride=1, padding=1)
+    return 1 + (factor - 1) * near
 
 
 def scene_class_affinity(
@@ -58,7 +69,8 @@ def occupancy_loss(
     scal_weight: float,
     bce_weight: float,
     occupied_weight: float = 1.0,
+    emphasis: Float[Tensor, "*b Z Y X"] | float = 1.0,
 ) -> Float[Tensor, ""]:
     """Return L_occ = λ_scal·L_scal + λ_BCE·L_BCE (eq. 11; the paper: 10 and 1)."""
-    bce = occupancy_bce(logit, occupied, known, occupied_weight)
+    bce = occupancy_bce(logit, occupied, known, occupied_weight, emphasis)
     return scal_weight * scene_class_affinity(logit, occupied, known) + bce_weight * bce
