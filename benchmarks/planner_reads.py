@@ -9,6 +9,7 @@ egos.
 
 import dataclasses
 import functools
+import itertools
 import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -36,7 +37,7 @@ from foredrive.runs.shipped import run_folder
 from foredrive.runs.train.run import Run, load_agent, open_run
 from foredrive.scene import VoxelSpec
 from foredrive.scene.conditions import CONDITIONS
-from foredrive.sensors.rigs import SURROUND
+from foredrive.sensors.rigs import SURROUND, RigPlan
 from foredrive.tasks.bootstrap import bootstrap_mean
 
 ROOT = Path("runs/planner_reads")
@@ -48,6 +49,8 @@ TEST_TOWNS = ("Town03", "Town05")
 """Towns that no arm is trained in. Architectures were chosen on them, with other seeds of traffic."""
 TRAIN_SEEDS, TEST_SEEDS, EGOS = tuple(range(2000, 2003)), tuple(range(3000, 3004)), 80
 """Seeds of traffic, and virtual egos of each town and seed."""
+UNSEEN_SEEDS, UNSEEN_EGOS, UNSEEN_PER_WINDOW = tuple(range(2100, 2102)), 240, 4
+"""The same of egos without images, and how many are taken of the same time of the traffic."""
 SHIPPED = Path("embedded:nemo_town")
 Volumes = Callable[[TruePlanes], Tensor]
 BATCH = 8
@@ -113,6 +116,21 @@ def logs_to_learn(workers: int = 1) -> tuple[LogPath, ...]:
     return _recorded(TRAIN_TOWNS, TRAIN_SEEDS, workers)
 
 
+def unseen_logs_to_learn(workers: int = 1) -> tuple[LogPath, ...]:
+    """Record the virtual egos without images that are missing; return them.
+
+    Few are taken of each window of traffic: what a planner can learn is bounded by the number of windows.
+    """
+    plans = [
+        EgosPlan(town, seed, UNSEEN_EGOS, per_window=UNSEEN_PER_WINDOW)
+        for seed in UNSEEN_SEEDS
+        for town in TRAIN_TOWNS
+    ]
+    # A log has images: these have eight pixels, which nobody reads
+    rig = RigPlan((2, 4), dict(itertools.islice(SURROUND.cameras.items(), 1)))
+    return _logs_of(plans, ROOT / "unseen", rig, workers)
+
+
 def logs_to_judge(workers: int = 1) -> tuple[LogPath, ...]:
     """Record the virtual egos to judge by that are missing; return them."""
     return _recorded(TEST_TOWNS, TEST_SEEDS, workers)
@@ -125,8 +143,11 @@ def _recorded(towns: Sequence[str], seeds: Sequence[int], workers: int) -> tuple
         for seed in seeds
         for town in towns
     ]
-    rig = SURROUND.of_size(RECIPE.clips.image_hw)
-    logs, failed = record_egos(plans, ROOT / "egos", rig, workers)
+    return _logs_of(plans, ROOT / "egos", SURROUND.of_size(RECIPE.clips.image_hw), workers)
+
+
+def _logs_of(plans: Sequence[EgosPlan], out: Path, rig: RigPlan, workers: int) -> tuple[LogPath, ...]:
+    logs, failed = record_egos(plans, out, rig, workers)
     if failed:
         raise InputError(f"{len(failed)} recordings failed: {next(iter(failed.values()))}")
     return tuple(logs)
@@ -134,8 +155,12 @@ def _recorded(towns: Sequence[str], seeds: Sequence[int], workers: int) -> tuple
 
 @functools.cache
 def egos_to_learn() -> TruePlanes:
-    """Return the true surroundings of the egos to learn from."""
-    return kept(TruePlanes, WORK / "train.safetensors", lambda: read_planes(logs_to_learn(), RECIPE.clips))
+    """Return the true surroundings of the egos to learn from, those with images first."""
+
+    def read() -> TruePlanes:
+        return read_planes((*logs_to_learn(), *unseen_logs_to_learn()), RECIPE.clips)
+
+    return kept(TruePlanes, WORK / "train.safetensors", read)
 
 
 @functools.cache
@@ -365,6 +390,7 @@ BENCHMARK = Benchmark(
     config={
         "clips": [RECIPE.clips.image_hw, RECIPE.clips.horizon_steps, DT_S],
         "towns": [TRAIN_TOWNS, TEST_TOWNS, TRAIN_SEEDS, TEST_SEEDS, EGOS],
+        "unseen": [UNSEEN_SEEDS, UNSEEN_EGOS, UNSEEN_PER_WINDOW],
         "fits": [dataclasses.asdict(value) for value in (EGO_FIT, READ, READ_FIT)],
     },
 )

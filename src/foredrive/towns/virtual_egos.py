@@ -43,7 +43,7 @@ IMAGES, LATER = 6, 8
 FORESEEN = 4
 """Key frames after those with images that have occupancy: what a world model foresees from the last one."""
 EGOS_PER_WINDOW = 16
-"""Logs that are taken of the same time of the traffic."""
+"""Most logs that are taken of the same time of the traffic, where nothing else is said."""
 VEHICLES, PEOPLE = 90, 40
 SETTLE_S, APART_S = 8.0, 1.5
 """Time before the first window and between two of them, s."""
@@ -127,6 +127,8 @@ def record_virtual_egos(
     conditions: Sequence[Conditions] = (),
     occupancy: VoxelSpec | None = None,
     tick: Callable[[], None] = lambda: None,
+    *,
+    egos_per_window: int = EGOS_PER_WINDOW,
 ) -> list[LogPath]:
     """Record `count` short logs of one town. The same arguments give the same bytes on one kind of processor.
 
@@ -143,6 +145,7 @@ def record_virtual_egos(
         occupancy: grid of the occupancy with flow, recorded for the key frames with images and `FORESEEN`
             after them; None: none is recorded.
         tick: called after each log.
+        egos_per_window: largest number of logs that are taken of the same time of the traffic.
 
     Raises:
         InputError: there is no such town.
@@ -160,7 +163,7 @@ def record_virtual_egos(
     worlds = [first, *map(first.under, others)]
     maps = write_town_map(town, out)
     logs: list[LogPath] = []
-    for window, egos in _windows(town_map, seed, rng):
+    for window, egos in _windows(town_map, seed, rng, egos_per_window):
         for ego in egos[: count - len(logs)]:
             of_log = np.random.default_rng((seed, 6, len(logs)))  # whether the logs before are there or not
             path = LogPath(folders[len(logs)], maps)
@@ -194,7 +197,9 @@ class _Window:
     moments: list[_Moment]
 
 
-def _windows(town: TownMap, seed: int, rng: np.random.Generator) -> Iterator[tuple[_Window, list[_Ego]]]:
+def _windows(
+    town: TownMap, seed: int, rng: np.random.Generator, most_egos: int
+) -> Iterator[tuple[_Window, list[_Ego]]]:
     """Simulate without end, and yield stretches of time with the egos that are taken from each."""
     traffic = Traffic(town, seed, VEHICLES, PEOPLE)
     state = traffic.start()
@@ -210,12 +215,12 @@ def _windows(town: TownMap, seed: int, rng: np.random.Generator) -> Iterator[tup
             lights = traffic.zone_lights(state.time_s)
             moments.append(_Moment(state, traffic.poses(state), traffic.actors(state), lights))
         window = _Window(town, traffic, moments)
-        yield window, _choose_egos(window, rng)
+        yield window, _choose_egos(window, rng, most_egos)
         wait_s = APART_S
 
 
-def _choose_egos(window: _Window, rng: np.random.Generator) -> list[_Ego]:
-    """Return cars that keep their slot and lane sequence over the window, in random order.
+def _choose_egos(window: _Window, rng: np.random.Generator, most: int) -> list[_Ego]:
+    """Return at most `most` cars that keep their slot and lane sequence over the window, in random order.
 
     Those that come to a light first, up to their share.
     """
@@ -225,7 +230,7 @@ def _choose_egos(window: _Window, rng: np.random.Generator) -> list[_Ego]:
     rows = np.flatnonzero(lasting & (first.category == int(Category.CAR)))
     rng.shuffle(rows)
     # Of the standing ones only a share is kept
-    standing = rows[first.speed_mps[rows] < STANDING_MPS][round(STANDING_SHARE * EGOS_PER_WINDOW) :]
+    standing = rows[first.speed_mps[rows] < STANDING_MPS][round(STANDING_SHARE * most) :]
     rows = rows[~np.isin(rows, standing)]
     egos = []
     for row in rows.tolist():
@@ -236,9 +241,9 @@ def _choose_egos(window: _Window, rng: np.random.Generator) -> list[_Ego]:
             deviation = PathDeviation(lateral_m=float(lateral_m), yaw_rad=float(yaw_rad))
             egos.append(_Ego(row, route, deviation, _comes_to_light(window, row)))
     # Egos with a light ahead first, then the others
-    at_light = [ego for ego in egos if ego.at_light][: round(AT_LIGHT_SHARE * EGOS_PER_WINDOW)]
+    at_light = [ego for ego in egos if ego.at_light][: round(AT_LIGHT_SHARE * most)]
     others = [ego for ego in egos if ego not in at_light]
-    return (at_light + others)[:EGOS_PER_WINDOW]
+    return (at_light + others)[:most]
 
 
 def _route(window: _Window, row: int) -> Float64[np.ndarray, "M 3"] | None:

@@ -129,12 +129,14 @@ class EgosPlan:
     town: str
     seed: int
     count: int
-    conditions: tuple[str, ...]
+    conditions: tuple[str, ...] = ()
     """Names of `CONDITIONS`, of which one is drawn for each ego. Empty: bright daylight."""
     occupancy: bool = False
     """Record exact occupancy with flow."""
     lidar: bool = False
     """Record the sweep of the lidar on the roof beside the images."""
+    per_window: int = virtual_egos.EGOS_PER_WINDOW
+    """Most egos of the same time of the traffic. Fewer of them see more different traffic, and take longer."""
 
     @property
     def name(self) -> str:
@@ -179,4 +181,6 @@ def _record_egos(plan: EgosPlan, out: Path, rig: RigPlan) -> list[LogPath]:
     sensors = SensorSuite(camera_rig(plan=rig), roof_lidar() if plan.lidar else None)
     conditions = [find_conditions(name) for name in plan.conditions]
     spec = OCCUPANCY if plan.occupancy else None
-    return virtual_egos.record_virtual_egos(plan.town, plan.seed, plan.count, out, sensors, conditions, spec)
+    return virtual_egos.record_virtual_egos(
+        plan.town, plan.seed, plan.count, out, sensors, conditions, spec, egos_per_window=plan.per_window
+    )
