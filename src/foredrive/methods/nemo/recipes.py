@@ -97,7 +97,7 @@ def nemo_town() -> NemoRecipe:
         clips=dataclasses.replace(
             tiny.clips,
             now_stride_s=0.5,
-            voxels=VoxelSpec(lower_m=(-16.0, -24.0, -1.5), voxel_m=1.0, shape_zyx=(6, 48, 56)),
+            voxels=VoxelSpec(lower_m=(-32.0, -32.0, -1.5), voxel_m=1.0, shape_zyx=(6, 64, 72)),
         ),
         model=dataclasses.replace(
             tiny.model,
@@ -115,7 +115,7 @@ def nemo_town() -> NemoRecipe:
         pretrain=rescheduled(
             dataclasses.replace(
                 tiny.pretrain,
-                weights=dataclasses.replace(tiny.pretrain.weights, future=0.5, ego=1.0),
+                weights=dataclasses.replace(tiny.pretrain.weights, moving=5.0, future=0.5, ego=1.0),
                 ray_stride=16,
                 imagined=dataclasses.replace(tiny.pretrain.imagined, every=2),
             ),
