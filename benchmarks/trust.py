@@ -6,9 +6,9 @@ predicts the errors in one town with weights fitted to the others; `fit` fits to
 weights that methods/reconstruction/trust.py holds. Towns are kept in runs/trust.
 
 Arms TOWN_sight use weights that were fitted to the five other towns, on the reconstructions of `bench ncap`
-(seven cameras, twenty seconds, another recipe), and show what a moment that is not trusted means to those who look: how far off the
-beams of the lidar are, and whether the shipped driver finds road users in the same places of its images as
-in the town's own ones.
+(seven cameras, twenty seconds, another recipe), and show what a moment that is not trusted means to those who
+look: how far off the beams of the lidar are, and whether the shipped driver finds road users in the same
+places of its images as in the town's own ones.
 """
 
 import dataclasses

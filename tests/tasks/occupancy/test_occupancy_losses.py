@@ -4,7 +4,12 @@ import math
 
 import torch
 
-from foredrive.tasks.occupancy.losses import motion_emphasis, occupancy_bce, occupancy_loss, scene_class_affinity
+from foredrive.tasks.occupancy.losses import (
+    motion_emphasis,
+    occupancy_bce,
+    occupancy_loss,
+    scene_class_affinity,
+)
 
 
 def grid(*values: float) -> torch.Tensor:

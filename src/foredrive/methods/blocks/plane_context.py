@@ -59,8 +59,8 @@ class PlaneContext(nn.Module):
         fine = self.fine(self.down(plane))
         coarse = self.lateral(self.coarse(fine))
         merged = self.merged(fine + F.interpolate(coarse, size=fine.shape[-2:], mode="nearest"))
-        # The 4 · Z · D channels at half resolution are Z · D of each cell of 2 by 2, as in a pixel shuffle. The
-        # cells of the output come first here, so that the channels of a voxel stay together in memory.
+        # The 4 · Z · D channels at half resolution are Z · D of each of 2 by 2 cells, as in a pixel shuffle.
+        # Here the cells come first, so that the channels of a voxel stay together in memory
         assert self.out.bias is not None
         weight, bias = (
             of_out.unflatten(0, (z, d, 2, 2)).permute(2, 3, 0, 1, *range(4, of_out.dim() + 3)).flatten(0, 3)

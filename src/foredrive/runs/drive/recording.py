@@ -136,7 +136,7 @@ class EgosPlan:
     lidar: bool = False
     """Record the sweep of the lidar on the roof beside the images."""
     per_window: int = virtual_egos.EGOS_PER_WINDOW
-    """Most egos of the same time of the traffic. Fewer of them see more different traffic, and take longer."""
+    """Most egos of the same time of the traffic. With fewer, a log takes longer and more traffic is seen."""
 
     @property
     def name(self) -> str:
