@@ -200,9 +200,16 @@ class Messages:
         return sorted(found, key=lambda each: each[1])
 
 
-def write_ros1(path: Path) -> None:
+def write_ros1(
+    path: Path, compression: Writer1.CompressionFormat | None = None, chunk_bytes: int | None = None
+) -> None:
     messages = Messages(1)
-    with Writer1(path) as writer:
+    file = Writer1(path)
+    if compression is not None:
+        file.set_compression(compression)
+    if chunk_bytes is not None:
+        file.chunk_threshold = chunk_bytes
+    with file as writer:
         opened: dict[str, Any] = {}
         for topic, t_ns, message in messages.recording():
             kind = message.__msgtype__

@@ -2,12 +2,14 @@
 
 import base64
 import json
+import re
 from pathlib import Path
 
 import made_bags
 import numpy as np
 import pytest
 from mcap.writer import Writer
+from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import StoragePlugin
 
 from foredrive.data.formats.bag_contents import Bag
@@ -86,6 +88,30 @@ def test_a_damaged_chunk_of_an_mcap_costs_itself_alone_and_is_named(cut: bool, t
     (line,) = (line for line in read_notices(tmp_path) if "damaged" in line)
     first_s, last_s = (f"{lost[k][1]:.3f}" for k in (0, -1))
     assert line.startswith(f"drive.mcap: damaged chunks, left out: 1 (recorded at {first_s} to {last_s} s: ")
+
+
+@pytest.mark.parametrize("compression", list(Writer1.CompressionFormat))
+def test_a_damaged_chunk_of_a_ros1_bag_costs_itself_alone_and_is_named(
+    compression: Writer1.CompressionFormat, tmp_path: Path
+) -> None:
+    file = tmp_path / "drive.bag"
+    made_bags.write_ros1(file, compression, chunk_bytes=6000)
+    with open_bag(file) as bag:
+        complete = [(message.topic, message.recorded_s) for message in bag.read(list(bag.topics))]
+    content = bytearray(file.read_bytes())
+    third = [match.end() for match in re.finditer(b"compression=", content)][2] + 80
+    content[third : third + 200] = b"\xff" * 200
+    file.write_bytes(content)
+    with open_bag(file) as bag, collecting():
+        rest = [(message.topic, message.recorded_s) for message in bag.read(list(bag.topics))]
+        list(bag.read(list(bag.topics)))  # a second pass, as for images
+        write_notices(tmp_path)
+    lost = [row for row in complete if row not in rest]
+    assert [row for row in complete if row not in lost] == rest
+    assert 0 < len(lost) < 0.4 * len(complete)
+    assert rest[-1][1] > lost[-1][1]
+    (line,) = read_notices(tmp_path)
+    assert line.startswith("drive.bag: damaged chunks, left out: 1 (")
 
 
 def test_a_recording_without_a_whole_chunk_is_one_line(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Reader of ROS 1 bags without an index, as a recorder that was cut off leaves them (`.bag.active`).
+"""Reader of ROS 1 bags without their index: cut off as a recorder leaves them (`.bag.active`), or damaged.
 
 The format is ROS' "Bag format 2.0": records of a header and data, each behind its length. Chunks are records
 that hold records; the last one of a bag that was not closed has no length yet, so its records follow it.
@@ -20,6 +20,8 @@ _MAGIC = b"#ROSBAG V2.0\n"
 _MESSAGE, _CHUNK, _CONNECTION = 2, 5, 7
 _Found = tuple[str, str, int, bytes]
 """Topic, type, time (ns) and bytes of a message."""
+Connections = dict[bytes, tuple[str, str]]
+"""Topic and type by the number of a connection."""
 
 
 def open_rest(path: Path) -> Bag:
@@ -30,7 +32,7 @@ def open_rest(path: Path) -> Bag:
     """
     counts: Counter[tuple[str, str]] = Counter()
     last_ns = 0
-    for topic, kind, t_ns, _ in _messages(path):
+    for topic, kind, t_ns, _ in _messages(path, {}):
         counts[topic, kind] += 1
         last_ns = max(last_ns, t_ns)
     if not counts:
@@ -38,27 +40,42 @@ def open_rest(path: Path) -> Bag:
     read_to = f"{counts.total()} whole messages were read, to {last_ns * 1e-9:.3f} s"
     note(path.name, f"the recording was cut off; {read_to}")
 
-    def read(names: Collection[str]) -> Iterator[Message]:
-        for topic, kind, t_ns, data in _messages(path) if names else ():
-            if topic in names:
-                yield Message(topic, t_ns * 1e-9, functools.partial(ros_decoder(1), data, kind))
-
+    read = functools.partial(read_rest, path, {}, Counter())
     return Bag(joined_topics(Topic(*key, count) for key, count in counts.items()), read)
 
 
-def _messages(path: Path) -> Iterator[_Found]:
+def read_rest(
+    path: Path, connections: Connections, known: Counter[tuple[str, int]], names: Collection[str]
+) -> Iterator[Message]:
+    """Yield the whole messages of some topics, without the index.
+
+    Args:
+        path: of the bag.
+        connections: those that are known from the index. Others are read as they come.
+        known: topics and times, ns, of messages that were read before, which are left out.
+        names: of the topics.
+    """
+    left = known.copy()
+    for topic, kind, t_ns, data in _messages(path, connections) if names else ():
+        if left[topic, t_ns]:
+            left[topic, t_ns] -= 1
+        elif topic in names:
+            yield Message(topic, t_ns * 1e-9, functools.partial(ros_decoder(1), data, kind))
+
+
+def _messages(path: Path, connections: Connections) -> Iterator[_Found]:
     with path.open("rb") as file:
         if file.read(len(_MAGIC)) == _MAGIC:
-            yield from _of_records(file, {})
+            yield from _of_records(file, path.name, dict(connections))
 
 
-def _of_records(stream: io.BufferedIOBase, connections: dict[bytes, tuple[str, str]]) -> Iterator[_Found]:
+def _of_records(stream: io.BufferedIOBase, bag: str, connections: Connections) -> Iterator[_Found]:
     """Yield the messages of a stream of records, up to where it is cut or damaged."""
     while (header := _sized(stream)) is not None:
         entries = _entries(header)
         kind = entries.get("op", b"\0")[0]
         if kind == _CHUNK:
-            yield from _of_chunk(entries, stream, connections)
+            yield from _of_chunk(entries, stream, bag, connections)
             continue
         data = _sized(stream)
         if data is None:
@@ -72,7 +89,7 @@ def _of_records(stream: io.BufferedIOBase, connections: dict[bytes, tuple[str, s
 
 
 def _of_chunk(
-    entries: dict[str, bytes], stream: io.BufferedIOBase, connections: dict[bytes, tuple[str, str]]
+    entries: dict[str, bytes], stream: io.BufferedIOBase, bag: str, connections: Connections
 ) -> Iterator[_Found]:
     """Yield the messages of a chunk, or note that it cannot be unpacked."""
     import lz4.frame
@@ -85,9 +102,9 @@ def _of_chunk(
     try:
         unpacked = unpack(data) if data else b""
     except (OSError, RuntimeError, ValueError, EOFError) as error:
-        note("chunks", "damaged, left out", f"{len(data)} bytes from {start} on: {error}")
+        note(bag, "damaged chunks, left out", f"{len(data)} bytes from {start} on: {error}", once=True)
         return
-    yield from _of_records(io.BytesIO(unpacked), connections)
+    yield from _of_records(io.BytesIO(unpacked), bag, connections)
 
 
 def _sized(stream: io.BufferedIOBase) -> bytes | None:

@@ -4,10 +4,11 @@ import contextlib
 import functools
 import importlib.util
 import re
+from collections import Counter
 from collections.abc import Collection, Iterator
 from pathlib import Path
 
-from foredrive.data.formats.bag1_rest import open_rest
+from foredrive.data.formats.bag1_rest import open_rest, read_rest
 from foredrive.data.formats.bag_contents import Bag, Message, Topic, joined_topics, ros_decoder
 from foredrive.data.formats.mcap_files import open_mcap
 from foredrive.data.notices import note
@@ -99,9 +100,16 @@ def _open_ros1(path: Path) -> Iterator[Bag]:
         def read(names: Collection[str]) -> Iterator[Message]:
             # Only connections of the named topics are read
             wanted = [one for one in reader.connections if one.topic in names]
-            for connection, t_ns, data in reader.messages(connections=wanted) if wanted else ():
-                content = functools.partial(decode, data, connection.msgtype)
-                yield Message(connection.topic, t_ns * 1e-9, content)
+            known = Counter[tuple[str, int]]()
+            try:
+                for connection, t_ns, data in reader.messages(connections=wanted) if wanted else ():
+                    known[connection.topic, t_ns] += 1
+                    content = functools.partial(decode, data, connection.msgtype)
+                    yield Message(connection.topic, t_ns * 1e-9, content)
+            except Exception:  # of a damaged chunk, those of its compression too
+                # The index leads no further: read the chunks one after the other
+                numbered = {one.id.to_bytes(4, "little"): (one.topic, one.msgtype) for one in wanted}
+                yield from read_rest(path, numbered, known, names)
 
         yield Bag(
             joined_topics(Topic(one.topic, one.msgtype, one.msgcount) for one in reader.connections), read
