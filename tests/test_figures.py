@@ -120,7 +120,7 @@ def test_a_page_says_what_was_measured(page: str, text: str) -> None:
 
 @pytest.mark.parametrize("picture", PICTURES, ids=lambda path: path.name)
 def test_a_picture_is_made_by_committed_code(picture: Path) -> None:
-    scripts = "".join(path.read_text() for path in (ROOT / "docs").glob("draw_*.py"))
+    scripts = "".join(path.read_text() for path in (ROOT / "docs/draw").glob("*.py"))
     by_verb = "".join(path.read_text() for path in (ROOT / "docs").glob("*.md"))
     assert picture.name in scripts or re.search(rf"--(out|save) {picture.stem}\.", by_verb)
 

@@ -1,4 +1,4 @@
-"""Draws docs/frames.png, the picture of the conventions page: `python docs/draw_frames.py`."""
+"""Draws docs/frames.png, the picture of the conventions page: `python docs/draw/frames.py`."""
 
 from pathlib import Path
 
@@ -64,7 +64,7 @@ def main() -> None:
     for ax in (side, top):
         ax.axis("off")
     fig.tight_layout()
-    fig.savefig(Path(__file__).with_name("frames.png"), dpi=110)
+    fig.savefig(Path(__file__).parents[1] / "frames.png", dpi=110)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Draws the pictures of docs/towns.md: `python docs/draw_towns.py`. Takes some minutes."""
+"""Draws the pictures of docs/towns.md: `python docs/draw/towns.py`. Takes some minutes."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -19,7 +19,7 @@ from foredrive.towns.traffic.expert import ExpertDrive
 from foredrive.towns.traffic.traffic import Traffic
 from foredrive.towns.world import SensorFrame, World
 
-HERE = Path(__file__).parent
+DOCS = Path(__file__).parents[1]
 SIZE_HW = (216, 384)
 SEED = 4
 GAP = 6
@@ -104,15 +104,15 @@ def main() -> None:
     fair = {"clear": CONDITIONS["clear"]}
     days = {town: see(town, CONDITIONS if town == "Town05" else fair) for town in TOWNS}
     sheet([(town, frames["clear"].images["PCAM_F0"]) for town, frames in days.items()], 4).save(
-        HERE / "towns_places.jpg", quality=88
+        DOCS / "towns_places.jpg", quality=88
     )
     frames = days["Town05"]
     sheet([(name, frame.images["PCAM_F0"]) for name, frame in frames.items()], 3).save(
-        HERE / "towns_conditions.jpg", quality=88
+        DOCS / "towns_conditions.jpg", quality=88
     )
     side = 2 * SIZE_HW[0] + GAP
     views = [(name, draw_from_above(frames[name].sweep, side)) for name in ("clear", "rain", "fog")]
-    sheet(views, 3).save(HERE / "towns_lidar.png")
+    sheet(views, 3).save(DOCS / "towns_lidar.png")
     clear = frames["clear"]
     width = 3 * side + 2 * GAP
     rows = Image.fromarray(as_sensor_sees(clear.sweep, width))
@@ -121,7 +121,7 @@ def main() -> None:
     page = Image.new("RGB", (width, rows.height + GAP + cameras.height), "white")
     page.paste(rows, (0, 0))
     page.paste(cameras, (0, rows.height + GAP))
-    page.save(HERE / "towns_sensor_view.jpg", quality=88)
+    page.save(DOCS / "towns_sensor_view.jpg", quality=88)
 
 
 if __name__ == "__main__":

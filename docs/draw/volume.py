@@ -1,4 +1,4 @@
-"""Draws docs/nemo_volume.jpg: `python docs/draw_volume.py LOG RUN SECONDS [SECONDS ...]`."""
+"""Draws docs/nemo_volume.jpg: `python docs/draw/volume.py LOG RUN SECONDS [SECONDS ...]`."""
 
 import dataclasses
 import sys
@@ -18,7 +18,7 @@ from foredrive.view.log_frames import LogFrames
 from foredrive.view.model_panel import shown_voxels
 from foredrive.view.voxel_drawing import draw_volume_pca, draw_voxels
 
-HERE = Path(__file__).parent
+DOCS = Path(__file__).parents[1]
 CELL_HW = (198, 352)
 PCA_PX, GAP = 198, 6
 NAMES = ("camera", "rendered from the volume", "PCA, mean over Z", "occupancy now", "imagined, 1 s ahead")
@@ -67,7 +67,7 @@ def main(log: Path, run: Path, *seconds: float) -> None:
     with tempfile.TemporaryDirectory() as folder:  # for the run that comes with the package
         frames = LogFrames(find_logs(log)[0], CELL_HW[1], open_run(run_folder(run, Path(folder))))
         page = sheet([row(frames, t_s) for t_s in seconds])
-    page.save(HERE / "nemo_volume.jpg", quality=88, optimize=True)
+    page.save(DOCS / "nemo_volume.jpg", quality=88, optimize=True)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Draws the picture of docs/tasks.md: `python docs/draw_tasks.py [LOG]`. It records a town without LOG."""
+"""Draws the picture of docs/tasks.md: `python docs/draw/tasks.py [LOG]`. It records a town without LOG."""
 
 import sys
 import tempfile
@@ -29,7 +29,7 @@ from foredrive.sensors.vehicle import roof_lidar
 from foredrive.towns.recorder import record
 from foredrive.towns.sensing.capture import SensorSuite
 
-OUT = Path(__file__).parent / "tasks_truth.jpg"
+OUT = Path(__file__).parents[1] / "tasks_truth.jpg"
 TOWN, SECONDS, SEED, RATE_HZ, NOW_S = "Town03", 15.0, 1, 2.0, 8.0
 IMAGE_HW = (216, 384)
 VOXELS = VoxelSpec((-40.0, -40.0, -1.0), 0.4, (16, 200, 200))

@@ -1,4 +1,4 @@
-"""Draws docs/hero.png, what the shipped NeMo sees: `python docs/draw_hero.py LOG INDEX`.
+"""Draws docs/hero.png, what the shipped NeMo sees: `python docs/draw/hero.py LOG INDEX`.
 
 INDEX counts COUNT clips that are spread evenly over the log. The picture is of Town05_seed6 of the drives of
 `foredrive bench learning`, clip 25.
@@ -13,7 +13,7 @@ from foredrive.runs import open_run, predict_examples
 from foredrive.runs.shipped import run_folder
 from foredrive.view.overview import Overview, write_overview
 
-HERE = Path(__file__).parent
+DOCS = Path(__file__).parents[1]
 COUNT = 40
 
 
@@ -23,7 +23,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         run = open_run(run_folder(Path("embedded:nemo_town"), Path(folder)))
         shown = predict_examples(run, find_logs(Path(log)), COUNT)
-        write_overview(HERE / "hero.png", Overview.of(shown[int(index)]))
+        write_overview(DOCS / "hero.png", Overview.of(shown[int(index)]))
 
 
 if __name__ == "__main__":

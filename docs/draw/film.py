@@ -1,7 +1,7 @@
 """Makes docs/film.webp, the moving picture of the README.
 
     foredrive reconstruct data/logs/pandaset_train/002 --cameras pcam_f0 --out runs/002
-    python docs/draw_film.py runs/002
+    python docs/draw/film.py runs/002
 
 Above: PandaSet's log 002 (CC BY 4.0, Hesai and Scale AI) as it was recorded, and the reconstruction without a
 car, seen from 2 m to the left. Below: the driver of the package on a route by sight.
@@ -117,7 +117,7 @@ def main() -> None:
     above = street(Path(sys.argv[1]))
     with tempfile.TemporaryDirectory() as folder:
         frames = film(above, *drive(Path(folder)))
-        write_video(Path(__file__).parent / "film.webp", frames, STEP_S)
+        write_video(Path(__file__).parents[1] / "film.webp", frames, STEP_S)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Draws pages in the browser with Chromium: `python docs/draw_pages.py model LOG` or `… reconstructed RUN`.
+"""Draws pages in the browser with Chromium: `python docs/draw/pages.py model LOG` or `… reconstructed RUN`.
 
 `model` draws docs/nemo_viewer.jpg, nemo_features.jpg and nemo_rendered.jpg: what the NeMo of the package
 sees in runs/demo-quick/logs/town_test/Town05_seed7 of `foredrive demo --quick`. `reconstructed` draws
@@ -32,7 +32,7 @@ from foredrive.view.page import START_EYE_M, START_TARGET_M, Page
 from foredrive.view.reconstruction_viewer import ReconstructedViewer
 from foredrive.view.viewer import Viewer
 
-HERE = Path(__file__).parent
+DOCS = Path(__file__).parents[1]
 FLAGS = (
     "--headless",
     "--no-sandbox",
@@ -119,14 +119,14 @@ def draw_model(log: Path, chromium: Browser) -> None:
             assert viewer.model is not None
             viewer.show(frames.nearest(AT_S))
             client = chromium.open(viewer)
-            chromium.write(HERE / "nemo_viewer.jpg")
+            chromium.write(DOCS / "nemo_viewer.jpg")
 
             client.camera.position, client.camera.look_at = (-8.0, 0.0, 4.0), (12.0, 0.0, 0.5)
             time.sleep(DRAWN_S)
             chromium.press("Render from here")
             time.sleep(DRAWN_S)
             client.camera.position, client.camera.look_at = (-13.0, 3.0, 6.0), (0.0, 0.0, 2.0)
-            chromium.write(HERE / "nemo_rendered.jpg")
+            chromium.write(DOCS / "nemo_rendered.jpg")
 
             viewer.server.scene.remove_by_name("/rendered")
             client.camera.position, client.camera.look_at = START_EYE_M, START_TARGET_M
@@ -134,7 +134,7 @@ def draw_model(log: Path, chromium: Browser) -> None:
                 viewer.layers[layer].value = False
             viewer.model.colour_by.value = "features"
             viewer.model.min_height_m.value = viewer.model.spec.lower_m[2]
-            chromium.write(HERE / "nemo_features.jpg")
+            chromium.write(DOCS / "nemo_features.jpg")
 
 
 def draw_reconstructed(folder: Path, chromium: Browser) -> None:
@@ -144,7 +144,7 @@ def draw_reconstructed(folder: Path, chromium: Browser) -> None:
         page.show(AT_S)
         client = chromium.open(page)
         client.camera.position, client.camera.look_at = (-16.0, 7.0, 10.0), (8.0, 0.0, 0.0)
-        chromium.write(HERE / "reconstructed_view.jpg")
+        chromium.write(DOCS / "reconstructed_view.jpg")
 
 
 DRAWN_BY = {"model": draw_model, "reconstructed": draw_reconstructed}
