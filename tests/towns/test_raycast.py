@@ -1,5 +1,8 @@
 """Packets of rays against embreex, which casts them one by one."""
 
+import runpy
+import sys
+
 import numpy as np
 import pytest
 from embreex.mesh_construction import TriangleMesh
@@ -7,6 +10,7 @@ from embreex.rtcore_scene import EmbreeScene
 
 from foredrive.errors import InputError
 from foredrive.towns.place.mesh import Mesh, triangles
+from foredrive.towns.sensing import embree
 from foredrive.towns.sensing.embree import check_release
 from foredrive.towns.sensing.raycast import RaycastScene, ShapeInstances, TriangleScene
 from foredrive.towns.sensing.shading import MISS
@@ -88,6 +92,12 @@ def test_nobody_there() -> None:
     assert world.cast(start, ahead).t[0] == pytest.approx(5.0)
     assert world.cast(start, away).triangle[0] == MISS
     assert np.isinf(world.cast(start, away).t[0])
+
+
+def test_a_machine_without_embreex_gets_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "embreex", None)
+    with pytest.raises(InputError, match=r"^towns cast rays with embreex, which is not installed"):
+        runpy.run_path(embree.__file__)
 
 
 def test_an_embree_with_other_structs_is_refused() -> None:

@@ -9,16 +9,22 @@ from functools import cache
 from pathlib import Path
 from typing import no_type_check
 
-import embreex
 import llvmlite.binding
 import numba
 import numpy as np
-from embreex import rtcore_scene
 from jaxtyping import Bool, Float, Float32, UInt32, UInt64
 from numba import types
 
 from foredrive.errors import InputError
 from foredrive.towns.sensing.shading import MISS, Hits
+
+try:
+    import embreex
+    from embreex import rtcore_scene
+except ModuleNotFoundError as error:
+    raise InputError(
+        "towns cast rays with embreex, which is not installed (it has no wheels for Linux on ARM)"
+    ) from error
 
 Rays = Float32[np.ndarray, "N 3"]
 Times = Float32[np.ndarray, "_"]
