@@ -232,7 +232,7 @@ def by_sight(name: str, run_of: Callable[[int], DriverRun], prefix: str = "") ->
     return measure
 
 
-def told(agent: str, name: str) -> Arm:
+def untrained(agent: str, name: str) -> Arm:
     """Return an arm of an agent that learns nothing: all seeds are the same drives."""
     return lambda seed, routes: scores(agent, name, routes)
 
@@ -251,13 +251,16 @@ def by_leaderboard(seed: int, routes: str) -> Mapping[str, float]:
 
 
 ARMS: Mapping[str, Arm] = {
-    "shipped": told(SHIPPED, "shipped"),
+    "shipped": untrained(SHIPPED, "shipped"),
     "shipped_by_leaderboard": by_leaderboard,
-    **{f"shipped_{part.replace('-', '_')}": told(f"{part}:{SHIPPED}", f"shipped_{part}") for part in PARTS},
-    "expert": told(EXPERT, "expert"),
-    "idm": told(IDM, "idm"),
-    "stop": told(STOP, "stop"),
-    "constant_velocity": told(CONSTANT_VELOCITY, "constant_velocity"),
+    **{
+        f"shipped_{part.replace('-', '_')}": untrained(f"{part}:{SHIPPED}", f"shipped_{part}")
+        for part in PARTS
+    },
+    "expert": untrained(EXPERT, "expert"),
+    "idm": untrained(IDM, "idm"),
+    "stop": untrained(STOP, "stop"),
+    "constant_velocity": untrained(CONSTANT_VELOCITY, "constant_velocity"),
     **{
         f"small_{rounds}": by_sight(f"small_{rounds}", partial(small, rounds)) for rounds in range(ROUNDS + 1)
     },

@@ -201,11 +201,11 @@ def _server() -> ProgramServer:
 
 def bad_inputs(seed: int) -> dict[str, float]:
     """Return the number of tests of damaged files and of bad input, and how many of them fail."""
-    told = {
+    counts = {
         what: int(number) for number, what in re.findall(r"(\d+) (passed|failed|error)", _tested(BAD_INPUTS))
     }
-    failed = told.get("failed", 0) + told.get("error", 0)
-    return {"bad_inputs": float(told.get("passed", 0)), "bad_inputs_failed": float(failed)}
+    failed = counts.get("failed", 0) + counts.get("error", 0)
+    return {"bad_inputs": float(counts.get("passed", 0)), "bad_inputs_failed": float(failed)}
 
 
 def field_cases(seed: int) -> dict[str, float]:

@@ -67,12 +67,12 @@ def _named(rows: Sequence[ViewRow], found: Float[np.ndarray, "n D"], towers: Tow
     """Return the mean over classes of the share that is classified correctly."""
     out = {}
     for kind in KINDS:
-        told = [getattr(row.facts, kind) for row in rows]
-        classes = {name: SETTINGS[name] for name in sorted({name for name in told if name is not None})}
+        labels = [getattr(row.facts, kind) for row in rows]
+        classes = {name: SETTINGS[name] for name in sorted({name for name in labels if name is not None})}
         if len(classes) < 2:
             continue
         chosen = classify(torch.from_numpy(found), class_vectors(towers, classes)).numpy()
-        right = [np.mean(chosen[[name == want for name in told]] == n) for n, want in enumerate(classes)]
+        right = [np.mean(chosen[[name == want for name in labels]] == n) for n, want in enumerate(classes)]
         out[f"named_{kind}"] = float(np.mean(right))
     return out
 

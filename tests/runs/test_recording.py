@@ -14,7 +14,7 @@ from foredrive.data.logs import Log
 from foredrive.engine.fan_out import fan_out
 from foredrive.errors import InputError
 from foredrive.runs.drive.recording import RecordingResult, is_recorded, record_drives, record_plan
-from foredrive.sensors.rigs import DRIVING, SURROUND, TELE, Mount, RigPlan, same_rig, told_rig
+from foredrive.sensors.rigs import DRIVING, SURROUND, TELE, Mount, RigPlan, rig_yaml, same_rig
 from foredrive.towns.campaign import DrivePlan
 
 RIG = SURROUND.of_size((36, 64))
@@ -85,7 +85,7 @@ def test_cameras_keep_their_names(tmp_path: Path) -> None:
     ],
 )
 def test_a_rig_that_cannot_be_recorded_is_told_at_once(rig: RigPlan, message: str, tmp_path: Path) -> None:
-    (tmp_path / "rig.yaml").write_text(told_rig(rig))
+    (tmp_path / "rig.yaml").write_text(rig_yaml(rig))
     with pytest.raises(InputError, match=message):
         chosen_rig(str(tmp_path / "rig.yaml"), None)
 

@@ -19,8 +19,8 @@ from foredrive.sensors.rigs import (
     camera_rig,
     find_rig,
     rig_of_cameras,
+    rig_yaml,
     same_rig,
-    told_rig,
 )
 
 RIG = """
@@ -58,7 +58,7 @@ def test_a_rig_is_read_back_from_its_matrices(yaw: float, pitch: float, roll: fl
 @pytest.mark.parametrize("name", RIGS)
 def test_known_rigs_survive_their_file(name: str, tmp_path: Path) -> None:
     path = tmp_path / "rig.yaml"
-    path.write_text(told_rig(RIGS[name]))
+    path.write_text(rig_yaml(RIGS[name]))
     assert find_rig(str(path)) == RIGS[name] == find_rig(name)
 
 

@@ -17,7 +17,7 @@ from foredrive.lazy import importing
 if TYPE_CHECKING:
     from foredrive.runs.improve.records import Source
 
-TRAINING, IN_TOWNS = InTowns(routes="training-short"), InReconstruction()
+TRAINING, NO_RECONSTRUCTION = InTowns(routes="training-short"), InReconstruction()
 
 
 def improve(
@@ -25,7 +25,7 @@ def improve(
     pool: SomePaths,
     out: Path,
     towns: tyro.conf.OmitArgPrefixes[InTowns] = TRAINING,
-    reconstructed: tyro.conf.OmitArgPrefixes[InReconstruction] = IN_TOWNS,
+    reconstructed: tyro.conf.OmitArgPrefixes[InReconstruction] = NO_RECONSTRUCTION,
     on: SomePaths = (),
     logs: SomePaths = (),
     judge: Annotated[str | None, tyro.conf.arg(metavar="SET|FILE.xml|LOGS")] = None,

@@ -109,7 +109,7 @@ def names_of_camera(log: Log, name: str) -> tuple[str, ...]:
     return () if metadata is None else (metadata.camera_name, metadata.camera_id.serialize())
 
 
-def told_cameras(cameras: Iterable[PinholeCameraMetadata]) -> str:
+def camera_list(cameras: Iterable[PinholeCameraMetadata]) -> str:
     """Return a list of cameras for error messages, with both names that `find_camera` accepts."""
     names = dict.fromkeys((metadata.camera_name, metadata.camera_id.serialize()) for metadata in cameras)
     texts = [own if own == shared else f"{own} ({shared})" for own, shared in names]

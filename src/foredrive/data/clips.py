@@ -13,7 +13,7 @@ from jaxtyping import Float64, Int64
 from torch.utils.data import Dataset
 
 from foredrive.data.assemble import assemble_clip
-from foredrive.data.cameras import find_camera, pinhole_cameras, told_cameras
+from foredrive.data.cameras import camera_list, find_camera, pinhole_cameras
 from foredrive.data.clip_config import ClipConfig
 from foredrive.data.commands import command_at, count_command_sources, route_ahead_at
 from foredrive.data.frame_store import FrameStore
@@ -219,7 +219,7 @@ class ClipDataset(Dataset[Example]):
             return tuple(dict.fromkeys(name for cameras in self._cameras for name in cameras))
         for name in self.config.cameras:
             if not any(find_camera(cameras, name) for cameras in self._cameras):
-                names = told_cameras(camera for cameras in self._cameras for camera in cameras.values())
+                names = camera_list(camera for cameras in self._cameras for camera in cameras.values())
                 raise InputError(f"no log has a camera {name!r}; there are: {names}")
         return self.config.cameras
 

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from foredrive.data.assemble import assemble_clip
-from foredrive.data.cameras import find_camera, pinhole_cameras, told_cameras
+from foredrive.data.cameras import camera_list, find_camera, pinhole_cameras
 from foredrive.data.frame_store import FrameStore
 from foredrive.data.lidar import read_sweep
 from foredrive.data.log_paths import LogPath
@@ -61,7 +61,7 @@ def read_drive(
     for name, camera in zip(names, chosen, strict=True):
         if camera is None:
             raise InputError(
-                f"{path.folder}: no camera {name!r}; there are: {told_cameras(cameras_by_name.values())}"
+                f"{path.folder}: no camera {name!r}; there are: {camera_list(cameras_by_name.values())}"
             )
     frames = range(len(log)) if frames is None else frames
     store = FrameStore(cache_dir, image_hw, names)

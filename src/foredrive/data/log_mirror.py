@@ -192,7 +192,7 @@ def _copy(entry: _Entry, folder: Path, file: tuple[str, int, int]) -> None:
     path = folder / name
     path.parent.mkdir(parents=True, exist_ok=True)
     url = f"{entry.url}/{name}"
-    with _told(url):
+    with _download_errors(url):
         storage, place = _storage(url)
         with storage.open_input_stream(place) as source, path.open("wb") as target:
             shutil.copyfileobj(source, target, CHUNK)
@@ -258,7 +258,7 @@ def _open_lock(entry: _Entry) -> int:
 def _listings(url: str, *, allow_missing: bool = False) -> dict[Path, Listing]:
     """Return the files of all folders at a URL, by their local folders. A folder of maps is one entry."""
     scheme = url.split("://")[0]
-    with _told(url):
+    with _download_errors(url):
         storage, place = _storage(url)
         selector = fs.FileSelector(place, recursive=True, allow_not_found=allow_missing)
         file_infos = [info for info in storage.get_file_info(selector) if info.type == fs.FileType.File]
@@ -288,7 +288,7 @@ def _file_system(bucket: str) -> fs.FileSystem:
 
 
 @contextlib.contextmanager
-def _told(url: str) -> Iterator[None]:
+def _download_errors(url: str) -> Iterator[None]:
     """Convert errors of object storage to `InputError`s of one line."""
     try:
         yield

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from foredrive.data.cameras import find_camera, pinhole_cameras, read_camera, told_cameras
+from foredrive.data.cameras import camera_list, find_camera, pinhole_cameras, read_camera
 from foredrive.data.lidar import read_sweep
 from foredrive.data.log_paths import LogPath, find_logs
 from foredrive.data.logs import Log
@@ -127,7 +127,7 @@ def _cropped(log: Log, frame: int, like: Like, towers: Towers) -> View:
     """Return a part of an image as a view. The towers' own crop applies to this part."""
     metadata = find_camera(pinhole_cameras(log), like.view)
     if metadata is None:
-        cameras = told_cameras(pinhole_cameras(log).values())
+        cameras = camera_list(pinhole_cameras(log).values())
         raise InputError(f"{log.path.name}: no camera {like.view}; there are: {cameras}")
     camera = read_camera(log, frame, metadata, (metadata.height, metadata.width), with_image=True)
     assert like.crop_px is not None

@@ -176,7 +176,7 @@ def _numbers(plan: RigPlan) -> dict[str, tuple[float, ...]]:
     }
 
 
-def told_rig(plan: RigPlan) -> str:
+def rig_yaml(plan: RigPlan) -> str:
     """Return a rig as the YAML that `find_rig` reads."""
     text: str = yaml.safe_dump(TypeAdapter(RigPlan).dump_python(plan, mode="json"), sort_keys=False)
     return text

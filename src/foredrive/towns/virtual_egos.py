@@ -326,7 +326,6 @@ def _comes_by_s(window: _Window, ego: _Ego, ahead_m: float) -> float | None:
     xyz = np.stack([moment.poses.axle_xyz[ego.row] for moment in window.moments])
     driven_m = arc_lengths(xyz)
     if driven_m[-1] < ahead_m:
-        # Time at which the driven distance is reached, between key frames
         return None
     return float(np.interp(ahead_m, driven_m, KEY_DT_S * np.arange(len(driven_m))))
 

@@ -45,7 +45,7 @@ def write_search_sheet(path: Path, query: Query, hits: Sequence[Hit], unlike: bo
         _write_picture(path, title, hits[:MAX_ON_PICTURE])
         return
     shown = [
-        (picture(hit_picture(hit), f"{number}   {hit_name(hit)}"), score_text(hit), _told(hit))
+        (picture(hit_picture(hit), f"{number}   {hit_name(hit)}"), score_text(hit), _hit_lines(hit))
         for number, hit in enumerate(hits, 1)
     ]
     write_page(path, "search_sheet.html.j2", title=title, hits=shown)
@@ -106,5 +106,5 @@ def hits_table(hits: Sequence[Hit]) -> Table:
     return simple_table(columns, rows)
 
 
-def _told(hit: Hit) -> list[str]:
+def _hit_lines(hit: Hit) -> list[str]:
     return [content_text(hit)] + ([] if hit.row.caption is None else [hit.row.caption])

@@ -133,7 +133,7 @@ def download(
         except _NETWORK as error:
             if attempt + 1 == TRIES:
                 raise InputError(
-                    f"{bucket}/{entry.key}: {_told(error)} ({TRIES} tries); start again to go on"
+                    f"{bucket}/{entry.key}: {_reason(error)} ({TRIES} tries); start again to go on"
                 ) from error
             time.sleep(pause_s * 2**attempt)
     os.replace(part, file)
@@ -191,7 +191,7 @@ def _md5(file: Path) -> str:
         return hashlib.file_digest(opened, lambda: hashlib.md5(usedforsecurity=False)).hexdigest()
 
 
-def _told(error: BaseException) -> str:
+def _reason(error: BaseException) -> str:
     reason = getattr(error, "reason", None) or error
     return " ".join(str(reason).split()) or type(error).__name__
 

@@ -59,10 +59,10 @@ def find_raw_logs(source: Path, dataset: str, topics: Path | None = None) -> Ite
     kind, any_log = DATASETS[dataset], False
     logs = iter(kind.find(source) if topics is None else find_bags(source, topics))
     while True:
+        # Errors of a parser become an error that names the log
         with reading_raw(source):
             raw = next(logs, None)
         if raw is None:
-            # Errors of a parser become an error that names the log
             break
         any_log = True
         yield raw

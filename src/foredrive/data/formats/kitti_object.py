@@ -127,7 +127,7 @@ class KittiObjectParser(BaseLogParser):
         return Camera(metadata, image, _pose(T_imu_cam), _NOW)
 
     def _boxes(self, calibration: "_Calibration") -> list[BaseModality]:
-        """Return the boxes and their attributes. A row that is none is left out."""
+        """Return the boxes and their attributes. Rows that are no boxes are left out."""
         file = self._file("label_2", "txt")
         detections, kinds = [], []
         read = PartReader(f"label_2/{file.name}", "rows")
@@ -136,8 +136,8 @@ class KittiObjectParser(BaseLogParser):
                 continue
             label = read(f"line {number + 1}", functools.partial(_Label.of, line))
             if label is None:
-                # Camera frame to IMU frame
                 continue
+            # Camera frame to IMU frame
             pose = _pose(calibration.T_imu_rect @ label.T_rect_box)
             category = category_or_other(label.kind, f"label_2/{file.name}")
             attributes = BoxDetectionAttributes(LABEL_OF_CATEGORY[category], str(number), None)
@@ -170,8 +170,8 @@ class _Label:
         """
         kind, *words = line.split()
         if len(words) < _COLUMNS - 1 or kind.replace(".", "").lstrip("-").isdigit():
-            # Order of KITTI's columns: height, width, length, then place and turn
             raise InputError(f"not {_COLUMNS} columns that begin with a class")
+        # Order of KITTI's columns: height, width, length, then place and turn
         height, width, length, x, y, z, turn = (float(word) for word in words[7:14])
         if not np.isfinite([x, y, z, turn]).all() or not min(height, width, length) > 0:
             raise InputError("an object without place or size")

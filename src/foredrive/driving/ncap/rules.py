@@ -2,8 +2,8 @@
 
 docs/safety-tests.md compares them field by field. Sources: Ljungbergh et al., "NeuroNCAP: Photorealistic
 Closed-loop Safety Testing for Autonomous Driving", ECCV 2024 (the paper), and the public repository
-atonderski/neuro-ncap at ecdcf28 (the released code). `PAPER` has the values of the code, but for three of
-which the code does something else than it sets out to do: `reference`, `pose_feedback`, `unchecked_end_s`.
+atonderski/neuro-ncap at ecdcf28 (the released code). `PAPER` has the values of the released code, except
+where that code does not do what it intends: `reference`, `pose_feedback`, `unchecked_end_s`.
 """
 
 import enum

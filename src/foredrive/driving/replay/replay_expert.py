@@ -6,7 +6,7 @@ side, and each driven by the controller and the vehicle of our drives, as PDM-Cl
 that touch nobody it takes the one that comes furthest, less what it swerves; those that keep a margin go
 first. If all touch somebody, it takes the one with the slowest first impact.
 
-In a simulator it is told where the road users will be, since they replay their tracks. In a log it expects
+In a simulator it knows where the road users will be, since they replay their tracks. In a log it expects
 them to go on at constant velocity.
 """
 
@@ -51,8 +51,8 @@ MIN_CRUISE_MPS = 3.0
 
 
 @runtime_checkable
-class ToldWorld(Protocol):
-    """What the expert is told by a simulator beside its observations."""
+class PrivilegedWorld(Protocol):
+    """The privileged state that a simulator gives the expert beside its observations."""
 
     def ego(self) -> BicycleState:
         """Return the state of the ego vehicle."""
@@ -65,7 +65,7 @@ class ToldWorld(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class ReplayedWorld:
-    """A `ToldWorld` of the simulator of a reconstructed log."""
+    """A `PrivilegedWorld` of the simulator of a reconstructed log."""
 
     simulator: ReconstructedSimulator
 
@@ -85,7 +85,7 @@ class ReplayExpert:
     """An agent that reads the boxes of its observation, which are true in a simulator."""
 
     drive: LoggedDrive
-    world: ToldWorld | None = None
+    world: PrivilegedWorld | None = None
     """None: road users are expected to go on at constant velocity."""
 
     def act(self, observation: Clip) -> Trajectory:

@@ -61,7 +61,7 @@ class NuScenesFolder:
             with atomic_path(noted) as file:
                 file.write_text(json.dumps(options))
         elif (before := json.loads(noted.read_text())) != options:
-            begun = f"was begun with {_told(before)}, not {_told(options)}"
+            begun = f"was begun with {_option_list(before)}, not {_option_list(options)}"
             raise InputError(f"{self.tables}: {begun}; choose another --name")
         remove_abandoned(self.parts, below=True)
 
@@ -142,5 +142,5 @@ def _write_table(file: Path, rows: Iterable[Row]) -> None:
         opened.write("\n]\n" if before != "[\n" else "[]\n")
 
 
-def _told(options: dict[str, object]) -> str:
+def _option_list(options: dict[str, object]) -> str:
     return f"--rate {options['rate_hz']:g}{'' if options['sweeps'] else ' --no-sweeps'}"

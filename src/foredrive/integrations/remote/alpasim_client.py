@@ -75,7 +75,7 @@ class GrpcDriver:
             )
             answer = self._stub.drive(asked, timeout=_left_s(until_s))
         except grpc.RpcError as error:
-            raise _told(self._address, error) from error
+            raise _input_error(self._address, error) from error
         T_local_now = self._T_local_world @ clip.T_world_ego[clip.now].numpy()
         return plan_of(points_of(TimedPoses.from_proto(answer.trajectory), T_local_now, now_us)[None, None])
 
@@ -125,10 +125,10 @@ def check_driver(address: Address, within_s: float) -> None:
             stub: Any = protocol.EgodriverServiceStub(channel)
             stub.get_version(protocol.Empty(), timeout=within_s, wait_for_ready=True)
         except grpc.RpcError as error:
-            raise InputError(f"no driver is alive: {_told(address, error)}") from error
+            raise InputError(f"no driver is alive: {_input_error(address, error)}") from error
 
 
-def _told(address: Address, error: Any) -> InputError:
+def _input_error(address: Address, error: Any) -> InputError:
     """Return an error of gRPC as one line."""
     late = error.code() is grpc.StatusCode.DEADLINE_EXCEEDED
     why = f"no answer within {address.answer_s:g} s" if late else f"{error.code().name}: {error.details()}"

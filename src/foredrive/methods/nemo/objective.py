@@ -191,7 +191,6 @@ class NemoObjective(nn.Module):
         """Return the mean error of the predicted ego motions, m."""
         spec, driven = self.agent.world_model.spec, clip.T_world_ego[:, clip.now :]
         errors = []
-        # Driven poses from now on, in the world
         for k, future in enumerate(futures, start=1):
             assert future.T_now_ego is not None
             items = len(future.T_now_ego)

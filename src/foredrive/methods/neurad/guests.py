@@ -1,8 +1,8 @@
-"""Actors of other fields in a field: rendered by their own field, seen by their own decoders.
+"""Actors of one neural field, inserted into the scene of another.
 
-The features of two fields have nothing in common. So rays are rendered in both fields, and what they see is
-put together by its share: the probability that a ray ends in the one or the other. In the box of a guest
-nothing else stops a ray, as in the box of an actor of the scene's own.
+The features of two fields have nothing in common, so each ray is rendered in both fields, with the decoders
+of each. The two results are blended by the probability that the ray ends in the one or the other. Within the
+box of an inserted actor, nothing but that actor stops a ray.
 """
 
 from typing import NamedTuple

@@ -133,10 +133,12 @@ class PlanningAgent(nn.Module, Generic[W]):
             beliefs: about now and about the next key frames.
             output: output of `perceive`, if it is known.
         """
-        plan: Trajectory = self.planner(*self._told(clip, beliefs, output))
+        plan: Trajectory = self.planner(*self._planner_inputs(clip, beliefs, output))
         return plan
 
-    def _told(self, clip: Clip, beliefs: Sequence[Belief], output: HeadOutput | None) -> tuple[Any, ...]:
+    def _planner_inputs(
+        self, clip: Clip, beliefs: Sequence[Belief], output: HeadOutput | None
+    ) -> tuple[Any, ...]:
         """Return the arguments of the planner."""
         poses, speeds = ego_motion(clip, self.planner.history)
         return (

@@ -133,7 +133,7 @@ class Round:
     judged: Mapping[str, Judged] = field(default_factory=dict)
     """The drives or moments that judge the round, by name."""
     suite: Path | None = None
-    """Folder of these."""
+    """Folder of the drives that judge the round."""
     kept: bool = True
     """False if the round was dropped, because it was judged worse."""
 

@@ -98,9 +98,9 @@ def _from_annotations(content: Any, file: Path) -> dict[str, FramePose]:
 
 def _annotated_pose(frame: Mapping[str, Any]) -> FramePose:
     path = str(next(iter(frame["camera_sensor"].values()))["img_path"])
+    # The name of an image file begins with the vehicle's name
     vehicle = next((name for name in LIDAR_POSITION_M if name in path), None)
     if vehicle is None:
-        # The name of an image file begins with the vehicle's name
         raise ValueError(f"the name of image {path} begins with none of {', '.join(LIDAR_POSITION_M)}")
     T_ego_lidar = np.eye(4)
     T_ego_lidar[:3, 3] = LIDAR_POSITION_M[vehicle]

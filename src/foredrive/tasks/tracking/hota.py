@@ -107,7 +107,7 @@ def _counts(track: Int[ndarray, "n"]) -> tuple[Int[ndarray, "T"], Int[ndarray, "
 
 
 def _share(similar: Candidates, true: int, predicted: int) -> Float[ndarray, "P"]:
-    """Return the similarity of each pair as a share of that of all pairs that its two boxes have."""
+    """Return the similarity of each pair, divided by the sum over all pairs with one of its two boxes."""
     value = similar.value
     # Similarity of all pairs of the true box and of the found box, the pair itself counted once
     whole = np.bincount(similar.true_row, value, true)[similar.true_row] - value

@@ -80,9 +80,9 @@ def build_posts(town: TownMap, site: Site, table: MaterialTable) -> Props:
     lanes = site.plan.lanes
     shapely.prepare(lanes)
     for index, zone in enumerate(town.stop_zones):
+        # The post stands off the lanes, and nothing else may stand where it does
         foot = _off_lanes(zone, lanes)
         if foot is None:
-            # The foot of the post is moved off the lanes, and its place is taken first
             continue
         site.take(shapely.Point(foot[:2]).buffer(0.4))
         z = float(site.height(foot[None, :2])[0])
