@@ -18,12 +18,13 @@ from foredrive.runs.evaluate.predict import AgentPredictor
 from foredrive.runs.shipped import run_folder
 from foredrive.runs.train.run import load_agent, open_run
 from foredrive.scene import Example
+from foredrive.scene.voxels import MOVING_MPS
 from foredrive.tasks.evaluation.metric import EvaluationContext, Shown, labels_from_now
 from foredrive.tasks.evaluation.predictor import Part, Prediction
 from foredrive.tasks.evaluation.run import evaluate
 from foredrive.tasks.occupancy.flow_metric import FlowMetric
 from foredrive.tasks.occupancy.occupancy_metric import OccupancyMetric
-from foredrive.tasks.occupancy.scores import MOVING_MPS, above_ground
+from foredrive.tasks.occupancy.scores import above_ground
 
 LOGS_APART, STRIDE_S = 2, 1.0
 """Every second ego is judged, at nows so far apart."""

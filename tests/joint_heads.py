@@ -6,6 +6,10 @@ from collections.abc import Sequence
 import torch
 
 from foredrive.data.clip_config import TaskTruthConfig
+from foredrive.heads.agents_head import AgentHeadConfig, CarriedConfig
+from foredrive.heads.decoder import DecoderConfig
+from foredrive.heads.map_head import MapHeadConfig
+from foredrive.heads.motion_head import MotionConfig
 from foredrive.methods.recipe import Recipe
 from foredrive.runs.recipes.task_heads import TaskHeadsRecipe, town_heads, with_joint_heads
 from foredrive.scene import Example
@@ -13,10 +17,6 @@ from foredrive.scene.agent_futures import AgentFutures
 from foredrive.scene.map_elements import MapElements, MapRaster, RasterLayer
 from foredrive.scene.semantics import SemanticVoxels
 from foredrive.scene.task_truth import TaskTruth
-from foredrive.tasks.detection.agents_head import AgentHeadConfig, CarriedConfig
-from foredrive.tasks.heads.decoder import DecoderConfig
-from foredrive.tasks.maps.head import MapHeadConfig
-from foredrive.tasks.motion.head import MotionConfig
 
 ALL = ("detection", "motion", "map", "occupancy")
 

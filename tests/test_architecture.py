@@ -15,6 +15,7 @@ FLOORS = [
     {"sensors", "sets"},
     {"data"},
     {"engine"},
+    {"heads"},
     {"tasks"},
     {"methods"},
     {"driving"},

@@ -76,7 +76,7 @@ import importlib, pkgutil, sys
 for name in sys.argv[1].split(","):
     sys.modules[name] = None  # not installed
 imported = 0
-for root in ("ops", "methods", "geometry", "scene", "sensors", "sets", "tasks.heads"):
+for root in ("ops", "methods", "geometry", "scene", "sensors", "sets", "heads"):
     package = importlib.import_module(f"foredrive.{root}")
     for module in pkgutil.walk_packages(package.__path__, f"foredrive.{root}."):
         try:
@@ -84,8 +84,6 @@ for root in ("ops", "methods", "geometry", "scene", "sensors", "sets", "tasks.he
         except ModuleNotFoundError as error:
             assert error.name == "triton", f"{module.name}: {error}"
         imported += 1
-for losses in ("detection.losses", "maps.losses", "occupancy.losses", "planning.losses"):
-    importlib.import_module(f"foredrive.tasks.{losses}")
 print(imported)
 """
 

@@ -17,11 +17,11 @@ from torch import Tensor
 
 from foredrive.data import ClipConfig, ClipDataset, LogPath
 from foredrive.geometry.boxes import points_in_boxes
+from foredrive.heads.detection_losses import Loss, MatchingLossConfig, matching_loss, set_loss
+from foredrive.heads.detection_network import DetectionHead
 from foredrive.scene import Category, Clip, LidarSweep, VoxelSpec, WorldModel
 from foredrive.sets import Family, LabelledBoxes, MultiBernoulli, UniformPoisson, fit_set_calibration
 from foredrive.tasks.detection.frames import DetectionFrame, DetectionSet
-from foredrive.tasks.detection.losses import Loss, MatchingLossConfig, matching_loss, set_loss
-from foredrive.tasks.detection.network import DetectionHead
 from foredrive.tasks.detection.score import score_frames
 from foredrive.tasks.detection.summary import summarise_scores
 from foredrive.tasks.detection.training import Sample, fit_head, predict_sets

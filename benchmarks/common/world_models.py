@@ -43,7 +43,7 @@ LEARNED_BY_BOTH = (
     "foredrive.methods.blocks.averaging",
     "foredrive.methods.blocks.backbone",
     "foredrive.methods.blocks.lifting",
-    "foredrive.tasks.occupancy.losses",
+    "foredrive.heads.occupancy_losses",
 )
 DECIDED_BY = (
     *LEARNED_BY_BOTH,
@@ -58,12 +58,12 @@ DECIDED_BY = (
 )
 
 TASKS_DECIDED_BY = (
-    "foredrive.tasks.detection.agent_losses",
-    "foredrive.tasks.detection.agents_head",
-    "foredrive.tasks.detection.proposals",
-    "foredrive.tasks.heads",
-    "foredrive.tasks.maps.head",
-    "foredrive.tasks.maps.losses",
+    "foredrive.heads.agent_losses",
+    "foredrive.heads.agents_head",
+    "foredrive.heads.proposals",
+    "foredrive.heads",
+    "foredrive.heads.map_head",
+    "foredrive.heads.map_losses",
 )
 """The code that decides what task heads learn."""
 

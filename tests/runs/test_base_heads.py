@@ -7,6 +7,8 @@ import torch
 from joint_heads import ALL
 
 from foredrive.engine.parameter_groups import parameter_groups
+from foredrive.heads.heads import TaskHeads, TaskVolume
+from foredrive.heads.losses import task_losses
 from foredrive.runs.recipes.known import RECIPES
 from foredrive.runs.recipes.task_heads import heads_for
 from foredrive.scene import Boxes
@@ -14,8 +16,6 @@ from foredrive.scene.boxes import unlabelled
 from foredrive.scene.map_elements import MapElements, MapRaster, RasterLayer
 from foredrive.scene.semantics import SemanticVoxels
 from foredrive.scene.task_truth import TaskTruth
-from foredrive.tasks.heads.heads import TaskHeads, TaskVolume
-from foredrive.tasks.heads.losses import task_losses
 
 FRAMES = 2
 

@@ -17,6 +17,8 @@ from foredrive.engine.checkpoints import save_weights
 from foredrive.engine.folder import WEIGHTS
 from foredrive.engine.metrics_log import read_metrics
 from foredrive.errors import InputError
+from foredrive.heads.agents_head import CarriedConfig
+from foredrive.heads.probe import task_volumes
 from foredrive.methods.driveworld.planes import VectorToPlaneConfig
 from foredrive.methods.driveworld.task_prompt import PROMPTS, PromptConfig
 from foredrive.methods.planner.agent import PlanningAgent
@@ -32,8 +34,6 @@ from foredrive.runs.recipes.task_heads import (
 from foredrive.runs.train.run import begin_run
 from foredrive.runs.train.tasks import TASKS, load_heads, probe_run, train_heads
 from foredrive.scene import Example
-from foredrive.tasks.detection.agents_head import CarriedConfig
-from foredrive.tasks.heads.probe import task_volumes
 
 
 def test_heads_of_a_run_are_trained_continued_and_evaluated(

@@ -15,6 +15,8 @@ from torch import Tensor, nn
 from foredrive.data import ClipConfig, LogPath
 from foredrive.engine.loop import Schedule
 from foredrive.errors import InputError
+from foredrive.heads.joint import TaskTerms
+from foredrive.heads.plan_losses import waypoint_loss
 from foredrive.methods.planner.agent import PlanningAgent
 from foredrive.methods.recipe import Recipe
 from foredrive.runs import Run, evaluate_run, open_run, predict_examples, train_run
@@ -27,8 +29,6 @@ from foredrive.runs.export import export_run
 from foredrive.runs.recipes.world_models import WORLD_MODELS, WorldModelEntry, load_recipe
 from foredrive.scene import Belief, Clip, Decoded, Example, Frames, Task, VoxelSpec, WorldModel, last_frames
 from foredrive.sensors.rigs import SURROUND
-from foredrive.tasks.heads.joint import TaskTerms
-from foredrive.tasks.planning.losses import waypoint_loss
 from foredrive.towns.map.town_map import load_town_map
 from foredrive.towns.traffic.lane_graph import build_lane_graph
 from foredrive.view.log_frames import LogFrames

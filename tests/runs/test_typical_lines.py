@@ -4,11 +4,11 @@ import pytest
 import torch
 from joint_heads import small_heads
 
+from foredrive.heads.heads import TaskHeads
 from foredrive.runs.train.task_priors import place_map_elements, typical_lines
 from foredrive.scene import VoxelSpec
 from foredrive.scene.map_elements import ElementKind, MapElements
 from foredrive.scene.task_truth import TaskTruth
-from foredrive.tasks.heads.heads import TaskHeads
 
 GRID = VoxelSpec((-16.0, -16.0, -1.0), 2.0, (2, 16, 16))
 

@@ -17,10 +17,10 @@ from foredrive.data.clip_config import TaskTruthConfig
 from foredrive.data.log_writer import LogWriter
 from foredrive.data.maps import write_map
 from foredrive.data.modalities import FullOccupancy
+from foredrive.heads.agents_head import AGENT_CLASSES
 from foredrive.scene import Attribute, Boxes, Category, Example, VoxelSpec
 from foredrive.scene.agents import Agents, MapLines
 from foredrive.scene.map_elements import ElementKind
-from foredrive.tasks.detection.agents_head import AGENT_CLASSES
 from foredrive.tasks.evaluation.predictor import Prediction
 
 STEP_S, SECONDS = 0.25, 9.0

@@ -5,10 +5,10 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Generic, Literal, TypeVar
 
 from foredrive.data import ClipConfig
+from foredrive.heads.joint import JointTasks
 from foredrive.methods.planner.ego_mlp_fit import EgoMLPFit
 from foredrive.methods.planner.path_fit import PathFit
 from foredrive.methods.planner.planner import PlannerConfig
-from foredrive.tasks.heads.joint import JointTasks
 
 M = TypeVar("M")
 S = TypeVar("S")

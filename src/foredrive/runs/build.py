@@ -6,13 +6,13 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from foredrive.errors import InputError
+from foredrive.heads.heads import TaskHeads
+from foredrive.heads.joint import TaskTerms
 from foredrive.methods.planner.agent import PlanningAgent
 from foredrive.methods.planner.objective import PlannerObjective
 from foredrive.methods.planner.planner import VolumePlanner
 from foredrive.methods.recipe import Recipe
 from foredrive.runs.recipes.world_models import WORLD_MODELS
-from foredrive.tasks.heads.heads import TaskHeads
-from foredrive.tasks.heads.joint import TaskTerms
 
 
 def build_agent(recipe: Recipe[Any, Any], *, fetch: bool = True) -> PlanningAgent[Any]:

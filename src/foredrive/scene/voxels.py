@@ -8,6 +8,9 @@ from torch import Tensor
 
 from foredrive.scene.record import Record
 
+MOVING_MPS = 0.5
+"""Speed from which the content of a voxel counts as moving, m/s."""
+
 
 @dataclass(frozen=True)
 class VoxelSpec:

@@ -6,9 +6,9 @@ import pytest
 import torch
 
 from foredrive.geometry.se3 import matrix_from_yaw
+from foredrive.heads.plan_losses import ego_motion_loss, waypoint_loss
 from foredrive.methods.blocks.losses import l1_loss, perceptual_loss
 from foredrive.scene import Trajectory, VoxelSpec
-from foredrive.tasks.planning.losses import ego_motion_loss, waypoint_loss
 
 
 def trajectory(xy: list[list[float]], valid: list[bool]) -> Trajectory:

@@ -12,15 +12,15 @@ from torch import nn
 
 import foredrive
 from foredrive.geometry.se3 import compose_se3, exp_se3, inverse_se3, transform_points
+from foredrive.heads.instances_head import InstanceHead, InstanceHeadConfig
+from foredrive.heads.plane import Plane, PlanePyramid, cell_middles
+from foredrive.heads.proposals import CentreHead
 from foredrive.methods.blocks.lift_splat import LiftSplatConfig, LiftSplatEncoder
 from foredrive.methods.blocks.lifting import project_to_cameras
 from foredrive.methods.blocks.training_rays import thinned_rays
 from foredrive.methods.driveworld.planes import warp_plane
 from foredrive.scene import Clip, Example, VoxelSpec
 from foredrive.sensors import camera_rays
-from foredrive.tasks.detection.proposals import CentreHead
-from foredrive.tasks.heads.plane import Plane, PlanePyramid, cell_middles
-from foredrive.tasks.occupancy.instances_head import InstanceHead, InstanceHeadConfig
 
 SPEC = VoxelSpec(lower_m=(-25.6, -25.6, -2.0), voxel_m=0.8, shape_zyx=(8, 64, 64))
 BF16 = torch.autocast("cpu", torch.bfloat16)

@@ -5,8 +5,8 @@ import math
 import pytest
 import torch
 
-from foredrive.tasks.detection.agent_losses import centre_loss, centre_target
-from foredrive.tasks.heads.plane import cell_middles
+from foredrive.heads.agent_losses import centre_loss, centre_target
+from foredrive.heads.plane import cell_middles
 
 MIDDLE = cell_middles((0.0, 0.0), 2.0, (3, 4)).view(3, 4, 2)
 

@@ -3,7 +3,7 @@
 import torch
 from torch import nn
 
-from foredrive.tasks.detection.few_queries import FewQueriesDecoderLayer, attend_few
+from foredrive.heads.few_queries import FewQueriesDecoderLayer, attend_few
 
 
 def test_layer_and_gradients_are_those_of_torch() -> None:

@@ -9,20 +9,12 @@ import torch
 from torch import nn
 
 from foredrive.geometry.se3 import matrix_from_yaw
-from foredrive.scene import Boxes, Category, Example, VoxelSpec
-from foredrive.scene.boxes import unlabelled
-from foredrive.scene.map_elements import InstanceRaster, PlaneSpec
-from foredrive.scene.task_truth import TaskTruth
-from foredrive.tasks.detection.agents_head import AGENT_CLASSES, AgentHeadConfig, AgentSet, CarriedConfig
-from foredrive.tasks.detection.losses import MatchingLossConfig
-from foredrive.tasks.detection.network import BoxSet
-from foredrive.tasks.evaluation.metric import EvaluationContext
-from foredrive.tasks.evaluation.predictor import Prediction
-from foredrive.tasks.heads.heads import TaskHeads, TaskHeadsConfig, TaskVolume
-from foredrive.tasks.heads.losses import TaskWeights, task_losses
-from foredrive.tasks.heads.plane import Plane, PlanePyramid, cell_middles
-from foredrive.tasks.occupancy.instance_losses import instance_loss
-from foredrive.tasks.occupancy.instances_head import (
+from foredrive.heads.agents_head import AGENT_CLASSES, AgentHeadConfig, AgentSet, CarriedConfig
+from foredrive.heads.detection_losses import MatchingLossConfig
+from foredrive.heads.detection_network import BoxSet
+from foredrive.heads.heads import TaskHeads, TaskHeadsConfig, TaskVolume
+from foredrive.heads.instance_losses import instance_loss
+from foredrive.heads.instances_head import (
     MARGIN_M,
     InstanceHead,
     InstanceHeadConfig,
@@ -30,6 +22,14 @@ from foredrive.tasks.occupancy.instances_head import (
     instance_logits,
     instance_raster,
 )
+from foredrive.heads.losses import TaskWeights, task_losses
+from foredrive.heads.plane import Plane, PlanePyramid, cell_middles
+from foredrive.scene import Boxes, Category, Example, VoxelSpec
+from foredrive.scene.boxes import unlabelled
+from foredrive.scene.map_elements import InstanceRaster, PlaneSpec
+from foredrive.scene.task_truth import TaskTruth
+from foredrive.tasks.evaluation.metric import EvaluationContext
+from foredrive.tasks.evaluation.predictor import Prediction
 from foredrive.tasks.occupancy.instances_metric import InstanceMetric, drawn_boxes
 
 SPEC = VoxelSpec((-8.0, -12.0, -1.0), 1.0, (2, 24, 32))

@@ -4,7 +4,7 @@ import math
 
 import torch
 
-from foredrive.tasks.occupancy.losses import (
+from foredrive.heads.occupancy_losses import (
     motion_emphasis,
     occupancy_bce,
     occupancy_loss,

@@ -2,11 +2,11 @@
 
 import torch
 
+from foredrive.heads.agents_head import AGENT_CLASSES
+from foredrive.heads.detection_losses import MatchingLossConfig
+from foredrive.heads.detection_network import BoxSet
+from foredrive.heads.track_matching import NOBODY, held_objects, matching_beside, owners
 from foredrive.sets import LabelledBoxes
-from foredrive.tasks.detection.agents_head import AGENT_CLASSES
-from foredrive.tasks.detection.losses import MatchingLossConfig
-from foredrive.tasks.detection.network import BoxSet
-from foredrive.tasks.tracking.matching import NOBODY, held_objects, matching_beside, owners
 
 
 def queries(x: list[float]) -> BoxSet:

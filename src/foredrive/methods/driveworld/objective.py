@@ -10,14 +10,14 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from foredrive.engine.loop import Schedule
+from foredrive.heads.joint import TaskTerms
+from foredrive.heads.occupancy_losses import occupancy_loss
+from foredrive.heads.plan_losses import waypoint_loss
 from foredrive.methods.driveworld import DriveWorld, Unrolled, actions_of, balanced_kl
 from foredrive.methods.planner.agent import PlanningAgent
 from foredrive.methods.planner.planner import set_planner_trainable
 from foredrive.ops.masked import masked_mean
 from foredrive.scene import Belief, Boxes, Clip, Example, last_frames
-from foredrive.tasks.heads.joint import TaskTerms
-from foredrive.tasks.occupancy.losses import occupancy_loss
-from foredrive.tasks.planning.losses import waypoint_loss
 
 
 @dataclass(frozen=True)

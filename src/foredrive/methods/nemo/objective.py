@@ -9,6 +9,9 @@ from torch import Tensor, nn
 
 from foredrive.data.augmentation import AugmentConfig, augmented
 from foredrive.engine.loop import Schedule
+from foredrive.heads.joint import TaskTerms
+from foredrive.heads.occupancy_losses import motion_emphasis, occupancy_loss
+from foredrive.heads.plan_losses import ego_motion_loss, waypoint_loss
 from foredrive.methods.blocks.losses import ImageFeatures, l1_loss, perceptual_loss
 from foredrive.methods.blocks.training_rays import averaged_rays, thinned_rays
 from foredrive.methods.nemo.sampling import ImaginationSampler, ImaginationSampling
@@ -16,9 +19,6 @@ from foredrive.methods.nemo.world_model import Nemo
 from foredrive.methods.planner.agent import PlanningAgent
 from foredrive.methods.planner.planner import set_planner_trainable
 from foredrive.scene import Belief, Clip, Example
-from foredrive.tasks.heads.joint import TaskTerms
-from foredrive.tasks.occupancy.losses import motion_emphasis, occupancy_loss
-from foredrive.tasks.planning.losses import ego_motion_loss, waypoint_loss
 
 
 @dataclass(frozen=True)

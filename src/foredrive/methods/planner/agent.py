@@ -8,11 +8,11 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from foredrive.geometry.precision import full_precision
+from foredrive.heads.carried import CarriedAgents
+from foredrive.heads.heads import HeadOutput, TaskHeads, volumes_of
 from foredrive.methods.planner.ego_mlp import ego_motion, route_target
 from foredrive.methods.planner.planner import VolumePlanner
 from foredrive.scene import Belief, Clip, Decoded, Trajectory, WorldModel
-from foredrive.tasks.heads.heads import HeadOutput, TaskHeads, volumes_of
-from foredrive.tasks.tracking.carried import CarriedAgents
 
 W = TypeVar("W", bound=WorldModel)
 

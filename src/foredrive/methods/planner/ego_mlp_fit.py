@@ -9,10 +9,10 @@ from torch import Tensor
 
 from foredrive.engine.in_memory_fit import FitSchedule, fit_in_memory
 from foredrive.errors import InputError
+from foredrive.heads.plan_losses import l1_waypoint_loss
 from foredrive.methods.planner.ego_mlp import EgoMLP, EgoMLPConfig, ego_status
 from foredrive.scene import Clip
 from foredrive.scene.record import Record
-from foredrive.tasks.planning.losses import l1_waypoint_loss
 
 
 @dataclass(frozen=True)

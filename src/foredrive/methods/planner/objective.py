@@ -6,10 +6,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from foredrive.heads.plan_losses import waypoint_loss
 from foredrive.methods.planner.agent import PlanningAgent
 from foredrive.methods.planner.planner import set_planner_trainable
 from foredrive.scene import Example
-from foredrive.tasks.planning.losses import waypoint_loss
 
 
 class PlannerObjective(nn.Module):

@@ -6,9 +6,9 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from foredrive.engine.in_memory_fit import FitSchedule, fit_in_memory
+from foredrive.heads.plan_losses import l1_waypoint_loss
 from foredrive.methods.planner.path_correction import PathCorrection, PathSamples
 from foredrive.scene.record import Record
-from foredrive.tasks.planning.losses import l1_waypoint_loss
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,9 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from foredrive.geometry.precision import full_precision
+from foredrive.heads.few_queries import FewQueriesDecoderLayer
+from foredrive.heads.heads import TaskHeadsConfig
+from foredrive.heads.scene_tokens import Attended, SceneTokens
 from foredrive.methods.planner.ego_mlp import EgoMLP, EgoMLPConfig, status_vector
 from foredrive.methods.planner.path_correction import (
     PathCorrection,
@@ -20,9 +23,6 @@ from foredrive.methods.planner.path_correction import (
     set_to_zero,
 )
 from foredrive.scene import Command, Trajectory, VoxelSpec
-from foredrive.tasks.detection.few_queries import FewQueriesDecoderLayer
-from foredrive.tasks.heads.heads import TaskHeadsConfig
-from foredrive.tasks.heads.scene_tokens import Attended, SceneTokens
 
 SHORTEST_M, LONGEST_M = 4.0, 200.0
 """Wavelengths of the initial places of rows and columns, m."""

@@ -11,6 +11,7 @@ import torch
 from foredrive.data.resizing import shrink_images
 from foredrive.driver.agent import Driver
 from foredrive.driving.restarts import is_free_ahead
+from foredrive.heads.following import AgentFollower
 from foredrive.methods.planner.agent import PlanningAgent
 from foredrive.methods.planner.ego_mlp import EgoMLP
 from foredrive.runs.train.baselines import run_baselines
@@ -18,7 +19,6 @@ from foredrive.runs.train.driver import load_driver, open_driver
 from foredrive.runs.train.run import load_agent, open_run
 from foredrive.scene import Agent, Clip, Trajectory
 from foredrive.tasks.evaluation.frame_keys import MAX_GAP_S
-from foredrive.tasks.tracking.following import AgentFollower
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,6 +9,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from foredrive.geometry.se3 import transform_points
+from foredrive.heads.heads import TaskHeads
 from foredrive.methods.planner.agent import PlanningAgent
 from foredrive.runs.evaluate.predict import AgentPredictor
 from foredrive.scene import CameraRig, Clip, Decoded, RayRenderer, Trajectory, VoxelSpec
@@ -17,7 +18,6 @@ from foredrive.scene.record import Record
 from foredrive.scene.semantics import Taxonomy
 from foredrive.sensors import camera_rays
 from foredrive.tasks.evaluation.predictor import Prediction
-from foredrive.tasks.heads.heads import TaskHeads
 
 RAYS_AT_ONCE = 8192
 

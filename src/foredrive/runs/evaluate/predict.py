@@ -10,16 +10,16 @@ import torch
 from jaxtyping import Bool, Float, Float64, Int
 from torch import Tensor
 
+from foredrive.heads.agents_head import CarriedConfig
+from foredrive.heads.carried import interleaved
+from foredrive.heads.following import AgentFollower, Perceive
+from foredrive.heads.heads import HeadOutput, TaskHeads, TaskVolume, volumes_of
+from foredrive.heads.instances_head import instance_raster
 from foredrive.methods.blocks.training_rays import thinned_rays
 from foredrive.methods.planner.agent import PlanningAgent
 from foredrive.scene import Belief, Clip, Decoded, RayRenderer, Task, WorldModel
-from foredrive.tasks.detection.agents_head import CarriedConfig
 from foredrive.tasks.evaluation.frame_keys import continues, time_of
 from foredrive.tasks.evaluation.predictor import Part, Prediction
-from foredrive.tasks.heads.heads import HeadOutput, TaskHeads, TaskVolume, volumes_of
-from foredrive.tasks.occupancy.instances_head import instance_raster
-from foredrive.tasks.tracking.carried import interleaved
-from foredrive.tasks.tracking.following import AgentFollower, Perceive
 
 
 class DriveFollower:

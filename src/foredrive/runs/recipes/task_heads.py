@@ -9,16 +9,16 @@ from foredrive.data.clip_config import TaskTruthConfig
 from foredrive.engine.config import overridden, read_values, validated
 from foredrive.engine.loop import Schedule
 from foredrive.errors import InputError
+from foredrive.heads.agents_head import AgentHeadConfig, CarriedConfig
+from foredrive.heads.decoder import DecoderConfig
+from foredrive.heads.heads import TaskHeadsConfig
+from foredrive.heads.instances_head import InstanceHeadConfig
+from foredrive.heads.joint import JointTasks
+from foredrive.heads.losses import TaskWeights
+from foredrive.heads.map_head import MapHeadConfig
+from foredrive.heads.motion_head import MotionConfig
 from foredrive.methods.recipe import Recipe
 from foredrive.scene import Task
-from foredrive.tasks.detection.agents_head import AgentHeadConfig, CarriedConfig
-from foredrive.tasks.heads.decoder import DecoderConfig
-from foredrive.tasks.heads.heads import TaskHeadsConfig
-from foredrive.tasks.heads.joint import JointTasks
-from foredrive.tasks.heads.losses import TaskWeights
-from foredrive.tasks.maps.head import MapHeadConfig
-from foredrive.tasks.motion.head import MotionConfig
-from foredrive.tasks.occupancy.instances_head import InstanceHeadConfig
 
 R = TypeVar("R", bound="Recipe[Any, Any]")
 

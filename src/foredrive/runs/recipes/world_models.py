@@ -10,6 +10,7 @@ from torch import nn
 from foredrive.data import ClipConfig
 from foredrive.engine.config import read_values, validated
 from foredrive.errors import InputError
+from foredrive.heads.joint import TaskTerms
 from foredrive.methods.blocks.losses import ImageFeatures
 from foredrive.methods.blocks.vgg import VggFeatures
 from foredrive.methods.driveworld import DriveWorld, DriveWorldConfig
@@ -20,7 +21,6 @@ from foredrive.methods.nemo.objective import NemoObjective, NemoStage
 from foredrive.methods.planner.agent import PlanningAgent
 from foredrive.methods.recipe import Recipe
 from foredrive.scene import WorldModel
-from foredrive.tasks.heads.joint import TaskTerms
 
 
 class WorldModelEntry(NamedTuple):

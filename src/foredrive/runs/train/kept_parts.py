@@ -8,11 +8,11 @@ from safetensors import safe_open
 
 from foredrive.engine.checkpoints import load_weights
 from foredrive.engine.folder import CONFIG, WEIGHTS
+from foredrive.heads.joint import JointTasks
 from foredrive.methods.planner.agent import PlanningAgent
 from foredrive.methods.recipe import Recipe
 from foredrive.runs.recipes.task_heads import load_task_heads
 from foredrive.runs.train.task_priors import TASKS
-from foredrive.tasks.heads.joint import JointTasks
 
 
 def with_kept_heads(recipe: Recipe[Any, Any], kept: Recipe[Any, Any], folder: Path) -> Recipe[Any, Any]:

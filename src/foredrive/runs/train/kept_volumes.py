@@ -16,12 +16,12 @@ from torch.utils.data import Dataset
 from foredrive.data import ClipConfig, ClipDataset, LogPath
 from foredrive.data.batches import stack_records
 from foredrive.files import atomic_path
+from foredrive.heads.joint import boxes_now
+from foredrive.heads.probe import TaskExample, TaskVolumes, task_volumes
 from foredrive.methods.planner.agent import PlanningAgent
 from foredrive.runs.open_clips import open_clips
 from foredrive.scene import Clip, Task
 from foredrive.scene.task_truth import TaskTruth
-from foredrive.tasks.heads.joint import boxes_now
-from foredrive.tasks.heads.probe import TaskExample, TaskVolumes, task_volumes
 
 BATCH_SIZE = 4
 VERSION = 2

@@ -10,8 +10,8 @@ from torch.utils.data import Dataset
 
 from foredrive.engine.loop import Schedule
 from foredrive.errors import InputError
+from foredrive.heads.heads import TaskHeadsConfig
 from foredrive.tasks.evaluation.frame_keys import log_of, time_of
-from foredrive.tasks.heads.heads import TaskHeadsConfig
 
 T = TypeVar("T")
 TOLERANCE = 0.25

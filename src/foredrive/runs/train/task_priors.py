@@ -15,12 +15,12 @@ from foredrive.data.logs import Log
 from foredrive.data.truth.tasks import tasks_of
 from foredrive.errors import InputError
 from foredrive.files import atomic_path
+from foredrive.heads.heads import TaskHeads, TaskHeadsConfig
+from foredrive.heads.semantic_losses import class_weights
+from foredrive.heads.targets import map_targets
 from foredrive.scene.semantics import VOXEL_CLASSES
 from foredrive.scene.task_truth import TaskTruth
 from foredrive.tasks.evaluation.task_priors import TaskPriors
-from foredrive.tasks.heads.heads import TaskHeads, TaskHeadsConfig
-from foredrive.tasks.heads.targets import map_targets
-from foredrive.tasks.occupancy.semantic_losses import class_weights
 
 TASKS = "tasks"
 """Folder of what belongs to the heads in the folder of a run."""

@@ -15,6 +15,8 @@ from foredrive.engine.folder import CONFIG, WEIGHTS
 from foredrive.engine.loop import train
 from foredrive.errors import InputError
 from foredrive.files import atomic_path
+from foredrive.heads.heads import TaskHeads
+from foredrive.heads.probe import ProbeObjective
 from foredrive.methods.recipe import Recipe
 from foredrive.runs.recipes.task_heads import TaskHeadsRecipe, check_instances, load_task_heads
 from foredrive.runs.train.kept_volumes import KeptVolumes, collate_kept
@@ -31,8 +33,6 @@ from foredrive.runs.train.task_priors import (
     semantic_weights,
 )
 from foredrive.tasks.evaluation.task_priors import TaskPriors, fit_task_priors
-from foredrive.tasks.heads.heads import TaskHeads
-from foredrive.tasks.heads.probe import ProbeObjective
 
 
 @dataclass(frozen=True)

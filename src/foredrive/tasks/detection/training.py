@@ -10,9 +10,9 @@ from torch import Tensor
 
 from foredrive.engine.parameter_groups import parameter_groups
 from foredrive.errors import InputError
+from foredrive.heads.detection_losses import Loss
+from foredrive.heads.detection_network import DetectionHead
 from foredrive.sets import LabelledBoxes, MultiBernoulli
-from foredrive.tasks.detection.losses import Loss
-from foredrive.tasks.detection.network import DetectionHead
 
 Sample = tuple[Float[Tensor, "D Z Y X"], LabelledBoxes]
 """A volume and its labelled objects."""

@@ -12,11 +12,11 @@ import shapely
 from jaxtyping import Bool, Float64, Int
 from numpy import ndarray
 
+from foredrive.heads.plane import cell_middles
 from foredrive.scene import Example, VoxelSpec
 from foredrive.scene.map_elements import ElementKind, RasterLayer
 from foredrive.tasks.evaluation.metric import CEILING, PRIOR, EvaluationContext, Figures, Shown
 from foredrive.tasks.evaluation.predictor import Part, Prediction
-from foredrive.tasks.heads.plane import cell_middles
 from foredrive.tasks.maps.lines import CLASSES, LineSet
 from foredrive.tasks.maps.precision import mean_precision, score_maps
 from foredrive.tasks.maps.protocols import PROTOCOLS, Area

@@ -14,7 +14,8 @@ from torch import Tensor
 from foredrive.geometry.se3 import transform_points
 from foredrive.scene import VoxelGrid, VoxelSpec
 from foredrive.scene.record import Record
-from foredrive.tasks.occupancy.scores import MOVING_MPS, OccupancyCounts, count_occupancy
+from foredrive.scene.voxels import MOVING_MPS
+from foredrive.tasks.occupancy.scores import OccupancyCounts, count_occupancy
 
 
 def ego_compensated(

@@ -15,13 +15,13 @@ from torch import Tensor
 from foredrive.data.truth.raster import fill_polygon
 from foredrive.errors import InputError
 from foredrive.geometry.boxes import box_corners
+from foredrive.heads.plane import cell_middles
 from foredrive.scene import Example, VoxelSpec
 from foredrive.scene.agents import Agents
 from foredrive.scene.boxes import VEHICLES
 from foredrive.scene.map_elements import InstanceRaster
 from foredrive.tasks.evaluation.metric import CEILING, STEADY, EvaluationContext, Figures, Shown
 from foredrive.tasks.evaluation.predictor import Part, Prediction
-from foredrive.tasks.heads.plane import cell_middles
 from foredrive.tasks.occupancy.protocols import UNIAD_INSTANCES, InstanceProtocol
 
 

@@ -15,9 +15,9 @@ from torch import Tensor
 from foredrive.errors import InputError
 from foredrive.scene import VoxelGrid, VoxelSpec
 from foredrive.scene.record import Record
+from foredrive.scene.voxels import MOVING_MPS
 
 ABOVE_GROUND_M = 0.4
-MOVING_MPS = 0.5
 
 
 def above_ground(spec: VoxelSpec, height_m: float = ABOVE_GROUND_M) -> Bool[Tensor, "Z Y X"]:

@@ -11,20 +11,20 @@ from foredrive.data.batches import stack_records
 from foredrive.data.truth.mirrored import mirrored_truth
 from foredrive.engine.parameter_groups import parameter_groups
 from foredrive.geometry.se3 import matrix_from_yaw, transform_points
+from foredrive.heads.agents_head import AGENT_CLASSES, AgentHeadConfig
+from foredrive.heads.decoder import DecoderConfig
+from foredrive.heads.heads import TaskHeads, TaskHeadsConfig
+from foredrive.heads.losses import TaskWeights, task_losses
+from foredrive.heads.map_head import MapHeadConfig, RasterHeadConfig
+from foredrive.heads.motion_head import MotionConfig
+from foredrive.heads.occupancy_head import VoxelHeadConfig
+from foredrive.heads.probe import ProbeObjective, TaskExample, TaskVolumes, mirrored_item
+from foredrive.heads.targets import agent_targets, map_targets
 from foredrive.scene import Boxes, Category, VoxelSpec
 from foredrive.scene.agent_futures import AgentFutures
 from foredrive.scene.map_elements import ElementKind, MapElements, MapRaster, PlaneSpec, RasterLayer
 from foredrive.scene.semantics import SemanticVoxels
 from foredrive.scene.task_truth import TaskTruth
-from foredrive.tasks.detection.agents_head import AGENT_CLASSES, AgentHeadConfig
-from foredrive.tasks.heads.decoder import DecoderConfig
-from foredrive.tasks.heads.heads import TaskHeads, TaskHeadsConfig
-from foredrive.tasks.heads.losses import TaskWeights, task_losses
-from foredrive.tasks.heads.probe import ProbeObjective, TaskExample, TaskVolumes, mirrored_item
-from foredrive.tasks.heads.targets import agent_targets, map_targets
-from foredrive.tasks.maps.head import MapHeadConfig, RasterHeadConfig
-from foredrive.tasks.motion.head import MotionConfig
-from foredrive.tasks.occupancy.head import VoxelHeadConfig
 
 SPEC = VoxelSpec(lower_m=(-8.0, -8.0, -1.0), voxel_m=1.0, shape_zyx=(2, 16, 16))
 RASTER = PlaneSpec((-8.0, -8.0), 1.0, (16, 16))

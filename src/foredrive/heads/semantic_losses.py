@@ -5,8 +5,8 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float, Shaped
 from torch import Tensor
 
+from foredrive.heads.occupancy_losses import EPS
 from foredrive.ops.masked import masked_mean
-from foredrive.tasks.occupancy.losses import EPS
 
 
 def class_weights(count: Shaped[Tensor, "C"]) -> Float[Tensor, "C"]:

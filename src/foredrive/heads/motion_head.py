@@ -6,8 +6,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from foredrive.tasks.heads.decoder import DecoderConfig, PlaceEmbedding, QueryDecoderLayer
-from foredrive.tasks.heads.plane import Planes
+from foredrive.heads.decoder import DecoderConfig, PlaceEmbedding, QueryDecoderLayer
+from foredrive.heads.plane import Planes
 
 FIRST_MODES = ((0.0, 0.0), (-1.5, 0.0), (1.0, 0.0), (0.0, 0.2), (0.0, -0.2), (-6.0, 0.0))
 """Initial acceleration (m/s²) and yaw rate (rad/s): steady, braking, starting, left, right, stopping."""

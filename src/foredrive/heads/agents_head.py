@@ -10,16 +10,16 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from foredrive.errors import InputError
+from foredrive.heads.decoder import DecoderConfig, PlaceEmbedding, QueryDecoderLayer
+from foredrive.heads.detection_losses import NO_OBJECT_WEIGHT
+from foredrive.heads.detection_network import LOG_STD_RANGE, BoxSet
+from foredrive.heads.motion_head import MotionConfig, MotionModes
+from foredrive.heads.plane import PlanePyramid, Planes
+from foredrive.heads.proposals import CentreHead, CentreMap, Proposals, best_proposals
+from foredrive.heads.taking import take_proposals
 from foredrive.scene import Attribute, Category
 from foredrive.scene.agents import Agents
 from foredrive.scene.record import Record
-from foredrive.tasks.detection.losses import NO_OBJECT_WEIGHT
-from foredrive.tasks.detection.network import LOG_STD_RANGE, BoxSet
-from foredrive.tasks.detection.proposals import CentreHead, CentreMap, Proposals, best_proposals
-from foredrive.tasks.heads.decoder import DecoderConfig, PlaceEmbedding, QueryDecoderLayer
-from foredrive.tasks.heads.plane import PlanePyramid, Planes
-from foredrive.tasks.heads.taking import take_proposals
-from foredrive.tasks.motion.head import MotionConfig, MotionModes
 
 AGENT_CLASSES = (
     Category.CAR,

@@ -6,9 +6,9 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from foredrive.heads.detection_losses import MatchingLossConfig, best_matching
+from foredrive.heads.detection_network import BoxSet
 from foredrive.sets import LabelledBoxes
-from foredrive.tasks.detection.losses import MatchingLossConfig, best_matching
-from foredrive.tasks.detection.network import BoxSet
 
 NOBODY = -1
 """Owner of a query that was matched to no object."""

@@ -9,13 +9,13 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from foredrive.geometry.polylines import arc_lengths, points_at
+from foredrive.heads.agents_head import AGENT_CLASSES
+from foredrive.heads.map_losses import equivalent_orders
 from foredrive.scene import Boxes, Category, VoxelSpec
 from foredrive.scene.agent_futures import AgentFutures
 from foredrive.scene.map_elements import MapElements
 from foredrive.scene.record import Record
 from foredrive.sets import LabelledBoxes
-from foredrive.tasks.detection.agents_head import AGENT_CLASSES
-from foredrive.tasks.maps.losses import equivalent_orders
 
 _LABELS = torch.full((len(Category),), -1)
 _LABELS[list(AGENT_CLASSES)] = torch.arange(len(AGENT_CLASSES))

@@ -8,11 +8,11 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from foredrive.heads.decoder import DecoderConfig, PlaceEmbedding, QueryDecoderLayer
+from foredrive.heads.plane import Plane, PlanePyramid, Planes, cell_middles, spread_points
 from foredrive.scene.agents import MapLines
 from foredrive.scene.map_elements import PlaneSpec, RasterLayer
 from foredrive.scene.record import Record
-from foredrive.tasks.heads.decoder import DecoderConfig, PlaceEmbedding, QueryDecoderLayer
-from foredrive.tasks.heads.plane import Plane, PlanePyramid, Planes, cell_middles, spread_points
 
 
 @dataclass(frozen=True)

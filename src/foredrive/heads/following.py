@@ -8,9 +8,9 @@ from jaxtyping import Bool, Float64, Int
 from torch import Tensor
 
 from foredrive.geometry.se3 import compose_se3, inverse_se3
-from foredrive.tasks.detection.agents_head import AgentSet, CarriedConfig
-from foredrive.tasks.heads.heads import HeadOutput
-from foredrive.tasks.tracking.carried import CarriedAgents, Lineage, carry
+from foredrive.heads.agents_head import AgentSet, CarriedConfig
+from foredrive.heads.carried import CarriedAgents, Lineage, carry
+from foredrive.heads.heads import HeadOutput
 
 Perceive = Callable[[CarriedAgents | None], HeadOutput]
 """Returns the output of heads for one clip, from the agents of the frame before."""

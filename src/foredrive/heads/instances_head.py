@@ -12,11 +12,11 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from foredrive.geometry.se3 import inverse_se3
+from foredrive.heads.agents_head import AGENT_CLASSES, AgentSet
+from foredrive.heads.plane import Plane, PlanePyramid, cell_middles, moved_over_ground
 from foredrive.scene.boxes import VEHICLES
 from foredrive.scene.map_elements import PlaneSpec
 from foredrive.scene.record import Record
-from foredrive.tasks.detection.agents_head import AGENT_CLASSES, AgentSet
-from foredrive.tasks.heads.plane import Plane, PlanePyramid, cell_middles, moved_over_ground
 
 MARGIN_M = 0.25
 """The truth's cells are about half a cell of 0.5 m larger than a box, on each side."""

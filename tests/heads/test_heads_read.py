@@ -10,6 +10,8 @@ from torch import Tensor
 from benchmarks.common.true_planes import CHANNELS, SPEC, draw
 from foredrive.data import ClipDataset, collate
 from foredrive.engine.summary import numbers
+from foredrive.heads.heads import TaskHeads, TaskVolume
+from foredrive.heads.losses import task_losses
 from foredrive.runs.drive.recording import EgosPlan, record_egos
 from foredrive.runs.recipes.known import find_recipe
 from foredrive.runs.recipes.task_heads import town_heads
@@ -18,8 +20,6 @@ from foredrive.sensors.rigs import SURROUND, RigPlan
 from foredrive.tasks.detection.metric import DetectionMetric
 from foredrive.tasks.evaluation.metric import EvaluationContext, Metric
 from foredrive.tasks.evaluation.predictor import Prediction
-from foredrive.tasks.heads.heads import TaskHeads, TaskVolume
-from foredrive.tasks.heads.losses import task_losses
 from foredrive.tasks.maps.metric import MapLinesMetric
 from foredrive.tasks.motion.metric import MotionMetric
 

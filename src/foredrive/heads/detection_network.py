@@ -6,10 +6,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from foredrive.heads.plane import PlaneFeatures, cell_middles
 from foredrive.scene import Detections, VoxelSpec
 from foredrive.scene.record import Record
 from foredrive.sets import BoxDensity, Family, MultiBernoulli
-from foredrive.tasks.heads.plane import PlaneFeatures, cell_middles
 
 LOG_STD_RANGE = (-4.0, 2.0)
 """Bounds of the log standard deviations: 2 cm to 7 m for positions; log sizes and headings use the same

@@ -9,15 +9,15 @@ from torch import Tensor
 
 from foredrive.errors import InputError
 from foredrive.geometry.se3 import inverse_se3, matrix_from_yaw
+from foredrive.heads.agents_head import AGENT_CLASSES, AgentHeadConfig, AgentSet, CarriedConfig
+from foredrive.heads.carried import CarriedAgents, carry, frame_steps, lineage_of, moved
+from foredrive.heads.decoder import DecoderConfig
+from foredrive.heads.detection_network import BoxSet
+from foredrive.heads.heads import HeadOutput, TaskHeads, TaskHeadsConfig, TaskVolume
+from foredrive.heads.motion_head import MotionConfig
+from foredrive.heads.taking import take_proposals
 from foredrive.runs.evaluate.predict import DriveFollower
 from foredrive.scene import Attribute, VoxelSpec
-from foredrive.tasks.detection.agents_head import AGENT_CLASSES, AgentHeadConfig, AgentSet, CarriedConfig
-from foredrive.tasks.detection.network import BoxSet
-from foredrive.tasks.heads.decoder import DecoderConfig
-from foredrive.tasks.heads.heads import HeadOutput, TaskHeads, TaskHeadsConfig, TaskVolume
-from foredrive.tasks.heads.taking import take_proposals
-from foredrive.tasks.motion.head import MotionConfig
-from foredrive.tasks.tracking.carried import CarriedAgents, carry, frame_steps, lineage_of, moved
 
 SPEC = VoxelSpec(lower_m=(-8.0, -8.0, -1.0), voxel_m=1.0, shape_zyx=(2, 16, 16))
 FRAMES, SEQUENCES = 3, 2

@@ -11,10 +11,10 @@ from torch import Tensor
 
 from foredrive.geometry.precision import full_precision
 from foredrive.geometry.se3 import compose_se3, inverse_se3, rotate_vectors, transform_points
+from foredrive.heads.agents_head import AgentHead, AgentSet, CarriedConfig
+from foredrive.heads.plane import Planes
+from foredrive.heads.proposals import CentreMap
 from foredrive.scene.record import Record
-from foredrive.tasks.detection.agents_head import AgentHead, AgentSet, CarriedConfig
-from foredrive.tasks.detection.proposals import CentreMap
-from foredrive.tasks.heads.plane import Planes
 
 R = TypeVar("R", bound=Record)
 NEW = -1

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from foredrive.heads.plane import PlanePyramid, Planes
 from foredrive.scene.semantics import VOXEL_CLASSES, Taxonomy
-from foredrive.tasks.heads.plane import PlanePyramid, Planes
 
 
 @dataclass(frozen=True)

@@ -6,9 +6,9 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from foredrive.errors import InputError
+from foredrive.heads.heads import HeadOutput, TaskHeadsConfig
+from foredrive.heads.losses import TaskWeights, task_losses
 from foredrive.scene import Boxes, Clip, Example, VoxelSpec
-from foredrive.tasks.heads.heads import HeadOutput, TaskHeadsConfig
-from foredrive.tasks.heads.losses import TaskWeights, task_losses
 
 
 @dataclass(frozen=True)

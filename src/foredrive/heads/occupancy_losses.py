@@ -6,7 +6,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from foredrive.ops.masked import masked_mean
-from foredrive.tasks.occupancy.scores import MOVING_MPS
+from foredrive.scene.voxels import MOVING_MPS
 
 EPS = 1e-6
 

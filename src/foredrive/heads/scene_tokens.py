@@ -7,11 +7,11 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from foredrive.errors import InputError
+from foredrive.heads.agents_head import AGENT_CLASSES, AgentSet
+from foredrive.heads.decoder import PlaceEmbedding
+from foredrive.heads.heads import HeadOutput, TaskHeadsConfig
+from foredrive.heads.map_head import MapSet
 from foredrive.scene import VoxelSpec
-from foredrive.tasks.detection.agents_head import AGENT_CLASSES, AgentSet
-from foredrive.tasks.heads.decoder import PlaceEmbedding
-from foredrive.tasks.heads.heads import HeadOutput, TaskHeadsConfig
-from foredrive.tasks.maps.head import MapSet
 
 Attended = Literal["agents", "map"]
 """Outputs of the task heads that a planner can attend to."""

@@ -8,11 +8,11 @@ from torch import Tensor, nn
 
 from foredrive.data.augmentation import mirrored_boxes, mirrored_pose
 from foredrive.data.truth.mirrored import mirrored_truth
+from foredrive.heads.heads import TaskHeads, TaskVolume, volumes_of
+from foredrive.heads.losses import TaskWeights, task_losses
 from foredrive.scene import Belief, Boxes, Task, VoxelSpec, WorldModel
 from foredrive.scene.record import Record
 from foredrive.scene.task_truth import TaskTruth
-from foredrive.tasks.heads.heads import TaskHeads, TaskVolume, volumes_of
-from foredrive.tasks.heads.losses import TaskWeights, task_losses
 
 
 @dataclass(frozen=True)

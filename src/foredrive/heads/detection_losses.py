@@ -11,9 +11,9 @@ import torch.nn.functional as F
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from foredrive.heads.detection_network import BoxSet
 from foredrive.sets import Family, LabelledBoxes, PoissonMultiBernoulli, set_nll
 from foredrive.sets.assignment import best_assignment
-from foredrive.tasks.detection.network import BoxSet
 
 STATE_SCALE = (1.0, 1.0, 1.0, 0.3, 0.3, 0.3)
 """Errors of this size, in m and log m, have equal weight."""

@@ -7,9 +7,9 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from foredrive.heads.detection_network import TYPICAL_LOG_LWH
+from foredrive.heads.plane import Plane
 from foredrive.scene.record import Record
-from foredrive.tasks.detection.network import TYPICAL_LOG_LWH
-from foredrive.tasks.heads.plane import Plane
 
 BOX_NUMBERS = (2, 1, 3, 2, 2)
 """Numbers of a cell's box: shift, height, size, heading, velocity."""

@@ -10,17 +10,17 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from foredrive.heads.agents_head import AGENT_CLASSES, AgentSet
+from foredrive.heads.carried import Lineage
+from foredrive.heads.detection_losses import MatchingLossConfig, matched_loss, near_pairs
+from foredrive.heads.motion_losses import motion_losses
+from foredrive.heads.plane import cell_middles
+from foredrive.heads.proposals import CentreMap
+from foredrive.heads.targets import AgentTargets, agent_targets
+from foredrive.heads.track_matching import NOBODY, held_objects, matching_beside, owners
 from foredrive.ops.masked import masked_mean
 from foredrive.scene import Boxes, VoxelSpec
 from foredrive.scene.task_truth import TaskTruth
-from foredrive.tasks.detection.agents_head import AGENT_CLASSES, AgentSet
-from foredrive.tasks.detection.losses import MatchingLossConfig, matched_loss, near_pairs
-from foredrive.tasks.detection.proposals import CentreMap
-from foredrive.tasks.heads.plane import cell_middles
-from foredrive.tasks.heads.targets import AgentTargets, agent_targets
-from foredrive.tasks.motion.losses import motion_losses
-from foredrive.tasks.tracking.carried import Lineage
-from foredrive.tasks.tracking.matching import NOBODY, held_objects, matching_beside, owners
 
 
 def centre_target(

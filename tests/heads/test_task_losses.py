@@ -5,19 +5,19 @@ import math
 import pytest
 import torch
 
-from foredrive.scene import Attribute
-from foredrive.sets import LabelledBoxes
-from foredrive.tasks.detection.agents_head import AGENT_CLASSES, AgentSet
-from foredrive.tasks.detection.losses import matched_loss
-from foredrive.tasks.detection.network import BoxSet
-from foredrive.tasks.maps.losses import equivalent_orders, map_element_losses, sigmoid_focal_loss
-from foredrive.tasks.motion.losses import motion_losses
-from foredrive.tasks.occupancy.semantic_losses import (
+from foredrive.heads.agents_head import AGENT_CLASSES, AgentSet
+from foredrive.heads.detection_losses import matched_loss
+from foredrive.heads.detection_network import BoxSet
+from foredrive.heads.map_losses import equivalent_orders, map_element_losses, sigmoid_focal_loss
+from foredrive.heads.motion_losses import motion_losses
+from foredrive.heads.semantic_losses import (
     class_weights,
     raster_loss,
     semantic_affinity,
     voxel_cross_entropy,
 )
+from foredrive.scene import Attribute
+from foredrive.sets import LabelledBoxes
 
 SQUARE = torch.tensor([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0], [0.0, 0.0]])
 LINE = torch.tensor([[0.0, 0.0], [1.0, 0.0], [3.0, 0.0]])

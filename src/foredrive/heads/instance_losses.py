@@ -4,15 +4,15 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from foredrive.heads.agents_head import AGENT_CLASSES, AgentSet
+from foredrive.heads.detection_losses import MatchingLossConfig, best_matching, near_pairs
+from foredrive.heads.instances_head import InstanceSet, instance_logits
+from foredrive.heads.plane import cell_middles
+from foredrive.heads.semantic_losses import raster_loss
+from foredrive.heads.targets import agent_targets
 from foredrive.scene import Boxes, VoxelSpec
 from foredrive.scene.boxes import VEHICLES
 from foredrive.scene.map_elements import InstanceRaster, PlaneSpec
-from foredrive.tasks.detection.agents_head import AGENT_CLASSES, AgentSet
-from foredrive.tasks.detection.losses import MatchingLossConfig, best_matching, near_pairs
-from foredrive.tasks.heads.plane import cell_middles
-from foredrive.tasks.heads.targets import agent_targets
-from foredrive.tasks.occupancy.instances_head import InstanceSet, instance_logits
-from foredrive.tasks.occupancy.semantic_losses import raster_loss
 
 OCCUPIED_WEIGHT = 2.0
 STRIDE = 2

@@ -6,17 +6,17 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from foredrive.heads.agent_losses import AgentLossWeights, agent_losses
+from foredrive.heads.heads import HeadOutput
+from foredrive.heads.instance_losses import instance_loss
+from foredrive.heads.map_head import MapSet
+from foredrive.heads.map_losses import MapLossWeights, map_element_losses
+from foredrive.heads.semantic_losses import raster_loss, semantic_affinity, voxel_cross_entropy
+from foredrive.heads.targets import map_targets
 from foredrive.scene import Boxes, VoxelSpec
 from foredrive.scene.map_elements import MapElements
 from foredrive.scene.semantics import SemanticVoxels
 from foredrive.scene.task_truth import TaskTruth
-from foredrive.tasks.detection.agent_losses import AgentLossWeights, agent_losses
-from foredrive.tasks.heads.heads import HeadOutput
-from foredrive.tasks.heads.targets import map_targets
-from foredrive.tasks.maps.head import MapSet
-from foredrive.tasks.maps.losses import MapLossWeights, map_element_losses
-from foredrive.tasks.occupancy.instance_losses import instance_loss
-from foredrive.tasks.occupancy.semantic_losses import raster_loss, semantic_affinity, voxel_cross_entropy
 
 
 @dataclass(frozen=True)

@@ -7,16 +7,8 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor, nn
 
-from foredrive.scene import Belief, Task, VoxelSpec, WorldModel
-from foredrive.scene.map_elements import PlaneSpec
-from foredrive.scene.record import Record
-from foredrive.tasks.detection.agents_head import AgentHead, AgentHeadConfig, AgentSet
-from foredrive.tasks.detection.proposals import CentreMap
-from foredrive.tasks.heads.plane import Plane, PlanePyramid, Planes
-from foredrive.tasks.maps.head import MapHead, MapHeadConfig, MapSet, RasterHead, RasterHeadConfig
-from foredrive.tasks.occupancy.head import VoxelHead, VoxelHeadConfig
-from foredrive.tasks.occupancy.instances_head import InstanceHead, InstanceHeadConfig, InstanceSet
-from foredrive.tasks.tracking.carried import (
+from foredrive.heads.agents_head import AgentHead, AgentHeadConfig, AgentSet
+from foredrive.heads.carried import (
     CarriedAgents,
     FrameSteps,
     Lineage,
@@ -24,6 +16,14 @@ from foredrive.tasks.tracking.carried import (
     frame_steps,
     lineage_of,
 )
+from foredrive.heads.instances_head import InstanceHead, InstanceHeadConfig, InstanceSet
+from foredrive.heads.map_head import MapHead, MapHeadConfig, MapSet, RasterHead, RasterHeadConfig
+from foredrive.heads.occupancy_head import VoxelHead, VoxelHeadConfig
+from foredrive.heads.plane import Plane, PlanePyramid, Planes
+from foredrive.heads.proposals import CentreMap
+from foredrive.scene import Belief, Task, VoxelSpec, WorldModel
+from foredrive.scene.map_elements import PlaneSpec
+from foredrive.scene.record import Record
 
 
 @dataclass(frozen=True)

@@ -7,14 +7,13 @@ import pytest
 import torch
 
 from foredrive.geometry.se3 import matrix_from_yaw
-from foredrive.scene import Task, VoxelSpec
-from foredrive.scene.map_elements import PlaneSpec
-from foredrive.scene.semantics import VOXEL_CLASSES
-from foredrive.tasks.detection.agents_head import AgentHeadConfig
-from foredrive.tasks.detection.proposals import CentreMap, best_proposals
-from foredrive.tasks.heads.decoder import DecoderConfig
-from foredrive.tasks.heads.heads import TaskHeads, TaskHeadsConfig, TaskVolume
-from foredrive.tasks.heads.plane import (
+from foredrive.heads.agents_head import AgentHeadConfig
+from foredrive.heads.decoder import DecoderConfig
+from foredrive.heads.heads import TaskHeads, TaskHeadsConfig, TaskVolume
+from foredrive.heads.map_head import MapHeadConfig, RasterHeadConfig, _on_canvas
+from foredrive.heads.motion_head import MotionConfig, kinematic_motion
+from foredrive.heads.occupancy_head import VoxelHeadConfig
+from foredrive.heads.plane import (
     Plane,
     PlaneFeatures,
     PlanePyramid,
@@ -22,9 +21,10 @@ from foredrive.tasks.heads.plane import (
     halvings,
     spread_points,
 )
-from foredrive.tasks.maps.head import MapHeadConfig, RasterHeadConfig, _on_canvas
-from foredrive.tasks.motion.head import MotionConfig, kinematic_motion
-from foredrive.tasks.occupancy.head import VoxelHeadConfig
+from foredrive.heads.proposals import CentreMap, best_proposals
+from foredrive.scene import Task, VoxelSpec
+from foredrive.scene.map_elements import PlaneSpec
+from foredrive.scene.semantics import VOXEL_CLASSES
 
 SPEC = VoxelSpec(lower_m=(-4.0, -8.0, -1.0), voxel_m=1.0, shape_zyx=(2, 16, 24))
 RASTER = PlaneSpec((-10.0, -10.0), 1.0, (20, 20))
