@@ -1,1 +1,1 @@
-"""Parts of all task heads: one plane, one decoder, one training."""
+"""What learns the tasks on a volume: heads with one plane and one decoder, their losses, their training."""

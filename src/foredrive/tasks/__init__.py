@@ -1,1 +1,1 @@
-"""Tasks, a folder each: truth, head, loss, metric, protocols and files of results."""
+"""Tasks, a folder each: metrics, protocols and files of results."""
