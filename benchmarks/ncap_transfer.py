@@ -69,7 +69,7 @@ DECIDED_BY = (
     "foredrive.driving.dynamics",
     "foredrive.driving.ncap",
     "foredrive.driving.replay.reconstructed",
-    "foredrive.towns.driving.town_replay",
+    "benchmarks.common.town_replay",
     "foredrive.methods.splatad",
     "foredrive.methods.neurad",
 )

@@ -30,6 +30,7 @@ from benchmarks.common.reconstructed_towns import TownDrive, TownTruth
 from benchmarks.common.safety_pairs import NotedTrust
 from benchmarks.common.safety_suites import DRIVES as SAFETY_DRIVES
 from benchmarks.common.safety_suites import RECONSTRUCTION, reconstructed_town
+from benchmarks.common.town_replay import TownReplayRenderer
 from foredrive.data.batches import stack_records
 from foredrive.driver.agent import Driver
 from foredrive.driving.observation import KeyFrame, make_clip
@@ -60,7 +61,6 @@ from foredrive.runs.reconstruction.trust import trained_views, trust_of
 from foredrive.runs.shipped import run_folder
 from foredrive.scene import Boxes, Clip, Command, Rendered
 from foredrive.sensors.rigs import FRONT_TELE, camera_rig
-from foredrive.towns.driving.town_replay import TownReplayRenderer
 from foredrive.towns.sensing.capture import SensorSuite
 
 DRIVES = {

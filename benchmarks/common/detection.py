@@ -1,6 +1,6 @@
 """The detection task: samples from any log, metrics of a head on them, and a comparison of losses.
 
-`tasks.detection.training.fit_head` trains a head (`tasks.detection.network`) on samples; docs/sets.md shows
+`heads.detection_training.fit_head` trains a head (`heads.detection_network`) on samples; docs/sets.md shows
 how.
 """
 
@@ -19,12 +19,12 @@ from foredrive.data import ClipConfig, ClipDataset, LogPath
 from foredrive.geometry.boxes import points_in_boxes
 from foredrive.heads.detection_losses import Loss, MatchingLossConfig, matching_loss, set_loss
 from foredrive.heads.detection_network import DetectionHead
+from foredrive.heads.detection_training import Sample, fit_head, predict_sets
 from foredrive.scene import Category, Clip, LidarSweep, VoxelSpec, WorldModel
 from foredrive.sets import Family, LabelledBoxes, MultiBernoulli, UniformPoisson, fit_set_calibration
 from foredrive.tasks.detection.frames import DetectionFrame, DetectionSet
 from foredrive.tasks.detection.score import score_frames
 from foredrive.tasks.detection.summary import summarise_scores
-from foredrive.tasks.detection.training import Sample, fit_head, predict_sets
 
 CLASSES = ("vehicle", "cycle", "pedestrian")
 _CLASS_OF = {

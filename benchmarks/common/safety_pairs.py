@@ -15,6 +15,7 @@ import torch
 from jaxtyping import Float64
 
 from benchmarks.common.reconstructed_towns import TownDrive, TownTruth
+from benchmarks.common.town_replay import TownReplayRenderer
 from foredrive.driving.drive import Drive, drive_route
 from foredrive.driving.dynamics import EGO, STEP_S
 from foredrive.driving.ncap.drawing import DrawnRun, draw_run
@@ -38,7 +39,6 @@ from foredrive.runs.reconstruction.reconstruction_run import OpenedReconstructio
 from foredrive.runs.reconstruction.trust import trust_of
 from foredrive.scene import Agent, Clip, Renderer, Trajectory
 from foredrive.sensors.rigs import RigPlan, camera_rig
-from foredrive.towns.driving.town_replay import TownReplayRenderer
 from foredrive.towns.sensing.capture import SensorSuite
 
 

@@ -24,11 +24,11 @@ from foredrive.data import LogPath
 from foredrive.errors import InputError
 from foredrive.heads.detection_losses import matching_loss, set_loss
 from foredrive.heads.detection_network import DetectionHead
+from foredrive.heads.detection_training import fit_head, predict_sets
 from foredrive.runs.build import build_agent
 from foredrive.scene import Category, Example, LidarSweep, VoxelSpec
 from foredrive.scene.boxes import unlabelled
 from foredrive.sets import LabelledBoxes
-from foredrive.tasks.detection.training import fit_head, predict_sets
 
 SPEC = VoxelSpec(lower_m=(-8.0, -8.0, -1.0), voxel_m=1.0, shape_zyx=(4, 16, 16))
 

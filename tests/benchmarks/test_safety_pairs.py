@@ -13,6 +13,7 @@ from benchmarks.common.reconstructed_towns import FRONT, TownDrive, TownTruth
 from benchmarks.common.safety_agreement import agreement, control_variate, majority_agreement
 from benchmarks.common.safety_pairs import Driven, NoisyAgent, Pair, SensorNoise, outline
 from benchmarks.common.safety_suites import spread
+from benchmarks.common.town_replay import TownReplayRenderer
 from foredrive.driving.ncap.scenario import Polyline, SafetyScenario, ScenarioActor
 from foredrive.driving.observation import HORIZON_STEPS
 from foredrive.driving.replay.threats import Threat
@@ -20,7 +21,6 @@ from foredrive.driving.simple_agents import plan_of
 from foredrive.errors import InputError
 from foredrive.methods.reconstruction.tracks import ActorTracks
 from foredrive.scene import Clip, Example, Trajectory, VoxelSpec
-from foredrive.towns.driving.town_replay import TownReplayRenderer
 
 
 def driven(outcome: str, score: float | None, near_m: float = 0.0, lost_db: float = 0.0) -> Driven:

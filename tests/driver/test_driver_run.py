@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from benchmarks.common.shipping import ship_driver
 from foredrive.data import ClipDataset
 from foredrive.data.log_paths import LogPath
 from foredrive.driver.agent import SightDriver
@@ -21,7 +22,6 @@ from foredrive.runs.drive.in_towns import TownRoutes
 from foredrive.runs.model_card import find_card, read_card, shipped_weights
 from foredrive.runs.recipes.known import find_recipe
 from foredrive.runs.recipes.reconstruction import ReconstructionRecipe
-from foredrive.runs.ship import ship_driver
 from foredrive.runs.shipped import DRIVER, run_folder
 from foredrive.runs.train.driver import load_driver, open_driver, train_driver
 from foredrive.runs.train.run import load_agent, open_run

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from benchmarks.common.shipping import MAX_BYTES, ship
 from foredrive.cli.main import main
 from foredrive.data import LogPath
 from foredrive.engine.summary import read_summary
@@ -16,7 +17,6 @@ from foredrive.errors import InputError
 from foredrive.runs import Run, evaluate_run, load_agent, open_run, shipped
 from foredrive.runs.drive.agent_inputs import inputs_of, rig_of
 from foredrive.runs.model_card import find_card, read_card, shipped_weights
-from foredrive.runs.ship import MAX_BYTES, ship
 from foredrive.runs.shipped import run_folder
 from foredrive.runs.train.driver import DriverRun, is_driver, load_driver, open_driver
 

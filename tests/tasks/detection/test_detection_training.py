@@ -11,10 +11,10 @@ import torch
 from foredrive.errors import InputError
 from foredrive.heads.detection_losses import MatchingLossConfig, energy_score, matching_loss, set_loss
 from foredrive.heads.detection_network import BoxSet, DetectionHead
+from foredrive.heads.detection_training import fit_head
 from foredrive.scene import VoxelSpec
 from foredrive.sets import Family, LabelledBoxes, PoissonMultiBernoulli, pmb_from_detections, set_nll
 from foredrive.tasks.detection.proper_scores import crps_gaussian, crps_laplace
-from foredrive.tasks.detection.training import fit_head
 
 
 @pytest.fixture(autouse=True)

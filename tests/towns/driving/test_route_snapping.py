@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
+from benchmarks.common.training_routes import ROUTE_SETS
 from foredrive.driving.route_sets import (
     RouteWaypoints,
     load_route_set,
@@ -18,7 +19,6 @@ from foredrive.driving.route_sets import (
 from foredrive.errors import InputError
 from foredrive.towns.driving.lane_search import find_way, places_near
 from foredrive.towns.driving.routes import DriveRoute, RouteOption, route_line, snap_route
-from foredrive.towns.driving.training_routes import ROUTE_SETS
 from foredrive.towns.map.names import TEST_TOWNS, TOWNS
 from foredrive.towns.map.town_map import load_town_map
 from foredrive.towns.traffic.lane_graph import LaneGraph, build_lane_graph

@@ -1,4 +1,7 @@
-"""Add a trained run to the models of the package (`runs.shipped`)."""
+"""Add an evaluated run to the models of the package (`runs.shipped`).
+
+`python -m benchmarks.common.shipping RUN NAME --test LOGS ...` adds a world model.
+"""
 
 import dataclasses
 import json
@@ -8,9 +11,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import tyro
 from torch import nn
 
-from foredrive.data import LogPath
+from foredrive.data import LogPath, find_all_logs
 from foredrive.driver.judging import judge_sight
 from foredrive.driver.packed import PackedClips
 from foredrive.engine.config import save_recipe
@@ -30,7 +34,7 @@ from foredrive.runs.shipped import CARD, MODELS
 from foredrive.runs.train.baselines import Baselines, baselines_file, run_baselines
 from foredrive.runs.train.driver import DriverRun, load_driver
 from foredrive.runs.train.rigs import RIGS
-from foredrive.runs.train.run import Run, load_agent
+from foredrive.runs.train.run import Run, load_agent, open_run
 from foredrive.runs.train.task_priors import PRIORS, TASKS
 
 MAX_BYTES = 6_000_000
@@ -182,3 +186,22 @@ def _card(
     }
     clips, failed, commit = shipped["items"], shipped["failed"], str(trained.get("commit"))
     return ModelCard(name, recipe, commit, data, clips, failed, figures, limits)
+
+
+def main(
+    run: tyro.conf.Positional[Path], name: tyro.conf.Positional[str], test: list[Path], data: str, limits: str
+) -> None:
+    """Write src/foredrive/runs/models/NAME.
+
+    Args:
+        run: run folder.
+        name: name of the model.
+        test: logs of the evaluation whose figures the card shows.
+        data: the training and test data, in one sentence.
+        limits: what the model cannot do.
+    """
+    print(ship(open_run(run), name, find_all_logs(test), data, limits))
+
+
+if __name__ == "__main__":
+    tyro.cli(main)

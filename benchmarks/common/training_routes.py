@@ -1,6 +1,6 @@
 """Foredrive's own routes in the training towns, drawn from a seed and kept in the package's data file.
 
-`python -m foredrive.towns.driving.training_routes` draws all of them again and writes them there.
+`python -m benchmarks.common.training_routes` draws all of them again and writes them there.
 """
 
 import math
