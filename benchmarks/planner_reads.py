@@ -49,7 +49,7 @@ TEST_TOWNS = ("Town03", "Town05")
 """Towns that no arm is trained in. Architectures were chosen on them, with other seeds of traffic."""
 TRAIN_SEEDS, TEST_SEEDS, EGOS = tuple(range(2000, 2003)), tuple(range(3000, 3004)), 80
 """Seeds of traffic, and virtual egos of each town and seed."""
-UNSEEN_SEEDS, UNSEEN_EGOS, UNSEEN_PER_WINDOW = tuple(range(2100, 2102)), 240, 4
+UNSEEN_SEEDS, UNSEEN_EGOS, UNSEEN_PER_WINDOW = tuple(range(2100, 2104)), 240, 4
 """The same of egos without images, and how many are taken of the same time of the traffic."""
 SHIPPED = Path("embedded:nemo_town")
 Volumes = Callable[[TruePlanes], Tensor]
