@@ -97,7 +97,7 @@ def nemo_town() -> NemoRecipe:
         clips=dataclasses.replace(
             tiny.clips,
             now_stride_s=0.5,
-            voxels=VoxelSpec(lower_m=(-32.0, -32.0, -1.5), voxel_m=1.0, shape_zyx=(6, 64, 72)),
+            voxels=VoxelSpec(lower_m=(-16.0, -24.0, -1.5), voxel_m=1.0, shape_zyx=(6, 48, 56)),
         ),
         model=dataclasses.replace(
             tiny.model,
@@ -115,7 +115,7 @@ def nemo_town() -> NemoRecipe:
         pretrain=rescheduled(
             dataclasses.replace(
                 tiny.pretrain,
-                weights=dataclasses.replace(tiny.pretrain.weights, moving=5.0, future=0.5, ego=1.0),
+                weights=dataclasses.replace(tiny.pretrain.weights, future=0.5, ego=1.0),
                 ray_stride=16,
                 imagined=dataclasses.replace(tiny.pretrain.imagined, every=2),
             ),
@@ -124,6 +124,30 @@ def nemo_town() -> NemoRecipe:
         ),
         finetune=rescheduled(tiny.finetune, steps=300, warmup_steps=20),
         precision="bf16-mixed",
+    )
+
+
+def nemo_wide() -> NemoRecipe:
+    """Return `nemo_town` on a grid that holds what detectors and maps are judged on, 32 m behind and beside.
+
+    It is pre-trained on the exact occupancy of virtual egos (`--occupancy recorded`), in which voxels that
+    move, and those next to them, weigh five times as much.
+    """
+    town = nemo_town()
+    assert town.pretrain is not None
+    return dataclasses.replace(
+        town,
+        name="nemo_wide",
+        about="nemo_town on a grid that reaches 32 m behind and beside, for virtual egos",
+        clips=dataclasses.replace(
+            town.clips,
+            voxels=VoxelSpec(lower_m=(-32.0, -32.0, -1.5), voxel_m=1.0, shape_zyx=(6, 64, 72)),
+            occupancy_source="recorded",
+        ),
+        pretrain=dataclasses.replace(
+            rescheduled(town.pretrain, steps=4600, warmup_steps=432),
+            weights=dataclasses.replace(town.pretrain.weights, moving=5.0),
+        ),
     )
 
 

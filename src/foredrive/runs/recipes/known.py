@@ -11,7 +11,15 @@ from foredrive.errors import InputError
 from foredrive.methods.driveworld.ablations import driveworld_ablations
 from foredrive.methods.driveworld.recipes import driveworld_base, driveworld_tiny, driveworld_town
 from foredrive.methods.nemo.ablations import nemo_ablations
-from foredrive.methods.nemo.recipes import BASE_BEV, TOWN_BEV, nemo_base, nemo_drive, nemo_tiny, nemo_town
+from foredrive.methods.nemo.recipes import (
+    BASE_BEV,
+    TOWN_BEV,
+    nemo_base,
+    nemo_drive,
+    nemo_tiny,
+    nemo_town,
+    nemo_wide,
+)
 from foredrive.methods.recipe import Recipe
 from foredrive.runs.recipes.reconstruction import (
     RECONSTRUCTION_RECIPES,
@@ -23,6 +31,7 @@ from foredrive.runs.recipes.world_models import recipe_from
 RECIPES: dict[str, Recipe[Any, Any]] = {
     "nemo_tiny": nemo_tiny(),
     "nemo_drive": nemo_drive(),
+    "nemo_wide": nemo_wide(),
     **nemo_ablations(nemo_town(), TOWN_BEV),
     **nemo_ablations(nemo_base(), BASE_BEV),
     "driveworld_tiny": driveworld_tiny(),
