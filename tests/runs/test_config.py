@@ -86,8 +86,8 @@ def test_a_folder_without_a_config_is_no_run(tmp_path: Path) -> None:
 
 
 def test_an_unknown_name_is_told_the_known_ones() -> None:
-    with pytest.raises(InputError, match="no recipe 'nemo_huge'; near: nemo_base"):
-        find_recipe("nemo_huge")
+    with pytest.raises(InputError, match="no recipe 'nemo_bass'; near: nemo_base"):
+        find_recipe("nemo_bass")
 
 
 def test_a_recipe_may_be_a_file_and_entries_may_be_set(tmp_path: Path) -> None:
