@@ -9,7 +9,6 @@ egos.
 
 import dataclasses
 import functools
-import itertools
 import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -37,7 +36,7 @@ from foredrive.runs.shipped import run_folder
 from foredrive.runs.train.run import Run, load_agent, open_run
 from foredrive.scene import VoxelSpec
 from foredrive.scene.conditions import CONDITIONS
-from foredrive.sensors.rigs import SURROUND, RigPlan
+from foredrive.sensors.rigs import SURROUND
 from foredrive.tasks.bootstrap import bootstrap_mean
 
 ROOT = Path("runs/planner_reads")
@@ -49,8 +48,6 @@ TEST_TOWNS = ("Town03", "Town05")
 """Towns that no arm is trained in. Architectures were chosen on them, with other seeds of traffic."""
 TRAIN_SEEDS, TEST_SEEDS, EGOS = tuple(range(2000, 2003)), tuple(range(3000, 3004)), 80
 """Seeds of traffic, and virtual egos of each town and seed."""
-UNSEEN_SEEDS, UNSEEN_EGOS, UNSEEN_PER_WINDOW = tuple(range(2100, 2104)), 240, 4
-"""The same of egos without images, and how many are taken of the same time of the traffic."""
 SHIPPED = Path("embedded:nemo_town")
 Volumes = Callable[[TruePlanes], Tensor]
 BATCH = 8
@@ -123,21 +120,6 @@ def logs_to_learn(workers: int = 1) -> tuple[LogPath, ...]:
     return _recorded(TRAIN_TOWNS, TRAIN_SEEDS, workers)
 
 
-def unseen_logs_to_learn(workers: int = 1) -> tuple[LogPath, ...]:
-    """Record the virtual egos without images that are missing; return them.
-
-    Few are taken of each window of traffic: what a planner can learn is bounded by the number of windows.
-    """
-    plans = [
-        EgosPlan(town, seed, UNSEEN_EGOS, per_window=UNSEEN_PER_WINDOW)
-        for seed in UNSEEN_SEEDS
-        for town in TRAIN_TOWNS
-    ]
-    # A log has images: these have eight pixels, which nobody reads
-    rig = RigPlan((2, 4), dict(itertools.islice(SURROUND.cameras.items(), 1)))
-    return _logs_of(plans, ROOT / "unseen", rig, workers)
-
-
 def logs_to_judge(workers: int = 1) -> tuple[LogPath, ...]:
     """Record the virtual egos to judge by that are missing; return them."""
     return _recorded(TEST_TOWNS, TEST_SEEDS, workers)
@@ -150,11 +132,8 @@ def _recorded(towns: Sequence[str], seeds: Sequence[int], workers: int) -> tuple
         for seed in seeds
         for town in towns
     ]
-    return _logs_of(plans, ROOT / "egos", SURROUND.of_size(RECIPE.clips.image_hw), workers)
-
-
-def _logs_of(plans: Sequence[EgosPlan], out: Path, rig: RigPlan, workers: int) -> tuple[LogPath, ...]:
-    logs, failed = record_egos(plans, out, rig, workers)
+    rig = SURROUND.of_size(RECIPE.clips.image_hw)
+    logs, failed = record_egos(plans, ROOT / "egos", rig, workers)
     if failed:
         raise InputError(f"{len(failed)} recordings failed: {next(iter(failed.values()))}")
     return tuple(logs)
@@ -162,12 +141,8 @@ def _logs_of(plans: Sequence[EgosPlan], out: Path, rig: RigPlan, workers: int) -
 
 @functools.cache
 def egos_to_learn() -> TruePlanes:
-    """Return the true surroundings of the egos to learn from, those with images first."""
-
-    def read() -> TruePlanes:
-        return read_planes((*logs_to_learn(), *unseen_logs_to_learn()), RECIPE.clips)
-
-    return kept(TruePlanes, WORK / "train.safetensors", read)
+    """Return the true surroundings of the egos to learn from."""
+    return kept(TruePlanes, WORK / "train.safetensors", lambda: read_planes(logs_to_learn(), RECIPE.clips))
 
 
 @functools.cache
@@ -184,7 +159,12 @@ def status_of(planes: TruePlanes) -> Tensor:
 @functools.cache
 def ego_mlp() -> EgoMLP:
     """Return the ego-only MLP that the planners correct and are judged against."""
-    train = joined([egos_to_learn(), egos_to_learn().mirrored()])
+    return fitted_mlp(egos_to_learn())
+
+
+def fitted_mlp(egos: TruePlanes) -> EgoMLP:
+    """Return an ego-only MLP of some egos, which it sees mirrored too."""
+    train = joined([egos, egos.mirrored()])
     valid = torch.ones(train.driven.shape[:2], dtype=torch.bool)
     data = StatusDemonstrations(status_of(train), train.driven, valid)
     return fit_ego_mlp(EgoMLPConfig(rates=True), data, EGO_FIT, past_frames=PAST, dt_s=DT_S)
@@ -202,39 +182,48 @@ class PathStudy(NamedTuple):
     test: PathDemonstrations
     judged: TruePlanes
     """The egos to judge by."""
+    mlp: EgoMLP
 
 
 @torch.no_grad()
-def demonstrations(planes: TruePlanes, reads: PathCorrection, volumes: Volumes) -> PathDemonstrations:
-    """Sample volumes along the plans of the ego-only MLP."""
+def demonstrations(
+    planes: TruePlanes, mlp: EgoMLP, reads: PathCorrection, volumes: Volumes
+) -> PathDemonstrations:
+    """Sample volumes along the plans of an ego-only MLP."""
     rows = []
     for chosen in track(torch.arange(len(planes.window)).split(BATCH), description="sampling along plans"):
         part = planes[chosen]
         status = status_of(part)
-        planned_xy = ego_mlp()(status)[..., :2]
+        planned_xy = mlp(status)[..., :2]
         values, positions_m = reads.sample(volumes(part), planned_xy)
         valid = torch.ones(planned_xy.shape[:2], dtype=torch.bool)
-        standardised, driven_xy = ego_mlp().standardised(status), part.driven[..., :2]
+        standardised, driven_xy = mlp.standardised(status), part.driven[..., :2]
         row = PathDemonstrations(values.half(), positions_m, standardised, planned_xy, driven_xy, valid)
         rows.append(row)
     return joined(rows)
 
 
-def _reads(spec: VoxelSpec, channels: int) -> PathCorrection:
-    status = ego_mlp().status_mean.shape[0]
-    return PathCorrection(READ, spec, channels=channels, status=status, steps=HORIZON)
+def _reads(spec: VoxelSpec, channels: int, mlp: EgoMLP) -> PathCorrection:
+    return PathCorrection(READ, spec, channels=channels, status=mlp.status_mean.shape[0], steps=HORIZON)
 
 
 @functools.cache
 def true_study(*, blind: bool = False) -> PathStudy:
-    """Return demonstrations with the true surroundings, those to learn from once more mirrored."""
-    reads, train, test = _reads(SPEC, CHANNELS), egos_to_learn(), egos_to_judge()
+    """Return demonstrations with the true surroundings."""
+    return study_of(egos_to_learn(), ego_mlp(), blind=blind)
+
+
+def study_of(egos: TruePlanes, mlp: EgoMLP, *, blind: bool) -> PathStudy:
+    """Return demonstrations with the true surroundings of some egos, which are learned from mirrored too."""
+    reads, test = _reads(SPEC, CHANNELS, mlp), egos_to_judge()
 
     def volumes(planes: TruePlanes) -> Tensor:
         return planes.volumes() * (not blind)
 
-    learned, judged = (demonstrations(of, reads, volumes) for of in (joined([train, train.mirrored()]), test))
-    return PathStudy(SPEC, CHANNELS, learned, judged, test)
+    learned, judged = (
+        demonstrations(of, mlp, reads, volumes) for of in (joined([egos, egos.mirrored()]), test)
+    )
+    return PathStudy(SPEC, CHANNELS, learned, judged, test, mlp)
 
 
 @functools.cache
@@ -242,7 +231,7 @@ def seen_study(*, blind: bool = False) -> PathStudy:
     """Return demonstrations with the volumes of the shipped NeMo."""
     run = open_run(run_folder(SHIPPED, WORK / "models"))
     spec, channels = run.recipe.clips.voxels, run.recipe.model.channels
-    reads = _reads(spec, channels)
+    reads = _reads(spec, channels, ego_mlp())
 
     def sampled(
         name: str, egos: TruePlanes, logs: Sequence[LogPath]
@@ -250,12 +239,12 @@ def seen_study(*, blind: bool = False) -> PathStudy:
         volumes = SeenVolumes(run, logs)
         # Later frames have no images
         shown = egos[torch.tensor([key in volumes.clips for key in _keys(egos)])]
-        make = functools.partial(demonstrations, shown, reads, volumes)
+        make = functools.partial(demonstrations, shown, ego_mlp(), reads, volumes)
         found = kept(PathDemonstrations, WORK / f"seen_{name}.safetensors", make)
         return dataclasses.replace(found, values=found.values * (not blind)), shown
 
     learned, _ = sampled("train", egos_to_learn(), logs_to_learn())
-    return PathStudy(spec, channels, learned, *sampled("test", egos_to_judge(), logs_to_judge()))
+    return PathStudy(spec, channels, learned, *sampled("test", egos_to_judge(), logs_to_judge()), ego_mlp())
 
 
 class SeenVolumes:
@@ -294,14 +283,14 @@ def errors_m(reads: PathCorrection, data: PathDemonstrations) -> tuple[np.ndarra
     return own, rival
 
 
-def read_along(study: Callable[[], PathStudy]) -> Callable[[int], dict[str, float]]:
+def read_along(study: Callable[[], PathStudy], fit: PathFit = READ_FIT) -> Callable[[int], dict[str, float]]:
     """Return an arm that reads along the MLP's plan."""
 
     def measure(seed: int) -> dict[str, float]:
-        spec, channels, train, test, egos = study()
+        spec, channels, train, test, egos, mlp = study()
         torch.manual_seed(seed)
-        reads = _reads(spec, channels)
-        fit_path(reads, train, READ_FIT, seed)
+        reads = _reads(spec, channels, mlp)
+        fit_path(reads, train, fit, seed)
         own, rival = errors_m(reads, test)
         # Whole windows of traffic are drawn, because their egos see the same
         windows = [str(number) for number in egos.window.tolist()]
@@ -397,7 +386,6 @@ BENCHMARK = Benchmark(
     config={
         "clips": [RECIPE.clips.image_hw, RECIPE.clips.horizon_steps, DT_S],
         "towns": [TRAIN_TOWNS, TEST_TOWNS, TRAIN_SEEDS, TEST_SEEDS, EGOS],
-        "unseen": [UNSEEN_SEEDS, UNSEEN_EGOS, UNSEEN_PER_WINDOW],
         "fits": [dataclasses.asdict(value) for value in (EGO_FIT, READ, READ_FIT)],
     },
     decided_by=DECIDED_BY,

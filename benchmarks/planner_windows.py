@@ -1,0 +1,86 @@
+"""Gain of perfect sight by the traffic that a planner learns from: `foredrive bench planner-windows`.
+
+The planners of planner_reads that see the true map, boxes and lights learn from more windows of traffic, of
+which few egos are taken, without images. Each number of windows has an ego-only MLP of its own, which its
+planner corrects and is judged against.
+"""
+
+import dataclasses
+import functools
+import itertools
+
+import torch
+
+from benchmarks.common.true_planes import TruePlanes, kept, read_planes
+from benchmarks.planner_reads import (
+    DECIDED_BY,
+    EGO_FIT,
+    READ,
+    READ_FIT,
+    RECIPE,
+    ROOT,
+    TEST_SEEDS,
+    TEST_TOWNS,
+    TRAIN_TOWNS,
+    PathStudy,
+    fitted_mlp,
+    read_along,
+    study_of,
+)
+from foredrive.data import LogPath
+from foredrive.engine.bench import Benchmark
+from foredrive.errors import InputError
+from foredrive.runs.drive.recording import EgosPlan, record_egos
+from foredrive.sensors.rigs import SURROUND, RigPlan
+
+SEEDS, EGOS, PER_WINDOW = tuple(range(2100, 2104)), 240, 4
+"""Seeds of traffic, virtual egos of each town and seed, and those of the same time of the traffic."""
+WINDOWS = (90, 360, 1440)
+STEPS = {90: READ_FIT.steps, 360: 3000, 1440: 6000}
+"""Steps of a fit, by the number of windows."""
+
+
+def logs_to_learn(workers: int = 1) -> tuple[LogPath, ...]:
+    """Record the virtual egos that are missing; return them."""
+    plans = [EgosPlan(town, seed, EGOS, per_window=PER_WINDOW) for seed in SEEDS for town in TRAIN_TOWNS]
+    # A log has images: these have eight pixels, which nobody reads
+    rig = RigPlan((2, 4), dict(itertools.islice(SURROUND.cameras.items(), 1)))
+    logs, failed = record_egos(plans, ROOT / "unseen", rig, workers)
+    if failed:
+        raise InputError(f"{len(failed)} recordings failed: {next(iter(failed.values()))}")
+    return tuple(logs)
+
+
+@functools.cache
+def egos_to_learn() -> TruePlanes:
+    """Return the true surroundings of the egos to learn from."""
+    file = ROOT / "unseen" / "planes.safetensors"
+    return kept(TruePlanes, file, lambda: read_planes(logs_to_learn(), RECIPE.clips))
+
+
+@functools.cache
+def study(windows: int, *, blind: bool) -> PathStudy:
+    """Return demonstrations of the egos of some windows, drawn evenly from all towns and seeds."""
+    egos = egos_to_learn()
+    order = torch.randperm(int(egos.window.max()) + 1, generator=torch.Generator().manual_seed(0))
+    chosen = egos[torch.isin(egos.window, order[:windows])]
+    return study_of(chosen, fitted_mlp(chosen), blind=blind)
+
+
+BENCHMARK = Benchmark(
+    question="How much more does perfect sight gain a planner that has learned from more traffic?",
+    arms={
+        f"{'blind' if blind else 'true'}_{windows}": read_along(
+            functools.partial(study, windows, blind=blind),
+            dataclasses.replace(READ_FIT, steps=STEPS[windows]),
+        )
+        for windows in WINDOWS
+        for blind in (False, True)
+    },
+    config={
+        "towns": [TRAIN_TOWNS, TEST_TOWNS, SEEDS, TEST_SEEDS, EGOS, PER_WINDOW],
+        "fits": [dataclasses.asdict(value) for value in (EGO_FIT, READ, READ_FIT)],
+        "steps": [STEPS[windows] for windows in WINDOWS],
+    },
+    decided_by=DECIDED_BY,
+)
