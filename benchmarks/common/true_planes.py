@@ -38,6 +38,8 @@ SIDEWAYS = (CHANNELS - 6, CHANNELS - 3, CHANNELS - 1)
 """Channels that change sign in a mirror: velocities and directions along y."""
 PAST, HORIZON = 3, 6
 MAX_MPS = 10.0
+SLACK_US = 1e4
+"""Difference between times of a log and of plans that does not count, µs."""
 LEVELS = 64
 """Steps of a stored channel between 0 and 1."""
 _IN_BOX = (13, 5)
@@ -98,11 +100,15 @@ def read_planes(logs: Sequence[LogPath], clips: ClipConfig) -> TruePlanes:
     dataset = ClipDataset(tuple(logs), config, None)
     rows, windows = [], dict[tuple[str, int], int]()
     for index in track(range(len(dataset)), description="true planes"):
+        number, frames = dataset.frames_of(index)
+        log = dataset.logs[number]
+        # Known without reading the clip: its future is longer than the log
+        last_us = log.t_us[frames[PAST]] + 1e6 * config.horizon_steps * config.horizon_dt_s
+        if last_us > log.t_us[-1] + SLACK_US:
+            continue
         clip = dataset.clip(index)
         if not bool(clip.future.valid.all()):
             continue
-        number, frames = dataset.frames_of(index)
-        log = dataset.logs[number]
         poses, speeds = ego_motion(clip.map_tensors(lambda tensor: tensor[None]), PAST)
         stops = read_stop_lines(log, frames[PAST])
         T_ego_world = torch.linalg.inv(clip.T_world_ego[clip.now])
