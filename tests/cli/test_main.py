@@ -309,8 +309,8 @@ def test_an_unknown_recipe_is_told_the_nearest_ones(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "sync.arrow").touch()  # looks like a log
-    assert main(["train", "nemo_huge", "--logs", str(tmp_path), "--out", str(tmp_path / "run")]) == 2
-    assert "no recipe 'nemo_huge'; near: nemo_base" in capsys.readouterr().err
+    assert main(["train", "nemo_bass", "--logs", str(tmp_path), "--out", str(tmp_path / "run")]) == 2
+    assert "no recipe 'nemo_bass'; near: nemo_base" in capsys.readouterr().err
     assert not (tmp_path / "run").exists()
 
 
