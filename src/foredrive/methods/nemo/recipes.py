@@ -131,7 +131,7 @@ def nemo_wide() -> NemoRecipe:
     """Return `nemo_town` on a grid that holds what detectors and maps are judged on, 32 m behind and beside.
 
     It is pre-trained on the exact occupancy of virtual egos (`--occupancy recorded`), in which voxels that
-    move, and those next to them, weigh five times as much.
+    move, and those next to them, weigh five times as much. Its planner has no head along the path.
     """
     town = nemo_town()
     assert town.pretrain is not None
@@ -144,6 +144,8 @@ def nemo_wide() -> NemoRecipe:
             voxels=VoxelSpec(lower_m=(-32.0, -32.0, -1.5), voxel_m=1.0, shape_zyx=(6, 64, 72)),
             occupancy_source="recorded",
         ),
+        planner=dataclasses.replace(town.planner, path=None),
+        path=None,
         pretrain=dataclasses.replace(
             rescheduled(town.pretrain, steps=4600, warmup_steps=432),
             weights=dataclasses.replace(town.pretrain.weights, moving=5.0),
