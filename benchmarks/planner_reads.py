@@ -61,13 +61,6 @@ READ = PathCorrectionConfig(
 )
 READ_FIT = PathFit(steps=1500, lr=1e-3, weight_decay=0.5)
 """Chosen by leaving out two of the training towns, after longer fits had been judged in the test towns."""
-DECIDED_BY = (
-    "benchmarks.planner_reads",
-    "benchmarks.common.true_planes",
-    "foredrive.methods.planner",
-    "foredrive.towns.traffic",
-    "foredrive.towns.virtual_egos",
-)
 FEW, FEW_BATCH = 64, 16
 """Number of demonstrations that a planner has to learn by heart, and of a step."""
 COARSE = VoxelSpec(SPEC.lower_m, 2 * SPEC.voxel_m, (1, 16, 18))
@@ -388,5 +381,4 @@ BENCHMARK = Benchmark(
         "towns": [TRAIN_TOWNS, TEST_TOWNS, TRAIN_SEEDS, TEST_SEEDS, EGOS],
         "fits": [dataclasses.asdict(value) for value in (EGO_FIT, READ, READ_FIT)],
     },
-    decided_by=DECIDED_BY,
 )

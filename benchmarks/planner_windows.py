@@ -8,17 +8,16 @@ planner corrects and is judged against.
 import dataclasses
 import functools
 import itertools
+from pathlib import Path
 
 import torch
 
 from benchmarks.common.true_planes import TruePlanes, kept, read_planes
 from benchmarks.planner_reads import (
-    DECIDED_BY,
     EGO_FIT,
     READ,
     READ_FIT,
     RECIPE,
-    ROOT,
     TEST_SEEDS,
     TEST_TOWNS,
     TRAIN_TOWNS,
@@ -28,7 +27,7 @@ from benchmarks.planner_reads import (
     study_of,
 )
 from foredrive.data import LogPath
-from foredrive.engine.bench import Benchmark
+from foredrive.engine.bench import Benchmark, study_identity
 from foredrive.errors import InputError
 from foredrive.runs.drive.recording import EgosPlan, record_egos
 from foredrive.sensors.rigs import SURROUND, RigPlan
@@ -38,6 +37,20 @@ SEEDS, EGOS, PER_WINDOW = tuple(range(2100, 2104)), 240, 4
 WINDOWS = (90, 360, 1440)
 STEPS = {90: READ_FIT.steps, 360: 3000, 1440: 6000}
 """Steps of a fit, by the number of windows."""
+CONFIG = {
+    "towns": [TRAIN_TOWNS, TEST_TOWNS, SEEDS, TEST_SEEDS, EGOS, PER_WINDOW],
+    "fits": [dataclasses.asdict(value) for value in (EGO_FIT, READ, READ_FIT)],
+    "steps": [STEPS[windows] for windows in WINDOWS],
+}
+DECIDED_BY = (
+    "benchmarks.common.true_planes",
+    "benchmarks.planner_reads",
+    "benchmarks.planner_windows",
+    "foredrive.methods.planner",
+    "foredrive.towns.traffic",
+    "foredrive.towns.virtual_egos",
+)
+WORK = Path("runs/planner_windows") / study_identity(CONFIG, DECIDED_BY)
 
 
 def logs_to_learn(workers: int = 1) -> tuple[LogPath, ...]:
@@ -45,7 +58,7 @@ def logs_to_learn(workers: int = 1) -> tuple[LogPath, ...]:
     plans = [EgosPlan(town, seed, EGOS, per_window=PER_WINDOW) for seed in SEEDS for town in TRAIN_TOWNS]
     # A log has images: these have eight pixels, which nobody reads
     rig = RigPlan((2, 4), dict(itertools.islice(SURROUND.cameras.items(), 1)))
-    logs, failed = record_egos(plans, ROOT / "unseen", rig, workers)
+    logs, failed = record_egos(plans, WORK / "egos", rig, workers)
     if failed:
         raise InputError(f"{len(failed)} recordings failed: {next(iter(failed.values()))}")
     return tuple(logs)
@@ -54,13 +67,12 @@ def logs_to_learn(workers: int = 1) -> tuple[LogPath, ...]:
 @functools.cache
 def egos_to_learn() -> TruePlanes:
     """Return the true surroundings of the egos to learn from."""
-    file = ROOT / "unseen" / "planes.safetensors"
-    return kept(TruePlanes, file, lambda: read_planes(logs_to_learn(), RECIPE.clips))
+    return kept(TruePlanes, WORK / "planes.safetensors", lambda: read_planes(logs_to_learn(), RECIPE.clips))
 
 
 @functools.cache
 def study(windows: int, *, blind: bool) -> PathStudy:
-    """Return demonstrations of the egos of some windows, drawn evenly from all towns and seeds."""
+    """Return demonstrations of the egos of some windows, drawn at random from all towns and seeds."""
     egos = egos_to_learn()
     order = torch.randperm(int(egos.window.max()) + 1, generator=torch.Generator().manual_seed(0))
     chosen = egos[torch.isin(egos.window, order[:windows])]
@@ -77,10 +89,6 @@ BENCHMARK = Benchmark(
         for windows in WINDOWS
         for blind in (False, True)
     },
-    config={
-        "towns": [TRAIN_TOWNS, TEST_TOWNS, SEEDS, TEST_SEEDS, EGOS, PER_WINDOW],
-        "fits": [dataclasses.asdict(value) for value in (EGO_FIT, READ, READ_FIT)],
-        "steps": [STEPS[windows] for windows in WINDOWS],
-    },
+    config=CONFIG,
     decided_by=DECIDED_BY,
 )

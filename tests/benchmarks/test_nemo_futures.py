@@ -1,4 +1,4 @@
-"""What the study of NeMo's futures counts as moving."""
+"""Tests of the share of moving voxels in the study of NeMo's futures."""
 
 import dataclasses
 from collections.abc import Callable

@@ -1,1 +1,1 @@
-"""What learns the tasks on a volume: heads with one plane and one decoder, their losses, their training."""
+"""Heads that learn the tasks on a volume: they share one plane, one decoder and one training."""

@@ -45,17 +45,17 @@ def open_rest(path: Path) -> Bag:
 
 
 def read_rest(
-    path: Path, connections: Connections, known: Counter[tuple[str, int]], names: Collection[str]
+    path: Path, connections: Connections, message_counts: Counter[tuple[str, int]], names: Collection[str]
 ) -> Iterator[Message]:
     """Yield the whole messages of some topics, without the index.
 
     Args:
         path: of the bag.
         connections: those that are known from the index. Others are read as they come.
-        known: topics and times, ns, of messages that were read before, which are left out.
+        message_counts: number of messages that were read before, by topic and time, ns; they are left out.
         names: of the topics.
     """
-    left = known.copy()
+    left = message_counts.copy()
     for topic, kind, t_ns, data in _messages(path, connections) if names else ():
         if left[topic, t_ns]:
             left[topic, t_ns] -= 1

@@ -100,16 +100,18 @@ def _open_ros1(path: Path) -> Iterator[Bag]:
         def read(names: Collection[str]) -> Iterator[Message]:
             # Only connections of the named topics are read
             wanted = [one for one in reader.connections if one.topic in names]
-            known = Counter[tuple[str, int]]()
+            message_counts = Counter[tuple[str, int]]()
             try:
                 for connection, t_ns, data in reader.messages(connections=wanted) if wanted else ():
-                    known[connection.topic, t_ns] += 1
+                    message_counts[connection.topic, t_ns] += 1
                     content = functools.partial(decode, data, connection.msgtype)
                     yield Message(connection.topic, t_ns * 1e-9, content)
-            except Exception:  # of a damaged chunk, those of its compression too
+            except Exception as error:  # of a damaged chunk, those of its compression too
                 # The index leads no further: read the chunks one after the other
+                reason = next(iter(str(error).splitlines()), type(error).__name__)
+                note(path.name, f"damaged; read on without its index: {reason}", once=True)
                 numbered = {one.id.to_bytes(4, "little"): (one.topic, one.msgtype) for one in wanted}
-                yield from read_rest(path, numbered, known, names)
+                yield from read_rest(path, numbered, message_counts, names)
 
         yield Bag(
             joined_topics(Topic(one.topic, one.msgtype, one.msgcount) for one in reader.connections), read
