@@ -40,8 +40,8 @@ KEY_DT_S, STEP_S = 0.5, 0.1
 """Time between key frames and between steps of the traffic, s."""
 IMAGES, LATER = 6, 8
 """Key frames of a log with images, and after them without: the last image has a future of 4 s."""
-FORESEEN = 4
-"""Key frames after those with images that have occupancy: what a world model foresees from the last one."""
+FORESEEN = 6
+"""Key frames after those with images that have occupancy: plans of 3 s are judged from the last one."""
 EGOS_PER_WINDOW = 16
 """Most logs that are taken of the same time of the traffic, where nothing else is said."""
 VEHICLES, PEOPLE = 90, 40

@@ -285,3 +285,28 @@ def test_the_ego_motion_learns_from_the_driven_path_of_imagined_items(example: E
     rigid = agent.world_model.motion.rigid[-1]
     assert rigid.bias.grad is not None
     assert rigid.bias.grad.abs().max() > 0
+
+
+def test_the_flow_learns_from_labels_of_imagined_items(example: Example) -> None:
+    """The loss is the error of the velocity, times the emphasis; the flow points to where content was."""
+    velocity = torch.tensor([2.0, -1.0, 0.5])
+    values = velocity.view(3, 1, 1, 1).expand_as(example.flow.values)
+    example = dataclasses.replace(example, flow=dataclasses.replace(example.flow, values=values))
+    torch.manual_seed(0)
+    agent = build_agent(RECIPE)
+    losses = {}
+    for weight in (0.0, 0.5):
+        weights = dataclasses.replace(RECIPE.pretrain.weights, flow=weight, moving=4.0)
+        stage = dataclasses.replace(
+            RECIPE.pretrain, weights=weights, imagined=ImaginationSampling(items=1), augment=AugmentConfig()
+        )
+        objective = build_objective(RECIPE, stage, agent).eval()
+        losses[weight] = objective(example, torch.Generator().manual_seed(1))
+    assert "flow" not in losses[0.0]
+    torch.testing.assert_close(losses[0.5]["flow"], 4.0 * velocity.norm())
+    torch.testing.assert_close(losses[0.5]["loss"], losses[0.0]["loss"] + 0.5 * losses[0.5]["flow"])
+    losses[0.5]["flow"].backward()
+    bias = agent.world_model.motion.flow[-1].bias
+    assert bias.grad is not None
+    # A descent step makes the flow the opposite of the velocity
+    assert (bias.grad.view(-1, 3) * velocity > 0).all()

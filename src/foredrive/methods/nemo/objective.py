@@ -18,6 +18,7 @@ from foredrive.methods.nemo.sampling import ImaginationSampler, ImaginationSampl
 from foredrive.methods.nemo.world_model import Nemo
 from foredrive.methods.planner.agent import PlanningAgent
 from foredrive.methods.planner.planner import set_planner_trainable
+from foredrive.ops.masked import masked_mean
 from foredrive.scene import Belief, Clip, Example
 
 
@@ -49,6 +50,9 @@ class NemoWeights:
     ego: float = 0.0
     """Weight of the error of the predicted ego motion against the driven path. The paper has no such loss:
     its ego motion is learned through the imagined frames alone."""
+    flow: float = 0.0
+    """Weight of the error of the predicted flow, m/s, where labels know it. The paper has no such loss: its
+    flow is learned through the imagined frames alone. `moving` weighs here too."""
     over_frames: Literal["mean", "sum"] = "mean"
     """Reduction of `recon` and `occ` over now and the imagined frames. Eq. 9 and 10 sum, so with T_f = 3 a
     mean has a quarter of their weight beside `wpts`. Over voxels and pixels both take the mean."""
@@ -132,18 +136,22 @@ class NemoObjective(nn.Module):
         decoded = [world.decode(belief) for belief in beliefs[: steps + 1]]
 
         losses = {name: clip.t_s.new_zeros(()) for name in ("l1", "perc", "occ")}
+        flow_errors = []
         # Relative weight of now and of each imagined frame
         shares = clip.t_s.new_tensor([1.0] + [weights.future] * (len(decoded) - 1))
         shares = shares / shares.sum() if weights.over_frames == "mean" else shares
         for k, (belief, share) in enumerate(zip(decoded, shares, strict=True)):
             # Imagined beliefs may hold only the first items of the batch
             frame, items = now + k, slice(len(belief.occupancy_logit))
+            flow, flow_known = example.flow.values[items, frame], example.flow.known[items, frame]
+            emphasis: Tensor | float = 1.0
+            if weights.moving != 1:
+                emphasis = motion_emphasis(flow, flow_known, weights.moving)
+            if weights.flow > 0 and belief.flow is not None:
+                error = (belief.flow - flow).norm(dim=1)
+                flow_errors.append(masked_mean(emphasis * error, flow_known))
             if weights.occ > 0:
                 # Occupancy of each frame against the labels of the same frame (eq. 10)
-                emphasis: Tensor | float = 1.0
-                if weights.moving != 1:
-                    flow, known = example.flow.values[items, frame], example.flow.known[items, frame]
-                    emphasis = motion_emphasis(flow, known, weights.moving)
                 losses["occ"] = losses["occ"] + share * occupancy_loss(
                     belief.occupancy_logit,
                     example.occupancy.values[items, frame, 0],
@@ -172,6 +180,9 @@ class NemoObjective(nn.Module):
         losses["loss"] = weights.occ * losses["occ"] + weights.recon * (
             losses["l1"] + weights.perc * losses["perc"]
         )
+        if flow_errors:
+            losses["flow"] = torch.stack(flow_errors).mean()
+            losses["loss"] = losses["loss"] + weights.flow * losses["flow"]
         if weights.ego > 0 and steps > 0:
             losses["ego"] = self._ego_error(clip, beliefs[1 : steps + 1])
             losses["loss"] = losses["loss"] + weights.ego * losses["ego"]
