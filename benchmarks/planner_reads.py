@@ -110,16 +110,19 @@ def cell_error_m(seed: int, steps: int = 1000, lr: float = 3e-3) -> float:
 
 def logs_to_learn(workers: int = 1) -> tuple[LogPath, ...]:
     """Record the virtual egos to learn from that are missing; return them."""
-    return _recorded(TRAIN_TOWNS, TRAIN_SEEDS, workers)
+    return recorded(TRAIN_TOWNS, TRAIN_SEEDS, workers)
 
 
 def logs_to_judge(workers: int = 1) -> tuple[LogPath, ...]:
     """Record the virtual egos to judge by that are missing; return them."""
-    return _recorded(TEST_TOWNS, TEST_SEEDS, workers)
+    return recorded(TEST_TOWNS, TEST_SEEDS, workers)
 
 
-def _recorded(towns: Sequence[str], seeds: Sequence[int], workers: int) -> tuple[LogPath, ...]:
-    """Record virtual egos with images and exact occupancy. Every other seed has all conditions."""
+def recorded(towns: Sequence[str], seeds: Sequence[int], workers: int = 1) -> tuple[LogPath, ...]:
+    """Record the virtual egos that are missing, with images and exact occupancy; return them.
+
+    Every other seed has all conditions.
+    """
     plans = [
         EgosPlan(town, seed, EGOS, tuple(CONDITIONS) if seed % 2 else (), occupancy=True)
         for seed in seeds

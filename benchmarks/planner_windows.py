@@ -32,10 +32,10 @@ from foredrive.errors import InputError
 from foredrive.runs.drive.recording import EgosPlan, record_egos
 from foredrive.sensors.rigs import SURROUND, RigPlan
 
-SEEDS, EGOS, PER_WINDOW = tuple(range(2100, 2104)), 240, 4
+SEEDS, EGOS, PER_WINDOW = tuple(range(2100, 2102)), 240, 4
 """Seeds of traffic, virtual egos of each town and seed, and those of the same time of the traffic."""
-WINDOWS = (90, 360, 1440)
-STEPS = {90: READ_FIT.steps, 360: 3000, 1440: 6000}
+WINDOWS = (90, 240, 720)
+STEPS = {90: READ_FIT.steps, 240: 2500, 720: 4000}
 """Steps of a fit, by the number of windows."""
 CONFIG = {
     "towns": [TRAIN_TOWNS, TEST_TOWNS, SEEDS, TEST_SEEDS, EGOS, PER_WINDOW],
