@@ -179,6 +179,8 @@ class PathStudy(NamedTuple):
     judged: TruePlanes
     """The egos to judge by."""
     mlp: EgoMLP
+    judged_egos: int = EGOS
+    """Number of the egos to judge by, of each town and seed."""
 
 
 @torch.no_grad()
@@ -206,12 +208,12 @@ def _reads(spec: VoxelSpec, channels: int, mlp: EgoMLP) -> PathCorrection:
 @functools.cache
 def true_study(*, blind: bool = False) -> PathStudy:
     """Return demonstrations with the true surroundings."""
-    return study_of(egos_to_learn(), ego_mlp(), blind=blind)
+    return study_of(egos_to_learn(), egos_to_judge(), ego_mlp(), blind=blind)
 
 
-def study_of(egos: TruePlanes, mlp: EgoMLP, *, blind: bool) -> PathStudy:
+def study_of(egos: TruePlanes, test: TruePlanes, mlp: EgoMLP, *, blind: bool) -> PathStudy:
     """Return demonstrations with the true surroundings of some egos, which are learned from mirrored too."""
-    reads, test = _reads(SPEC, CHANNELS, mlp), egos_to_judge()
+    reads = _reads(SPEC, CHANNELS, mlp)
 
     def volumes(planes: TruePlanes) -> Tensor:
         return planes.volumes() * (not blind)
@@ -283,7 +285,7 @@ def read_along(study: Callable[[], PathStudy], fit: PathFit = READ_FIT) -> Calla
     """Return an arm that reads along the MLP's plan."""
 
     def measure(seed: int) -> dict[str, float]:
-        spec, channels, train, test, egos, mlp = study()
+        spec, channels, train, test, egos, mlp, judged_egos = study()
         torch.manual_seed(seed)
         reads = _reads(spec, channels, mlp)
         fit_path(reads, train, fit, seed)
@@ -294,7 +296,7 @@ def read_along(study: Callable[[], PathStudy], fit: PathFit = READ_FIT) -> Calla
         by_town = {}
         for number, town in enumerate(TEST_TOWNS):
             # Each seed has the logs of one town after those of the other
-            of_town = (egos.log // EGOS % len(TEST_TOWNS) == number).numpy()
+            of_town = (egos.log // judged_egos % len(TEST_TOWNS) == number).numpy()
             by_town[f"gain_pct_{town}"] = float(100 * (1 - own[of_town].mean() / rival[of_town].mean()))
         return by_town | {
             "l2_m": float(own.mean()),

@@ -8,6 +8,7 @@ planner corrects and is judged against.
 import dataclasses
 import functools
 import itertools
+from collections.abc import Sequence
 from pathlib import Path
 
 import torch
@@ -18,7 +19,6 @@ from benchmarks.planner_reads import (
     READ,
     READ_FIT,
     RECIPE,
-    TEST_SEEDS,
     TEST_TOWNS,
     TRAIN_TOWNS,
     PathStudy,
@@ -32,13 +32,13 @@ from foredrive.errors import InputError
 from foredrive.runs.drive.recording import EgosPlan, record_egos
 from foredrive.sensors.rigs import SURROUND, RigPlan
 
-SEEDS, EGOS, PER_WINDOW = tuple(range(2100, 2102)), 240, 4
-"""Seeds of traffic, virtual egos of each town and seed, and those of the same time of the traffic."""
+SEEDS, JUDGED_SEED, EGOS, PER_WINDOW = (2100, 2101), 3100, 240, 4
+"""Seeds of traffic, to learn from and to judge by; egos of each town and seed; those of the same time."""
 WINDOWS = (90, 240, 720)
 STEPS = {90: READ_FIT.steps, 240: 2500, 720: 4000}
 """Steps of a fit, by the number of windows."""
 CONFIG = {
-    "towns": [TRAIN_TOWNS, TEST_TOWNS, SEEDS, TEST_SEEDS, EGOS, PER_WINDOW],
+    "towns": [TRAIN_TOWNS, TEST_TOWNS, SEEDS, JUDGED_SEED, EGOS, PER_WINDOW],
     "fits": [dataclasses.asdict(value) for value in (EGO_FIT, READ, READ_FIT)],
     "steps": [STEPS[windows] for windows in WINDOWS],
 }
@@ -53,9 +53,9 @@ DECIDED_BY = (
 WORK = Path("runs/planner_windows") / study_identity(CONFIG, DECIDED_BY)
 
 
-def logs_to_learn(workers: int = 1) -> tuple[LogPath, ...]:
+def recorded(towns: Sequence[str], seeds: Sequence[int], workers: int = 1) -> tuple[LogPath, ...]:
     """Record the virtual egos that are missing; return them."""
-    plans = [EgosPlan(town, seed, EGOS, per_window=PER_WINDOW) for seed in SEEDS for town in TRAIN_TOWNS]
+    plans = [EgosPlan(town, seed, EGOS, per_window=PER_WINDOW) for seed in seeds for town in towns]
     # A log has images: these have eight pixels, which nobody reads
     rig = RigPlan((2, 4), dict(itertools.islice(SURROUND.cameras.items(), 1)))
     logs, failed = record_egos(plans, WORK / "egos", rig, workers)
@@ -67,7 +67,15 @@ def logs_to_learn(workers: int = 1) -> tuple[LogPath, ...]:
 @functools.cache
 def egos_to_learn() -> TruePlanes:
     """Return the true surroundings of the egos to learn from."""
-    return kept(TruePlanes, WORK / "planes.safetensors", lambda: read_planes(logs_to_learn(), RECIPE.clips))
+    logs = functools.partial(recorded, TRAIN_TOWNS, SEEDS)
+    return kept(TruePlanes, WORK / "train.safetensors", lambda: read_planes(logs(), RECIPE.clips))
+
+
+@functools.cache
+def egos_to_judge() -> TruePlanes:
+    """Return the true surroundings of the egos to judge by."""
+    logs = functools.partial(recorded, TEST_TOWNS, (JUDGED_SEED,))
+    return kept(TruePlanes, WORK / "test.safetensors", lambda: read_planes(logs(), RECIPE.clips))
 
 
 @functools.cache
@@ -76,7 +84,8 @@ def study(windows: int, *, blind: bool) -> PathStudy:
     egos = egos_to_learn()
     order = torch.randperm(int(egos.window.max()) + 1, generator=torch.Generator().manual_seed(0))
     chosen = egos[torch.isin(egos.window, order[:windows])]
-    return study_of(chosen, fitted_mlp(chosen), blind=blind)
+    demonstrations = study_of(chosen, egos_to_judge(), fitted_mlp(chosen), blind=blind)
+    return demonstrations._replace(judged_egos=EGOS)
 
 
 BENCHMARK = Benchmark(

@@ -59,6 +59,8 @@ WIDE_STEPS, WIDE_BATCH, WIDE_LR = 2600, 4, 1.5e-3
 """Steps of what goes on from them, clips of a step, and learning rate: an hour and a half of a core."""
 WIDE_SEEDS = planner_reads.TRAIN_SEEDS[:2]
 """Seeds of the traffic that nemo_wide learns from, of 80 egos in each town."""
+WIDE_JUDGED_SEEDS = planner_reads.TEST_SEEDS[:2]
+"""Seeds of the traffic that it is judged by."""
 JUDGED_EVERY_S = 0.5
 """Time between judged key frames, s: that of the key frames, because tracks are judged too."""
 TASKS = (*HEADED, INSTANCES)
@@ -144,9 +146,7 @@ def wide_judged(town: str, seed: int) -> dict[str, float]:
     run = wide_joint(seed)
     heads = load_heads(run)
     assert heads is not None
-    return judged(
-        run, heads, [log for log in planner_reads.logs_to_judge() if log.folder.name.startswith(town)]
-    )
+    return judged(run, heads, planner_reads.recorded((town,), WIDE_JUDGED_SEEDS))
 
 
 def joint_recipe(recipe: Recipe[Any, Any], heads: TaskHeadsRecipe) -> Recipe[Any, Any]:
