@@ -55,8 +55,8 @@ STEPS, BATCH = 1200, 8
 """Steps of the heads, and clips of a step."""
 WIDE = Path(__file__).with_name("nemo_wide")
 """Weights of the recipe nemo_wide, from which its arms go on."""
-WIDE_STEPS, WIDE_BATCH, WIDE_LR = 2600, 4, 1.5e-3
-"""Steps of what goes on from them, clips of a step, and learning rate: an hour and a half of a core."""
+WIDE_STEPS, WIDE_LR = 1450, 2e-3
+"""Steps and learning rate of what goes on from them: an hour and a half of a core."""
 WIDE_SEEDS = planner_reads.TRAIN_SEEDS[:2]
 """Seeds of the traffic that nemo_wide learns from, of 80 egos in each town."""
 WIDE_JUDGED_SEEDS = planner_reads.TEST_SEEDS[:2]
@@ -132,7 +132,7 @@ def wide_joint(seed: int) -> Run:
 def wide_recipe(seed: int) -> Recipe[Any, Any]:
     """Return nemo_wide with heads. One item of each step is imagined."""
     heads = heads_recipe(seed)
-    schedule = dataclasses.replace(heads.schedule, steps=WIDE_STEPS, batch_size=WIDE_BATCH)
+    schedule = dataclasses.replace(heads.schedule, steps=WIDE_STEPS)
     heads = dataclasses.replace(heads, schedule=schedule, now_stride_s=JUDGED_EVERY_S)
     recipe = joint_recipe(seeded(find_recipe(WIDE.name), seed), heads)
     finetune = dataclasses.replace(
