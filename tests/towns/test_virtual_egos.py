@@ -245,7 +245,7 @@ def _persons(log: Log, frame: int) -> dict[int, np.ndarray]:
 
 
 def test_a_world_model_learns_from_past_now_and_what_comes(logs: list[LogPath]) -> None:
-    """The last image has occupancy three seconds later; road users fill it, those who move with their flow."""
+    """The last image has occupancy three seconds later; road users fill it, who move with their flow."""
     config = ClipConfig(1, FORESEEN, (24, 40), GRID, occupancy_source="recorded", future_images=False)
     clips = ClipDataset(logs, config, None)
     assert len(clips) == COUNT * (IMAGES - 1)

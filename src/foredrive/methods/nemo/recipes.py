@@ -131,8 +131,8 @@ def nemo_wide() -> NemoRecipe:
     """Return `nemo_town` on a grid that holds what detectors and maps are judged on, 32 m behind and beside.
 
     It is pre-trained on the exact occupancy of virtual egos (`--occupancy recorded`), in which voxels that
-    move, and those next to them, weigh five times as much, and on their exact flow: without that loss the flow
-    grew until all futures were empty. Its planner has no head along the path.
+    move, and those next to them, weigh five times as much, and on their exact flow: without that loss the
+    flow grew until all futures were empty. Its planner has no head along the path.
     """
     town = nemo_town()
     assert town.pretrain is not None
