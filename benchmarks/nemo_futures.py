@@ -19,12 +19,12 @@ from foredrive.runs.shipped import run_folder
 from foredrive.runs.train.run import load_agent, open_run
 from foredrive.scene import Example
 from foredrive.scene.voxels import MOVING_MPS
-from foredrive.tasks.evaluation.metric import EvaluationContext, Shown, labels_from_now
-from foredrive.tasks.evaluation.predictor import Part, Prediction
 from foredrive.tasks.evaluation.run import evaluate
+from foredrive.tasks.metric import EvaluationContext, Shown, labels_from_now
 from foredrive.tasks.occupancy.flow_metric import FlowMetric
 from foredrive.tasks.occupancy.occupancy_metric import OccupancyMetric
 from foredrive.tasks.occupancy.scores import above_ground
+from foredrive.tasks.predictor import Part, Prediction
 
 LOGS_APART, STRIDE_S = 2, 1.0
 """Every second ego is judged, at nows so far apart."""

@@ -22,10 +22,10 @@ from foredrive.runs.recipes.task_heads import town_heads
 from foredrive.runs.shipped import run_folder
 from foredrive.runs.train.run import load_agent, open_run
 from foredrive.runs.train.tasks import probe_run, train_heads
-from foredrive.tasks.detection.metric import DetectionMetric
+from foredrive.tasks.detection.detection_metric import DetectionMetric
 from foredrive.tasks.evaluation.run import evaluate
-from foredrive.tasks.motion.metric import MotionMetric
-from foredrive.tasks.tracking.metric import TrackingMetric
+from foredrive.tasks.motion.motion_metric import MotionMetric
+from foredrive.tasks.tracking.tracking_metric import TrackingMetric
 
 ROOT = Path("runs/task_pandaset")
 TRAIN_S, JUDGE_S = (0.0, 4.0), (4.0, 6.0)

@@ -108,6 +108,13 @@ INNER_FLOORS = {
         {"driveworld", "neurad"},
     ],
     "data": [{"formats", "truth"}],
+    "tasks": [
+        {"files"},
+        {"objects", "planning", "rendering"},
+        {"detection", "maps", "occupancy"},
+        {"tracking", "motion"},
+        {"evaluation"},
+    ],
 }
 """Folders of a folder. What lies beside them joins them.
 

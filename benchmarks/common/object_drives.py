@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from foredrive.scene.boxes import Attribute
-from foredrive.tasks.detection.protocols import CLASSES
+from foredrive.tasks.objects.object_rows import DETECTION_CLASSES
 
 Box = dict[str, Any]
 SHARES = np.array([493, 88, 16, 25, 15, 220, 13, 12, 98, 152]) / 1132
@@ -67,7 +67,7 @@ def _add_scene(drives: Drives, scene: int, size: Size, rng: np.random.Generator)
     n, reach = size.objects, size.reach_m
     start = np.array([*rng.uniform(200, 1500, 2), 0.0])
     shares = SHARES if size.shares else None
-    names = [str(name) for name in rng.choice(CLASSES, n, p=shares)]
+    names = [str(name) for name in rng.choice(DETECTION_CLASSES, n, p=shares)]
     place = start + np.c_[rng.uniform(-reach, reach, (n, 2)), rng.normal(1, 0.3, n)]
     speed, lwh = rng.normal(0, 4, (n, 2)), rng.uniform(0.5, 5, (n, 3))
     yaw, sure = rng.uniform(-math.pi, math.pi, n), np.clip(rng.beta(3, 2, n), 0.02, 0.98)
@@ -97,7 +97,7 @@ def _add_scene(drives: Drives, scene: int, size: Size, rng: np.random.Generator)
                 found.append(_found(rng, box, sure[k] + rng.normal(0, 0.1), identity[k]))
         for k in range(int(rng.integers(0, size.false + 1))):
             name, at = (
-                str(rng.choice(CLASSES, p=shares)),
+                str(rng.choice(DETECTION_CLASSES, p=shares)),
                 ego + np.array([*rng.uniform(-reach, reach, 2), 1.0]),
             )
             box = _box(token, at, ego, rng.uniform(0.5, 5, 3), rng.uniform(-3, 3), rng.normal(0, 3, 2), name)

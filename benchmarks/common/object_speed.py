@@ -24,14 +24,14 @@ from benchmarks.common.object_drives import (
     tracking_boxes,
     truth_file,
 )
-from foredrive.tasks.detection.protocols import CLASSES, DETECTION_PROTOCOLS, evaluate_detections
+from foredrive.tasks.detection.protocols import DETECTION_PROTOCOLS, evaluate_detections
 from foredrive.tasks.motion.protocols import PROTOCOLS as MOTION_PROTOCOLS
 from foredrive.tasks.motion.scores import score_motion
-from foredrive.tasks.tracking.nuscenes_json import ObjectTask
-from foredrive.tasks.tracking.object_rows import Frames, ObjectRows, make_rows
+from foredrive.tasks.objects.nuscenes_json import ObjectTask
+from foredrive.tasks.objects.object_rows import DETECTION_CLASSES, Frames, ObjectRows, make_rows
+from foredrive.tasks.objects.reading import read_objects
+from foredrive.tasks.objects.truth import ObjectTruth
 from foredrive.tasks.tracking.protocols import TRACKING_PROTOCOLS, evaluate_tracking
-from foredrive.tasks.tracking.score import read_objects
-from foredrive.tasks.tracking.truth import ObjectTruth
 
 FIFTEEN_SCENES = Size(scenes=15, frames=40, objects=60, false=420, false_frames=3, reach_m=45.0, shares=True)
 """600 frames of some 250 detections."""
@@ -148,7 +148,7 @@ VALIDATION_TASKS: dict[str, Callable[[np.random.Generator], Callable[[], object]
 
 
 def _validation_rows(
-    rng: np.random.Generator, classes: tuple[str, ...] = CLASSES
+    rng: np.random.Generator, classes: tuple[str, ...] = DETECTION_CLASSES
 ) -> tuple[ObjectRows, ObjectRows, Frames]:
     """Objects that move straight on; 85 % are found in each frame, and false tracks last four frames."""
     frame = np.arange(FRAMES)

@@ -8,9 +8,9 @@ import torch
 
 from benchmarks.nemo_futures import MovingShareMetric
 from foredrive.scene import Example, VoxelGrid, VoxelSpec
-from foredrive.tasks.evaluation.metric import EvaluationContext
-from foredrive.tasks.evaluation.predictor import Prediction
+from foredrive.tasks.metric import EvaluationContext
 from foredrive.tasks.occupancy.scores import above_ground
+from foredrive.tasks.predictor import Prediction
 
 
 def test_what_moves_now_above_the_ground_is_counted(make_example: Callable[..., Example]) -> None:

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from foredrive.cli.main import main
-from foredrive.tasks.tracking.kitti_boxes import score_kitti_boxes
+from foredrive.tasks.detection.kitti_boxes import score_kitti_boxes
 
 Box = dict[str, Any]
 Content = dict[str, list[Box]]

@@ -17,11 +17,11 @@ from foredrive.runs.recipes.known import find_recipe
 from foredrive.runs.recipes.task_heads import town_heads
 from foredrive.scene import Example
 from foredrive.sensors.rigs import SURROUND, RigPlan
-from foredrive.tasks.detection.metric import DetectionMetric
-from foredrive.tasks.evaluation.metric import EvaluationContext, Metric
-from foredrive.tasks.evaluation.predictor import Prediction
-from foredrive.tasks.maps.metric import MapLinesMetric
-from foredrive.tasks.motion.metric import MotionMetric
+from foredrive.tasks.detection.detection_metric import DetectionMetric
+from foredrive.tasks.maps.map_lines_metric import MapLinesMetric
+from foredrive.tasks.metric import EvaluationContext, Metric
+from foredrive.tasks.motion.motion_metric import MotionMetric
+from foredrive.tasks.predictor import Prediction
 
 EGOS, FRAMES, BATCH, RATE = 8, 16, 4, 3e-3
 TRUTH = dataclasses.replace(town_heads(["detection", "motion", "map"]).truth, raster=None)

@@ -27,8 +27,8 @@ from foredrive.data.maps import write_map
 from foredrive.integrations.nuscenes.scene import _drawn
 from foredrive.integrations.nuscenes.streams import lidar_axes
 from foredrive.scene import Attribute, Category
-from foredrive.tasks.detection.protocols import CLASSES
-from foredrive.tasks.tracking.nuscenes_tables import read_tables_truth
+from foredrive.tasks.objects.nuscenes_tables import read_tables_truth
+from foredrive.tasks.objects.object_rows import DETECTION_CLASSES
 
 FRAMES = 21
 """Two seconds at 10 Hz: five samples."""
@@ -121,7 +121,7 @@ def test_points_lie_on_the_boxes_and_in_their_image(tables: Tables) -> None:
 
 def test_our_own_reader_of_truth_takes_the_tables(tables: Tables, root: Path) -> None:
     listed = list(tables.of["sample"])
-    truth = read_tables_truth(root / "v1.0-foredrive", listed, root, "tracking", CLASSES)
+    truth = read_tables_truth(root / "v1.0-foredrive", listed, root, "tracking", DETECTION_CLASSES)
     speed = np.linalg.norm(truth.boxes.velocity, axis=-1)
     assert sorted(speed.round(6).tolist()) == [0.0] * 5 + [world.MOVING["speed"]] * 5
     assert {CLASSES[label] for label in truth.boxes.label} == {"car", "truck"}

@@ -14,9 +14,9 @@ from foredrive.tasks.detection.files import read_detections
 from foredrive.tasks.detection.protocols import DETECTION_PROTOCOLS, evaluate_detections
 from foredrive.tasks.detection.score import score_frames
 from foredrive.tasks.detection.summary import summarise_scores
+from foredrive.tasks.objects.nuscenes_json import read_json_truth, read_results
 from foredrive.tasks.tracking.clear import Candidates, clear_mot
 from foredrive.tasks.tracking.hota import hota
-from foredrive.tasks.tracking.nuscenes_json import read_json_truth, read_results
 from foredrive.tasks.tracking.protocols import TRACKING_PROTOCOLS, evaluate_tracking
 
 ERRORS = {

@@ -11,7 +11,7 @@ from miniature import write_log
 
 from foredrive.cli.main import main
 from foredrive.data.logs import Log
-from foredrive.tasks.detection.protocols import CLASSES
+from foredrive.tasks.objects.object_rows import DETECTION_CLASSES
 
 pytestmark = [pytest.mark.oracle, pytest.mark.filterwarnings("ignore")]
 
@@ -106,5 +106,5 @@ def test_truth_of_detection(nusc: Any) -> None:
     truth = load_gt_of_sample_tokens(nusc, tokens, DetectionBox, verbose=False)
     boxes = [box for token in tokens for box in truth[token]]
     assert len(boxes) == 10
-    assert {box.detection_name for box in boxes} <= set(CLASSES)
+    assert {box.detection_name for box in boxes} <= set(DETECTION_CLASSES)
     assert min(box.num_pts for box in boxes) > 0

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from foredrive.tasks.detection.matching import overlaps
+from foredrive.tasks.objects.matching import overlaps
 from foredrive.tasks.tracking.clear import Candidates, ClearCounts, TrackRows, clear_mot
 
 pytestmark = pytest.mark.oracle

@@ -9,7 +9,7 @@ import pytest
 from oracles.reference_code import FOLDER, METRICS
 from oracles.reference_scenes import line_set
 
-from foredrive.tasks.maps.metric import count_raster, raster_figures
+from foredrive.tasks.maps.map_raster_metric import count_raster, raster_figures
 from foredrive.tasks.maps.precision import mean_precision, score_maps
 from foredrive.tasks.maps.protocols import PROTOCOLS as MAPS
 from foredrive.tasks.motion.agents import PredictedAgents, TrueAgents

@@ -17,7 +17,7 @@ import pytest
 from oracles.test_published import MIN_OVERLAP, counts_by_overlap
 
 from foredrive.sets.assignment import best_assignment
-from foredrive.tasks.detection.matching import overlaps
+from foredrive.tasks.objects.matching import overlaps
 
 pytestmark = pytest.mark.oracle
 

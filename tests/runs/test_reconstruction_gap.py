@@ -16,7 +16,7 @@ from foredrive.runs.evaluate.real_to_sim_gap import RealToSimComparison, measure
 from foredrive.runs.reconstruction.reconstruct import read_reconstruction_data, reconstruct
 from foredrive.runs.reconstruction.reconstruction_run import open_reconstruction
 from foredrive.scene import Clip, Trajectory
-from foredrive.tasks.evaluation.predictor import Prediction
+from foredrive.tasks.predictor import Prediction
 
 RECIPE = dataclasses.replace(SMALLEST, hold_out_every=4)
 

@@ -21,7 +21,7 @@ from foredrive.heads.agents_head import AGENT_CLASSES
 from foredrive.scene import Attribute, Boxes, Category, Example, VoxelSpec
 from foredrive.scene.agents import Agents, MapLines
 from foredrive.scene.map_elements import ElementKind
-from foredrive.tasks.evaluation.predictor import Prediction
+from foredrive.tasks.predictor import Prediction
 
 STEP_S, SECONDS = 0.25, 9.0
 GRID = VoxelSpec((-8.0, -8.0, -1.0), 0.5, (6, 32, 32))

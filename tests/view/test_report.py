@@ -14,7 +14,7 @@ from foredrive.errors import InputError
 from foredrive.runs import ExamplePrediction
 from foredrive.scene import Example
 from foredrive.tasks.evaluation import metrics
-from foredrive.tasks.evaluation.metric import EvaluationContext, Shown
+from foredrive.tasks.metric import EvaluationContext, Shown
 from foredrive.tasks.planning.protocols import PROTOCOLS
 from foredrive.view import palette
 from foredrive.view.example_panel import (

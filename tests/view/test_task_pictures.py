@@ -13,7 +13,7 @@ from foredrive.scene.agents import Agents, MapLines
 from foredrive.scene.map_elements import ElementKind, MapElements
 from foredrive.scene.semantics import VOXEL_CLASSES, SemanticVoxels
 from foredrive.scene.task_truth import TaskTruth
-from foredrive.tasks.evaluation.predictor import Prediction
+from foredrive.tasks.predictor import Prediction
 from foredrive.view import palette
 from foredrive.view.example_panel import draw_example
 from foredrive.view.task_pictures import columns_rgb, found_agents, true_scene

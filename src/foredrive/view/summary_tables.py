@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from rich.console import Console
 
 from foredrive.engine.summary import Summary
-from foredrive.tasks.evaluation.metric import CEILING, PRIOR, EvaluationContext
+from foredrive.tasks.metric import CEILING, PRIOR, EvaluationContext
 from foredrive.tasks.occupancy.scores import ABOVE_GROUND_M
 from foredrive.tasks.planning.protocols import HORIZON_NAMES, PROTOCOLS
 from foredrive.view.table import (

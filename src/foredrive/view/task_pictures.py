@@ -23,8 +23,8 @@ from foredrive.scene.agents import Agents
 from foredrive.scene.boxes import unlabelled
 from foredrive.scene.map_elements import ElementKind
 from foredrive.scene.semantics import VOXEL_CLASSES, Taxonomy
-from foredrive.tasks.evaluation.predictor import Prediction
 from foredrive.tasks.maps.lines import CLASSES
+from foredrive.tasks.predictor import Prediction
 from foredrive.view import palette
 from foredrive.view.bev import draw_boxes, draw_ego, start_bev
 from foredrive.view.html import Picture, picture

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from foredrive.tasks.detection.matching import (
+from foredrive.tasks.objects.matching import (
     average_precision_coco,
     average_precision_nuscenes,
     descending,

@@ -8,8 +8,14 @@ import pytest
 
 from foredrive.scene.boxes import UNKNOWN, Attribute
 from foredrive.tasks.detection.over_recall import running_mean
-from foredrive.tasks.detection.protocols import CLASSES, DETECTION_PROTOCOLS, evaluate_detections, hit_errors
-from foredrive.tasks.tracking.object_rows import ObjectRows, counted, inside_racks, make_rows
+from foredrive.tasks.detection.protocols import DETECTION_PROTOCOLS, evaluate_detections, hit_errors
+from foredrive.tasks.objects.object_rows import (
+    DETECTION_CLASSES,
+    ObjectRows,
+    counted,
+    inside_racks,
+    make_rows,
+)
 
 NUSCENES, VAD = DETECTION_PROTOCOLS["nuscenes"], DETECTION_PROTOCOLS["vad"]
 
@@ -18,7 +24,7 @@ def at(*places: tuple[float, float], name: str = "car", score: float = math.nan)
     n, xy = len(places), np.array(places).reshape(-1, 2)
     return make_rows(
         np.zeros(n, np.int64),
-        np.full(n, CLASSES.index(name)),
+        np.full(n, DETECTION_CLASSES.index(name)),
         np.pad(xy, ((0, 0), (0, 1))),
         np.full((n, 3), 2.0),
         np.zeros(n),
@@ -34,10 +40,16 @@ NONE = at()
 def test_the_ground_that_counts() -> None:
     """nuScenes: less than 50 m away. VAD: less than 30 m along x and less than 15 m along y."""
     cars = at((29.0, 14.0), (31.0, 0.0), (0.0, 16.0), (40.0, 31.0), (50.0, 0.0))
-    assert counted(cars, NONE, NUSCENES.region, CLASSES).tolist() == [True, True, True, False, False]
-    assert counted(cars, NONE, VAD.region, CLASSES).tolist() == [True, False, False, False, False]
+    assert counted(cars, NONE, NUSCENES.region, DETECTION_CLASSES).tolist() == [
+        True,
+        True,
+        True,
+        False,
+        False,
+    ]
+    assert counted(cars, NONE, VAD.region, DETECTION_CLASSES).tolist() == [True, False, False, False, False]
     cones = at((29.0, 0.0), (31.0, 0.0), name="traffic_cone")
-    assert counted(cones, NONE, NUSCENES.region, CLASSES).tolist() == [True, False]
+    assert counted(cones, NONE, NUSCENES.region, DETECTION_CLASSES).tolist() == [True, False]
 
 
 def test_the_same_detections_under_both_protocols() -> None:
@@ -50,16 +62,16 @@ def test_the_same_detections_under_both_protocols() -> None:
 
 def test_an_unknown_place_counts_everywhere() -> None:
     lost = dataclasses.replace(at((900.0, 900.0)), from_ego=np.full((1, 2), np.nan))
-    assert counted(lost, NONE, NUSCENES.region, CLASSES).tolist() == [True]
+    assert counted(lost, NONE, NUSCENES.region, DETECTION_CLASSES).tolist() == [True]
 
 
 def test_cycles_in_a_rack_of_their_frame() -> None:
     """A rack of 2 m around the origin in frame 0 holds neither what is elsewhere, nor a car, nor frame 1."""
     cycles = at((0.5, 0.5), (1.5, 0.0), name="bicycle")
-    assert inside_racks(cycles, at((0.0, 0.0)), CLASSES).tolist() == [True, False]
-    assert inside_racks(at((0.0, 0.0)), at((0.0, 0.0)), CLASSES).tolist() == [False]
+    assert inside_racks(cycles, at((0.0, 0.0)), DETECTION_CLASSES).tolist() == [True, False]
+    assert inside_racks(at((0.0, 0.0)), at((0.0, 0.0)), DETECTION_CLASSES).tolist() == [False]
     later = dataclasses.replace(cycles, frame=np.ones(2, np.int64))
-    assert inside_racks(later, at((0.0, 0.0)), CLASSES).tolist() == [False, False]
+    assert inside_racks(later, at((0.0, 0.0)), DETECTION_CLASSES).tolist() == [False, False]
 
 
 def test_errors_of_a_hit() -> None:

@@ -13,9 +13,9 @@ from tasks.files_of_detections import box, write_nuscenes
 from foredrive.engine.summary import Figures
 from foredrive.tasks.detection.files import read_detections
 from foredrive.tasks.detection.nuscenes_results import BICYCLE_RACK
-from foredrive.tasks.detection.protocols import CLASSES
 from foredrive.tasks.detection.score import score_frames
 from foredrive.tasks.detection.summary import summarise_scores
+from foredrive.tasks.objects.object_rows import DETECTION_CLASSES
 
 Boxes = list[dict[str, Any]]
 
@@ -81,7 +81,7 @@ def test_a_match_is_closer_than_the_threshold(tmp_path: Path) -> None:
 def random_drive(rng: np.random.Generator) -> tuple[dict[str, Boxes], dict[str, Boxes]]:
     """Frames of objects up to 60 m away, racks, near detections and false ones, many with equal scores."""
     truth, found = {}, {}
-    names = sorted(CLASSES)
+    names = sorted(DETECTION_CLASSES)
     for n in range(12):
         places = [(*rng.uniform(-45, 45, 2), str(rng.choice(names))) for _ in range(25)]
         truth[f"f{n}"] = [at(x, y, name, num_pts=int(rng.integers(0, 6))) for x, y, name in places]

@@ -9,11 +9,11 @@ from typing import Any
 import pytest
 
 from foredrive.errors import InputError
+from foredrive.tasks.detection.kitti_boxes import score_kitti_boxes
 from foredrive.tasks.maps.files import read_maps
 from foredrive.tasks.motion.files import read_agents
-from foredrive.tasks.tracking.kitti_boxes import score_kitti_boxes
+from foredrive.tasks.objects.reading import read_objects
 from foredrive.tasks.tracking.kitti_tracks import score_kitti_tracks
-from foredrive.tasks.tracking.score import read_objects
 
 BOX = {
     "translation": [10.0, 0.0, 1.0],

@@ -11,10 +11,10 @@ from torch.utils.data import DataLoader, Dataset
 from foredrive.errors import InputError
 from foredrive.methods.planner.baselines import ConstantVelocity, StandStill
 from foredrive.scene import Clip, Example, Trajectory, VoxelGrid
-from foredrive.tasks.evaluation.predictor import Prediction
 from foredrive.tasks.evaluation.run import evaluate
 from foredrive.tasks.occupancy.scores import OccupancyPrior
 from foredrive.tasks.planning.protocols import PROTOCOLS
+from foredrive.tasks.predictor import Prediction
 
 MakeExample = Callable[..., Example]
 FRAMES = 3

@@ -9,9 +9,9 @@ from foredrive.data import ClipConfig, ClipDataset, collate
 from foredrive.data.formats.convert import convert
 from foredrive.methods.planner.baselines import ConstantVelocity, StandStill
 from foredrive.scene import Clip, VoxelSpec
-from foredrive.tasks.evaluation.predictor import Prediction
 from foredrive.tasks.evaluation.run import evaluate
 from foredrive.tasks.planning.protocols import PROTOCOLS
+from foredrive.tasks.predictor import Prediction
 
 
 class GoOn:

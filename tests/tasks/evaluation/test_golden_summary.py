@@ -15,9 +15,9 @@ import torch
 
 from foredrive.methods.planner.baselines import ConstantVelocity, StandStill
 from foredrive.scene import Clip, Example, Trajectory
-from foredrive.tasks.evaluation.predictor import Prediction
 from foredrive.tasks.evaluation.run import evaluate
 from foredrive.tasks.occupancy.scores import OccupancyPrior
+from foredrive.tasks.predictor import Prediction
 
 GOLDEN = Path(__file__).with_name("golden_summary.json")
 FRAMES, FUTURES = 3, 4

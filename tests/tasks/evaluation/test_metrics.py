@@ -10,11 +10,11 @@ import torch
 
 from foredrive.methods.planner.baselines import ConstantVelocity, StandStill
 from foredrive.scene import Clip, Example
-from foredrive.tasks.evaluation.metric import EvaluationContext, Figures, Shown
 from foredrive.tasks.evaluation.metrics import METRICS
-from foredrive.tasks.evaluation.predictor import Part, Prediction
 from foredrive.tasks.evaluation.run import evaluate
-from foredrive.tasks.rendering.metric import ImageMetric
+from foredrive.tasks.metric import EvaluationContext, Figures, Shown
+from foredrive.tasks.predictor import Part, Prediction
+from foredrive.tasks.rendering.image_metric import ImageMetric
 
 MakeExample = Callable[..., Example]
 

@@ -11,20 +11,22 @@ from recorded_street import near_truth, read_batch, record
 from foredrive.data.clip_config import TaskTruthConfig
 from foredrive.files import together
 from foredrive.scene import Example, VoxelSpec
-from foredrive.tasks.detection.metric import DetectionMetric
-from foredrive.tasks.evaluation.metric import EvaluationContext, Figures
-from foredrive.tasks.evaluation.predictor import Prediction
+from foredrive.tasks.detection.detection_metric import DetectionMetric
+from foredrive.tasks.detection.figures import score_objects
 from foredrive.tasks.evaluation.results_files import ResultsFiles
 from foredrive.tasks.maps.files import read_maps
-from foredrive.tasks.maps.metric import MapLinesMetric
+from foredrive.tasks.maps.map_lines_metric import MapLinesMetric
 from foredrive.tasks.maps.score import score_map_files
+from foredrive.tasks.metric import EvaluationContext, Figures
 from foredrive.tasks.motion.files import read_agents
-from foredrive.tasks.motion.metric import MotionMetric
+from foredrive.tasks.motion.motion_metric import MotionMetric
 from foredrive.tasks.motion.score import score_agent_files
+from foredrive.tasks.objects.reading import read_objects
 from foredrive.tasks.occupancy.log_results import score_against_logs
 from foredrive.tasks.occupancy.semantics_metric import SemanticVoxelMetric
-from foredrive.tasks.tracking.metric import TrackingMetric
-from foredrive.tasks.tracking.score import read_objects, score_detections, score_tracks
+from foredrive.tasks.predictor import Prediction
+from foredrive.tasks.tracking.score import score_tracks
+from foredrive.tasks.tracking.tracking_metric import TrackingMetric
 
 
 @pytest.fixture(scope="module")
@@ -62,7 +64,7 @@ def test_detections(logs: Path, example: Example, tmp_path: Path) -> None:
     write(tmp_path, prediction, example)
     printed = evaluated(DetectionMetric, prediction, example)
     assert 0.05 < float(printed["detection.nuscenes.map"]) < 0.3  # three of ten classes, with noise
-    scored = score_detections(*read_objects(tmp_path / "detection.json", logs, "detection"))
+    scored = score_objects(*read_objects(tmp_path / "detection.json", logs, "detection"))
     assert_same_figures(printed, scored, 30)
     assert scored["frames_counted"] == len(example.key)
 

@@ -13,13 +13,14 @@ from foredrive.scene.agents import Agents, MapLines
 from foredrive.scene.map_elements import ElementKind, MapElements, MapRaster, PlaneSpec
 from foredrive.scene.semantics import SemanticVoxels
 from foredrive.scene.task_truth import TaskTruth
-from foredrive.tasks.detection.metric import DetectionMetric
-from foredrive.tasks.evaluation.metric import EvaluationContext
-from foredrive.tasks.evaluation.predictor import Prediction
-from foredrive.tasks.evaluation.task_priors import TaskPriors, best_mask, fit_task_priors
-from foredrive.tasks.maps.metric import MapLinesMetric, MapRasterMetric, _part_above
-from foredrive.tasks.motion.metric import MotionMetric
+from foredrive.tasks.detection.detection_metric import DetectionMetric
+from foredrive.tasks.maps.map_lines_metric import MapLinesMetric, _part_above
+from foredrive.tasks.maps.map_raster_metric import MapRasterMetric
+from foredrive.tasks.metric import EvaluationContext
+from foredrive.tasks.motion.motion_metric import MotionMetric
 from foredrive.tasks.occupancy.semantics_metric import SemanticVoxelMetric
+from foredrive.tasks.predictor import Prediction
+from foredrive.tasks.task_priors import TaskPriors, best_mask, fit_task_priors
 
 SPEC = VoxelSpec(lower_m=(-4.0, -4.0, -1.0), voxel_m=1.0, shape_zyx=(2, 8, 8))
 RASTER = PlaneSpec((-4.0, -4.0), 1.0, (8, 8))

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from foredrive.scene.map_elements import RasterLayer
-from foredrive.tasks.maps.metric import count_raster, raster_figures
+from foredrive.tasks.maps.map_raster_metric import count_raster, raster_figures
 
 NOTHING = np.zeros((1, len(RasterLayer), 4, 4), dtype=bool)
 

@@ -8,10 +8,10 @@ import torch
 
 from foredrive.geometry.se3 import exp_se3, transform_points
 from foredrive.scene import Example, VoxelGrid, VoxelSpec
-from foredrive.tasks.evaluation.metric import EvaluationContext
-from foredrive.tasks.evaluation.predictor import Prediction
+from foredrive.tasks.metric import EvaluationContext
 from foredrive.tasks.occupancy.forecasts import ego_compensated
 from foredrive.tasks.occupancy.occupancy_metric import OccupancyMetric
+from foredrive.tasks.predictor import Prediction
 
 SPEC = VoxelSpec((-8.0, -12.0, -1.0), 1.0, (3, 24, 32))
 TWIST = torch.tensor([3.0, 0.0, 0.0, 0.0, 0.0, 0.3], dtype=torch.float64)

@@ -28,9 +28,9 @@ from foredrive.scene import Boxes, Category, Example, VoxelSpec
 from foredrive.scene.boxes import unlabelled
 from foredrive.scene.map_elements import InstanceRaster, PlaneSpec
 from foredrive.scene.task_truth import TaskTruth
-from foredrive.tasks.evaluation.metric import EvaluationContext
-from foredrive.tasks.evaluation.predictor import Prediction
+from foredrive.tasks.metric import EvaluationContext
 from foredrive.tasks.occupancy.instances_metric import InstanceMetric, drawn_boxes
+from foredrive.tasks.predictor import Prediction
 
 SPEC = VoxelSpec((-8.0, -12.0, -1.0), 1.0, (2, 24, 32))
 GRID = PlaneSpec((-50.0, -50.0), 0.5, (200, 200))

@@ -11,13 +11,14 @@ from recorded_street import near_truth, read_batch, record
 
 from foredrive.scene import Example
 from foredrive.scene.agents import Agents
-from foredrive.tasks.evaluation.frame_keys import continues
-from foredrive.tasks.evaluation.metric import EvaluationContext, Figures
-from foredrive.tasks.evaluation.predictor import Prediction
 from foredrive.tasks.evaluation.results_files import ResultsFiles
-from foredrive.tasks.tracking.metric import BASELINE, TrackingMetric, greedy_tracks
-from foredrive.tasks.tracking.object_rows import Frames, ObjectRows, make_rows
-from foredrive.tasks.tracking.score import read_objects, score_tracks
+from foredrive.tasks.files.frame_keys import continues
+from foredrive.tasks.metric import EvaluationContext, Figures
+from foredrive.tasks.objects.object_rows import Frames, ObjectRows, make_rows
+from foredrive.tasks.objects.reading import read_objects
+from foredrive.tasks.predictor import Prediction
+from foredrive.tasks.tracking.score import score_tracks
+from foredrive.tasks.tracking.tracking_metric import BASELINE, TrackingMetric, greedy_tracks
 
 CLASSES = ("car", "pedestrian", "traffic_cone")
 

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from foredrive.tasks.tracking.object_rows import Frames, ObjectRows, make_rows
+from foredrive.tasks.objects.object_rows import Frames, ObjectRows, make_rows
 from foredrive.tasks.tracking.protocols import (
     TRACKING_PROTOCOLS,
     TrackingFigures,

@@ -18,7 +18,7 @@ from foredrive.runs.train.baselines import run_baselines
 from foredrive.runs.train.driver import load_driver, open_driver
 from foredrive.runs.train.run import load_agent, open_run
 from foredrive.scene import Agent, Clip, Trajectory
-from foredrive.tasks.evaluation.frame_keys import MAX_GAP_S
+from foredrive.tasks.files.frame_keys import MAX_GAP_S
 
 
 @dataclass(frozen=True, eq=False)

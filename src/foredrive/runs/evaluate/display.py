@@ -17,7 +17,7 @@ from foredrive.scene.agents import Agents, MapLines
 from foredrive.scene.record import Record
 from foredrive.scene.semantics import Taxonomy
 from foredrive.sensors import camera_rays
-from foredrive.tasks.evaluation.predictor import Prediction
+from foredrive.tasks.predictor import Prediction
 
 RAYS_AT_ONCE = 8192
 

@@ -18,8 +18,8 @@ from foredrive.heads.instances_head import instance_raster
 from foredrive.methods.blocks.training_rays import thinned_rays
 from foredrive.methods.planner.agent import PlanningAgent
 from foredrive.scene import Belief, Clip, Decoded, RayRenderer, Task, WorldModel
-from foredrive.tasks.evaluation.frame_keys import continues, time_of
-from foredrive.tasks.evaluation.predictor import Part, Prediction
+from foredrive.tasks.files.frame_keys import continues, time_of
+from foredrive.tasks.predictor import Part, Prediction
 
 
 class DriveFollower:

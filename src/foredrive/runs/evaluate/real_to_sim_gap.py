@@ -21,11 +21,11 @@ from foredrive.runs.reconstruction.reconstruct import read_reconstruction_data
 from foredrive.runs.reconstruction.reconstruction_run import open_reconstruction, open_run_log
 from foredrive.runs.train.run import Run, load_agent
 from foredrive.scene import Clip, Example, VoxelGrid
-from foredrive.tasks.evaluation.metric import CEILING, Figures
-from foredrive.tasks.evaluation.predictor import Part, Prediction, Predictor
 from foredrive.tasks.evaluation.run import evaluate
+from foredrive.tasks.metric import CEILING, Figures
 from foredrive.tasks.occupancy.occupancy_metric import PERSISTENT
 from foredrive.tasks.planning.protocols import STEP_S, STEPS
+from foredrive.tasks.predictor import Part, Prediction, Predictor
 from foredrive.tasks.rendering.image_scores import psnr_db
 
 GAP = "gap.json"

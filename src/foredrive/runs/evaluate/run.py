@@ -34,8 +34,6 @@ from foredrive.runs.train.baselines import run_baselines
 from foredrive.runs.train.run import Run, load_agent, open_run
 from foredrive.runs.train.tasks import load_heads
 from foredrive.scene import Example, Trajectory
-from foredrive.tasks.evaluation.metric import Figures
-from foredrive.tasks.evaluation.predictor import Part, Prediction
 from foredrive.tasks.evaluation.results_files import ResultsFiles
 from foredrive.tasks.evaluation.run import (
     EvaluationResult,
@@ -45,6 +43,8 @@ from foredrive.tasks.evaluation.run import (
     parts_needed,
     predict_batches,
 )
+from foredrive.tasks.metric import Figures
+from foredrive.tasks.predictor import Part, Prediction
 
 SHARD_BATCHES = 4
 """Batches of a shard. The limit keeps the memory independent of the length of a log."""

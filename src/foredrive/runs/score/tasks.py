@@ -10,15 +10,17 @@ from foredrive.engine.provenance import collect_provenance, peak_rss_gib
 from foredrive.engine.summary import Figures, write_summary
 from foredrive.errors import InputError
 from foredrive.runs.score.run import SUMMARY
+from foredrive.tasks.detection.figures import score_objects
+from foredrive.tasks.detection.kitti_boxes import score_kitti_boxes
 from foredrive.tasks.maps.files import read_maps
 from foredrive.tasks.maps.score import score_map_files, tell_if_map_is_turned
 from foredrive.tasks.motion.score import score_motion_results
+from foredrive.tasks.objects.reading import read_objects
 from foredrive.tasks.occupancy.files import find_voxels
 from foredrive.tasks.occupancy.log_results import holds_logs, score_against_logs
 from foredrive.tasks.occupancy.score import score_voxels
-from foredrive.tasks.tracking.kitti_boxes import score_kitti_boxes
 from foredrive.tasks.tracking.kitti_tracks import score_kitti_tracks
-from foredrive.tasks.tracking.score import read_objects, score_detections, score_tracks
+from foredrive.tasks.tracking.score import score_tracks
 
 
 def score_occupancy(results: Path, truth: Path, poses: Path | None) -> Figures:
@@ -53,7 +55,7 @@ def score_detection(results: Path, truth: Path, poses: Path | None) -> Figures:
     _check_no_poses("detection", poses)
     if results.is_dir():
         return score_kitti_boxes(results, truth)
-    return score_detections(*read_objects(results, truth, "detection"))
+    return score_objects(*read_objects(results, truth, "detection"))
 
 
 def score_tracking(results: Path, truth: Path, poses: Path | None) -> Figures:

@@ -15,7 +15,7 @@ from foredrive.methods.planner.ego_mlp import EgoMLP, EgoMLPConfig
 from foredrive.methods.planner.ego_mlp_fit import StatusDemonstrations, fit_ego_mlp, read_status
 from foredrive.methods.recipe import Recipe
 from foredrive.scene import Clip, Example
-from foredrive.tasks.evaluation.metric import labels_from_now
+from foredrive.tasks.metric import labels_from_now
 from foredrive.tasks.occupancy.scores import OccupancyPrior
 
 

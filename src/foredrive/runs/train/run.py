@@ -41,7 +41,7 @@ from foredrive.runs.train.task_priors import (
     semantic_weights,
 )
 from foredrive.scene.task_truth import TaskTruth
-from foredrive.tasks.evaluation.task_priors import fit_task_priors
+from foredrive.tasks.task_priors import fit_task_priors
 
 if TYPE_CHECKING:
     from lightning_fabric import Fabric

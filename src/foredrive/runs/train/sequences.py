@@ -11,7 +11,7 @@ from torch.utils.data import Dataset
 from foredrive.engine.loop import Schedule
 from foredrive.errors import InputError
 from foredrive.heads.heads import TaskHeadsConfig
-from foredrive.tasks.evaluation.frame_keys import log_of, time_of
+from foredrive.tasks.files.frame_keys import log_of, time_of
 
 T = TypeVar("T")
 TOLERANCE = 0.25

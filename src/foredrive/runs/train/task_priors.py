@@ -20,7 +20,7 @@ from foredrive.heads.semantic_losses import class_weights
 from foredrive.heads.targets import map_targets
 from foredrive.scene.semantics import VOXEL_CLASSES
 from foredrive.scene.task_truth import TaskTruth
-from foredrive.tasks.evaluation.task_priors import TaskPriors
+from foredrive.tasks.task_priors import TaskPriors
 
 TASKS = "tasks"
 """Folder of what belongs to the heads in the folder of a run."""

@@ -32,7 +32,7 @@ from foredrive.runs.train.task_priors import (
     save_priors,
     semantic_weights,
 )
-from foredrive.tasks.evaluation.task_priors import TaskPriors, fit_task_priors
+from foredrive.tasks.task_priors import TaskPriors, fit_task_priors
 
 
 @dataclass(frozen=True)

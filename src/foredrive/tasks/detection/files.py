@@ -34,18 +34,17 @@ from foredrive.tasks.detection.frames import (
     make_objects,
     read_class_probabilities,
     read_covariances,
-    read_number_rows,
-    read_numbers,
     read_relevance,
-    tell_left_out,
 )
 from foredrive.tasks.detection.kitti_labels import read_kitti
-from foredrive.tasks.detection.nuscenes_results import boxes_by_frame, read_nuscenes
-from foredrive.tasks.detection.protocols import CLASSES
+from foredrive.tasks.detection.nuscenes_results import read_nuscenes
 from foredrive.tasks.detection.score import FrameScore
-from foredrive.tasks.evaluation.frames_of_results import annotated_frames
-from foredrive.tasks.evaluation.plain_files import read_plain
-from foredrive.tasks.tracking.in_world import ego_yaw, places_in_world
+from foredrive.tasks.files.frames_of_results import annotated_frames
+from foredrive.tasks.files.numbers import read_number_rows, read_numbers, tell_left_out
+from foredrive.tasks.files.plain_files import read_plain
+from foredrive.tasks.objects.in_world import ego_yaw, places_in_world
+from foredrive.tasks.objects.nuscenes_json import boxes_by_frame
+from foredrive.tasks.objects.object_rows import DETECTION_CLASSES
 
 Record = Mapping[str, Any]
 
@@ -283,7 +282,7 @@ def boxes_of_logs(folder: Path, listed: Iterable[str], path: Path) -> dict[str, 
             }
             | ({} if points == UNKNOWN else {"num_pts": points})
             for name, translation, from_ego, size, rotation, points in columns
-            if name in CLASSES
+            if name in DETECTION_CLASSES
         ]
     return frames
 

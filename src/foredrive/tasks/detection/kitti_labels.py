@@ -16,7 +16,6 @@ from numpy import ndarray
 from foredrive.errors import InputError
 from foredrive.sets import Family, MultiBernoulli
 from foredrive.tasks.detection.frames import (
-    MAX_NUMBER,
     STD_YAW_RAD,
     DetectionFrame,
     DetectionSet,
@@ -24,9 +23,9 @@ from foredrive.tasks.detection.frames import (
     make_detections,
     make_objects,
     order_classes,
-    tell_left_out,
 )
 from foredrive.tasks.detection.nuscenes_results import DEFAULT_COVARIANCE
+from foredrive.tasks.files.numbers import MAX_NUMBER, tell_left_out
 
 LOWER = np.array([0.0, -60.0, -10.0, -3.0, -3.0, -3.0])
 UPPER = np.array([120.0, 60.0, 10.0, 4.0, 4.0, 4.0])

@@ -35,13 +35,12 @@ from foredrive.tasks.detection.frames import (
     order_classes,
     read_class_probabilities,
     read_covariances,
-    read_number_rows,
-    read_numbers,
     read_relevance,
-    tell_left_out,
 )
 from foredrive.tasks.detection.protocols import DETECTION_PROTOCOLS
-from foredrive.tasks.tracking.object_rows import ObjectRows, counted, make_rows
+from foredrive.tasks.files.numbers import read_number_rows, read_numbers, tell_left_out
+from foredrive.tasks.objects.nuscenes_json import boxes_by_frame, read_geometry
+from foredrive.tasks.objects.object_rows import ObjectRows, counted, make_rows
 
 LOWER = np.array([-60.0, -60.0, -10.0, -3.0, -3.0, -3.0])
 UPPER = np.array([60.0, 60.0, 10.0, 4.0, 4.0, 4.0])
@@ -202,24 +201,6 @@ def _detections(
     )
 
 
-def boxes_by_frame(path: Path, content: Mapping[str, Any]) -> dict[str, Sequence[Box]]:
-    """Return the boxes of a file by sample token.
-
-    Raises:
-        InputError: it has none.
-    """
-    boxes = content.get("results", content)
-    if not isinstance(boxes, dict) or not all(
-        isinstance(frame_boxes, list) for frame_boxes in boxes.values()
-    ):
-        raise InputError(f"{path}: there must be a list of boxes by sample token, under `results` or alone")
-    for name, frame_boxes in boxes.items():
-        for n, box in enumerate(frame_boxes):
-            if not isinstance(box, dict):
-                raise InputError(f"{path}: frame {name}, box {n} is no object")
-    return boxes
-
-
 def _by_frame(content: Mapping[str, Any], path: Path) -> dict[str, Sequence[Box]]:
     boxes = boxes_by_frame(path, content)
     for token, frame_boxes in boxes.items():
@@ -227,31 +208,6 @@ def _by_frame(content: Mapping[str, Any], path: Path) -> dict[str, Sequence[Box]
             if not isinstance(box.get("detection_name"), str):
                 raise InputError(f"{path}: frame {token}, box {n} has no detection_name")
     return boxes
-
-
-def read_geometry(
-    boxes: Sequence[Box], names: Sequence[str]
-) -> tuple[Float[ndarray, "n 3"], Float[ndarray, "n 3"], Float[ndarray, "n"]]:
-    """Return centre (m, global), length, width, height (m, 0 where a box has none), and heading (rad).
-
-    Raises:
-        InputError: a box has a size below 0 or no rotation, or a number that is not finite.
-    """
-    centre, size, rotation = (
-        read_number_rows(boxes, key, count, names)
-        for key, count in (("translation", 3), ("size", 3), ("rotation", 4))
-    )
-    wrong = np.flatnonzero((size < 0).any(1))
-    if len(wrong):
-        raise InputError(f"{names[wrong[0]]} has the size {size[wrong[0]].tolist()}")
-    wrong = np.flatnonzero(~(np.linalg.norm(rotation, axis=1) > 0))
-    if len(wrong):
-        raise InputError(f"{names[wrong[0]]} has the rotation {rotation[wrong[0]].tolist()}")
-    # Yaw of a unit quaternion w x y z
-    w, x, y, z = (rotation / np.linalg.norm(rotation, axis=1, keepdims=True)).T
-    yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y**2 + z**2))
-    # nuScenes writes width, length, height
-    return centre, size[:, [1, 0, 2]], yaw
 
 
 def _ego(

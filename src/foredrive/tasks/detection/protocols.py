@@ -19,15 +19,15 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 
 from foredrive.scene.boxes import UNKNOWN
-from foredrive.tasks.detection.matching import (
+from foredrive.tasks.detection.over_recall import error_over_recall
+from foredrive.tasks.objects.matching import (
     NUSCENES_DISTANCES_M,
     descending,
     match_centres,
     mean_of_valid,
     ranked_precision_nuscenes,
 )
-from foredrive.tasks.detection.over_recall import error_over_recall
-from foredrive.tasks.tracking.object_rows import ObjectRows, Region, counted
+from foredrive.tasks.objects.object_rows import DETECTION_CLASSES, MAX_BOXES, ObjectRows, Region, counted
 
 ERRORS = ("ate_m", "ase", "aoe_rad", "ave_mps", "aae")
 """Errors of translation, scale (1 - overlap of sizes), orientation, velocity, attribute (1 - accuracy)."""
@@ -54,10 +54,6 @@ class DetectionProtocol:
     """Maximum number of detections in a frame of a results file."""
 
 
-CLASSES: Final = (
-    "car", "truck", "bus", "trailer", "construction_vehicle", "pedestrian", "motorcycle", "bicycle",
-    "traffic_cone", "barrier",
-)  # fmt: skip
 _REACH_M: Final = {
     **dict.fromkeys(("car", "truck", "bus", "trailer", "construction_vehicle"), (50.0, 50.0)),
     **dict.fromkeys(("pedestrian", "motorcycle", "bicycle"), (40.0, 40.0)),
@@ -68,7 +64,7 @@ _REACH_M: Final = {
 def _nuscenes(title: str, region: Region) -> DetectionProtocol:
     return DetectionProtocol(
         title=title,
-        classes=CLASSES,
+        classes=DETECTION_CLASSES,
         region=region,
         distances_m=NUSCENES_DISTANCES_M,
         error_distance_m=2.0,
@@ -78,13 +74,13 @@ def _nuscenes(title: str, region: Region) -> DetectionProtocol:
             "barrier": frozenset({"ave_mps", "aae"}),
         },
         map_weight=5.0,
-        max_boxes=500,
+        max_boxes=MAX_BOXES,
     )
 
 
 DETECTION_PROTOCOLS: Mapping[str, DetectionProtocol] = {
     "nuscenes": _nuscenes("nuScenes", Region("circle", _REACH_M)),
-    "vad": _nuscenes("VAD", Region("rectangle", dict.fromkeys(CLASSES, (30.0, 15.0)))),
+    "vad": _nuscenes("VAD", Region("rectangle", dict.fromkeys(DETECTION_CLASSES, (30.0, 15.0)))),
 }
 
 

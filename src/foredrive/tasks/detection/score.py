@@ -11,15 +11,15 @@ from numpy import ndarray
 from foredrive.sets import PoissonMultiBernoulli, SetNll, UniformPoisson, set_nll
 from foredrive.tasks.detection.frames import DetectionFrame, DetectionSet
 from foredrive.tasks.detection.gospa import Gospa, gospa, wasserstein_distance
-from foredrive.tasks.detection.matching import (
+from foredrive.tasks.detection.pdq import PdqCounts, count_pdq, pixel_quality
+from foredrive.tasks.detection.proper_scores import object_brier
+from foredrive.tasks.objects.matching import (
     COCO_OVERLAPS,
     NUSCENES_DISTANCES_M,
     descending,
     match_greedily,
     overlaps,
 )
-from foredrive.tasks.detection.pdq import PdqCounts, count_pdq, pixel_quality
-from foredrive.tasks.detection.proper_scores import object_brier
 
 PARTS = ("localisation", "classification", "false", "missed", "expected_background", "ambiguity")
 NEAR_M, NEAR_OVERLAP = (1.0, 2.0), (0.5, 0.75)

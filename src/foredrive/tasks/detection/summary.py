@@ -14,17 +14,17 @@ from foredrive.errors import InputError
 from foredrive.sets import BoxDensity, LabelledBoxes, conformal_factor, conformal_scores, fit_scale
 from foredrive.tasks.bootstrap import BootstrapMean, bootstrap_mean
 from foredrive.tasks.detection.frames import DetectionFrame, DetectionSet
-from foredrive.tasks.detection.matching import (
+from foredrive.tasks.detection.pdq import pdq
+from foredrive.tasks.detection.proper_scores import brier, crps_gaussian, crps_laplace, energy_score
+from foredrive.tasks.detection.reliability import Reliability, reliability
+from foredrive.tasks.detection.score import PARTS, FrameScore
+from foredrive.tasks.objects.matching import (
     COCO_OVERLAPS,
     NUSCENES_DISTANCES_M,
     average_precision_coco,
     average_precision_nuscenes,
     mean_of_valid,
 )
-from foredrive.tasks.detection.pdq import pdq
-from foredrive.tasks.detection.proper_scores import brier, crps_gaussian, crps_laplace, energy_score
-from foredrive.tasks.detection.reliability import Reliability, reliability
-from foredrive.tasks.detection.score import PARTS, FrameScore
 
 LENGTHS_M = (0.0, 2.0, 6.0, np.inf)
 SIDES_PX = (0.0, 32.0, 96.0, np.inf)

@@ -26,12 +26,9 @@ from foredrive.scene import Attribute, Category, Example
 from foredrive.scene.agents import Agents, MapLines
 from foredrive.scene.map_elements import ElementKind
 from foredrive.scene.semantics import SemanticVoxels
-from foredrive.tasks.detection.protocols import CLASSES
-from foredrive.tasks.evaluation.predictor import Prediction
-from foredrive.tasks.maps.metric import AREA
+from foredrive.tasks.maps.map_lines_metric import AREA
 from foredrive.tasks.maps.protocols import HALF_XY_M
-from foredrive.tasks.occupancy.log_results import GRID_FILE, VoxelGridOfResults, write_grid, write_voxels
-from foredrive.tasks.tracking.in_world import (
+from foredrive.tasks.objects.in_world import (
     Pose,
     ego_yaw,
     futures_in_world,
@@ -39,6 +36,9 @@ from foredrive.tasks.tracking.in_world import (
     places_in_world,
     velocities_in_world,
 )
+from foredrive.tasks.objects.object_rows import DETECTION_CLASSES
+from foredrive.tasks.occupancy.log_results import GRID_FILE, VoxelGridOfResults, write_grid, write_voxels
+from foredrive.tasks.predictor import Prediction
 from foredrive.tasks.tracking.protocols import TRACKING_PROTOCOLS
 
 MAPTR_NAMES = {
@@ -224,7 +224,7 @@ def _rotations(half_yaw: Float[ndarray, "n"]) -> Float[ndarray, "n 4"]:
 
 def _names(agents: Agents) -> list[str]:
     names = [Category(kind).name.lower() for kind in agents.category.tolist()]
-    assert set(names) <= set(CLASSES), "heads predict nuScenes' ten classes"
+    assert set(names) <= set(DETECTION_CLASSES), "heads predict nuScenes' ten classes"
     return names
 
 

@@ -15,12 +15,12 @@ from foredrive.engine.provenance import peak_rss_gib
 from foredrive.errors import InputError
 from foredrive.scene import Agent, Example, Trajectory
 from foredrive.scene.record import Record
-from foredrive.tasks.evaluation.metric import EvaluationContext, Figures, MetricFactory
 from foredrive.tasks.evaluation.metrics import METRICS
-from foredrive.tasks.evaluation.predictor import DriveFollowing, Part, PlannerPredictor, Prediction, Predictor
-from foredrive.tasks.evaluation.task_priors import TaskPriors
+from foredrive.tasks.metric import EvaluationContext, Figures, MetricFactory
 from foredrive.tasks.occupancy.scores import OccupancyPrior
 from foredrive.tasks.planning.protocols import STEPS
+from foredrive.tasks.predictor import DriveFollowing, Part, PlannerPredictor, Prediction, Predictor
+from foredrive.tasks.task_priors import TaskPriors
 
 OnPrediction = Callable[[Prediction, Example], None]
 """Called with predictions and their truth."""

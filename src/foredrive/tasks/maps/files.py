@@ -25,8 +25,8 @@ from numpy import ndarray
 from foredrive.data.truth.map_elements import read_map_elements
 from foredrive.errors import InputError
 from foredrive.scene.map_elements import ElementKind
-from foredrive.tasks.evaluation.frames_of_results import check_known_frames, log_frames
-from foredrive.tasks.evaluation.plain_files import read_plain
+from foredrive.tasks.files.frames_of_results import check_known_frames, log_frames
+from foredrive.tasks.files.plain_files import read_plain
 from foredrive.tasks.maps.lines import LineSet
 from foredrive.tasks.maps.protocols import HALF_XY_M, Area
 

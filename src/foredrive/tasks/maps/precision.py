@@ -10,10 +10,10 @@ from numpy import ndarray
 
 from foredrive.errors import InputError
 from foredrive.scene.map_elements import ElementKind
-from foredrive.tasks.detection.matching import descending, mean_of_valid, precision_recall
 from foredrive.tasks.frames import rows_by_frame
 from foredrive.tasks.maps.lines import CLASSES, LineSet, chamfer_distances, resample
 from foredrive.tasks.maps.protocols import Area, VectorProtocol
+from foredrive.tasks.objects.matching import descending, mean_of_valid, precision_recall
 
 _UNTOUCHED_M = 100.0
 """Distance of a pair whose buffers do not touch, as MapTR has it: farther than any match."""

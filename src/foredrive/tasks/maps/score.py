@@ -9,12 +9,12 @@ from numpy import ndarray
 
 from foredrive.engine.summary import Figures
 from foredrive.scene.map_elements import ElementKind
-from foredrive.tasks.detection.matching import mean_of_valid
-from foredrive.tasks.evaluation.turned_axes import MAX_FRAMES, TURNS, tell_if_turned
+from foredrive.tasks.files.turned_axes import MAX_FRAMES, TURNS, tell_if_turned
 from foredrive.tasks.maps.files import MapFiles
 from foredrive.tasks.maps.lines import CLASSES
 from foredrive.tasks.maps.precision import MapPrecision, mean_precision, score_maps
 from foredrive.tasks.maps.protocols import PROTOCOLS
+from foredrive.tasks.objects.matching import mean_of_valid
 
 FIGURES = {
     "maptr": ("maptr", ""),

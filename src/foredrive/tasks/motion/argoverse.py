@@ -12,10 +12,10 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
-from foredrive.tasks.detection.matching import mean_of_valid
 from foredrive.tasks.motion.agents import PredictedAgents, TrueAgents, displacement_errors
 from foredrive.tasks.motion.matching import match_by_score
 from foredrive.tasks.motion.protocols import MISS_M, STEP_S
+from foredrive.tasks.objects.matching import mean_of_valid
 
 STEPS = 6
 """Steps of 0.5 s that mAP_F judges."""

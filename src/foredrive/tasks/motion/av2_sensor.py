@@ -17,9 +17,9 @@ from numpy import ndarray
 from scipy.spatial.transform import Rotation
 
 from foredrive.errors import InputError
-from foredrive.tasks.detection.frames import read_number_rows
-from foredrive.tasks.evaluation.arrow_tables import read_table
-from foredrive.tasks.evaluation.plain_files import read_plain
+from foredrive.tasks.files.arrow_tables import read_table
+from foredrive.tasks.files.numbers import read_number_rows
+from foredrive.tasks.files.plain_files import read_plain
 from foredrive.tasks.motion.agents import PredictedAgents, TrueAgents
 from foredrive.tasks.motion.argoverse import FUTURES, MEAN_SPEED_MPS, STEPS
 from foredrive.tasks.motion.protocols import STEP_S

@@ -32,13 +32,12 @@ from foredrive.data.truth.agent_futures import read_futures
 from foredrive.errors import InputError
 from foredrive.scene import Boxes, Category
 from foredrive.scene.agent_futures import AgentFutures
-from foredrive.tasks.detection.frames import read_number_rows, read_numbers
-from foredrive.tasks.detection.nuscenes_results import boxes_by_frame
-from foredrive.tasks.evaluation.frames_of_results import check_known_frames, log_frames
+from foredrive.tasks.files.frames_of_results import check_known_frames, log_frames
+from foredrive.tasks.files.numbers import read_number_rows, read_numbers
 from foredrive.tasks.motion.agents import PredictedAgents, TrueAgents
 from foredrive.tasks.motion.protocols import STEP_S
-from foredrive.tasks.tracking.in_world import ego_yaw, futures_in_world, places_in_world
-from foredrive.tasks.tracking.nuscenes_json import read_object
+from foredrive.tasks.objects.in_world import ego_yaw, futures_in_world, places_in_world
+from foredrive.tasks.objects.nuscenes_json import boxes_by_frame, read_object
 
 STEPS = 12
 NAMES = ("detection_name", "tracking_name", "class_name")

@@ -7,9 +7,9 @@ import numpy as np
 from jaxtyping import Int
 from numpy import ndarray
 
-from foredrive.tasks.detection.matching import descending
 from foredrive.tasks.frames import rows_by_frame
 from foredrive.tasks.motion.agents import PredictedAgents, TrueAgents
+from foredrive.tasks.objects.matching import descending
 
 _APART = 1e6
 """Cost of a pair that is too far apart: more than any sum of distances."""

@@ -13,9 +13,9 @@ from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
 from foredrive.scene import Category
-from foredrive.tasks.detection.matching import average_precision_nuscenes, precision_recall
 from foredrive.tasks.motion.agents import PredictedAgents, TrueAgents, displacement_errors
 from foredrive.tasks.motion.matching import match_by_distance, match_by_score
+from foredrive.tasks.objects.matching import average_precision_nuscenes, precision_recall
 
 STEPS = 12
 MATCH_M = 2.0

@@ -15,7 +15,7 @@ from numpy import ndarray
 
 from foredrive.engine.summary import Figures
 from foredrive.errors import InputError
-from foredrive.tasks.evaluation.arrow_tables import read_table
+from foredrive.tasks.files.arrow_tables import read_table
 from foredrive.tasks.motion.argoverse import forecast_errors, forecast_precision
 from foredrive.tasks.motion.av2_sensor import CLASSES, SensorForecasts, has_sensor_logs, read_end_to_end
 from foredrive.tasks.motion.files import AgentFiles, read_agents

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from foredrive.errors import InputError
 from foredrive.sensors.ray_origins import ray_origins
-from foredrive.tasks.evaluation.plain_files import read_plain
+from foredrive.tasks.files.plain_files import read_plain
 from foredrive.tasks.occupancy.arrays import array_names, read_labels, read_mask, read_velocities
 from foredrive.tasks.occupancy.protocols import VOXEL_PROTOCOLS
 

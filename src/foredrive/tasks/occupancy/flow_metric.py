@@ -1,9 +1,9 @@
 """Flow of moving voxels, beside predicting no motion."""
 
 from foredrive.scene import Example
-from foredrive.tasks.evaluation.metric import EvaluationContext, Figures, Shown, labels_from_now
-from foredrive.tasks.evaluation.predictor import Part, Prediction
+from foredrive.tasks.metric import EvaluationContext, Figures, Shown, labels_from_now
 from foredrive.tasks.occupancy.scores import FlowErrors, flow_errors
+from foredrive.tasks.predictor import Part, Prediction
 
 
 class FlowMetric:

@@ -1,10 +1,10 @@
 """Sampled futures: the best of K, the mean of all, and their spread."""
 
 from foredrive.scene import Example
-from foredrive.tasks.evaluation.metric import EvaluationContext, Figures, Shown, labels_from_now
-from foredrive.tasks.evaluation.predictor import Part, Prediction
+from foredrive.tasks.metric import EvaluationContext, Figures, Shown, labels_from_now
 from foredrive.tasks.occupancy.forecasts import FuturesCounts, count_futures
 from foredrive.tasks.occupancy.scores import above_ground
+from foredrive.tasks.predictor import Part, Prediction
 
 
 class FuturesMetric:

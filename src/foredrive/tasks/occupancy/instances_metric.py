@@ -20,9 +20,9 @@ from foredrive.scene import Example, VoxelSpec
 from foredrive.scene.agents import Agents
 from foredrive.scene.boxes import VEHICLES
 from foredrive.scene.map_elements import InstanceRaster
-from foredrive.tasks.evaluation.metric import CEILING, STEADY, EvaluationContext, Figures, Shown
-from foredrive.tasks.evaluation.predictor import Part, Prediction
+from foredrive.tasks.metric import CEILING, STEADY, EvaluationContext, Figures, Shown
 from foredrive.tasks.occupancy.protocols import UNIAD_INSTANCES, InstanceProtocol
+from foredrive.tasks.predictor import Part, Prediction
 
 
 @dataclass(frozen=True)

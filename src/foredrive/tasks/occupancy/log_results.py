@@ -23,8 +23,8 @@ from foredrive.errors import InputError
 from foredrive.files import atomic_path
 from foredrive.scene import VoxelSpec
 from foredrive.scene.semantics import VOXEL_CLASSES, Taxonomy
-from foredrive.tasks.evaluation.frames_of_results import log_frames
-from foredrive.tasks.evaluation.plain_files import read_plain
+from foredrive.tasks.files.frames_of_results import log_frames
+from foredrive.tasks.files.plain_files import read_plain
 from foredrive.tasks.occupancy.arrays import array_names, read_labels, read_velocities
 from foredrive.tasks.occupancy.files import PREDICTED_NAMES
 from foredrive.tasks.occupancy.of_logs import LogVoxelCounts

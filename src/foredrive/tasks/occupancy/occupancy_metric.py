@@ -9,7 +9,7 @@ from foredrive.geometry.se3 import inverse_se3
 from foredrive.scene import Clip, Example, VoxelGrid, VoxelSpec, last_frames
 from foredrive.scene.ego_motion import continued_motion
 from foredrive.scene.voxels import MOVING_MPS
-from foredrive.tasks.evaluation.metric import (
+from foredrive.tasks.metric import (
     CEILING,
     PRIOR,
     EvaluationContext,
@@ -17,9 +17,9 @@ from foredrive.tasks.evaluation.metric import (
     Shown,
     labels_from_now,
 )
-from foredrive.tasks.evaluation.predictor import Part, Prediction
 from foredrive.tasks.occupancy.forecasts import carried_by_flow, ego_compensated, swept_by_motion
 from foredrive.tasks.occupancy.scores import OccupancyCounts, above_ground, count_occupancy
+from foredrive.tasks.predictor import Part, Prediction
 
 PERSISTENCE, EGO_COMPENSATED, CONTINUED = ".copy", ".carried_copy", ".continued_copy"
 """Suffixes of persistence: the predicted present in place of the future, the same moved along the driven

@@ -19,7 +19,7 @@ from foredrive.errors import InputError
 from foredrive.ops.threads import prefetched
 from foredrive.ops.voxel_rays import RayEnds, first_hits
 from foredrive.scene import VoxelSpec
-from foredrive.tasks.detection.matching import mean_of_valid
+from foredrive.tasks.objects.matching import mean_of_valid
 from foredrive.tasks.occupancy.files import VoxelFiles, VoxelFrame, read_frame
 from foredrive.tasks.occupancy.protocols import GRID, RAY_PROTOCOLS, VOXEL_PROTOCOLS, RayProtocol
 from foredrive.tasks.occupancy.semantic_scores import count_voxels, mean_iou, voxel_ious

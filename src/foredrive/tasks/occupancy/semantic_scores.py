@@ -6,7 +6,7 @@ from numpy import ndarray
 from torch import Tensor
 
 from foredrive.scene.semantics import VOXEL_CLASSES, SemanticVoxels
-from foredrive.tasks.detection.matching import mean_of_valid
+from foredrive.tasks.objects.matching import mean_of_valid
 from foredrive.tasks.occupancy.protocols import VoxelProtocol
 
 

@@ -1,9 +1,9 @@
 """Semantic voxels under the protocols of Occ3D and OpenOcc, beside the commonest class of each voxel."""
 
 from foredrive.scene import Example
-from foredrive.tasks.evaluation.metric import PRIOR, EvaluationContext, Figures, Shown
-from foredrive.tasks.evaluation.predictor import Part, Prediction
+from foredrive.tasks.metric import PRIOR, EvaluationContext, Figures, Shown
 from foredrive.tasks.occupancy.of_logs import LogVoxelCounts
+from foredrive.tasks.predictor import Part, Prediction
 
 BESIDE_PRIOR = ("miou_pct", "rayiou_pct", "rayiou_1m_pct", "rayiou_2m_pct", "rayiou_4m_pct", "occ_score")
 """Figures that the prior has, too."""

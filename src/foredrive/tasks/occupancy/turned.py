@@ -5,7 +5,7 @@ from pathlib import Path
 from jaxtyping import Bool, UInt8
 from numpy import ndarray
 
-from foredrive.tasks.evaluation.turned_axes import MAX_FRAMES, TURNS, Turn, tell_if_turned
+from foredrive.tasks.files.turned_axes import MAX_FRAMES, TURNS, Turn, tell_if_turned
 
 _AS_GIVEN = Turn(False, False, False)
 

@@ -9,9 +9,9 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from foredrive.scene import Boxes, Category, Example, VoxelGrid, VoxelSpec
-from foredrive.tasks.evaluation.metric import EvaluationContext, Figures, Shown, labels_from_now
-from foredrive.tasks.evaluation.predictor import Part, Prediction
+from foredrive.tasks.metric import EvaluationContext, Figures, Shown, labels_from_now
 from foredrive.tasks.occupancy.scores import above_ground
+from foredrive.tasks.predictor import Part, Prediction
 
 CARS = (Category.CAR, Category.TRUCK, Category.BUS, Category.TRAILER, Category.CONSTRUCTION_VEHICLE)
 

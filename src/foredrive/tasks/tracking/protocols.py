@@ -23,6 +23,14 @@ from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
 from foredrive.ops.threads import in_parallel
+from foredrive.tasks.objects.object_rows import (
+    MAX_BOXES,
+    TRACKING_CLASSES,
+    Frames,
+    ObjectRows,
+    Region,
+    counted,
+)
 from foredrive.tasks.tracking.clear import (
     MATCH,
     ClearCounts,
@@ -34,7 +42,6 @@ from foredrive.tasks.tracking.clear import (
     lay_out,
     near_pairs,
 )
-from foredrive.tasks.tracking.object_rows import Frames, ObjectRows, Region, counted
 
 
 def whole_tracks(boxes: ObjectRows, frames: Frames) -> ObjectRows:
@@ -159,7 +166,7 @@ _REACH_M: Final = {
 def _nuscenes(title: str, min_score: float) -> TrackingProtocol:
     return TrackingProtocol(
         title=title,
-        classes=("bicycle", "bus", "car", "motorcycle", "pedestrian", "trailer", "truck"),
+        classes=TRACKING_CLASSES,
         region=Region("circle", _REACH_M),
         max_distance_m=2.0,
         min_score=min_score,
@@ -168,7 +175,7 @@ def _nuscenes(title: str, min_score: float) -> TrackingProtocol:
         worst_motp_m=2.0,
         worst_faf=500.0,
         worst_s=20.0,
-        max_boxes=500,
+        max_boxes=MAX_BOXES,
     )
 
 

@@ -8,9 +8,10 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 
+from foredrive.engine.summary import Figures
 from foredrive.errors import InputError
 from foredrive.scene.boxes import UNKNOWN
-from foredrive.tasks.tracking.object_rows import Frames, ObjectRows
+from foredrive.tasks.objects.object_rows import Frames, ObjectRows
 
 RACK = "static_object.bicycle_rack"
 """Name of the objects in which bicycles and motorcycles are not counted."""
@@ -92,3 +93,15 @@ def lacking(boxes: ObjectRows) -> frozenset[str]:
         "range": np.isfinite(boxes.from_ego).all(1),
     }
     return frozenset(name for name, column in columns.items() if len(boxes) and not column.any())
+
+
+def count_objects(predicted: FoundObjects, truth: ObjectTruth) -> Figures:
+    """Return how many frames and objects are judged, and what the truth lacks."""
+    return {
+        "frames_counted": len(truth.names),
+        "scenes": len(set(truth.frames.scene.tolist())),
+        "frames_without_results": predicted.frames_without_results,
+        "objects": len(truth.boxes),
+        "found": len(predicted.boxes),
+        "truth_lacks": ", ".join(sorted(truth.lacks)) or None,
+    }

@@ -26,13 +26,11 @@ from numpy import ndarray
 
 from foredrive.errors import InputError
 from foredrive.scene.boxes import UNKNOWN, Attribute
-from foredrive.tasks.detection.frames import read_number_rows, read_numbers, tell_left_out
-from foredrive.tasks.detection.nuscenes_results import boxes_by_frame, read_geometry
-from foredrive.tasks.detection.protocols import CLASSES
-from foredrive.tasks.evaluation.frames_of_results import check_known_frames
-from foredrive.tasks.evaluation.plain_files import read_plain
-from foredrive.tasks.tracking.object_rows import Frames, ObjectRows, make_rows
-from foredrive.tasks.tracking.truth import (
+from foredrive.tasks.files.frames_of_results import check_known_frames
+from foredrive.tasks.files.numbers import read_number_rows, read_numbers, tell_left_out
+from foredrive.tasks.files.plain_files import read_plain
+from foredrive.tasks.objects.object_rows import DETECTION_CLASSES, Frames, ObjectRows, make_rows
+from foredrive.tasks.objects.truth import (
     RACK,
     BoxNames,
     FoundObjects,
@@ -44,6 +42,49 @@ from foredrive.tasks.tracking.truth import (
 
 Box = Mapping[str, Any]
 _log = logging.getLogger(__name__)
+
+
+def boxes_by_frame(path: Path, content: Mapping[str, Any]) -> dict[str, Sequence[Box]]:
+    """Return the boxes of a file by sample token.
+
+    Raises:
+        InputError: it has none.
+    """
+    boxes = content.get("results", content)
+    if not isinstance(boxes, dict) or not all(
+        isinstance(frame_boxes, list) for frame_boxes in boxes.values()
+    ):
+        raise InputError(f"{path}: there must be a list of boxes by sample token, under `results` or alone")
+    for name, frame_boxes in boxes.items():
+        for n, box in enumerate(frame_boxes):
+            if not isinstance(box, dict):
+                raise InputError(f"{path}: frame {name}, box {n} is no object")
+    return boxes
+
+
+def read_geometry(
+    boxes: Sequence[Box], names: Sequence[str]
+) -> tuple[Float[ndarray, "n 3"], Float[ndarray, "n 3"], Float[ndarray, "n"]]:
+    """Return centre (m, global), length, width, height (m, 0 where a box has none), and heading (rad).
+
+    Raises:
+        InputError: a box has a size below 0 or no rotation, or a number that is not finite.
+    """
+    centre, size, rotation = (
+        read_number_rows(boxes, key, count, names)
+        for key, count in (("translation", 3), ("size", 3), ("rotation", 4))
+    )
+    wrong = np.flatnonzero((size < 0).any(1))
+    if len(wrong):
+        raise InputError(f"{names[wrong[0]]} has the size {size[wrong[0]].tolist()}")
+    wrong = np.flatnonzero(~(np.linalg.norm(rotation, axis=1) > 0))
+    if len(wrong):
+        raise InputError(f"{names[wrong[0]]} has the rotation {rotation[wrong[0]].tolist()}")
+    # Yaw of a unit quaternion w x y z
+    w, x, y, z = (rotation / np.linalg.norm(rotation, axis=1, keepdims=True)).T
+    yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y**2 + z**2))
+    # nuScenes writes width, length, height
+    return centre, size[:, [1, 0, 2]], yaw
 
 
 def read_labels(
@@ -307,7 +348,7 @@ def _true_rows(
     identities = read_texts(boxes, "tracking_id", names) if task == "tracking" else []
     if task == "tracking":
         columns["track"] = number_names(identities)
-    label = read_labels(boxes, _TRUE_NAMES, classes, {*CLASSES, RACK}, names)
+    label = read_labels(boxes, _TRUE_NAMES, classes, {*DETECTION_CLASSES, RACK}, names)
     rows = make_rows(frame, label, centre, size_lwh, yaw, **columns)
     if task == "tracking":
         check_tracks(rows, identities, names)

@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 
 from foredrive.engine.summary import Figures
-from foredrive.tasks.detection.frames import tell_left_out
 from foredrive.tasks.detection.kitti_labels import KittiLine, box_states, check_type, read_frames
 from foredrive.tasks.detection.protocols import DETECTION_PROTOCOLS, evaluate_detections
-from foredrive.tasks.tracking.object_rows import ObjectRows, Region, make_rows
+from foredrive.tasks.files.numbers import tell_left_out
+from foredrive.tasks.objects.object_rows import ObjectRows, Region, make_rows
 
 _UNKNOWN = frozenset({"ave_mps", "aae"})
 """Errors that need values which KITTI's text does not have."""

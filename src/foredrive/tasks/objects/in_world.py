@@ -8,7 +8,7 @@ from numpy import ndarray
 
 from foredrive.scene import Boxes, Category
 from foredrive.scene.agents import Agents
-from foredrive.tasks.tracking.object_rows import ObjectRows, make_rows
+from foredrive.tasks.objects.object_rows import ObjectRows, make_rows
 
 MIN_SCORE = 0.001
 """Detections with a lower score are left out, which keeps files small. A class that is never more probable

@@ -8,11 +8,11 @@ from jaxtyping import Float, Int64
 from numpy import ndarray
 
 from foredrive.scene import Example
-from foredrive.tasks.evaluation.frame_keys import continues, time_of
-from foredrive.tasks.evaluation.metric import EvaluationContext, Figures, Shown
-from foredrive.tasks.evaluation.predictor import Part, Prediction
-from foredrive.tasks.tracking.in_world import agent_rows, box_rows, likely, stacked
-from foredrive.tasks.tracking.object_rows import Frames, ObjectRows, Region
+from foredrive.tasks.files.frame_keys import continues, time_of
+from foredrive.tasks.metric import EvaluationContext, Figures, Shown
+from foredrive.tasks.objects.in_world import agent_rows, box_rows, likely, stacked
+from foredrive.tasks.objects.object_rows import Frames, ObjectRows, Region
+from foredrive.tasks.predictor import Part, Prediction
 from foredrive.tasks.tracking.protocols import TRACKING_PROTOCOLS, evaluate_tracking
 from foredrive.tasks.tracking.score import tracking_figures
 

@@ -5,13 +5,13 @@ import dataclasses
 import numpy as np
 
 from foredrive.scene import Example
-from foredrive.tasks.detection.protocols import CLASSES, DETECTION_PROTOCOLS, evaluate_detections
-from foredrive.tasks.evaluation.metric import CEILING, EvaluationContext, Figures, Shown
-from foredrive.tasks.evaluation.predictor import Part, Prediction
-from foredrive.tasks.tracking.in_world import agent_rows, box_rows, likely, stacked
-from foredrive.tasks.tracking.object_rows import ObjectRows, Region
-from foredrive.tasks.tracking.score import detection_figures
-from foredrive.tasks.tracking.truth import lacking
+from foredrive.tasks.detection.figures import detection_figures
+from foredrive.tasks.detection.protocols import DETECTION_PROTOCOLS, evaluate_detections
+from foredrive.tasks.metric import CEILING, EvaluationContext, Figures, Shown
+from foredrive.tasks.objects.in_world import agent_rows, box_rows, likely, stacked
+from foredrive.tasks.objects.object_rows import DETECTION_CLASSES, ObjectRows, Region
+from foredrive.tasks.objects.truth import lacking
+from foredrive.tasks.predictor import Part, Prediction
 
 CAR_30M = dataclasses.replace(
     DETECTION_PROTOCOLS["nuscenes"],
@@ -52,12 +52,14 @@ class DetectionMetric:
             frame = len(self._true)
             # World coordinates, as in files of results
             pose = clip.T_world_ego[item, clip.now].cpu().numpy()
-            self._found.append(agent_rows(likely(prediction.agents[item]), pose, frame, CLASSES))
+            self._found.append(agent_rows(likely(prediction.agents[item]), pose, frame, DETECTION_CLASSES))
             boxes = clip.boxes[item, clip.now]
-            self._true.append(box_rows(boxes, pose, frame, CLASSES))
+            self._true.append(box_rows(boxes, pose, frame, DETECTION_CLASSES))
             # Boxes without a point do not count, so finding them would be wrong
             shown = boxes.valid & truth.occupancy.spec.covers(boxes.centre) & (boxes.num_points != 0)
-            self._above.append(box_rows(dataclasses.replace(boxes, valid=shown), pose, frame, CLASSES))
+            self._above.append(
+                box_rows(dataclasses.replace(boxes, valid=shown), pose, frame, DETECTION_CLASSES)
+            )
 
     def result(self) -> Figures:
         """Return the figures over all annotated frames."""

@@ -3,7 +3,7 @@
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, TypeVar
+from typing import Final, Literal, TypeVar
 
 import numpy as np
 import torch
@@ -13,6 +13,14 @@ from numpy import ndarray
 from foredrive.geometry.boxes import points_in_boxes
 from foredrive.scene.boxes import UNKNOWN
 
+DETECTION_CLASSES: Final = (
+    "car", "truck", "bus", "trailer", "construction_vehicle", "pedestrian", "motorcycle", "bicycle",
+    "traffic_cone", "barrier",
+)  # fmt: skip
+TRACKING_CLASSES: Final = ("bicycle", "bus", "car", "motorcycle", "pedestrian", "trailer", "truck")
+"""nuScenes' classes."""
+MAX_BOXES = 500
+"""nuScenes' maximum number of boxes in a frame of a results file."""
 IN_RACKS = ("bicycle", "motorcycle")
 """Classes that are not counted inside a bicycle rack."""
 

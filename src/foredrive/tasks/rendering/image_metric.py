@@ -4,8 +4,8 @@ import torch
 from torch import Tensor
 
 from foredrive.scene import Example
-from foredrive.tasks.evaluation.metric import EvaluationContext, Figures, Shown
-from foredrive.tasks.evaluation.predictor import Part, Prediction
+from foredrive.tasks.metric import EvaluationContext, Figures, Shown
+from foredrive.tasks.predictor import Part, Prediction
 from foredrive.tasks.rendering.image_scores import psnr_db, ssim
 
 

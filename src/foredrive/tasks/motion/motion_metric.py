@@ -9,12 +9,12 @@ from numpy import ndarray
 from torch import Tensor
 
 from foredrive.scene import Example
-from foredrive.tasks.evaluation.metric import STEADY, EvaluationContext, Figures, Shown
-from foredrive.tasks.evaluation.predictor import Part, Prediction
+from foredrive.tasks.metric import STEADY, EvaluationContext, Figures, Shown
 from foredrive.tasks.motion.agents import PredictedAgents, TrueAgents
 from foredrive.tasks.motion.protocols import PROTOCOLS, STEP_S
 from foredrive.tasks.motion.scores import score_motion
-from foredrive.tasks.tracking.in_world import futures_in_world, levelled
+from foredrive.tasks.objects.in_world import futures_in_world, levelled
+from foredrive.tasks.predictor import Part, Prediction
 
 FIGURES = ("min_ade_m", "min_fde_m", "miss_rate", "epa")
 _PREDICTED = tuple(field.name for field in dataclasses.fields(PredictedAgents))

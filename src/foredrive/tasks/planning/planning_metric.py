@@ -4,11 +4,11 @@ import torch
 from torch import Tensor
 
 from foredrive.scene import Example
-from foredrive.tasks.evaluation.metric import EvaluationContext, Figures, Shown
-from foredrive.tasks.evaluation.predictor import Part, Prediction
+from foredrive.tasks.metric import EvaluationContext, Figures, Shown
 from foredrive.tasks.planning.obstacles import future_obstacles
 from foredrive.tasks.planning.protocols import HORIZON_NAMES, PROTOCOLS, STEP_S, STEPS
 from foredrive.tasks.planning.scores import score_plan
+from foredrive.tasks.predictor import Part, Prediction
 
 COLLISIONS = ("collision", "collision_centre", "driven_collision")
 

@@ -11,9 +11,11 @@ from foredrive.data.boxes import read_boxes
 from foredrive.data.logs import Log
 from foredrive.errors import InputError
 from foredrive.scene import Category
-from foredrive.tasks.detection.protocols import CLASSES
-from foredrive.tasks.tracking.nuscenes_tables import find_tables
-from foredrive.tasks.tracking.score import read_log_truth, read_objects, score_detections, score_tracks
+from foredrive.tasks.detection.figures import score_objects
+from foredrive.tasks.objects.nuscenes_tables import find_tables
+from foredrive.tasks.objects.object_rows import DETECTION_CLASSES
+from foredrive.tasks.objects.reading import read_log_truth, read_objects
+from foredrive.tasks.tracking.score import score_tracks
 
 if TYPE_CHECKING:
     from foredrive.data import LogPath
@@ -128,7 +130,7 @@ def test_boxes_without_size_are_left_out(
     (tmp_path / "gt.json").write_text(json.dumps({"s0": [flat, sized], "s1": []}))
     (tmp_path / "boxes.json").write_text(json.dumps({"s0": [{**sized, "detection_score": 0.5}]}))
     read = read_objects(tmp_path / "boxes.json", tmp_path / "gt.json", "detection")
-    assert score_detections(*read)["detection.nuscenes.car.ap"] == pytest.approx(1.0)
+    assert score_objects(*read)["detection.nuscenes.car.ap"] == pytest.approx(1.0)
     (tmp_path / "gt.json").write_text(json.dumps({"s0": [flat], "s1": []}))
     with pytest.raises(InputError, match="left out of 1: 1 boxes without size: nothing remains"):
         read_objects(tmp_path / "boxes.json", tmp_path / "gt.json", "detection")
@@ -142,13 +144,13 @@ def test_tables_of_nuscenes(tables: Path, tmp_path: Path) -> None:
     found, truth = read_objects(results, tables.parent, "detection")
     assert list(truth.names) == ["s0", "s1", "s2"]
     assert found.frames_without_results == 1
-    labels = [CLASSES[label] for label in truth.boxes.label]
+    labels = [DETECTION_CLASSES[label] for label in truth.boxes.label]
     assert labels == ["car", "car", "truck", "car", "bicycle"]
     cars = truth.boxes[truth.boxes.label == 0]
     assert cars.velocity == pytest.approx(np.tile([4.0, 0.0], (3, 1)))  # one-sided at the ends
     assert cars.from_ego[:, 0].tolist() == [5.0, 7.0, 9.0]
     assert np.isnan(truth.boxes.velocity[labels.index("bicycle")]).all()
-    figures = score_detections(found, truth)
+    figures = score_objects(found, truth)
     assert figures["detection.nuscenes.car.ap"] == pytest.approx(((66 - 10) * 0.9 / 90 + 0) / 0.9, abs=0.01)
     assert figures["detection.nuscenes.car.ave_mps"] == pytest.approx(0.0, abs=1e-9)
     assert figures["detection.nuscenes.car.aae"] == 0.0
@@ -203,7 +205,7 @@ def test_boxes_of_a_log_are_their_own_perfect_results(log: "LogPath", tmp_path: 
     assert figures["frames_counted"] == len(content)
     assert figures["tracking.nuscenes.car.amota"] == pytest.approx(1.0)
     assert figures["tracking.nuscenes.car.ids"] == 0
-    truth = read_log_truth(root, content, results, CLASSES)
+    truth = read_log_truth(root, content, results, DETECTION_CLASSES)
     assert truth.frames.time_us.tolist() == sorted(truth.frames.time_us.tolist())
     with pytest.raises(InputError, match=r"frame none@5 \(1 of 2\) has no ground truth in"):
-        read_log_truth(root, [next(iter(content)), "none@5"], results, CLASSES)
+        read_log_truth(root, [next(iter(content)), "none@5"], results, DETECTION_CLASSES)

@@ -12,9 +12,9 @@ import numpy as np
 
 from foredrive.data.formats.nuscenes_names import read_table
 from foredrive.errors import InputError
-from foredrive.tasks.evaluation.frames_of_results import check_known_frames
-from foredrive.tasks.tracking.nuscenes_json import ObjectTask, Sample, make_truth
-from foredrive.tasks.tracking.truth import RACK, ObjectTruth
+from foredrive.tasks.files.frames_of_results import check_known_frames
+from foredrive.tasks.objects.nuscenes_json import ObjectTask, Sample, make_truth
+from foredrive.tasks.objects.truth import RACK, ObjectTruth
 
 Row = Mapping[str, Any]
 _CLASS_OF_CATEGORY = {

@@ -7,9 +7,9 @@ from typing import Protocol
 from foredrive.engine.summary import Figures
 from foredrive.errors import InputError
 from foredrive.scene import Clip, Example, VoxelGrid
-from foredrive.tasks.evaluation.predictor import Part, Prediction
-from foredrive.tasks.evaluation.task_priors import TaskPriors
 from foredrive.tasks.occupancy.scores import OccupancyPrior
+from foredrive.tasks.predictor import Part, Prediction
+from foredrive.tasks.task_priors import TaskPriors
 
 
 @dataclass(frozen=True)
