@@ -5,21 +5,17 @@ on them with the same clips, steps and seeds. Heads on a world model without any
 from places and shapes alone. In a joint arm they are trained together with the world model, on as many clips.
 World models are the pre-trainings of nemo_ablation and driveworld_ablation (common/world_models.py); heads
 learn from a part of their virtual egos, whose volumes fit on a disk. Runs are kept in runs/world_models.
-
-`nemo_wide_TOWN` are joint arms of a grid that holds what is judged. They learn from egos of planner_reads and
-are judged by those of Town03 and Town05, which nothing was trained in.
 """
 
 import dataclasses
 import functools
 from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import torch
 from torch.utils.data import DataLoader
 
-from benchmarks import learning, planner_reads
+from benchmarks import learning
 from benchmarks.common.study import seeded
 from benchmarks.common.world_models import (
     DECIDED_BY,
@@ -33,10 +29,8 @@ from benchmarks.common.world_models import (
 from foredrive.data import ClipDataset, LogPath, collate
 from foredrive.engine.bench import Benchmark, study_identity
 from foredrive.engine.summary import Summary, numbers
-from foredrive.methods.nemo.sampling import ImaginationSampling
 from foredrive.methods.recipe import Recipe, rescheduled
 from foredrive.runs.evaluate.predict import AgentPredictor
-from foredrive.runs.recipes.known import find_recipe
 from foredrive.runs.recipes.task_heads import (
     HEADED,
     INSTANCES,
@@ -53,14 +47,6 @@ SHARE = 0.2
 """Part of the egos that heads learn from."""
 STEPS, BATCH = 1200, 8
 """Steps of the heads, and clips of a step."""
-WIDE = Path(__file__).with_name("nemo_wide")
-"""Weights of the recipe nemo_wide, from which its arms go on."""
-WIDE_STEPS, WIDE_LR = 1450, 2e-3
-"""Steps and learning rate of what goes on from them: an hour and a half of a core."""
-WIDE_SEEDS = planner_reads.TRAIN_SEEDS[:2]
-"""Seeds of the traffic that nemo_wide learns from, of 80 egos in each town."""
-WIDE_JUDGED_SEEDS = planner_reads.TEST_SEEDS[:2]
-"""Seeds of the traffic that it is judged by."""
 JUDGED_EVERY_S = 0.5
 """Time between judged key frames, s: that of the key frames, because tracks are judged too."""
 TASKS = (*HEADED, INSTANCES)
@@ -121,34 +107,6 @@ def joint(name: str, seed: int) -> dict[str, float]:
     return judged(run, heads, study_logs().test)
 
 
-@functools.cache
-def wide_joint(seed: int) -> Run:
-    """Return the run of nemo_wide that goes on together with heads."""
-    folder = ROOT / "task_probes" / IDENTITY / f"nemo_wide_seed{seed}"
-    logs = planner_reads.recorded(planner_reads.TRAIN_TOWNS, WIDE_SEEDS)
-    return train_run(wide_recipe(seed), logs, folder, CACHE, WIDE)
-
-
-def wide_recipe(seed: int) -> Recipe[Any, Any]:
-    """Return nemo_wide with heads. One item of each step is imagined."""
-    heads = heads_recipe(seed)
-    schedule = dataclasses.replace(heads.schedule, steps=WIDE_STEPS)
-    heads = dataclasses.replace(heads, schedule=schedule, now_stride_s=JUDGED_EVERY_S)
-    recipe = joint_recipe(seeded(find_recipe(WIDE.name), seed), heads)
-    finetune = dataclasses.replace(
-        recipe.finetune, imagined=ImaginationSampling(items=1, past_gradient=False)
-    )
-    return dataclasses.replace(recipe, finetune=rescheduled(finetune, lr=WIDE_LR, warmup_steps=60))
-
-
-def wide_judged(town: str, seed: int) -> dict[str, float]:
-    """Return the figures of nemo_wide with heads on the virtual egos of one town."""
-    run = wide_joint(seed)
-    heads = load_heads(run)
-    assert heads is not None
-    return judged(run, heads, planner_reads.recorded((town,), WIDE_JUDGED_SEEDS))
-
-
 def joint_recipe(recipe: Recipe[Any, Any], heads: TaskHeadsRecipe) -> Recipe[Any, Any]:
     """Return a recipe that goes on with its pre-training, together with heads, for as long as they learn."""
     assert recipe.pretrain is not None
@@ -191,7 +149,7 @@ def kept_figures(summary: Summary) -> dict[str, float]:
 CACHE = learning.ROOT / "cache"
 CONFIG = {
     name: {**config_of(name), "heads": dataclasses.asdict(heads_recipe()), "share": SHARE} for name in WORLDS
-} | {"judged_every_s": JUDGED_EVERY_S, "wide": dataclasses.asdict(wide_recipe(0))}
+} | {"judged_every_s": JUDGED_EVERY_S}
 IDENTITY = study_identity(CONFIG, (*DECIDED_BY, *TASKS_DECIDED_BY))
 ARMS: Mapping[str, Callable[[int], Mapping[str, float]]] = {
     **{name: functools.partial(probed, name, trained, name) for name in WORLDS},
@@ -200,7 +158,6 @@ ARMS: Mapping[str, Callable[[int], Mapping[str, float]]] = {
         for name in WORLDS
     },
     **{f"{name}_joint": functools.partial(joint, name) for name in WORLDS},
-    **{f"nemo_wide_{town}": functools.partial(wide_judged, town) for town in planner_reads.TEST_TOWNS},
 }
 BENCHMARK = Benchmark(
     question="What do heads of the six tasks learn on a world model, frozen and with it?",

@@ -1,0 +1,76 @@
+"""NeMo on a grid that holds what is judged, with heads: `foredrive bench wide-grid`, two hours of a core.
+
+The recipe `nemo_wide` goes on from its pre-training (benchmarks/nemo_wide) together with heads of the six
+tasks. It learns from virtual egos of planner_reads in six towns, with exact occupancy and flow, and is judged
+by those of Town03 and Town05, which nothing was trained in. Its run is kept in runs/wide_grid.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from benchmarks.common.study import seeded
+from benchmarks.common.world_models import LEARNED_BY, LEARNED_BY_BOTH, TASKS_DECIDED_BY
+from benchmarks.planner_reads import TEST_SEEDS, TEST_TOWNS, TRAIN_SEEDS, TRAIN_TOWNS, recorded
+from benchmarks.task_probes import JUDGED_EVERY_S, heads_recipe, joint_recipe, judged
+from foredrive.engine.bench import Benchmark, study_identity
+from foredrive.methods.nemo.sampling import ImaginationSampling
+from foredrive.methods.recipe import Recipe, rescheduled
+from foredrive.runs.recipes.known import find_recipe
+from foredrive.runs.train.run import Run, train_run
+from foredrive.runs.train.tasks import load_heads
+
+ROOT = Path("runs/wide_grid")
+START = Path(__file__).with_name("nemo_wide")
+"""Weights of the recipe of that name, after 18,400 clips."""
+STEPS, LR = 1450, 2e-3
+"""Steps of eight clips, and their learning rate: an hour and a half of a core."""
+SEEDS, JUDGED_SEEDS = TRAIN_SEEDS[:2], TEST_SEEDS[:2]
+"""Seeds of the traffic to learn from and to judge by, of 80 egos in each town."""
+
+
+@functools.cache
+def trained(seed: int) -> Run:
+    """Return the run of world model and heads; train what is missing."""
+    folder = ROOT / IDENTITY / f"seed{seed}"
+    return train_run(wide_recipe(seed), recorded(TRAIN_TOWNS, SEEDS), folder, ROOT / "cache", START)
+
+
+def wide_recipe(seed: int) -> Recipe[Any, Any]:
+    """Return nemo_wide with heads. One item of each step is imagined."""
+    heads = heads_recipe(seed)
+    schedule = dataclasses.replace(heads.schedule, steps=STEPS)
+    heads = dataclasses.replace(heads, schedule=schedule, now_stride_s=JUDGED_EVERY_S)
+    recipe = joint_recipe(seeded(find_recipe(START.name), seed), heads)
+    imagined = ImaginationSampling(items=1, past_gradient=False)
+    finetune = dataclasses.replace(recipe.finetune, imagined=imagined)
+    return dataclasses.replace(recipe, finetune=rescheduled(finetune, lr=LR, warmup_steps=60))
+
+
+def in_town(town: str, seed: int) -> dict[str, float]:
+    """Return the figures on the virtual egos of one town."""
+    run = trained(seed)
+    heads = load_heads(run)
+    assert heads is not None
+    return judged(run, heads, recorded((town,), JUDGED_SEEDS))
+
+
+ARMS: Mapping[str, Callable[[int], Mapping[str, float]]] = {
+    town: functools.partial(in_town, town) for town in TEST_TOWNS
+}
+CONFIG = {
+    "recipe": dataclasses.asdict(wide_recipe(0)),
+    "towns": [TRAIN_TOWNS, TEST_TOWNS, SEEDS, JUDGED_SEEDS],
+    "judged_every_s": JUDGED_EVERY_S,
+}
+DECIDED_BY = (*LEARNED_BY_BOTH, *LEARNED_BY["nemo"], *TASKS_DECIDED_BY, "foredrive.towns.virtual_egos")
+IDENTITY = study_identity(CONFIG, DECIDED_BY)
+BENCHMARK = Benchmark(
+    question="What does NeMo see, foresee and find on a grid that holds what is judged?",
+    arms=ARMS,
+    seeds=(0,),
+    config=CONFIG,
+    decided_by=DECIDED_BY,
+)
