@@ -124,7 +124,7 @@ def test_our_own_reader_of_truth_takes_the_tables(tables: Tables, root: Path) ->
     truth = read_tables_truth(root / "v1.0-foredrive", listed, root, "tracking", DETECTION_CLASSES)
     speed = np.linalg.norm(truth.boxes.velocity, axis=-1)
     assert sorted(speed.round(6).tolist()) == [0.0] * 5 + [world.MOVING["speed"]] * 5
-    assert {CLASSES[label] for label in truth.boxes.label} == {"car", "truck"}
+    assert {DETECTION_CLASSES[label] for label in truth.boxes.label} == {"car", "truck"}
     assert truth.boxes.num_points.min() > 0
     assert len(tables.of["instance"]) == 2
 
