@@ -11,16 +11,24 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+import torch
+from torch.utils.data import DataLoader
+
 from benchmarks.common.study import seeded
 from benchmarks.common.world_models import LEARNED_BY, LEARNED_BY_BOTH, TASKS_DECIDED_BY
 from benchmarks.planner_reads import TEST_SEEDS, TEST_TOWNS, TRAIN_SEEDS, TRAIN_TOWNS, recorded
 from benchmarks.task_probes import JUDGED_EVERY_S, heads_recipe, joint_recipe, judged
+from foredrive.data import ClipDataset, collate
 from foredrive.engine.bench import Benchmark, study_identity
+from foredrive.engine.summary import numbers
 from foredrive.methods.nemo.sampling import ImaginationSampling
 from foredrive.methods.recipe import Recipe, rescheduled
+from foredrive.runs.evaluate.predict import AgentPredictor
 from foredrive.runs.recipes.known import find_recipe
-from foredrive.runs.train.run import Run, train_run
+from foredrive.runs.train.run import Run, load_agent, train_run
 from foredrive.runs.train.tasks import load_heads
+from foredrive.tasks.evaluation.run import evaluate
+from foredrive.tasks.occupancy.occupancy_metric import OccupancyMetric
 
 ROOT = Path("runs/wide_grid")
 START = Path(__file__).with_name("nemo_wide")
@@ -29,6 +37,8 @@ STEPS, LR = 1450, 2e-3
 """Steps of eight clips, and their learning rate: an hour and a half of a core."""
 SEEDS, JUDGED_SEEDS = TRAIN_SEEDS[:2], TEST_SEEDS[:2]
 """Seeds of the traffic to learn from and to judge by, of 80 egos in each town."""
+FUTURES = ("occupancy.above_ground.", "occupancy.moving.", "occupancy.standing.")
+"""Beginnings of the keys of a summary that are kept of the futures."""
 
 
 @functools.cache
@@ -57,8 +67,30 @@ def in_town(town: str, seed: int) -> dict[str, float]:
     return judged(run, heads, recorded((town,), JUDGED_SEEDS))
 
 
+def foreseen(town: str, seed: int) -> dict[str, float]:
+    """Return the figures of the occupancy now and of the imagined frames on the same egos."""
+    torch.set_num_threads(1)
+    run = trained(seed)
+    clips = dataclasses.replace(
+        run.recipe.clips, future_images=False, now_stride_s=JUDGED_EVERY_S, tasks=None
+    )
+    dataset = ClipDataset(recorded((town,), JUDGED_SEEDS), clips, None)
+    result = evaluate(
+        AgentPredictor(load_agent(run), clips.future_frames, ray_stride=0),
+        DataLoader(dataset, batch_size=4, collate_fn=collate),
+        frame_dt_s=clips.frame_dt_s,
+        metrics=[OccupancyMetric],
+    )
+    summary = numbers(result.summary)
+    return {key: value for key, value in summary.items() if key.startswith(FUTURES)} | {
+        "clips": summary["items"],
+        "failed": summary["failed"],
+    }
+
+
 ARMS: Mapping[str, Callable[[int], Mapping[str, float]]] = {
-    town: functools.partial(in_town, town) for town in TEST_TOWNS
+    **{town: functools.partial(in_town, town) for town in TEST_TOWNS},
+    **{f"{town}_futures": functools.partial(foreseen, town) for town in TEST_TOWNS},
 }
 CONFIG = {
     "recipe": dataclasses.asdict(wide_recipe(0)),
