@@ -59,6 +59,10 @@ DECIDING = {
     "motion.uniad.car.min_ade_m.constant_velocity",
     "task-probes": "detection.nuscenes.map tracking.nuscenes.amota motion.uniad.car.min_ade_m "
     "map.uniad.iou_lanes occupancy.occ3d.miou_pct occupancy.uniad.iou_near_pct",
+    "wide-grid": "occupancy.above_ground.iou_now occupancy.above_ground.iou_future_1s "
+    "occupancy.above_ground.iou_future_1s.continued_copy occupancy.moving.iou_future_1s "
+    "occupancy.moving.iou_future_1s.continued_copy detection.car_ap_2m_30m map.maptr.map "
+    "occupancy.uniad.vpq_near_pct occupancy.uniad.vpq_near_pct.constant_velocity",
     "trust": "psnr_held_out_db psnr_db calibration_error_db correlation good_of_trusted psnr_trusted_db "
     "psnr_untrusted_db detection_f1_trusted detection_f1_untrusted",
 }
