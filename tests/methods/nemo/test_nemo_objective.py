@@ -290,7 +290,10 @@ def test_the_ego_motion_learns_from_the_driven_path_of_imagined_items(example: E
 def test_the_flow_learns_from_labels_of_imagined_items(example: Example) -> None:
     """The loss is the error of the velocity, times the emphasis; the flow points to where content was."""
     velocity = torch.tensor([2.0, -1.0, 0.5])
-    values = velocity.view(3, 1, 1, 1).expand_as(example.flow.values)
+    frames, now = example.flow.values.shape[1], example.clip.now
+    # Frames differ, and so do the items, of which the first alone is imagined
+    scale = torch.stack([1.0 + torch.arange(frames), 20.0 + torch.arange(frames)])
+    values = (scale.view(2, frames, 1, 1, 1, 1) * velocity.view(3, 1, 1, 1)).expand_as(example.flow.values)
     example = dataclasses.replace(example, flow=dataclasses.replace(example.flow, values=values))
     torch.manual_seed(0)
     agent = build_agent(RECIPE)
@@ -303,7 +306,8 @@ def test_the_flow_learns_from_labels_of_imagined_items(example: Example) -> None
         objective = build_objective(RECIPE, stage, agent).eval()
         losses[weight] = objective(example, torch.Generator().manual_seed(1))
     assert "flow" not in losses[0.0]
-    torch.testing.assert_close(losses[0.5]["flow"], 4.0 * velocity.norm())
+    imagined = scale[0, now + 1 : now + 1 + RECIPE.clips.future_frames]
+    torch.testing.assert_close(losses[0.5]["flow"], 4.0 * velocity.norm() * imagined.mean())
     torch.testing.assert_close(losses[0.5]["loss"], losses[0.0]["loss"] + 0.5 * losses[0.5]["flow"])
     losses[0.5]["flow"].backward()
     bias = agent.world_model.motion.flow[-1].bias

@@ -148,6 +148,7 @@ class NemoObjective(nn.Module):
             if weights.moving != 1:
                 emphasis = motion_emphasis(flow, flow_known, weights.moving)
             if weights.flow > 0 and belief.flow is not None:
+                # Velocity of each imagined frame against the labels of the same frame; now has none
                 error = (belief.flow - flow).norm(dim=1)
                 flow_errors.append(masked_mean(emphasis * error, flow_known))
             if weights.occ > 0:
