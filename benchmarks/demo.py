@@ -11,8 +11,8 @@ import time
 from collections.abc import Mapping
 from pathlib import Path
 
+from benchmarks.common.benchmark import Benchmark
 from benchmarks.common.study import work_folder
-from foredrive.engine.bench import Benchmark
 from foredrive.engine.metrics_log import read_metrics
 from foredrive.engine.summary import numbers, read_summary
 

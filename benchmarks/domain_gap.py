@@ -15,9 +15,9 @@ import numpy as np
 import torch
 from jaxtyping import Float, UInt8
 
+from benchmarks.common.benchmark import Benchmark
 from foredrive.data import ClipConfig, ClipDataset
 from foredrive.data.formats.convert import convert
-from foredrive.engine.bench import Benchmark
 from foredrive.errors import InputError
 from foredrive.scene import LidarSweep, VoxelSpec
 from foredrive.scene.conditions import CONDITIONS

@@ -8,8 +8,8 @@ import os
 from collections.abc import Mapping
 from pathlib import Path
 
+from benchmarks.common.benchmark import Benchmark
 from benchmarks.common.study import work_folder
-from foredrive.engine.bench import Benchmark
 from foredrive.engine.summary import numbers
 from foredrive.errors import InputError
 from foredrive.runs.drive.in_towns import TownRoutes

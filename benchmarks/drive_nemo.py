@@ -24,6 +24,7 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.common.benchmark import Benchmark, study_identity
 from benchmarks.common.driver_study import (
     EGOS,
     PRETRAINED,
@@ -39,7 +40,6 @@ from benchmarks.common.study import seeded
 from foredrive.data import LogPath, find_all_logs
 from foredrive.driver.recipes import DRIVER_RECIPES, DriverRecipe
 from foredrive.driving.drive_record import DriveRecord
-from foredrive.engine.bench import Benchmark, study_identity
 from foredrive.errors import InputError
 from foredrive.methods.recipe import rescheduled
 from foredrive.runs.drive.agent_inputs import rig_of

@@ -14,6 +14,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+from benchmarks.common.benchmark import Benchmark, study_identity
 from benchmarks.common.driver_study import (
     EGOS,
     PRETRAINED,
@@ -25,7 +26,6 @@ from benchmarks.common.driver_study import (
     trained,
 )
 from foredrive.driver.recipes import DRIVER_RECIPES, DriverRecipe
-from foredrive.engine.bench import Benchmark, study_identity
 from foredrive.runs.shipped import run_folder
 from foredrive.sensors.rigs import FRONT_TELE
 

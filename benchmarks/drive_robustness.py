@@ -11,9 +11,9 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+from benchmarks.common.benchmark import Benchmark
 from benchmarks.common.study import work_folder
 from foredrive.driving.faults import CameraFault, Faults
-from foredrive.engine.bench import Benchmark
 from foredrive.errors import InputError
 from foredrive.runs.drive.agent_inputs import rig_of
 from foredrive.runs.drive.compare import values_of

@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from benchmarks.common.benchmark import Benchmark
 from benchmarks.common.measuring import held_mib
 from foredrive.data.batches import stack_records
 from foredrive.data.resizing import shrink_images
@@ -24,7 +25,6 @@ from foredrive.driving.dynamics import STEP_S
 from foredrive.driving.observation import FRAME_DT_S
 from foredrive.driving.plans import fixed_in_world
 from foredrive.driving.route_sets import load_route_set
-from foredrive.engine.bench import Benchmark
 from foredrive.runs.build import build_agent
 from foredrive.runs.drive.in_towns import TownRoutes
 from foredrive.runs.drive.suite import DriveSuite, drive_one

@@ -10,6 +10,7 @@ are rows of Table 2, the full recipe on parts of the egos.
 import dataclasses
 import functools
 
+from benchmarks.common.benchmark import Benchmark, study_identity
 from benchmarks.common.world_models import (
     DECIDED_BY,
     ROOT,
@@ -18,7 +19,6 @@ from benchmarks.common.world_models import (
     fine_tuned,
     of_the_study,
 )
-from foredrive.engine.bench import Benchmark, study_identity
 from foredrive.runs.recipes.known import RECIPES
 
 FULL, PROMPTS = "driveworld_town", "driveworld_town_prompts"

@@ -9,6 +9,7 @@ from its first frames, for the rest of it, beside training from scratch.
 import dataclasses
 from collections.abc import Callable
 
+from benchmarks.common.benchmark import Benchmark, study_identity
 from benchmarks.common.forecast import forecasting, judge_forecast
 from benchmarks.common.study import JUDGED_EVERY_S, pandaset_log
 from benchmarks.common.world_models import (
@@ -20,7 +21,6 @@ from benchmarks.common.world_models import (
     share_baselines,
     study_logs,
 )
-from foredrive.engine.bench import Benchmark, study_identity
 from foredrive.methods.recipe import rescheduled, with_occupancy_source
 from foredrive.runs.train.run import train_run
 

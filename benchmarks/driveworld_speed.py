@@ -12,9 +12,9 @@ from pathlib import Path
 
 import torch
 
+from benchmarks.common.benchmark import Benchmark
 from benchmarks.common.measuring import Took, forget_peak, measure, peak_mib
 from foredrive.data import collate
-from foredrive.engine.bench import Benchmark
 from foredrive.engine.fabric import make_fabric
 from foredrive.methods.recipe import Recipe
 from foredrive.runs.build import build_agent, build_objective

@@ -29,12 +29,12 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
+from benchmarks.common.benchmark import Benchmark
 from benchmarks.common.killing import Command, kill_and_compare
 from benchmarks.common.program_server import ProgramServer
 from foredrive.data.commands import route_at
 from foredrive.data.log_paths import LogPath, find_logs
 from foredrive.data.logs import Log
-from foredrive.engine.bench import Benchmark
 from foredrive.engine.config import save_recipe
 from foredrive.errors import InputError
 from foredrive.geometry.polylines import points_at

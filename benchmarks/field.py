@@ -19,8 +19,8 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from benchmarks.common.benchmark import Benchmark
 from benchmarks.common.measuring import in_a_process, measure
-from foredrive.engine.bench import Benchmark
 from foredrive.geometry.se3 import exp_se3
 from foredrive.methods.neurad.recipes import tiny_field
 from foredrive.methods.neurad.scene import FieldScene

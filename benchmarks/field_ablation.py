@@ -12,9 +12,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from benchmarks.common.benchmark import Benchmark, study_identity
 from benchmarks.common.study import RECONSTRUCTED_BY, pandaset_log
 from benchmarks.rebuild_pandaset import FIGURES
-from foredrive.engine.bench import Benchmark, study_identity
 from foredrive.methods.reconstruction.perceptual import PerceptualMetrics, PerceptualWeights
 from foredrive.runs.recipes.reconstruction import ReconstructionRecipe, field_tiny, rescheduled_recipe
 from foredrive.runs.reconstruction.reconstruct import reconstruct, shipped_tower

@@ -22,8 +22,8 @@ import torch
 from lightning_fabric import Fabric
 
 from benchmarks import field, lifting, nemo_base, ops, splats
+from benchmarks.common.benchmark import Benchmark, run_benchmark
 from benchmarks.common.measuring import CHECKOUT, in_a_process, measure
-from foredrive.engine.bench import Benchmark, run_benchmark
 from foredrive.errors import InputError
 from foredrive.integrations.graph import AgentGraph, GraphInputs, GraphOutputs
 from foredrive.methods.nemo.recipes import nemo_tiny

@@ -18,6 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.common.benchmark import Benchmark, study_identity
 from benchmarks.common.driver_study import (
     EGOS,
     TRAINING_TOWNS,
@@ -30,7 +31,6 @@ from benchmarks.common.driver_study import (
 from foredrive.data import LogPath
 from foredrive.driver.recipes import DriverRecipe
 from foredrive.driving.drive_record import DriveRecord
-from foredrive.engine.bench import Benchmark, study_identity
 from foredrive.runs.drive.compare import values_of
 from foredrive.runs.drive.in_towns import TownRoutes
 from foredrive.runs.drive.recording import EgosPlan

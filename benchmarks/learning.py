@@ -23,11 +23,11 @@ from typing import Any, Literal
 import torch
 from torch.utils.data import DataLoader
 
+from benchmarks.common.benchmark import Benchmark, study_identity
 from benchmarks.common.study import seeded
 from benchmarks.learning_towns import DIGEST, TEST_TOWNS, TRAIN_TOWNS, plan_learning, record_missing
 from foredrive.data import ClipDataset, LogPath, collate
 from foredrive.data.clip_config import OccupancySource
-from foredrive.engine.bench import Benchmark, study_identity
 from foredrive.engine.metrics_log import read_metrics
 from foredrive.engine.summary import numbers
 from foredrive.errors import InputError

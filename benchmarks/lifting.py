@@ -14,8 +14,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from benchmarks.common.benchmark import Benchmark
 from benchmarks.common.measuring import compare, in_a_process, measure_op
-from foredrive.engine.bench import Benchmark
 from foredrive.geometry.projection import project
 from foredrive.geometry.se3 import inverse_se3, matrix_from_yaw, transform_points
 from foredrive.ops.lifting import lift, lift_reference

@@ -15,9 +15,9 @@ from pathlib import Path
 
 from torch.utils.data import DataLoader
 
+from benchmarks.common.benchmark import Benchmark
 from benchmarks.common.process_tree import tree_use
 from foredrive.data import ClipDataset, collate, find_logs
-from foredrive.engine.bench import Benchmark
 from foredrive.engine.interrupts import start_fork_server
 from foredrive.runs.recipes.known import find_recipe
 from foredrive.scene import Example

@@ -15,6 +15,7 @@ import functools
 import os
 from pathlib import Path
 
+from benchmarks.common.benchmark import Benchmark, study_identity
 from benchmarks.common.safety_suites import (
     DRIVES,
     RECONSTRUCTION,
@@ -23,7 +24,6 @@ from benchmarks.common.safety_suites import (
     reconstructed_town,
 )
 from benchmarks.common.study import pandaset_log
-from foredrive.engine.bench import Benchmark, study_identity
 from foredrive.errors import InputError
 from foredrive.runs.drive.in_ncap import propose_scenarios
 from foredrive.runs.recipes.reconstruction import gaussians_tiny

@@ -17,6 +17,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from benchmarks.common.benchmark import Benchmark, study_identity
 from benchmarks.common.reconstructed_towns import TownDrive
 from benchmarks.common.safety_agreement import agreement
 from benchmarks.common.safety_pairs import Pair, PairedAgent, PairedTests, SensorNoise
@@ -27,7 +28,6 @@ from foredrive.driving.ncap.scenario import SafetyScenario
 from foredrive.driving.ncap.scenario_file import load_scenarios, save_scenarios
 from foredrive.driving.ncap.self_test import self_test
 from foredrive.driving.replay.threats import Threat
-from foredrive.engine.bench import Benchmark, study_identity
 from foredrive.runs.drive.in_ncap import place_in
 from foredrive.runs.recipes.reconstruction import ReconstructionRecipe
 from foredrive.sensors.rigs import FRONT_TELE, SURROUND, RigPlan

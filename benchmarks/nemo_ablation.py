@@ -8,8 +8,8 @@ The rows of Table 1 are `nemo_town_scratch`, `nemo_town_base`, `nemo_town_attent
 import dataclasses
 import functools
 
+from benchmarks.common.benchmark import Benchmark, study_identity
 from benchmarks.common.world_models import DECIDED_BY, ROOT, config_of, fine_tuned, of_the_study
-from foredrive.engine.bench import Benchmark, study_identity
 from foredrive.runs.recipes.known import RECIPES
 
 FULL = "nemo_town"

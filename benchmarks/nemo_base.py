@@ -18,8 +18,8 @@ from lightning_fabric import Fabric
 from torch import Tensor
 from torch.utils.flop_counter import FlopCounterMode, sdpa_flop_count
 
+from benchmarks.common.benchmark import Benchmark
 from benchmarks.common.measuring import forget_peak, in_a_process, measure, peak_mib
-from foredrive.engine.bench import Benchmark
 from foredrive.engine.fabric import make_fabric
 from foredrive.geometry.se3 import matrix_from_yaw
 from foredrive.methods.blocks import lifting

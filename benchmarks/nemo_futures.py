@@ -10,9 +10,9 @@ import dataclasses
 import torch
 from torch.utils.data import DataLoader
 
+from benchmarks.common.benchmark import Benchmark
 from benchmarks.planner_reads import ROOT, SHIPPED, logs_to_judge
 from foredrive.data import ClipDataset, collate
-from foredrive.engine.bench import Benchmark
 from foredrive.engine.summary import Figures, numbers
 from foredrive.runs.evaluate.predict import AgentPredictor
 from foredrive.runs.shipped import run_folder

@@ -15,9 +15,9 @@ from jaxtyping import Float
 from PIL import Image
 from torch import Tensor
 
+from benchmarks.common.benchmark import Benchmark
 from benchmarks.common.study import StudyTowns, record_study, seeded, work_folder
 from foredrive.data import ClipDataset, collate
-from foredrive.engine.bench import Benchmark
 from foredrive.methods.blocks.training_rays import thinned_rays
 from foredrive.methods.nemo import Nemo
 from foredrive.methods.nemo.recipes import NemoRecipe

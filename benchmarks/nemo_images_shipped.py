@@ -6,10 +6,10 @@ figures have no spread. Drives and the picture are kept in runs/nemo_images_ship
 
 from pathlib import Path
 
+from benchmarks.common.benchmark import Benchmark
 from benchmarks.common.study import record_study, work_folder
 from benchmarks.nemo_images import TOWNS, judge
 from foredrive.data import ClipDataset
-from foredrive.engine.bench import Benchmark
 from foredrive.runs.shipped import run_folder
 from foredrive.runs.train.run import load_agent, open_run
 

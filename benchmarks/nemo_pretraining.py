@@ -7,9 +7,9 @@ temporal attention too.
 
 import functools
 
+from benchmarks.common.benchmark import Benchmark
 from benchmarks.common.world_models import DECIDED_BY
 from benchmarks.nemo_ablation import CONFIG, FULL, arm
-from foredrive.engine.bench import Benchmark
 
 SHARES = (1.0, 0.3, 0.1)
 

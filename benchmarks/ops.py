@@ -13,8 +13,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from benchmarks.common.benchmark import Benchmark
 from benchmarks.common.measuring import compare, in_a_process, measure_op
-from foredrive.engine.bench import Benchmark
 from foredrive.geometry.se3 import exp_se3
 from foredrive.ops.attention3d import attend_volume, attend_volume_reference
 from foredrive.ops.volume import sample_volume, sample_volume_reference, source_points, warp_volume

@@ -10,9 +10,9 @@ import functools
 from typing import Any
 
 from benchmarks import task_probes
+from benchmarks.common.benchmark import Benchmark, study_identity
 from benchmarks.common.study import run_arm
 from benchmarks.common.world_models import DECIDED_BY, ROOT, of_the_study, study_logs
-from foredrive.engine.bench import Benchmark, study_identity
 from foredrive.heads.scene_tokens import Attended
 from foredrive.methods.recipe import Recipe
 

@@ -19,11 +19,11 @@ import torch
 from rich.progress import track
 from torch import Tensor, nn
 
+from benchmarks.common.benchmark import Benchmark
 from benchmarks.common.study import work_folder
 from benchmarks.common.true_planes import CHANNELS, HORIZON, PAST, SPEC, TruePlanes, joined, kept, read_planes
 from foredrive.data import ClipDataset, LogPath
 from foredrive.data.batches import stack_records
-from foredrive.engine.bench import Benchmark
 from foredrive.errors import InputError
 from foredrive.methods.planner.ego_mlp import EgoMLP, EgoMLPConfig, status_vector
 from foredrive.methods.planner.ego_mlp_fit import EgoMLPFit, StatusDemonstrations, fit_ego_mlp

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import torch
 
+from benchmarks.common.benchmark import Benchmark, study_identity
 from benchmarks.common.true_planes import TruePlanes, kept, read_planes
 from benchmarks.planner_reads import (
     EGO_FIT,
@@ -27,7 +28,6 @@ from benchmarks.planner_reads import (
     study_of,
 )
 from foredrive.data import LogPath
-from foredrive.engine.bench import Benchmark, study_identity
 from foredrive.errors import InputError
 from foredrive.runs.drive.recording import EgosPlan, record_egos
 from foredrive.sensors.rigs import SURROUND, RigPlan

@@ -11,8 +11,8 @@ from typing import Literal
 import numpy as np
 from scipy.special import expit
 
+from benchmarks.common.benchmark import Benchmark
 from foredrive.driving.item_response import rate
-from foredrive.engine.bench import Benchmark
 
 AGENTS, ROUTES = (2, 3, 5, 10), (16, 32, 56)
 SIMULATED = 600

@@ -10,10 +10,10 @@ import dataclasses
 import functools
 from pathlib import Path
 
+from benchmarks.common.benchmark import Benchmark
 from benchmarks.common.reconstructed_towns import TownDrive
 from benchmarks.common.study import pandaset_log, work_folder
 from foredrive.data import LogPath
-from foredrive.engine.bench import Benchmark
 from foredrive.engine.summary import numbers
 from foredrive.runs.evaluate.real_to_sim_gap import measure_gap
 from foredrive.runs.recipes.reconstruction import gaussians_tiny, rescheduled_recipe

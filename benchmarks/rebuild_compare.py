@@ -19,13 +19,13 @@ from pathlib import Path
 from statistics import fmean
 from typing import Any
 
+from benchmarks.common.benchmark import Benchmark, study_identity
 from benchmarks.common.measuring import forget_peak
 from benchmarks.common.points_aside import aside_figures
 from benchmarks.common.reconstructed_towns import TownDrive, TownTruth
 from benchmarks.common.study import RECONSTRUCTED_BY, kitti_drive, pandaset_log
 from benchmarks.rebuild_pandaset import FIGURES
 from foredrive.data import LogPath
-from foredrive.engine.bench import Benchmark, study_identity
 from foredrive.methods.reconstruction.edits import ShiftEgo
 from foredrive.methods.reconstruction.evaluation import evaluate_cameras, evaluate_sweeps
 from foredrive.runs.recipes.reconstruction import (

@@ -10,8 +10,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from benchmarks.common.benchmark import Benchmark, study_identity
 from benchmarks.common.study import RECONSTRUCTED_BY, pandaset_log
-from foredrive.engine.bench import Benchmark, study_identity
 from foredrive.runs.recipes.reconstruction import (
     ReconstructionRecipe,
     gaussians_small,

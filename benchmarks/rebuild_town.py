@@ -16,9 +16,9 @@ from typing import Any
 from jaxtyping import Bool
 from torch import Tensor
 
+from benchmarks.common.benchmark import Benchmark, study_identity
 from benchmarks.common.reconstructed_towns import TownDrive, TownTruth, TrueViews
 from benchmarks.common.study import RECONSTRUCTED_BY
-from foredrive.engine.bench import Benchmark, study_identity
 from foredrive.engine.summary import numbers
 from foredrive.methods.reconstruction.edits import Edit, Move, Remove, ShiftEgo, apply_edits
 from foredrive.methods.reconstruction.evaluation import evaluate_cameras, evaluate_sweeps

@@ -18,11 +18,11 @@ from pathlib import Path
 
 import torch
 
+from benchmarks.common.benchmark import Benchmark
 from benchmarks.loading import BATCH_SIZE, CLIPS, WORKERS, load_clips
 from foredrive.data import ClipDataset, LogPath, find_logs
 from foredrive.data.disk_cache import entry_file
 from foredrive.data.logs import Log
-from foredrive.engine.bench import Benchmark
 from foredrive.runs.evaluate.run import evaluate_run
 from foredrive.runs.recipes.known import find_recipe
 from foredrive.runs.search.indexing import index_logs

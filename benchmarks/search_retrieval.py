@@ -10,9 +10,9 @@ import functools
 import os
 from pathlib import Path
 
+from benchmarks.common.benchmark import Benchmark
 from benchmarks.common.retrieval_quality import GAP_S, MODALITIES, Judged, judge_naming, judge_retrieval
 from foredrive.data import LogPath
-from foredrive.engine.bench import Benchmark
 from foredrive.runs.drive.recording import record_drives
 from foredrive.runs.search.sector_views import gather_views
 from foredrive.runs.search.towers import EMBEDDED, find_towers

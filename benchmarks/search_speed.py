@@ -21,8 +21,8 @@ from statistics import median
 import numpy as np
 import pyarrow as pa
 
+from benchmarks.common.benchmark import Benchmark
 from benchmarks.common.measuring import held_mib
-from foredrive.engine.bench import Benchmark
 from foredrive.engine.provenance import peak_rss_gib
 from foredrive.runs.search.indexing import IndexWriter
 from foredrive.search.find import find

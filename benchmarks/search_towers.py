@@ -16,11 +16,11 @@ from pathlib import Path
 
 import torch
 
+from benchmarks.common.benchmark import Benchmark
 from benchmarks.common.measuring import Took, in_a_process, measure
 from foredrive.data import find_logs
 from foredrive.data.batches import stack_records
 from foredrive.data.logs import Log
-from foredrive.engine.bench import Benchmark
 from foredrive.methods.lidarclip import LidarEncoder, LidarEncoderConfig, PointCloud
 from foredrive.runs.drive.recording import record_plan
 from foredrive.scene import LidarSweep

@@ -7,8 +7,8 @@ default they are the embedded ones.
 
 import os
 
+from benchmarks.common.benchmark import Benchmark
 from benchmarks.search_retrieval import CROWD, RATE_HZ, SECONDS, SEEDS, TOWN, WEATHERS, WORK, drives
-from foredrive.engine.bench import Benchmark
 from foredrive.runs.search.evaluating import evaluate_index
 from foredrive.runs.search.indexing import index_logs
 from foredrive.runs.search.towers import EMBEDDED, find_towers

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from scipy.optimize import linear_sum_assignment
 
-from foredrive.engine.bench import Benchmark
+from benchmarks.common.benchmark import Benchmark
 from foredrive.engine.provenance import peak_rss_gib
 from foredrive.sets import (
     BoxDensity,

@@ -8,8 +8,8 @@ import functools
 import tempfile
 from pathlib import Path
 
+from benchmarks.common.benchmark import Benchmark
 from benchmarks.common.detection import DetectionSample, DetectionSplit, compare_losses, detection_samples
-from foredrive.engine.bench import Benchmark
 from foredrive.scene import VoxelSpec
 from foredrive.sensors.rigs import camera_rig
 from foredrive.sensors.vehicle import roof_lidar

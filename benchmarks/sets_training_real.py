@@ -9,9 +9,9 @@ import functools
 import tempfile
 from pathlib import Path
 
+from benchmarks.common.benchmark import Benchmark
 from benchmarks.common.detection import DetectionSplit, compare_losses, detection_samples
 from benchmarks.common.study import pandaset_log
-from foredrive.engine.bench import Benchmark
 from foredrive.scene import VoxelSpec
 
 SPEC = VoxelSpec(lower_m=(-32.0, -32.0, -1.0), voxel_m=1.0, shape_zyx=(4, 64, 64))

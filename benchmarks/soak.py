@@ -24,10 +24,10 @@ from pathlib import Path
 from statistics import fmean
 from typing import NamedTuple
 
+from benchmarks.common.benchmark import Benchmark
 from benchmarks.common.killing import left_temporary
 from benchmarks.common.page_clients import SearchClients, ViewerClients
 from benchmarks.common.process_tree import TreeUse, in_session, tree_use
-from foredrive.engine.bench import Benchmark
 from foredrive.engine.metrics_log import read_metrics
 from foredrive.view.page import free_port
 

@@ -26,9 +26,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from benchmarks.common.benchmark import Benchmark
 from benchmarks.common.measuring import in_a_process
 from benchmarks.common.measuring import measure as time_of
-from foredrive.engine.bench import Benchmark
 from foredrive.geometry.se3 import exp_se3, inverse_se3, sensor_twist
 from foredrive.methods.splatad import Gaussians, project_camera, project_lidar, scan_times, tiled_lidar_beams
 from foredrive.ops.splat_points import TiledPoints, pixel_points

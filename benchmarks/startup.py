@@ -12,7 +12,7 @@ import resource
 import subprocess
 import sys
 
-from foredrive.engine.bench import Benchmark
+from benchmarks.common.benchmark import Benchmark
 
 REPETITIONS = 3
 NOWHERE = "/nonexistent"

@@ -4,9 +4,9 @@
 """
 
 from benchmarks.common import object_speed
+from benchmarks.common.benchmark import Benchmark
 from benchmarks.common.forecast_scoring import motion_speed
 from benchmarks.common.occupancy_scoring import protocols_compared, rayiou_speed
-from foredrive.engine.bench import Benchmark
 
 BENCHMARK = Benchmark(
     question="How fast are the tasks' metrics, and how do protocols differ on the same predictions?",

@@ -12,10 +12,10 @@ from pathlib import Path
 
 from torch.utils.data import DataLoader
 
+from benchmarks.common.benchmark import Benchmark
 from benchmarks.common.study import pandaset_log
 from benchmarks.task_probes import kept_figures
 from foredrive.data import ClipDataset, collate
-from foredrive.engine.bench import Benchmark
 from foredrive.engine.summary import numbers
 from foredrive.runs.evaluate.predict import AgentPredictor
 from foredrive.runs.recipes.task_heads import town_heads

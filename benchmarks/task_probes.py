@@ -16,6 +16,7 @@ import torch
 from torch.utils.data import DataLoader
 
 from benchmarks import learning
+from benchmarks.common.benchmark import Benchmark, study_identity
 from benchmarks.common.study import seeded
 from benchmarks.common.world_models import (
     DECIDED_BY,
@@ -27,7 +28,6 @@ from benchmarks.common.world_models import (
     study_logs,
 )
 from foredrive.data import ClipDataset, LogPath, collate
-from foredrive.engine.bench import Benchmark, study_identity
 from foredrive.engine.summary import Summary, numbers
 from foredrive.methods.recipe import Recipe, rescheduled
 from foredrive.runs.evaluate.predict import AgentPredictor

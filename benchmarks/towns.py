@@ -18,8 +18,8 @@ from typing import Any, TypeVar
 import torch
 from py123d.common.io.camera import jpeg_camera_io
 
+from benchmarks.common.benchmark import Benchmark
 from foredrive.data.log_writer import LogWriter
-from foredrive.engine.bench import Benchmark
 from foredrive.scene.conditions import BackgroundTraffic
 from foredrive.sensors.rigs import camera_rig
 from foredrive.sensors.vehicle import roof_lidar

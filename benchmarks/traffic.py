@@ -9,8 +9,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from benchmarks.common.benchmark import Benchmark
 from benchmarks.common.traffic_audit import Audit
-from foredrive.engine.bench import Benchmark
 from foredrive.towns.map.names import TOWNS
 from foredrive.towns.map.town_map import load_town_map
 from foredrive.towns.traffic.expert import ExpertDrive

@@ -26,6 +26,7 @@ from safetensors.torch import load_file, save_file
 from scipy import stats
 from torch import Tensor
 
+from benchmarks.common.benchmark import Benchmark, study_identity
 from benchmarks.common.reconstructed_towns import TownDrive, TownTruth
 from benchmarks.common.safety_pairs import NotedTrust
 from benchmarks.common.safety_suites import DRIVES as SAFETY_DRIVES
@@ -34,7 +35,6 @@ from benchmarks.common.town_replay import TownReplayRenderer
 from foredrive.data.batches import stack_records
 from foredrive.driver.agent import Driver
 from foredrive.driving.observation import KeyFrame, make_clip
-from foredrive.engine.bench import Benchmark, study_identity
 from foredrive.errors import InputError
 from foredrive.files import atomic_path
 from foredrive.geometry.se3 import inverse_se3, matrix_from_yaw

@@ -14,12 +14,12 @@ from typing import Any
 import torch
 from torch.utils.data import DataLoader
 
+from benchmarks.common.benchmark import Benchmark, study_identity
 from benchmarks.common.study import seeded
 from benchmarks.common.world_models import LEARNED_BY, LEARNED_BY_BOTH, TASKS_DECIDED_BY
 from benchmarks.planner_reads import TEST_SEEDS, TEST_TOWNS, TRAIN_SEEDS, TRAIN_TOWNS, recorded
 from benchmarks.task_probes import JUDGED_EVERY_S, heads_recipe, joint_recipe, judged
 from foredrive.data import ClipDataset, collate
-from foredrive.engine.bench import Benchmark, study_identity
 from foredrive.engine.summary import numbers
 from foredrive.methods.nemo.sampling import ImaginationSampling
 from foredrive.methods.recipe import Recipe, rescheduled

@@ -159,10 +159,13 @@ def benchmark_file(name: str) -> Path:
     return ROOT / "benchmarks" / f"{name.replace('-', '_')}.py"
 
 
-def test_the_arms_of_a_benchmark_are_asked_of_the_program(tmp_path: Path) -> None:
+def test_the_arms_of_a_benchmark_are_asked_of_the_program(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("PYTHONPATH", str(ROOT))  # For `benchmarks.common`
     (tmp_path / "benchmarks").mkdir()
     (tmp_path / "benchmarks" / "a_speed.py").write_text(
-        "from foredrive.engine.bench import Benchmark\n"
+        "from benchmarks.common.benchmark import Benchmark\n"
         "BENCHMARK = Benchmark('Is it: fast?', {'one@part': dict, 'two: 2': dict})"
     )
     (tmp_path / "benchmarks" / "script.py").write_text("")

@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.common.benchmark import study_identity
 from benchmarks.common.reconstructed_towns import TownDrive
 from foredrive.driving.drive_record import DriveRecord
 from foredrive.driving.ncap.aggregation import SafetyFigures, aggregate
 from foredrive.driving.ncap.scenario import SafetyScenario
 from foredrive.driving.ncap.scenario_file import load_scenarios, save_scenarios
 from foredrive.driving.replay.threats import Threat
-from foredrive.engine.bench import study_identity
 from foredrive.errors import InputError
 from foredrive.runs.drive.in_ncap import SafetyTests, propose_scenarios
 from foredrive.runs.drive.records import tested_runs

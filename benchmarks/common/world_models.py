@@ -13,9 +13,9 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks import learning
+from benchmarks.common.benchmark import study_identity
 from benchmarks.common.study import StudyLogs, run_arm, seeded, share_of
 from foredrive.data import LogPath
-from foredrive.engine.bench import study_identity
 from foredrive.engine.small_weights import save_small
 from foredrive.files import atomic_path
 from foredrive.methods.planner.path_fit import PathFit

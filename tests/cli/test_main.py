@@ -347,7 +347,7 @@ def test_help_waits_for_nothing_heavy() -> None:
 
 def test_verbs_wait_for_nothing_they_do_not_use() -> None:
     bench, convert, record, view, recipes, evaluate = heavy_after(
-        "import foredrive.engine.bench",
+        "import benchmarks.common.benchmark",
         "import foredrive.data.formats.convert",
         "import foredrive.runs.drive.recording",
         "import foredrive.data, foredrive.view.log_sheet, foredrive.view.log_frames",

@@ -1,32 +1,13 @@
-"""The report of the demo: one self-contained page whose table of contents is the loop."""
+"""The report of the demo: a page whose table of contents is the loop, with links to the verbs' reports."""
 
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
-
-from markupsafe import Markup
 
 from foredrive.engine.fan_out import reason
 from foredrive.runs.demo import Demo
-from foredrive.view.html import MetricTile, Picture, Provenance, write_page
-from foredrive.view.table import Table
-
-
-@dataclass(frozen=True)
-class Block:
-    """A part of a section. Parts that are empty are left out."""
-
-    title: str = ""
-    text: str = ""
-    tiles: Sequence[MetricTile] = ()
-    drawings: Sequence[Markup] = ()
-    """Inline SVG; two stand side by side, the first one narrow."""
-    figures: Sequence[Picture] = ()
-    columns: Literal["one", "two", "three"] = "one"
-    """Number of figures side by side on a wide screen."""
-    table: Table | None = None
+from foredrive.view.html import Picture, Provenance, write_page
 
 
 @dataclass(frozen=True)
@@ -37,7 +18,10 @@ class Section:
     """The outcome in one line, for the loop."""
     cover: Picture | None
     """A small picture, for the loop."""
-    blocks: Sequence[Block]
+    figures: Sequence[Picture] = ()
+    """Pictures; two stand side by side on a wide screen."""
+    reports: Mapping[str, Path] = field(default_factory=dict)
+    """Paths of the verbs' own reports by title."""
 
 
 @dataclass(frozen=True)
@@ -87,12 +71,20 @@ def do_steps(steps: Sequence[Step], demo: Demo, say: Callable[[str], None]) -> l
 
 
 def write_demo_report(path: Path, outcomes: Sequence[Outcome], provenance: Provenance) -> None:
-    """Write the page."""
+    """Write the page into the demo's folder."""
+    links = {
+        outcome.step.title: {
+            title: report.relative_to(path.parent).as_posix()
+            for title, report in (outcome.section.reports if outcome.section else {}).items()
+        }
+        for outcome in outcomes
+    }
     write_page(
         path,
         "demo_report.html.j2",
         title="Once round the loop",
         provenance=provenance,
         outcomes=outcomes,
+        links=links,
         minutes=sum(outcome.seconds for outcome in outcomes) / 60,
     )

@@ -8,7 +8,7 @@ import pytest
 from foredrive.cli.main import main
 
 SOURCE = """
-from foredrive.engine.bench import Benchmark
+from benchmarks.common.benchmark import Benchmark
 
 def measure(seed):
     with open(__file__.replace("speed.py", "ran.txt"), "a") as file:

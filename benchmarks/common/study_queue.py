@@ -1,7 +1,7 @@
 """A queue of studies: what decides most for its computing time is measured first, one process a core.
 
 The file of the queue names claims, the arms of the benchmarks that decide them, and what an arm costs. The
-studies keep their own results (`engine.bench`), so that a queue goes on after an interruption, at another
+studies keep their own results (`common.benchmark`), so that a queue goes on after an interruption, at another
 commit, and beside other queues in the same folder.
 """
 
@@ -19,7 +19,7 @@ from typing import Annotated, NamedTuple
 
 from pydantic import Field
 
-from foredrive.engine.bench import Benchmark, measured_before
+from benchmarks.common.benchmark import Benchmark, measured_before
 from foredrive.engine.config import validated
 from foredrive.engine.folder import held
 from foredrive.errors import InputError
@@ -196,7 +196,7 @@ def _start_first(
                     [sys.executable, *command(one)],
                     stdout=output,
                     stderr=subprocess.STDOUT,
-                    env=os.environ | {"OMP_NUM_THREADS": "1"},
+                    env=os.environ | {"OMP_NUM_THREADS": "1", "PYTHONPATH": os.pathsep.join(sys.path)},
                 )
             return _Running(one, process, core, locks, log)
     return None

@@ -1,6 +1,7 @@
 """A queue of studies, with real processes."""
 
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -9,21 +10,21 @@ from pathlib import Path
 
 import pytest
 
-from foredrive.cli.main import main
-from foredrive.engine.bench import Benchmark
-from foredrive.engine.folder import held
-from foredrive.engine.study_queue import (
+from benchmarks.common.benchmark import Benchmark
+from benchmarks.common.study_queue import (
     Measurement,
     QueuedStudy,
     load_queue,
     missing_measurements,
 )
+from foredrive.cli.main import main
+from foredrive.engine.folder import held
 from foredrive.errors import InputError
 
 STUDY = """
 import os, time
 from pathlib import Path
-from foredrive.engine.bench import Benchmark
+from benchmarks.common.benchmark import Benchmark
 
 FOLDER = Path(__file__).parent
 
@@ -59,6 +60,7 @@ QUEUE = """
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(sys.path))  # Processes find `benchmarks.common`
     for name in ("costly", "cheap"):
         (tmp_path / f"{name}.py").write_text(STUDY.replace("NAME", name))
     (tmp_path / "queue.yaml").write_text(QUEUE)

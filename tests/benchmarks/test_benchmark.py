@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from foredrive.engine.bench import Benchmark, run_benchmark, study_identity
+from benchmarks.common.benchmark import Benchmark, run_benchmark, study_identity
 from foredrive.errors import InputError
 
 
@@ -121,13 +121,13 @@ def test_a_study_outlives_commits_machines_and_comments(
     monkeypatch.syspath_prepend(str(tmp_path))
     decided_by = _module(tmp_path, "def half(x):\n    return x / 2\n")
     first = {"commit": "aaa", "machine.cpu": "old", "machine.cores": 2}
-    monkeypatch.setattr("foredrive.engine.bench.collect_provenance", lambda: first)
+    monkeypatch.setattr("benchmarks.common.benchmark.collect_provenance", lambda: first)
     study = dataclasses.replace(_study(decided_by), seeds=(0,))
     run_benchmark("study", study, tmp_path, say=lambda line: None)
 
     decided_by = _module(tmp_path, 'def half(x):\n    """Return half."""\n    return x / 2  # exact\n')
     second = {"commit": "bbb", "machine.cpu": "new", "machine.cores": 4}
-    monkeypatch.setattr("foredrive.engine.bench.collect_provenance", lambda: second)
+    monkeypatch.setattr("benchmarks.common.benchmark.collect_provenance", lambda: second)
     path = run_benchmark("study", _study(decided_by), tmp_path, say=lambda line: None)
     runs = json.loads(path.read_text())["runs"]
     assert [(run["seed"], run["commit"], run["machine.cpu"]) for run in runs] == [
