@@ -98,7 +98,6 @@ class NeuralField(nn.Module):
         actors: FieldActors,
         generator: torch.Generator | None = None,
         learn_proposals: bool = True,
-        hidden_m: Float[Tensor, "H R 2"] | None = None,
     ) -> SeenAlongRays:
         """Render rays.
 
@@ -107,7 +106,6 @@ class NeuralField(nn.Module):
             actors: the actors of the scene.
             generator: for the random places of samples in training; None takes their middles.
             learn_proposals: whether the proposals' weights get gradients.
-            hidden_m: H spans of each ray, from a distance to another, in which nothing stops it.
         """
         config = self.config
         # Boxes of actors along the rays, at each ray's own time
@@ -121,7 +119,6 @@ class NeuralField(nn.Module):
             points, footprint, moving = self._samples(rays, border_m, crossings, actors, learn_poses=False)
             with torch.set_grad_enabled(learn_proposals and torch.is_grad_enabled()):
                 opacity = proposal(points, footprint, moving, border_m.diff(dim=-1))
-                opacity = _without_spans(opacity, border_m, hidden_m)
                 # Only the weights are read: the second argument stands in for distances
                 weight = composite(opacity, opacity.detach()).weights
             proposals.append(Intervals(border, border_m, weight))
@@ -134,7 +131,6 @@ class NeuralField(nn.Module):
         points, footprint, moving = self._samples(rays, border_m, crossings, actors, learn_poses=True)
         grid = self.grids(points, footprint, moving)
         opacity, embedding = self.layers.surface(grid, border_m.diff(dim=-1))
-        opacity = _without_spans(opacity, border_m, hidden_m)
         seen = composite(opacity, opacity.detach())
         intervals = Intervals(border, border_m, seen.weights)
         # What is left of a ray sees its last sample, the sky.
@@ -207,17 +203,6 @@ def _in_boxes(
         sign[:, 1] = torch.where(actors.mirror[box], -1.0, 1.0)
         point, direction = point * sign, direction * sign
     return ActorSamples(sample, actors.slot[box], point, direction, footprint[sample])
-
-
-def _without_spans(
-    opacity: Float[Tensor, "R S"], border_m: Float[Tensor, "R S1"], hidden_m: Float[Tensor, "H R 2"] | None
-) -> Float[Tensor, "R S"]:
-    """Return opacities that are 0 for samples in hidden spans."""
-    if hidden_m is None or len(hidden_m) == 0:
-        return opacity
-    middle_m = 0.5 * (border_m[:, 1:] + border_m[:, :-1])
-    inside = (middle_m > hidden_m[..., :1]) & (middle_m < hidden_m[..., 1:])
-    return opacity.masked_fill(inside.any(0), 0.0)
 
 
 @torch.no_grad()

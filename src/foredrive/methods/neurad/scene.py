@@ -14,16 +14,8 @@ from torch import Tensor, nn
 from foredrive.errors import InputError
 from foredrive.geometry.projection import pixels_to_rays
 from foredrive.methods.neurad.config import FieldConfig
-from foredrive.methods.neurad.content import FieldContent, FieldParts, field_of
+from foredrive.methods.neurad.content import FieldContent, field_of
 from foredrive.methods.neurad.decoders import UPSAMPLING, BeamDecoder, PatchDecoder, PatchDecoderConfig
-from foredrive.methods.neurad.guests import (
-    Guest,
-    SeenOfGuest,
-    look_with_guests,
-    split_guests,
-    with_guests_in_image,
-    with_guests_in_sweep,
-)
 from foredrive.methods.neurad.rays import FieldRays, beam_rays, pixel_rays
 from foredrive.methods.neurad.render import FieldActors, NeuralField, SeenAlongRays
 from foredrive.methods.reconstruction.gaussians import Gaussians
@@ -109,8 +101,8 @@ class FieldScene(ReconstructedScene):
         )
         # Row k of the tracks is at place k of the grid of actors
         slot = torch.arange(len(self.track_id), device=self.device)
-        parts = FieldParts(self.field, self.camera_decoder, self.lidar_decoder)
-        return FieldContent(slot, torch.zeros_like(slot), GaussianContent(points, self.shown_actor), (parts,))
+        shown = GaussianContent(points, self.shown_actor)
+        return FieldContent(slot, shown, self.field.grids.actors.table)
 
     @property
     def sizes(self) -> dict[str, int]:
@@ -128,7 +120,7 @@ class FieldScene(ReconstructedScene):
         """Render features along rays.
 
         Args:
-            graph: this scene, or an edited version of it without actors of other fields.
+            graph: this scene, or an edited version of it.
             rays: in the scene's frame.
             mirror: actors whose left and right sides are swapped; None: none.
             generator: for the random places of samples in training.
@@ -157,12 +149,10 @@ class FieldScene(ReconstructedScene):
         high, wide = (-(-side // UPSAMPLING) for side in view.size_hw)
         corner_uv, size = torch.zeros(2, dtype=torch.int64), torch.tensor([wide, high])
         rays = self.rays_of_pixels(view, corner_uv, size)
-        seen, guests = self._in_parts(graph, rays)
+        seen = self._in_parts(graph, rays)
         feature = seen["feature"].view(1, high, wide, -1)
         # Features of all rays form one image for the CNN
         rgb = self.camera_decoder(feature, torch.tensor([view.sensor], device=feature.device))[0]
-        if guests:
-            rgb = with_guests_in_image(rgb, *guests, view.sensor)
         # Cut what reaches beyond the image
         rgb = rgb[:, : view.size_hw[0], : view.size_hw[1]]
         # The camera's axis is that of the row's own time: it turns during the read-out.
@@ -181,10 +171,8 @@ class FieldScene(ReconstructedScene):
         Beams that end beyond the reach do not return, nor those that nothing stops.
         """
         rays = FieldRays(*(tensor.to(self.device) for tensor in points))
-        seen, guests = self._in_parts(graph, rays)
+        seen = self._in_parts(graph, rays)
         intensity, drop_logit = self.lidar_decoder(seen["feature"])
-        if guests:
-            intensity, drop_logit = with_guests_in_sweep(intensity, drop_logit, *guests)
         range_m = self._ranges(seen)
         median_m = seen["median_m"]
         # A beam that ends beyond the reach, or nowhere, is lost: a
@@ -199,31 +187,15 @@ class FieldScene(ReconstructedScene):
         depth_m, alpha = seen["depth_m"], seen["alpha"]
         return depth_m / alpha.clamp_min(_TINY) if self.config.whole_ranges else depth_m
 
-    def _in_parts(
-        self, graph: SceneGraph, rays: FieldRays
-    ) -> tuple[Mapping[str, Tensor], tuple[list[Guest], list[SeenOfGuest]] | None]:
-        """Return the features, distances and opacities of any number of rays, and guests if there are any."""
+    def _in_parts(self, graph: SceneGraph, rays: FieldRays) -> dict[str, Tensor]:
+        """Return the features, distances and opacities of any number of rays."""
         rendered: dict[str, list[Tensor]] = {"feature": [], "depth_m": [], "alpha": [], "median_m": []}
-        own, guests = split_guests(graph.tracks, field_of(graph))
-        of_guests: list[list[SeenOfGuest]] = []
         # Rays in parts bound the memory
         for first in range(0, max(len(rays.t_s), 1), RAYS_AT_ONCE):
-            part = FieldRays(*(tensor[first : first + RAYS_AT_ONCE] for tensor in rays))
-            if guests:
-                seen, parts = look_with_guests(self.field, part, own, guests)
-                of_guests.append(parts)
-            else:
-                seen = self.look(graph, part)
+            seen = self.look(graph, FieldRays(*(tensor[first : first + RAYS_AT_ONCE] for tensor in rays)))
             for name, values in rendered.items():
                 values.append(getattr(seen, name))
-        joined = {name: torch.cat(values) for name, values in rendered.items()}
-        if not guests:
-            return joined, None
-        # Join the parts of each guest
-        seen_of = [
-            SeenOfGuest(*map(torch.cat, zip(*parts, strict=True))) for parts in zip(*of_guests, strict=True)
-        ]
-        return joined, (guests, seen_of)
+        return {name: torch.cat(values) for name, values in rendered.items()}
 
 
 def _pixels_of_rays(corner_uv: Int[Tensor, "2"], size: Int[Tensor, "2"]) -> Float[Tensor, "R 2"]:
