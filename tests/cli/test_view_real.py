@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from nuscenes_keyframe import written_keyframe
 from PIL import Image
 
 from foredrive.cli.main import main
@@ -11,8 +12,8 @@ from foredrive.cli.main import main
 
 @pytest.fixture(scope="module")
 def key_frame(real_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    root = tmp_path_factory.mktemp("logs")
-    assert main(["convert", "nuscenes-keyframe", str(real_data / "nuscenes"), "--out", str(root)]) == 0
+    root, raw = tmp_path_factory.mktemp("logs"), written_keyframe(real_data, tmp_path_factory.mktemp("raw"))
+    assert main(["convert", "nuscenes", str(raw), "--out", str(root)]) == 0
     return root
 
 

@@ -3,7 +3,6 @@
 import dataclasses
 import json
 import math
-import shutil
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +11,7 @@ import raw_pandaset
 import synthetic_log as world
 import torch
 from arrow_surgery import rewrite_column
+from nuscenes_keyframe import written_keyframe
 
 from foredrive.data import ClipConfig, ClipDataset, LogPath, collate, find_logs
 from foredrive.data.boxes import read_boxes, with_counted_points
@@ -194,7 +194,7 @@ def test_real_logs_have_the_labels_that_they_tell(real_data: Path, tmp_path: Pat
     assert found["num_points"].min() >= 0
     assert found["num_points"].max() > 100
     assert (found["attribute"] == UNKNOWN).all()
-    (keyframe,) = convert(real_data / "nuscenes", "nuscenes-keyframe", tmp_path)
+    (keyframe,) = convert(written_keyframe(real_data, tmp_path), "nuscenes", tmp_path)
     assert clip_boxes(keyframe)["num_points"].min() >= 0
     kitti = convert(real_data / "kitti", "kitti-object", tmp_path)
     found = clip_boxes(kitti[1])
@@ -204,27 +204,16 @@ def test_real_logs_have_the_labels_that_they_tell(real_data: Path, tmp_path: Pat
 
 @pytest.mark.real
 def test_a_table_of_annotations_tells_attributes_and_visibility(real_data: Path, tmp_path: Path) -> None:
-    """The key frame has no such table; this one is made at the places of three of its boxes."""
-    (plain,) = convert(real_data / "nuscenes", "nuscenes-keyframe", tmp_path / "plain")
-    log = Log(plain)
-    boxes = read_boxes(log, 0)
-    assert boxes is not None
-    T = log.T_world_ego[0]
-    world_xyz = boxes.centre.double().numpy() @ T[:3, :3].T + T[:3, 3]
-    copy = tmp_path / "raw" / "keyframe"
-    shutil.copytree(real_data / "nuscenes" / "keyframe", copy)
-    tables = next(copy.glob("v1.0-*"))
-    token = {row["name"]: row["token"] for row in json.loads((tables / "attribute.json").read_text())}
-    rows = [
-        {"translation": world_xyz[row].tolist(), "attribute_tokens": attributes, "visibility_token": level}
-        for row, attributes, level in (
-            (0, [token["pedestrian.standing"]], "1"),
-            (1, [], "4"),
-            (2, [token["vehicle.parked"]], "3"),
-        )
-    ]
-    (tables / "sample_annotation.json").write_text(json.dumps(rows))
-    told = read_boxes(Log(convert(tmp_path / "raw", "nuscenes-keyframe", tmp_path / "told")[0]), 0)
+    """The info file of the key frame has neither; these are made up for three of its boxes."""
+    rows = json.loads(next((real_data / "nuscenes" / "keyframe").glob("v1.0-*/attribute.json")).read_text())
+    token = {row["name"]: row["token"] for row in rows}
+    labels = {
+        0: {"attribute_tokens": [token["pedestrian.standing"]], "visibility_token": "1"},
+        1: {"visibility_token": "4"},
+        2: {"attribute_tokens": [token["vehicle.parked"]], "visibility_token": "3"},
+    }
+    raw = written_keyframe(real_data, tmp_path, labels)
+    told = read_boxes(Log(convert(raw, "nuscenes", tmp_path / "out")[0]), 0)
     assert told is not None
     assert told.attribute[:3].tolist() == [Attribute.PEDESTRIAN_STANDING, UNKNOWN, Attribute.VEHICLE_PARKED]
     assert told.visibility[:3].tolist() == [Visibility.V0_40, Visibility.V80_100, Visibility.V60_80]

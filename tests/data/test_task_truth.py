@@ -8,6 +8,7 @@ import pytest
 import synthetic_log as world
 import torch
 from flat_street import street
+from nuscenes_keyframe import written_keyframe
 
 from foredrive.data import ClipConfig, ClipDataset, LogPath, collate, find_logs
 from foredrive.data.clip_config import TaskTruthConfig
@@ -161,7 +162,7 @@ def test_real_logs_say_what_they_can_judge(real_data: Path, tmp_path: Path) -> N
     assert judged(convert(real_data / "pandaset", "pandaset", tmp_path)) == everything - {"map"}
     av2 = convert(real_data / "av2", "av2", tmp_path)
     assert judged(av2) == everything
-    keyframe = convert(real_data / "nuscenes", "nuscenes-keyframe", tmp_path)
+    keyframe = convert(written_keyframe(real_data, tmp_path), "nuscenes", tmp_path / "out")
     assert judged(keyframe) == {"detection", "occupancy"}
     kitti = convert(real_data / "kitti", "kitti-object", tmp_path)
     assert "map" not in judged(kitti)

@@ -99,12 +99,14 @@ def test_the_name_of_a_log_stays_in_the_data_root(name: str, tmp_path: Path) -> 
 
 
 def test_a_scene_with_a_path_as_its_name_writes_nothing_outside(tmp_path: Path) -> None:
-    folder = tmp_path / "raw" / "v1.0-mini"
+    folder = tmp_path / "raw" / "v1.0-own"
     folder.mkdir(parents=True)
     (folder / "sample_data.json").write_text("[]")
-    (folder / "scene.json").write_text(json.dumps([{"name": "../../../leaked"}]))
+    (folder / "log.json").write_text('[{"token": "2"}]')
+    scene = {"token": "1", "name": "../../../leaked", "log_token": "2"}
+    (folder / "scene.json").write_text(json.dumps([scene]))
     with pytest.raises(InputError, match="cannot be that of a folder"):
-        convert(tmp_path / "raw", "nuscenes-keyframe", tmp_path / "out")
+        convert(tmp_path / "raw", "nuscenes", tmp_path / "out")
     assert not list(tmp_path.rglob("leaked*"))
 
 

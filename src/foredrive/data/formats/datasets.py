@@ -39,9 +39,6 @@ DATASETS: dict[str, RawDataset] = {
         "py123d_datasets.nuscenes", "v1.0-trainval, v1.0-test, v1.0-mini or v1.0-NAME with scene.json"
     ),
     "nuscenes-sweeps": RawDataset("py123d_datasets.nuscenes_sweeps", "the same as for nuscenes", "10 Hz"),
-    "nuscenes-keyframe": RawDataset(
-        "nuscenes_keyframe.find_keyframes", "v1.0-*/sample_data.json", "one sample"
-    ),
     "nuplan": RawDataset("py123d_datasets.nuplan", "nuplan-v1.1/splits/mini, trainval or test"),
     "waymo": RawDataset("py123d_datasets.waymo", "training, validation or testing with *.tfrecord"),
     "waymo-motion": RawDataset("py123d_datasets.waymo_motion", "training, validation, … with *.tfrecord-*"),
