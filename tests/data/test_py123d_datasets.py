@@ -4,6 +4,7 @@ import importlib.util
 import io
 import json
 import pickle
+import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -23,6 +24,7 @@ from py123d.parser.truckdrive.truckdrive_constants import LABEL_MAPPING, MAPPED_
 from scipy.spatial.transform import Rotation
 from test_raw_pandaset import Intruder
 
+from foredrive.cli.convert import convert as convert_verb
 from foredrive.data.boxes import read_boxes
 from foredrive.data.cameras import pinhole_cameras, read_camera
 from foredrive.data.formats.convert import convert
@@ -502,6 +504,11 @@ def test_a_missing_package_is_one_line_that_says_how_to_get_it(dataset: str, tmp
     with pytest.raises(InputError, match=r"needs the package \w+: pip install") as told:
         convert(tmp_path, dataset, tmp_path / "out")
     assert "\n" not in str(told.value)
+
+
+def test_the_help_names_every_data_set() -> None:
+    named = re.split(r"[\s,:()]+", convert_verb.__doc__ or "")
+    assert set(DATASETS) <= set(named)
 
 
 @pytest.mark.parametrize("dataset", DATASETS)

@@ -9,15 +9,12 @@ import tyro
 from foredrive.cli.arguments import OptionalPath, check_number, check_out_folder
 from foredrive.cli.failures import listed_failures
 from foredrive.cli.progress import frame_progress
-from foredrive.data.formats.datasets import datasets_help
 from foredrive.errors import InputError
 from foredrive.lazy import importing
 
-DATASET_HELP = f"Name of the data set: {datasets_help()}. Some need more packages; the message says which."
-
 
 def convert(
-    dataset: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="DATASET", help=DATASET_HELP)],
+    dataset: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="DATASET")],
     source: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")],
     out: OptionalPath = None,
     workers: int = 0,
@@ -32,7 +29,10 @@ def convert(
     does not stop the others.
 
     Args:
-        dataset: Name of the data set.
+        dataset: Name of the data set: pandaset, av2, nuscenes, nuscenes-sweeps (10 Hz), nuplan, waymo,
+            waymo-motion, kitti360, kitti-raw, kitti-object, griffin, truckdrive, physical-ai-av, ncore (NCore
+            v4), nureasoning, nerfstudio (folders with transforms.json) or rosbag (ROS 1, ROS 2 and MCAP).
+            Some need more packages; the message says which.
         source: Folder of one raw log, or of many; for rosbag also a file.
         out: 123D data root to write to.
         workers: Number of logs converted at a time; 0: one for each core.

@@ -57,7 +57,7 @@ def find_raw_logs(source: Path, dataset: str, topics: Path | None = None) -> Ite
     if not source.exists():
         raise InputError(f"{source}: no such folder")
     kind, any_log = DATASETS[dataset], False
-    logs = iter(kind.find(source) if topics is None else find_bags(source, topics))
+    logs = kind.find(source) if topics is None else find_bags(source, topics)
     while True:
         # Errors of a parser become an error that names the log
         with reading_raw(source):
