@@ -82,7 +82,7 @@ def test_two_cameras_at_the_same_times(tmp_path: Path) -> None:
     [
         ({"transform_matrix": [[1, 2], [3]]}, "transform_matrix must be 4 rows of 4"),
         ({"transform_matrix": np.full((4, 4), np.nan).tolist()}, "4 finite numbers"),
-        ({"transform_matrix": (2 * AHEAD).tolist()}, "a rotation that is none|last row"),
+        ({"transform_matrix": (2 * AHEAD).tolist()}, "a matrix that is no rotation|last row"),
         ({"file_path": "../../secret.png"}, "lies outside of the folder"),
         ({"file_path": "images/none.png"}, "cannot read the image"),
         ({"camera_model": "OPENCV_FISHEYE"}, "undistort the images first"),

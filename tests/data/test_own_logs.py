@@ -160,7 +160,7 @@ MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
         ({"t_s": TIMES_S[:3]}, r"t_s must be \[T\]"),
         ({"t_s": TIMES_S[::-1]}, "times must increase"),
         ({"T_world_ego": np.full((4, 4, 4), np.nan)}, "not finite"),
-        ({"T_world_ego": POSES * 2}, "a rotation that is none"),
+        ({"T_world_ego": POSES * 2}, "a matrix that is no rotation"),
         ({"T_world_ego": POSES * np.array([1.0, 1, 1, 2])[:, None]}, "the last row of each"),
         ({"sweeps": [POINTS]}, "1 entries in sweeps, but 4 frames"),
         ({"cameras": [CAMERA], "images": {"front": [IMAGE]}}, "1 entries in images of front"),
@@ -187,7 +187,7 @@ MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
         ({"cameras": [dataclasses.replace(CAMERA, K=-CAMERA.K)]}, "focal lengths of front must be above 0"),
         (
             {"cameras": [dataclasses.replace(CAMERA, T_ego_cam=MIRROR @ CAMERA.T_ego_cam)]},
-            "T_ego_cam of front holds a rotation that is none",
+            "T_ego_cam of front holds a matrix that is no rotation",
         ),
         (
             {"image_mounts": {"front": np.stack([CAMERA.T_ego_cam] * 3)}},
@@ -199,7 +199,7 @@ MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
         ),
         (
             {"cameras": [dataclasses.replace(CAMERA, T_ego_cam=2 * CAMERA.T_ego_cam)]},
-            "T_ego_cam of front holds a rotation that is none",
+            "T_ego_cam of front holds a matrix that is no rotation",
         ),
         ({"t_s": TIMES_S + 1.7e18}, "times are in seconds; 1.7e"),
         (

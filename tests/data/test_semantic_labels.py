@@ -14,7 +14,7 @@ from foredrive.data.labels import make_labels
 from foredrive.data.log_writer import LogWriter
 from foredrive.data.logs import Log
 from foredrive.data.modalities import FullOccupancy
-from foredrive.data.truth.semantic_labels import NEVER_IN_TOWNS, STATIC_CLASSES, read_semantics
+from foredrive.data.truth.semantic_labels import ABSENT_IN_TOWNS, STATIC_CLASSES, read_semantics
 from foredrive.scene import Category, VoxelSpec
 from foredrive.scene.semantics import VOXEL_CLASSES, SemanticVoxels, Taxonomy
 from foredrive.towns.place.materials import Surface
@@ -161,5 +161,5 @@ def test_every_surface_of_towns_has_a_class() -> None:
         "HIDDEN": "terrain",
         "SIGNAL": "manmade",
     }
-    assert not set(NEVER_IN_TOWNS) & set(classes.values())
-    assert set(NEVER_IN_TOWNS) < set(VOXEL_CLASSES["occ3d"])
+    assert not set(ABSENT_IN_TOWNS) & set(classes.values())
+    assert set(ABSENT_IN_TOWNS) < set(VOXEL_CLASSES["occ3d"])

@@ -217,7 +217,7 @@ class _Drive:
             raise InputError(f"{name}: times must increase, by a microsecond at least")
         R = T_world_ego[:, :3, :3]
         if not np.allclose(R @ R.mT, np.eye(3), atol=1e-3) or (np.linalg.det(R) < 0).any():
-            raise InputError(f"{name}: T_world_ego holds a rotation that is none")
+            raise InputError(f"{name}: T_world_ego holds a matrix that is no rotation")
         if not np.allclose(T_world_ego[:, 3], [0, 0, 0, 1], atol=1e-6):
             raise InputError(f"{name}: the last row of each T_world_ego must be 0, 0, 0, 1")
         velocity = _rates(T_world_ego[:, :3, 3], t_us)
@@ -284,7 +284,7 @@ def _check_cameras(name: str, cameras: Sequence[CameraSpec]) -> None:
         if K[0, 0] <= 0 or K[1, 1] <= 0:
             raise InputError(f"{name}: the focal lengths of {spec.name} must be above 0")
         if not _is_rotation(T):
-            raise InputError(f"{name}: T_ego_cam of {spec.name} holds a rotation that is none")
+            raise InputError(f"{name}: T_ego_cam of {spec.name} holds a matrix that is no rotation")
 
 
 def _is_rotation(T: Float64[np.ndarray, "4 4"]) -> bool:

@@ -1,6 +1,7 @@
 """What a driver sees of its route, and the head that reads it from image features."""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -145,6 +146,14 @@ class RouteReader(nn.Module):
         return Sight(light, lamps, lines, line, occupied, pixels.float(), user_cells)
 
 
+class LampReading(NamedTuple):
+    """What lamps show, as parts of `Sight`."""
+
+    light_logits: Float[Tensor, "b 4"]
+    lamp_logits: Float[Tensor, "b C 3 h w"]
+    lamp_line: Float[Tensor, "b C h w"]
+
+
 class LampHead(nn.Module):
     """Reads lamps at every place of fine image features, given the route.
 
@@ -169,8 +178,8 @@ class LampHead(nn.Module):
 
     def forward(
         self, fine: Float[Tensor, "b C F h w"], mean: Float[Tensor, "b C W"], context: Float[Tensor, "b V"]
-    ) -> tuple[Float[Tensor, "b 4"], Float[Tensor, "b C 3 h w"], Float[Tensor, "b C h w"]]:
-        """Return `Sight.light_logits`, `lamp_logits` and `lamp_line`."""
+    ) -> LampReading:
+        """Return what the lamps show."""
         b, _, _, h, w = fine.shape
         y, x = torch.meshgrid(torch.linspace(-1, 1, h), torch.linspace(-1, 1, w), indexing="ij")
         place = torch.stack([x, y]).to(fine).expand(b, 2, h, w)
@@ -187,7 +196,7 @@ class LampHead(nn.Module):
         # Maximum over places and cameras: each colour's best lamp
         lamps_logits = maps_of_all[:, :, : len(COLOURS)]
         colours = lamps_logits.flatten(3).amax(-1).amax(1)
-        return torch.cat([none, colours], dim=-1), lamps_logits, maps_of_all[:, :, len(COLOURS)]
+        return LampReading(torch.cat([none, colours], dim=-1), lamps_logits, maps_of_all[:, :, len(COLOURS)])
 
 
 def _lamp_layers(hidden: int) -> nn.Sequential:

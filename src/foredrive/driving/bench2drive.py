@@ -46,7 +46,7 @@ OppositeVehicleRunningRedLight. None asks for overtaking or giving way."""
 
 
 def succeeds(score: RouteScore) -> bool:
-    """Return whether a drive completed its route without an infraction; too low a speed is none."""
+    """Return whether a drive completed its route without an infraction. Low speeds do not count as one."""
     kinds = {infraction.kind for infraction in score.infractions} - {InfractionKind.MIN_SPEED}
     return score.ending is Ending.COMPLETED and not kinds and not score.outside_lanes
 

@@ -48,6 +48,37 @@ class _Search(NamedTuple):
     """Row that holds the node; -1 if the node is unused."""
 
 
+class _Solution(NamedTuple):
+    """An assignment with its prices."""
+
+    column: Int[ndarray, "R"]
+    """C: no column."""
+    row_price: Float[ndarray, "R"]
+    node_price: Float[ndarray, "C_R"]
+    """Of the columns, then of each row's "no column"."""
+
+
+class _Path(NamedTuple):
+    """A path that `_reroute` has found."""
+
+    length: float
+    """inf: there is none that is short enough."""
+    reached_unused: float
+    """Distance of the first unused node on it; inf if it has none."""
+    unused: int
+    """That node; -1 if it has none."""
+
+
+class _Subproblems(NamedTuple):
+    """The cheapest unsolved subproblems in order of their costs; inf where there are fewer."""
+
+    cost: Float[ndarray, "k"]
+    parent: Int[ndarray, "k"]
+    """The ranked assignment that is split."""
+    row: Int[ndarray, "k"]
+    """The row that must not take its own column."""
+
+
 _BY_UNUSED = -2
 
 
@@ -164,8 +195,7 @@ def _rank(cost, free, k):
     first_open = np.zeros(k, np.int64)  # rows before it keep their columns
     banned = np.zeros((k, columns + 1), np.bool_)  # columns that the first open row must not take
     no_ban = np.zeros(columns + 1, np.bool_)
-    waiting = np.full(k, np.inf)  # costs of the cheapest unsolved subproblems, in increasing order
-    parent_of, row_cut = np.empty(k, np.int64), np.empty(k, np.int64)
+    waiting = _Subproblems(np.full(k, np.inf), np.empty(k, np.int64), np.empty(k, np.int64))
     nodes = columns + rows
     search = _Search(
         np.empty(nodes), np.empty(nodes, np.int64), np.empty(nodes, np.bool_), np.empty(nodes, np.int64)
@@ -182,69 +212,69 @@ def _rank(cost, free, k):
         # ones cannot be ranked: `room` is the largest extra cost that is still of interest.
         parent, wanted = count - 1, k - count
         for r in range(first_open[parent], rows):
-            room = waiting[wanted - 1] - total[parent]
+            room = waiting.cost[wanted - 1] - total[parent]
             ban = banned[parent] if r == first_open[parent] else no_ban
-            extra, _, _ = _reroute(cost, free, column_of[parent], u[parent], v[parent], r, ban, room, search)
+            solution = _Solution(column_of[parent], u[parent], v[parent])
+            extra = _reroute(cost, free, solution, r, ban, room, search).length
             if extra < room:
-                _insert(waiting, parent_of, row_cut, wanted, total[parent] + extra, parent, r)
-        if waiting[0] == np.inf:
+                _insert(waiting, wanted, total[parent] + extra, parent, r)
+        if waiting.cost[0] == np.inf:
             break
         # The cheapest waiting subproblem is the next assignment. Solve it, starting from its parent's
         # solution.
-        parent, r, total[count] = parent_of[0], row_cut[0], waiting[0]
-        _drop_first(waiting, parent_of, row_cut)
+        parent, r, total[count] = waiting.parent[0], waiting.row[0], waiting.cost[0]
+        _drop_first(waiting)
         column_of[count], u[count], v[count], first_open[count] = column_of[parent], u[parent], v[parent], r
         # Bans accumulate while the same row is cut again. Otherwise only the parent's column is banned.
         if r == first_open[parent]:
             banned[count] = banned[parent]
-        extra, reached_unused, unused = _reroute(
-            cost, free, column_of[count], u[count], v[count], r, banned[count], np.inf, search
-        )
+        solution = _Solution(column_of[count], u[count], v[count])
+        path = _reroute(cost, free, solution, r, banned[count], np.inf, search)
         banned[count, column_of[parent, r]] = True
-        _apply(column_of[count], u[count], v[count], r, extra, reached_unused, unused, search)
+        _apply(solution, r, path, search)
         count += 1
     return column_of[:count], total[:count]
 
 
 @_kernel
 @no_type_check
-def _insert(waiting, parent_of, row_cut, wanted, cost, parent, row):
+def _insert(waiting, wanted, cost, parent, row):
     """Insert a subproblem into the sorted list of the `wanted` cheapest ones. The last one drops out."""
     place = wanted - 1
-    while place > 0 and waiting[place - 1] > cost:
-        waiting[place], parent_of[place] = waiting[place - 1], parent_of[place - 1]
-        row_cut[place] = row_cut[place - 1]
+    while place > 0 and waiting.cost[place - 1] > cost:
+        _copy(waiting, place - 1, place)
         place -= 1
-    waiting[place], parent_of[place], row_cut[place] = cost, parent, row
+    waiting.cost[place], waiting.parent[place], waiting.row[place] = cost, parent, row
 
 
 @_kernel
 @no_type_check
-def _drop_first(waiting, parent_of, row_cut):
+def _drop_first(waiting):
     """Remove the cheapest subproblem from the sorted list."""
-    last = len(waiting) - 1
-    for n in range(last):
-        waiting[n], parent_of[n], row_cut[n] = waiting[n + 1], parent_of[n + 1], row_cut[n + 1]
-    waiting[last] = np.inf
+    for place in range(1, len(waiting.cost)):
+        _copy(waiting, place, place - 1)
+    waiting.cost[-1] = np.inf
 
 
 @_kernel
 @no_type_check
-def _reroute(cost, free, column_of, u, v, start, ban, room, search):
+def _copy(waiting, place, to):
+    waiting.cost[to] = waiting.cost[place]
+    waiting.parent[to], waiting.row[to] = waiting.parent[place], waiting.row[place]
+
+
+@_kernel
+@no_type_check
+def _reroute(cost, free, solution, start, ban, room, search):
     """Find the shortest path that gives row `start` another node. Rows before `start` keep theirs.
 
     Nodes are the C columns, followed by each row's own "no column" node. `start` must not take a node in
     `ban`, nor the node that it holds now (`target`). The path ends at `target`, which `start` gives up.
 
     An unused node behaves as if an idle row held it at zero cost. A path that reaches an unused node may
-    continue to any node. That node then becomes unused.
-
-    Returns:
-        The length of the path (inf if it is not below `room`).
-        The distance of the first unused node on it (inf if it has none).
-        That node (-1 if it has none).
+    continue to any node. That node then becomes unused. Returns the `_Path`, if it is shorter than `room`.
     """
-    columns = cost.shape[1]
+    columns, (column_of, u, v) = cost.shape[1], solution
     distance, before, done, row_of = search
     _reset(search, column_of, columns, start)
     target = column_of[start] if column_of[start] < columns else columns + start
@@ -267,10 +297,10 @@ def _reroute(cost, free, column_of, u, v, start, ban, room, search):
             if distance[x] < nearest and not done[x]:
                 nearest, end = distance[x], x
         if end < 0:
-            return np.inf, reached_unused, unused
+            return _Path(np.inf, reached_unused, unused)
         reached = nearest
         if end == target:
-            return reached, reached_unused, unused
+            return _Path(reached, reached_unused, unused)
         done[end] = True
         row = row_of[end]
         if row < 0:  # it happens once: all unused nodes are done afterwards
@@ -312,8 +342,10 @@ def _relax_from_unused(v, reached, search):
 
 @_kernel
 @no_type_check
-def _apply(column_of, u, v, start, length, reached_unused, unused, search):
+def _apply(solution, start, path, search):
     """Apply the path found by `_reroute` in place: update the assignment and the prices."""
+    column_of, u, v = solution
+    length, reached_unused, unused = path
     distance, before, done, row_of = search
     rows = len(u)
     columns = len(v) - rows

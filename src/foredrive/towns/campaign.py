@@ -104,7 +104,7 @@ def plan_drives(campaign: Campaign) -> list[DrivePlan]:
     conditions_cycle, counts = _cycle_conditions(), Counter[Command]()
     plans = []
     for town in dict.fromkeys(campaign.towns):
-        load_town_map(town)  # raises an error that lists the known towns if it is none of them
+        load_town_map(town)  # Raises an error that lists the known towns
         for conditions, seed in _town_drives(campaign, town, conditions_cycle, counts):
             plans.append(_plan_drive(campaign, town, seed, conditions))
     return plans

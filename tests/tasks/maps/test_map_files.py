@@ -135,10 +135,13 @@ def test_centrelines_count_where_the_truth_has_them(tmp_path: Path) -> None:
 
 
 WRONG: dict[str, tuple[Any, str]] = {
-    "class": (maptr({"a": [("kerb", LINE, 0.9)]}), "frame a, vector 0: the class 'kerb' is none of divider"),
+    "class": (
+        maptr({"a": [("kerb", LINE, 0.9)]}),
+        "the class 'kerb' is not one of divider",
+    ),
     "label": (
         {"results": {"a": {"vectors": [LINE], "labels": [3], "scores": [0.5]}}},
-        "frame a, vector 0: the label 3 is none of 0 (crossing), 1 (divider), 2 (boundary)",
+        "frame a, vector 0: the label 3 is not one of 0 (crossing), 1 (divider), 2 (boundary)",
     ),
     "nan": (
         maptr({"a": [("divider", LINE, 0.9), ("divider", [[0.0, float("nan")], [1.0, 1.0]], 0.9)]}),

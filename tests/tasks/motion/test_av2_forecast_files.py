@@ -134,7 +134,7 @@ def test_end_to_end_by_hand(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        ({"log": {"0": [bus(name="TRAM")]}}, "log log, 0 ns, agent 0: the class 'TRAM' is none of"),
+        ({"log": {"0": [bus(name="TRAM")]}}, "log log, 0 ns, agent 0: the class 'TRAM' is not one of"),
         ({"log": {"0": [bus(detection_score=2.0)]}}, "log log, 0 ns, agent 0: the score 2 is not in"),
         ({"log": {"0": [bus(prediction_m=[[[1.0, 2.0]]])]}}, "agent 0 has no prediction_m of 60 number"),
         ({"log": {"0": [bus(score=[float("nan")] * 5)]}}, "agent 0: its score is not finite"),

@@ -110,7 +110,10 @@ def test_other_names_of_the_fields(tmp_path: Path) -> None:
 
 
 WRONG: dict[str, tuple[Any, str]] = {
-    "class": ({"a": [found_box(1.0, 1.0, name="tram")]}, "frame a, box 0: the class 'tram' is none of car"),
+    "class": (
+        {"a": [found_box(1.0, 1.0, name="tram")]},
+        "box 0: the class 'tram' is not one of car",
+    ),
     "score": ({"a": [found_box(1.0, 1.0, 1.5)]}, "frame a, box 0: the score 1.5 is not in [0, 1]"),
     "no score": ({"a": [found_box(1.0, 1.0, detection_score=None)]}, "frame a, box 0 has no score"),
     "place": ({"a": [found_box(1.0, 1.0, translation=[math.nan, 0, 0])]}, "its translation is not finite"),

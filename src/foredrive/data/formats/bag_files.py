@@ -32,7 +32,7 @@ def open_bag(path: Path) -> Iterator[Bag]:
     """Open a .bag, a ROS 2 bag (its folder, .db3 or .mcap), or an .mcap of Foxglove's messages.
 
     Raises:
-        InputError: the packages are not installed, or it is none of these.
+        InputError: the packages are not installed, or it has another format.
     """
     for package in ("rosbags", "mcap"):
         if importlib.util.find_spec(package) is None:

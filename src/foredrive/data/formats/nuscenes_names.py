@@ -43,7 +43,7 @@ def read_table(file: Path) -> dict[str, dict[str, Any]]:
     """Read a table of nuScenes by the token of its rows.
 
     Raises:
-        InputError: the file cannot be read, or is none.
+        InputError: the file cannot be read, or is not a table.
     """
     try:
         rows = json.loads(file.read_bytes())  # bytes may begin with a byte order mark

@@ -48,7 +48,14 @@ CATEGORY_CLASSES = {
     Category.BARRIER: "barrier",
     Category.OTHER: "others",
 }
-NEVER_IN_TOWNS = ("others", "barrier", "construction_vehicle", "traffic_cone", "trailer", "other_flat")
+ABSENT_IN_TOWNS = (
+    "others",
+    "barrier",
+    "construction_vehicle",
+    "traffic_cone",
+    "trailer",
+    "other_flat",
+)
 """Classes that no recording of a town has. Walls, fences and bridges are man-made there, parking lots and
 the paved sides of roads are road or sidewalk."""
 _NEARLY_AT_TOP = 0.98

@@ -9,7 +9,7 @@ from foredrive.data.cameras import pinhole_cameras
 from foredrive.data.logs import Log
 from foredrive.data.maps import map_file
 from foredrive.data.modalities import BOX_ATTRIBUTE, BOX_VISIBILITY, FULL_OCCUPANCY
-from foredrive.data.truth.semantic_labels import NEVER_IN_TOWNS
+from foredrive.data.truth.semantic_labels import ABSENT_IN_TOWNS
 from foredrive.scene.boxes import UNKNOWN, VEHICLES
 
 MOTION_S = 6.0
@@ -85,7 +85,7 @@ def _motion(tracks: Tracks | None, lasting_s: float) -> TaskSupport:
 def _occupancy(log: Log, tracks: Tracks | None) -> TaskSupport:
     vehicles = tracks is not None and bool(np.isin(tracks.category, [int(kind) for kind in VEHICLES]).any())
     if log.file(f"custom.{FULL_OCCUPANCY}").is_file():
-        never = ", ".join(NEVER_IN_TOWNS)
+        never = ", ".join(ABSENT_IN_TOWNS)
         return TaskSupport("occupancy", True, f"exact voxels with classes, but never {never}")
     if vehicles:
         return TaskSupport("occupancy", True, "vehicles from above (IoU, VPQ), but no voxels with classes")

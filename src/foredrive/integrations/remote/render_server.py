@@ -228,7 +228,7 @@ class RenderService:
         """Render the image of a request.
 
         Raises:
-            InputError: there is no such camera, the pose is none, or the log does not last until then.
+            InputError: there is no such camera, the pose is wrong, or the log does not last until then.
         """
         rig = dataclasses.replace(self._vehicle.rig, exposed_dt_s=None)
         if asked.camera_name not in self._cameras:

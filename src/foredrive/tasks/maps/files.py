@@ -211,7 +211,7 @@ def _of_maptr(content: Sequence[Any], predicted: bool) -> Iterator[tuple[str, _F
             kind = _KINDS.get(vector.get("cls_name"))
             if kind is None:
                 raise InputError(
-                    f"{where}: the class {vector.get('cls_name')!r} is none of {', '.join(_KINDS)}"
+                    f"{where}: the class {vector.get('cls_name')!r} is not one of {', '.join(_KINDS)}"
                 )
             score = _score(vector.get("confidence_level"), where) if predicted else 1.0
             identity = _identity(vector.get("global_id"), where)
@@ -237,7 +237,7 @@ def _of_streammapnet(content: Mapping[str, Any], predicted: bool) -> Iterator[tu
             where = f"frame {token}, vector {i}"
             if not isinstance(label, int) or isinstance(label, bool) or not 0 <= label < len(_BY_LABEL):
                 raise InputError(
-                    f"{where}: the label {label!r} is none of 0 (crossing), 1 (divider), 2 (boundary)"
+                    f"{where}: the label {label!r} is not one of 0 (crossing), 1 (divider), 2 (boundary)"
                 )
             score = _score(columns[2][i], where) if predicted else 1.0
             identity = _identity(identities[i], where)

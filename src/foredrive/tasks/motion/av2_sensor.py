@@ -93,7 +93,7 @@ def _agents(
             where = f"{path}: log {log}, {time} ns, agent {n}"
             if not isinstance(agent, dict) or agent.get("name") not in MEAN_SPEED_MPS:
                 name = agent.get("name") if isinstance(agent, dict) else agent
-                raise InputError(f"{where}: the class {name!r} is none of Argoverse 2's")
+                raise InputError(f"{where}: the class {name!r} is not one of Argoverse 2's")
             records.append(agent)
             names.append(where)
             frame.append(number)

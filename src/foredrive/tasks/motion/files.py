@@ -201,7 +201,7 @@ def _rows(boxes: Mapping[str, Sequence[Box]], tokens: Sequence[str], path: Path)
             where = f"{path}: frame {token}, box {n}"
             name = _first(box, NAMES)
             if name not in CATEGORIES:
-                raise InputError(f"{where}: the class {name!r} is none of {', '.join(CATEGORIES)}")
+                raise InputError(f"{where}: the class {name!r} is not one of {', '.join(CATEGORIES)}")
             records.append(box)
             names.append(where)
             frame.append(number)
