@@ -27,8 +27,17 @@ from foredrive.tasks.occupancy.protocols import (
     VOXEL_PROTOCOLS,
     RayProtocol,
 )
-from foredrive.tasks.occupancy.score import RayCounts, Seen, cast_rays, count_rays, lidar_rays, score_rays
-from foredrive.tasks.occupancy.semantic_scores import count_voxels, mean_iou, voxel_ious
+from foredrive.tasks.occupancy.score import (
+    RayCounts,
+    Seen,
+    cast_rays,
+    count_rays,
+    count_voxels,
+    lidar_rays,
+    mean_iou,
+    score_rays,
+    voxel_ious,
+)
 
 FRAMES, PLAIN_FRAMES, TABLE_FRAMES, SAMPLES = 100, 1, 12, 40
 OBJECTS = 45

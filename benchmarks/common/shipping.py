@@ -17,10 +17,10 @@ from torch import nn
 from foredrive.data import LogPath, find_all_logs
 from foredrive.driver.judging import judge_sight
 from foredrive.driver.packed import PackedClips
+from foredrive.engine.checkpoints import save_small
 from foredrive.engine.config import save_recipe
 from foredrive.engine.folder import CONFIG, LOGS, SUMMARY
 from foredrive.engine.provenance import collect_provenance
-from foredrive.engine.small_weights import save_small
 from foredrive.engine.summary import read_summary
 from foredrive.errors import InputError
 from foredrive.files import atomic_path

@@ -16,7 +16,7 @@ from benchmarks import learning
 from benchmarks.common.benchmark import study_identity
 from benchmarks.common.study import StudyLogs, run_arm, seeded, share_of
 from foredrive.data import LogPath
-from foredrive.engine.small_weights import save_small
+from foredrive.engine.checkpoints import save_small
 from foredrive.files import atomic_path
 from foredrive.methods.planner.path_fit import PathFit
 from foredrive.methods.recipe import Recipe, rescheduled, with_occupancy_source

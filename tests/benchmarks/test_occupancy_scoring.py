@@ -5,7 +5,7 @@ import pytest
 
 from benchmarks.common.occupancy_scoring import Frame, frames
 from foredrive.tasks.occupancy.protocols import OCC3D_CLASSES, VOXEL_PROTOCOLS
-from foredrive.tasks.occupancy.semantic_scores import count_voxels, mean_iou, voxel_ious
+from foredrive.tasks.occupancy.score import count_voxels, mean_iou, voxel_ious
 
 FREE = len(OCC3D_CLASSES) - 1
 

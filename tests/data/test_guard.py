@@ -15,7 +15,7 @@ from made_bags import Messages
 from PIL import Image
 from py123d.parser.base_dataset_parser import ParsedLidar
 
-from foredrive.data.formats.datasets import DATASETS
+from foredrive.data.formats.convert import DATASETS
 from foredrive.data.formats.guard import PartReader, SensorFiles
 from foredrive.data.images import read_rgb
 from foredrive.data.notices import collecting

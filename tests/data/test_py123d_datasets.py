@@ -27,8 +27,7 @@ from test_raw_pandaset import Intruder
 from foredrive.cli.convert import convert as convert_verb
 from foredrive.data.boxes import read_boxes
 from foredrive.data.cameras import pinhole_cameras, read_camera
-from foredrive.data.formats.convert import convert
-from foredrive.data.formats.datasets import DATASETS
+from foredrive.data.formats.convert import DATASETS, convert
 from foredrive.data.lidar import read_sweep
 from foredrive.data.logs import Log
 from foredrive.data.maps import read_map_patch

@@ -9,13 +9,18 @@ from torch import Tensor
 
 from foredrive.errors import InputError
 from foredrive.geometry.se3 import inverse_se3, matrix_from_yaw
-from foredrive.heads.agents_head import AGENT_CLASSES, AgentHeadConfig, AgentSet, CarriedConfig
+from foredrive.heads.agents_head import (
+    AGENT_CLASSES,
+    AgentHeadConfig,
+    AgentSet,
+    CarriedConfig,
+    take_proposals,
+)
 from foredrive.heads.carried import CarriedAgents, carry, frame_steps, lineage_of, moved
 from foredrive.heads.decoder import DecoderConfig
 from foredrive.heads.detection_network import BoxSet
 from foredrive.heads.heads import HeadOutput, TaskHeads, TaskHeadsConfig, TaskVolume
 from foredrive.heads.motion_head import MotionConfig
-from foredrive.heads.taking import take_proposals
 from foredrive.runs.evaluate.predict import DriveFollower
 from foredrive.scene import Attribute, VoxelSpec
 

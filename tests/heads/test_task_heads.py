@@ -9,10 +9,9 @@ import torch
 from foredrive.geometry.se3 import matrix_from_yaw
 from foredrive.heads.agents_head import AgentHeadConfig
 from foredrive.heads.decoder import DecoderConfig
-from foredrive.heads.heads import TaskHeads, TaskHeadsConfig, TaskVolume
+from foredrive.heads.heads import TaskHeads, TaskHeadsConfig, TaskVolume, VoxelHeadConfig
 from foredrive.heads.map_head import MapHeadConfig, RasterHeadConfig, _on_canvas
 from foredrive.heads.motion_head import MotionConfig, kinematic_motion
-from foredrive.heads.occupancy_head import VoxelHeadConfig
 from foredrive.heads.plane import (
     Plane,
     PlaneFeatures,

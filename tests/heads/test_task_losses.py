@@ -5,11 +5,11 @@ import math
 import pytest
 import torch
 
+from foredrive.heads.agent_losses import motion_losses
 from foredrive.heads.agents_head import AGENT_CLASSES, AgentSet
 from foredrive.heads.detection_losses import matched_loss
 from foredrive.heads.detection_network import BoxSet
 from foredrive.heads.map_losses import equivalent_orders, map_element_losses, sigmoid_focal_loss
-from foredrive.heads.motion_losses import motion_losses
 from foredrive.heads.semantic_losses import (
     class_weights,
     raster_loss,

@@ -13,11 +13,10 @@ from foredrive.engine.parameter_groups import parameter_groups
 from foredrive.geometry.se3 import matrix_from_yaw, transform_points
 from foredrive.heads.agents_head import AGENT_CLASSES, AgentHeadConfig
 from foredrive.heads.decoder import DecoderConfig
-from foredrive.heads.heads import TaskHeads, TaskHeadsConfig
+from foredrive.heads.heads import TaskHeads, TaskHeadsConfig, VoxelHeadConfig
 from foredrive.heads.losses import TaskWeights, task_losses
 from foredrive.heads.map_head import MapHeadConfig, RasterHeadConfig
 from foredrive.heads.motion_head import MotionConfig
-from foredrive.heads.occupancy_head import VoxelHeadConfig
 from foredrive.heads.probe import ProbeObjective, TaskExample, TaskVolumes, mirrored_item
 from foredrive.heads.targets import agent_targets, map_targets
 from foredrive.scene import Boxes, Category, VoxelSpec

@@ -17,8 +17,7 @@ from foredrive.tasks.motion.protocols import PROTOCOLS as MOTION
 from foredrive.tasks.motion.scores import score_motion
 from foredrive.tasks.occupancy.instances_metric import count_instances
 from foredrive.tasks.occupancy.protocols import OCC3D_CLASSES, RAY_PROTOCOLS, UNIAD_INSTANCES
-from foredrive.tasks.occupancy.score import cast_rays, count_rays, score_rays
-from foredrive.tasks.occupancy.semantic_scores import mean_iou
+from foredrive.tasks.occupancy.score import cast_rays, count_rays, mean_iou, score_rays
 
 Arrays = Mapping[str, np.ndarray]
 

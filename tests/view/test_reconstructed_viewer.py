@@ -20,9 +20,8 @@ from foredrive.methods.reconstruction.tracks import states_at
 from foredrive.methods.splatad import Gaussians
 from foredrive.runs.reconstruction.reconstruct import Reconstruction
 from foredrive.runs.reconstruction.reconstruction_run import OpenedReconstruction, open_reconstruction
-from foredrive.view.job_runner import JobRunner
 from foredrive.view.reconstruction_nodes import thin_out
-from foredrive.view.reconstruction_viewer import ReconstructedViewer
+from foredrive.view.reconstruction_viewer import JobRunner, ReconstructedViewer
 
 PARKED, MOVING = 7, 11
 

@@ -24,9 +24,8 @@ from foredrive.view.example_panel import (
     front_camera,
 )
 from foredrive.view.html import Provenance
-from foredrive.view.loss_curves import draw_loss_curves
 from foredrive.view.overview import Overview, write_overview
-from foredrive.view.run_report import RunReport, write_run_report
+from foredrive.view.run_report import RunReport, draw_loss_curves, write_run_report
 from foredrive.view.summary_tables import (
     full_table,
     image_table,

@@ -22,18 +22,13 @@ from foredrive.cli.convert import convert
 from foredrive.cli.demo import demo
 from foredrive.cli.drive import drive
 from foredrive.cli.evaluate import evaluate
-from foredrive.cli.export import export
-from foredrive.cli.export_mcap import export_mcap
-from foredrive.cli.export_ncore import export_ncore
-from foredrive.cli.export_nuscenes import export_nuscenes
-from foredrive.cli.export_rerun import export_rerun
+from foredrive.cli.export import export, export_mcap, export_ncore, export_nuscenes, export_rerun
 from foredrive.cli.fetch import fetch_av2
 from foredrive.cli.imagine import imagine
 from foredrive.cli.improve import improve
-from foredrive.cli.models import models
 from foredrive.cli.ncap import ncap
 from foredrive.cli.pseudo import pseudo
-from foredrive.cli.recipes import recipes
+from foredrive.cli.recipes import models, recipes
 from foredrive.cli.reconstruct import reconstruct
 from foredrive.cli.record import record
 from foredrive.cli.render import render

@@ -1,4 +1,4 @@
-"""`foredrive recipes`."""
+"""`foredrive recipes` and `foredrive models`."""
 
 from typing import Annotated
 
@@ -28,3 +28,31 @@ def recipes(
         print(f"foredrive {kind.verb}:")
         for key, entry in kind.recipes.items():
             print(f"  {key:28} {entry.about}")
+
+
+def models(
+    name: Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="MODEL")] = None,
+) -> None:
+    """List the trained models that come with the package, or print the card of one.
+
+    A model's name can stand wherever a run is asked for. The towers are those of `foredrive search`.
+
+    Args:
+        name: Print the card of this model, such as nemo_town, or of the towers.
+    """
+    with importing():
+        from rich.console import Console
+
+        from foredrive.runs.model_card import find_card, shipped_weights
+        from foredrive.view.model_tables import figures_table, models_table
+        from foredrive.view.table import print_table
+
+    if name is not None:
+        print(find_card(name).read_text(), end="")
+        return
+    console, weights = Console(), shipped_weights()
+    print_table(models_table(weights), console)
+    for entry in weights:
+        console.print(f"{entry.name}: {entry.data}", markup=False, highlight=False)
+        if entry.card is not None:
+            print_table(figures_table(entry.card), console)

@@ -1,9 +1,12 @@
-"""Losses of road users: of the dense map of centres, and of the queries by the best matching.
+"""Losses of road users: of the dense map of centres, of the queries by the best matching, of their motion.
+
+A carried query stays with the object that it was matched to.
 
 The map of centres is that of CenterNet (Zhou et al. 2019) and CenterPoint (Yin et al. 2021).
 """
 
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -12,15 +15,15 @@ from torch import Tensor
 
 from foredrive.heads.agents_head import AGENT_CLASSES, AgentSet
 from foredrive.heads.carried import Lineage
-from foredrive.heads.detection_losses import MatchingLossConfig, matched_loss, near_pairs
-from foredrive.heads.motion_losses import motion_losses
+from foredrive.heads.detection_losses import MatchingLossConfig, best_matching, matched_loss, near_pairs
+from foredrive.heads.detection_network import BoxSet
 from foredrive.heads.plane import cell_middles
 from foredrive.heads.proposals import CentreMap
 from foredrive.heads.targets import AgentTargets, agent_targets
-from foredrive.heads.track_matching import NOBODY, held_objects, matching_beside, owners
 from foredrive.ops.masked import masked_mean
 from foredrive.scene import Boxes, VoxelSpec
 from foredrive.scene.task_truth import TaskTruth
+from foredrive.sets import LabelledBoxes
 
 
 def centre_target(
@@ -216,3 +219,103 @@ def _matched_terms(
         targets.future_valid[match],
     )
     return terms | {"motion": motion.distance + motion.mode}
+
+
+class MotionLosses(NamedTuple):
+    """Terms of the loss, without their weights."""
+
+    distance: Float[Tensor, ""]
+    mode: Float[Tensor, ""]
+
+
+def motion_losses(
+    future_xy: Float[Tensor, "n M S 2"],
+    log_prob: Float[Tensor, "n M"],
+    true_xy: Float[Tensor, "n S 2"],
+    valid: Bool[Tensor, "n S"],
+) -> MotionLosses:
+    """Return the smooth L1 distance of the best mode, and the cross-entropy of that mode.
+
+    Only the mode with the least mean distance over the valid steps learns the path (winner takes all). Means
+    are over agents with a valid step; without any, both are 0.
+    """
+    known = valid.any(dim=-1)
+    steps = valid.sum(dim=-1).clamp_min(1)
+    with torch.no_grad():
+        # The mode with the least mean distance over known steps wins, without gradient
+        distance = (future_xy - true_xy[:, None]).norm(dim=-1) * valid[:, None]
+        best = (distance.sum(-1) / steps[:, None]).argmin(dim=-1)
+    won = future_xy[torch.arange(len(best), device=best.device), best]
+    error = F.smooth_l1_loss(won, true_xy, reduction="none").sum(-1)
+    per_agent = torch.where(valid, error, 0.0).sum(-1) / steps
+    # Agents without a known step have no loss
+    return MotionLosses(
+        distance=masked_mean(per_agent, known),
+        mode=masked_mean(F.nll_loss(log_prob, best, reduction="none"), known),
+    )
+
+
+NOBODY = -1
+"""Owner of a query that was matched to no object."""
+RELEASED_M = 4.0
+"""Distance from which on a carried query is no longer held to its object."""
+
+
+@dataclass(frozen=True)
+class Held:
+    """The queries of one frame that carry on an object of the frame before."""
+
+    query: Int[Tensor, "h"]
+    match: Int[Tensor, "h"]
+    """The object of each of `query` at now."""
+    bound: Bool[Tensor, "Q"]
+    """Queries that carry on an object, also one that has left: they can have no other."""
+
+
+def held_objects(
+    source: Int[Tensor, "Q"],
+    owner: Int[Tensor, "_Q"],
+    track_id: Int[Tensor, "N"],
+    away_m: Float[Tensor, "Q N"],
+) -> Held:
+    """Return which queries have to find which objects (MOTR, Zeng et al. 2022, §3.3).
+
+    A query that is `RELEASED_M` away from its object has lost it: both are free.
+
+    Args:
+        source: index of each query in the frame before, or -1.
+        owner: identity of the object that each query of the frame before was matched to, or `NOBODY`.
+        track_id: identity of each object at now.
+        away_m: distance of each query from each object, m.
+    """
+    # Object that the query carried on, if any
+    query_track = torch.where(source >= 0, owner[source.clamp_min(0)], NOBODY)
+    # Its row among the objects at now
+    has_same_track = (query_track[:, None] == track_id) & (query_track[:, None] != NOBODY)
+    # A query that is far from its object is free, and the object is free as well
+    is_released = (has_same_track & (away_m >= RELEASED_M)).any(dim=1)
+    has_same_track = has_same_track & ~is_released[:, None]
+    query, match = has_same_track.nonzero(as_tuple=True)
+    return Held(query, match, (query_track != NOBODY) & ~is_released)
+
+
+def matching_beside(
+    predicted: BoxSet, truth: LabelledBoxes, held: Held, config: MatchingLossConfig
+) -> tuple[Int[Tensor, "n"], Int[Tensor, "n"]]:
+    """Return queries and their objects: the held ones, and the best matching of all others."""
+    # Queries and objects without a partner are matched optimally
+    free_query = (~held.bound).nonzero()[:, 0]
+    free = torch.ones(len(truth.label), dtype=torch.bool, device=held.match.device)
+    free[held.match] = False
+    free_object = free.nonzero()[:, 0]
+    query, match = best_matching(predicted[free_query], truth[free_object], config)
+    return torch.cat([held.query, free_query[query]]), torch.cat([held.match, free_object[match]])
+
+
+def owners(
+    query: Int[Tensor, "n"], match: Int[Tensor, "n"], track_id: Int[Tensor, "N"], queries: int
+) -> Int[Tensor, "Q"]:
+    """Return the identity of the object of each query, or `NOBODY`."""
+    owner = torch.full((queries,), NOBODY, dtype=torch.long, device=query.device)
+    owner[query] = track_id[match].long()
+    return owner

@@ -18,12 +18,49 @@ from foredrive.heads.carried import (
 )
 from foredrive.heads.instances_head import InstanceHead, InstanceHeadConfig, InstanceSet
 from foredrive.heads.map_head import MapHead, MapHeadConfig, MapSet, RasterHead, RasterHeadConfig
-from foredrive.heads.occupancy_head import VoxelHead, VoxelHeadConfig
 from foredrive.heads.plane import Plane, PlanePyramid, Planes
 from foredrive.heads.proposals import CentreMap
 from foredrive.scene import Belief, Task, VoxelSpec, WorldModel
 from foredrive.scene.map_elements import PlaneSpec
 from foredrive.scene.record import Record
+from foredrive.scene.semantics import VOXEL_CLASSES, Taxonomy
+
+
+@dataclass(frozen=True)
+class VoxelHeadConfig:
+    """Sizes of a `VoxelHead`."""
+
+    taxonomy: Taxonomy = "occ3d"
+    hidden: int = 32
+
+
+class VoxelHead(nn.Module):
+    """An MLP from the features of a voxel and of its column to the logits of the voxel's classes.
+
+    The column's features come from the fine plane and become one vector for each height (FlashOcc, Yu et al.
+    2023).
+
+    Args:
+        planes: the module that makes the planes.
+        channels: D of the volume.
+        height: Z of the volume.
+        config: sizes.
+    """
+
+    def __init__(self, planes: PlanePyramid, channels: int, height: int, config: VoxelHeadConfig) -> None:
+        super().__init__()
+        self.taxonomy = config.taxonomy
+        self.height = height
+        self.own = nn.Conv3d(channels, config.hidden, 1)
+        self.column = nn.Conv2d(planes.fine_width, height * config.hidden, 1)
+        self.out = nn.Conv3d(config.hidden, len(VOXEL_CLASSES[config.taxonomy]), 1)
+
+    def forward(self, volume: Float[Tensor, "b D Z Y X"], planes: Planes) -> Float[Tensor, "b C Z Y X"]:
+        """Return the logits in the order of `VOXEL_CLASSES`."""
+        # One vector of the column for each height, added to the features of each voxel
+        around = self.column(planes.fine.features).unflatten(1, (-1, self.height))
+        logits: Tensor = self.out((self.own(volume) + around).relu())
+        return logits
 
 
 @dataclass(frozen=True)

@@ -7,8 +7,12 @@ import numpy as np
 import pytest
 
 from foredrive.scene.boxes import UNKNOWN, Attribute
-from foredrive.tasks.detection.over_recall import running_mean
-from foredrive.tasks.detection.protocols import DETECTION_PROTOCOLS, evaluate_detections, hit_errors
+from foredrive.tasks.detection.protocols import (
+    DETECTION_PROTOCOLS,
+    evaluate_detections,
+    hit_errors,
+    running_mean,
+)
 from foredrive.tasks.objects.object_rows import (
     DETECTION_CLASSES,
     ObjectRows,

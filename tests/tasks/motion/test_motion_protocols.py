@@ -19,7 +19,7 @@ from tasks.motion_scenes import (
 
 from foredrive.errors import InputError
 from foredrive.scene import Category
-from foredrive.tasks.detection.over_recall import error_over_recall
+from foredrive.tasks.detection.protocols import error_over_recall
 from foredrive.tasks.motion.agents import PredictedAgents, TrueAgents, displacement_errors
 from foredrive.tasks.motion.matching import match_by_distance, match_by_score
 from foredrive.tasks.motion.protocols import PROTOCOLS

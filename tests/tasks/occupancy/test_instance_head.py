@@ -13,7 +13,6 @@ from foredrive.heads.agents_head import AGENT_CLASSES, AgentHeadConfig, AgentSet
 from foredrive.heads.detection_losses import MatchingLossConfig
 from foredrive.heads.detection_network import BoxSet
 from foredrive.heads.heads import TaskHeads, TaskHeadsConfig, TaskVolume
-from foredrive.heads.instance_losses import instance_loss
 from foredrive.heads.instances_head import (
     MARGIN_M,
     InstanceHead,
@@ -22,7 +21,7 @@ from foredrive.heads.instances_head import (
     instance_logits,
     instance_raster,
 )
-from foredrive.heads.losses import TaskWeights, task_losses
+from foredrive.heads.losses import TaskWeights, instance_loss, task_losses
 from foredrive.heads.plane import Plane, PlanePyramid, cell_middles
 from foredrive.scene import Boxes, Category, Example, VoxelSpec
 from foredrive.scene.boxes import unlabelled

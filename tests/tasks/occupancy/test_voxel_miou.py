@@ -10,7 +10,7 @@ from torchmetrics.classification import MulticlassJaccardIndex
 from foredrive.scene import VoxelSpec
 from foredrive.scene.semantics import SemanticVoxels
 from foredrive.tasks.occupancy.protocols import OCC3D_CLASSES, VOXEL_PROTOCOLS, VoxelProtocol
-from foredrive.tasks.occupancy.semantic_scores import count_semantics, count_voxels, mean_iou, voxel_ious
+from foredrive.tasks.occupancy.score import count_semantics, count_voxels, mean_iou, voxel_ious
 
 C = len(OCC3D_CLASSES)
 CAR, ROAD, BUS, FREE = (OCC3D_CLASSES.index(name) for name in ("car", "driveable_surface", "bus", "free"))

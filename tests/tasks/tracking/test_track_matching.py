@@ -2,10 +2,10 @@
 
 import torch
 
+from foredrive.heads.agent_losses import NOBODY, held_objects, matching_beside, owners
 from foredrive.heads.agents_head import AGENT_CLASSES
 from foredrive.heads.detection_losses import MatchingLossConfig
 from foredrive.heads.detection_network import BoxSet
-from foredrive.heads.track_matching import NOBODY, held_objects, matching_beside, owners
 from foredrive.sets import LabelledBoxes
 
 

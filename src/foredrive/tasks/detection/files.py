@@ -40,8 +40,7 @@ from foredrive.tasks.detection.kitti_labels import read_kitti
 from foredrive.tasks.detection.nuscenes_results import read_nuscenes
 from foredrive.tasks.detection.score import FrameScore
 from foredrive.tasks.files.frames_of_results import annotated_frames
-from foredrive.tasks.files.numbers import read_number_rows, read_numbers, tell_left_out
-from foredrive.tasks.files.plain_files import read_plain
+from foredrive.tasks.files.plain_files import read_number_rows, read_numbers, read_plain, tell_left_out
 from foredrive.tasks.objects.in_world import ego_yaw, places_in_world
 from foredrive.tasks.objects.nuscenes_json import boxes_by_frame
 from foredrive.tasks.objects.object_rows import DETECTION_CLASSES

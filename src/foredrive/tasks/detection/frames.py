@@ -11,7 +11,7 @@ from numpy import ndarray
 
 from foredrive.errors import InputError
 from foredrive.sets import BoxDensity, Family, LabelledBoxes, MultiBernoulli
-from foredrive.tasks.files.numbers import read_numbers
+from foredrive.tasks.files.plain_files import read_numbers
 
 MIN_PROBABILITY = 1e-6
 """Distance that probabilities of files are kept from 0 and 1: an exact 0 or 1 is mostly due to rounding."""

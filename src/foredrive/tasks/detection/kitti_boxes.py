@@ -12,7 +12,7 @@ import numpy as np
 from foredrive.engine.summary import Figures
 from foredrive.tasks.detection.kitti_labels import KittiLine, box_states, check_type, read_frames
 from foredrive.tasks.detection.protocols import DETECTION_PROTOCOLS, evaluate_detections
-from foredrive.tasks.files.numbers import tell_left_out
+from foredrive.tasks.files.plain_files import tell_left_out
 from foredrive.tasks.objects.object_rows import ObjectRows, Region, make_rows
 
 _UNKNOWN = frozenset({"ave_mps", "aae"})

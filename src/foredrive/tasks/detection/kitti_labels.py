@@ -25,7 +25,7 @@ from foredrive.tasks.detection.frames import (
     order_classes,
 )
 from foredrive.tasks.detection.nuscenes_results import DEFAULT_COVARIANCE
-from foredrive.tasks.files.numbers import MAX_NUMBER, tell_left_out
+from foredrive.tasks.files.plain_files import MAX_NUMBER, tell_left_out
 
 LOWER = np.array([0.0, -60.0, -10.0, -3.0, -3.0, -3.0])
 UPPER = np.array([120.0, 60.0, 10.0, 4.0, 4.0, 4.0])

@@ -38,7 +38,7 @@ from foredrive.tasks.detection.frames import (
     read_relevance,
 )
 from foredrive.tasks.detection.protocols import DETECTION_PROTOCOLS
-from foredrive.tasks.files.numbers import read_number_rows, read_numbers, tell_left_out
+from foredrive.tasks.files.plain_files import read_number_rows, read_numbers, tell_left_out
 from foredrive.tasks.objects.nuscenes_json import boxes_by_frame, read_geometry
 from foredrive.tasks.objects.object_rows import ObjectRows, counted, make_rows
 

@@ -18,8 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from foredrive.errors import InputError
 from foredrive.tasks.files.arrow_tables import read_table
-from foredrive.tasks.files.numbers import read_number_rows
-from foredrive.tasks.files.plain_files import read_plain
+from foredrive.tasks.files.plain_files import read_number_rows, read_plain
 from foredrive.tasks.motion.agents import PredictedAgents, TrueAgents
 from foredrive.tasks.motion.argoverse import FUTURES, MEAN_SPEED_MPS, STEPS
 from foredrive.tasks.motion.protocols import STEP_S

@@ -33,7 +33,7 @@ from foredrive.errors import InputError
 from foredrive.scene import Boxes, Category
 from foredrive.scene.agent_futures import AgentFutures
 from foredrive.tasks.files.frames_of_results import check_known_frames, log_frames
-from foredrive.tasks.files.numbers import read_number_rows, read_numbers
+from foredrive.tasks.files.plain_files import read_number_rows, read_numbers
 from foredrive.tasks.motion.agents import PredictedAgents, TrueAgents
 from foredrive.tasks.motion.protocols import STEP_S
 from foredrive.tasks.objects.in_world import ego_yaw, futures_in_world, places_in_world

@@ -27,8 +27,7 @@ from numpy import ndarray
 from foredrive.errors import InputError
 from foredrive.scene.boxes import UNKNOWN, Attribute
 from foredrive.tasks.files.frames_of_results import check_known_frames
-from foredrive.tasks.files.numbers import read_number_rows, read_numbers, tell_left_out
-from foredrive.tasks.files.plain_files import read_plain
+from foredrive.tasks.files.plain_files import read_number_rows, read_numbers, read_plain, tell_left_out
 from foredrive.tasks.objects.object_rows import DETECTION_CLASSES, Frames, ObjectRows, make_rows
 from foredrive.tasks.objects.truth import (
     RACK,

@@ -20,7 +20,7 @@ from scipy.optimize import linear_sum_assignment
 from foredrive.engine.summary import Figures
 from foredrive.errors import InputError
 from foredrive.tasks.detection.kitti_labels import KITTI_TYPES, check_type, result_files
-from foredrive.tasks.files.numbers import MAX_NUMBER, tell_left_out
+from foredrive.tasks.files.plain_files import MAX_NUMBER, tell_left_out
 from foredrive.tasks.objects.matching import overlaps
 from foredrive.tasks.tracking.clear import Candidates, TrackRows, clear_mot
 from foredrive.tasks.tracking.hota import hota
