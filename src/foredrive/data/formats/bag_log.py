@@ -1,6 +1,5 @@
 """Logs from bags: the frames are the sweeps, or the images of the first camera in a bag without lidar."""
 
-import functools
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -106,8 +105,8 @@ class BagLog:
             if topics.lidar is not None:
                 lidar, first = topics.lidar, index.first[topics.lidar.topic]
                 position_m = mounts.position_m(lidar, first, int(times_us[0]))
-                points = functools.partial(_points, lidar, mounts, self._time_unit(index))
-                sweeps = _Stream(bag, lidar.topic, index.stamps[lidar.topic], times_us, points)
+                clouds = _Clouds(lidar, mounts, self._time_unit(index))
+                sweeps = _Stream(bag, lidar.topic, index.stamps[lidar.topic], times_us, clouds)
             # A sensor without a single readable message is an error
             for stream in [*images.values(), *([] if sweeps is None else [sweeps])]:
                 stream.check()
@@ -208,7 +207,7 @@ def _stream_of_camera(
 ) -> tuple["_Stream", CameraSpec, Float64[np.ndarray, "N 4 4"]]:
     """Return the images of a camera, its description, and its mount T_ego_cam at the time of each image."""
     calibration = _calibration(camera, index)
-    read = functools.partial(_image, size_hw=calibration.size_hw, value_range=camera.value_range)
+    read = _Images(calibration.size_hw, camera.value_range)
     stream = _Stream(bag, camera.images, index.stamps[camera.images], times_us, read)
     T_ego_cam = mounts.of_camera(camera, index.first[camera.images], stream.t_us)
     # Rectified images are turned against the optical axes
@@ -244,41 +243,48 @@ def _calibration(camera: CameraTopics, index: BagIndex) -> Calibration:
     return Calibration(K, dist, (height, width))
 
 
-def _points(lidar: LidarTopic, mounts: Mounts, unit: str | None, message: Any, t_us: int) -> Points:
-    """Return the points of a message in the log's ego frame at their own times.
+@dataclass(frozen=True)
+class _Clouds:
+    """How the clouds of a lidar are read."""
 
-    Args:
-        lidar: its topic.
-        mounts: where it is.
-        unit: of the points' times; None: they are not used.
-        message: the cloud.
-        t_us: its stamp on the common clock.
-    """
-    cloud = read_cloud(message)
-    T_ego_lidar = mounts.of_cloud(lidar, message, t_us)
-    intensity = None if cloud.intensity is None else np.nan_to_num(cloud.intensity / lidar.intensity_max)
-    if intensity is not None and (intensity > 1).any():
-        largest = f"up to {intensity.max() * lidar.intensity_max:g}"
-        note(lidar.topic, f"sweeps with intensities above {lidar.intensity_max:g}, clipped", largest)
-    dt_s = None
-    if unit is not None and cloud.times is not None:
-        dt_s = seconds_since_stamp(cloud.times, stamp_us(message), unit)
-    # Channels are stored in 8 bits
-    fits = cloud.channel is not None and ((cloud.channel >= 0) & (cloud.channel <= 255)).all()
-    return Points(
-        cloud.xyz_m @ T_ego_lidar[:3, :3].T + T_ego_lidar[:3, 3],
-        None if intensity is None else intensity.clip(0, 1),
-        dt_s,
-        cloud.channel if fits else None,
-        # What registered points in the world has removed the motion within the sweep
-        lidar.compensated or mounts.is_registered(lidar, message),
-    )
+    lidar: LidarTopic
+    mounts: Mounts
+    unit: str | None
+    """Of the points' times; None: they are not used."""
+
+    def decoded(self, message: Any, t_us: int) -> Points:
+        """Return the points of a message, stamped `t_us`, in the log's ego frame at their own times."""
+        cloud, lidar = read_cloud(message), self.lidar
+        T_ego_lidar = self.mounts.of_cloud(lidar, message, t_us)
+        intensity = None if cloud.intensity is None else np.nan_to_num(cloud.intensity / lidar.intensity_max)
+        if intensity is not None and (intensity > 1).any():
+            largest = f"up to {intensity.max() * lidar.intensity_max:g}"
+            note(lidar.topic, f"sweeps with intensities above {lidar.intensity_max:g}, clipped", largest)
+        dt_s = None
+        if self.unit is not None and cloud.times is not None:
+            dt_s = seconds_since_stamp(cloud.times, stamp_us(message), self.unit)
+        # Channels are stored in 8 bits
+        fits = cloud.channel is not None and ((cloud.channel >= 0) & (cloud.channel <= 255)).all()
+        return Points(
+            cloud.xyz_m @ T_ego_lidar[:3, :3].T + T_ego_lidar[:3, 3],
+            None if intensity is None else intensity.clip(0, 1),
+            dt_s,
+            cloud.channel if fits else None,
+            # What registered points in the world has removed the motion within the sweep
+            lidar.compensated or self.mounts.is_registered(lidar, message),
+        )
 
 
-def _image(
-    message: Any, _: int, *, size_hw: tuple[int, int], value_range: tuple[float, float] | None
-) -> UInt8[np.ndarray, "H W 3"]:
-    return check_size(read_image(message, value_range), size_hw)
+@dataclass(frozen=True)
+class _Images:
+    """How the images of a camera are read."""
+
+    size_hw: tuple[int, int]
+    value_range: tuple[float, float] | None
+
+    def decoded(self, message: Any, _: int) -> UInt8[np.ndarray, "H W 3"]:
+        """Return the image of a message."""
+        return check_size(read_image(message, self.value_range), self.size_hw)
 
 
 class _Stream(PartSequence):
@@ -293,7 +299,7 @@ class _Stream(PartSequence):
         topic: str,
         stamps: list[Stamp],
         times_us: np.ndarray,
-        decode: Callable[[Any, int], Any],
+        reading: _Clouds | _Images,
     ) -> None:
         super().__init__(topic, "messages", len(times_us))
         numbers, stamps_us, _ = np.array(stamps, np.int64).reshape(-1, 3).T
@@ -310,7 +316,7 @@ class _Stream(PartSequence):
         frames = np.flatnonzero(self._exists)
         # The last frame that needs each message, after which it can be dropped
         self._last_frame = dict(zip(self._numbers[frames].tolist(), frames.tolist(), strict=True))
-        self._bag, self._topic, self._decode = bag, topic, decode
+        self._bag, self._topic, self._reading = bag, topic, reading
         self._note_missing(times_us, stamps_us)
         self._rewind()
 
@@ -353,7 +359,7 @@ class _Stream(PartSequence):
             del self._ahead[number]
         place = f"message {number}, {self.t_us[frame] * 1e-6:.3f} s"
         t_us = int(self.t_us[frame])
-        return self._read(place, lambda: self._decode(message.decode(), t_us))
+        return self._read(place, lambda: self._reading.decoded(message.decode(), t_us))
 
     def check(self) -> None:
         """Check that one of the messages can be read, and begin anew."""
