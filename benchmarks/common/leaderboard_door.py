@@ -27,8 +27,9 @@ from foredrive.integrations.carla.control import (
 )
 from foredrive.integrations.carla.leaderboard import GPS, IMU, SPEED, LeaderboardDriver
 from foredrive.runs.drive.agent_inputs import inputs_of
+from foredrive.runs.drive.drive_setup import DriveSetup
 from foredrive.runs.drive.in_towns import TownRoutes
-from foredrive.runs.drive.suite import DriveJob, DriveSetup, DriveSuite
+from foredrive.runs.drive.suite import DriveJob, DriveSuite
 from foredrive.scene import BicycleState, Control, Step, Trajectory
 from foredrive.sensors.rigs import camera_rig
 from foredrive.towns.driving.routes import DriveRoute, RouteOption

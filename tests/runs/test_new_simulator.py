@@ -18,7 +18,8 @@ from foredrive.driving.route_progress import RouteLine, RouteProgress
 from foredrive.errors import InputError
 from foredrive.runs.drive.agent_inputs import inputs_of
 from foredrive.runs.drive.agents import make_agent
-from foredrive.runs.drive.suite import DriveJob, DriveSetup, DriveSource, DriveSuite, drive_suite
+from foredrive.runs.drive.drive_setup import DriveSetup
+from foredrive.runs.drive.suite import DriveJob, DriveSource, DriveSuite, drive_suite
 from foredrive.scene import BicycleState, Clip, Control, DriveProgress, Simulator, Step
 from foredrive.scene.actors import boxes_in_ego_frame
 from foredrive.towns.driving.drive_log import drive_log, log_frame

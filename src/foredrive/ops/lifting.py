@@ -56,7 +56,7 @@ def lift(
     if small and triton_supports(*values, uv, offsets, weights):
         from foredrive.ops.lifting_triton import lift_triton  # Triton may be missing
 
-        return lift_triton(values, uv, visible, offsets, weights)
+        return lift_triton(*join_levels(values), uv, visible, offsets, weights)
     points = weights.shape[3] * weights.shape[4]
     # More points than a block would not fit into the kernels' buffers
     if not (small and points <= BLOCK and numba_supports(*values, uv, offsets, weights)):

@@ -14,12 +14,12 @@ from jaxtyping import Bool, Float, Int32
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from foredrive.ops.lifting import join_levels
 from foredrive.ops.tiles import launch, neighbours, read, read_back, rows_of_program
 
 
 def lift_triton(
-    values: Sequence[Float[Tensor, "b C _h _w D"]],
+    values: Float[Tensor, "b C S D"],
+    sizes: Sequence[tuple[int, int, int]],
     uv: Float[Tensor, "b C Q 2"],
     visible: Bool[Tensor, "b C Q"],
     offsets: Float[Tensor, "b Q H L P 2"],
@@ -28,13 +28,16 @@ def lift_triton(
     """Compute `lift` on a GPU. Half precision is read as it is and summed in float32.
 
     The gradient of the values is summed by atomics, so its last bits differ from run to run.
+
+    Args:
+        values, sizes: feature maps as `lifting.join_levels` returns them.
+        uv, visible, offsets, weights: as for `lift`.
     """
-    joined, sizes = join_levels(values)
     places = uv.detach().float().contiguous()
     # Visibility divided by the number of cameras that see the query: mean and mask in one factor
     share = visible / visible.sum(1, keepdim=True).clamp_min(1)
     out: Tensor = _LiftTriton.apply(
-        joined, offsets, weights, places, share, torch.tensor(sizes, dtype=torch.int32, device=uv.device)
+        values, offsets, weights, places, share, torch.tensor(sizes, dtype=torch.int32, device=uv.device)
     )
     return out
 

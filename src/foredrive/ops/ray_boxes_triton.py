@@ -1,6 +1,7 @@
 """The CUDA path of `cross_boxes`: a program tests some rays against all boxes."""
 
-from typing import TYPE_CHECKING, no_type_check
+from collections.abc import Sequence
+from typing import no_type_check
 
 import torch
 import triton
@@ -8,28 +9,27 @@ import triton.language as tl
 from jaxtyping import Int
 from torch import Tensor
 
-if TYPE_CHECKING:
-    from foredrive.ops.ray_boxes import KeyPoses
-
 RAYS = 64
 """Rays of a program."""
 
 
-def crossing_pairs_triton(keys: "KeyPoses") -> Int[Tensor, "P 2"]:
+def crossing_pairs_triton(keys: Sequence[Tensor]) -> Int[Tensor, "P 2"]:
     """Return the crossing pairs (ray, box), in order of entry.
 
-    The kernel writes the distance of entry for each ray and box: R · A numbers, infinite where a ray misses.
+    `keys` are the parts of `ray_boxes.KeyPoses`. The kernel writes the distance of entry of each ray and box,
+    R · A numbers, infinite where a ray misses.
     """
-    rays, boxes, times = len(keys.origin), *keys.position.shape[:2]
-    enter = torch.empty(rays, boxes, device=keys.origin.device)
+    origin, position, shown = keys[0], keys[4], keys[8]
+    rays, boxes, times = len(origin), *position.shape[:2]
+    enter = torch.empty(rays, boxes, device=origin.device)
     _enter_boxes[(triton.cdiv(rays, RAYS),)](
         *keys[:8],
-        keys.shown.to(torch.uint8),
+        shown.to(torch.uint8),
         enter,
         rays,
         boxes,
         times,
-        keys.shown.shape[1],
+        shown.shape[1],
         RAYS=RAYS,
     )
     # Sort each ray's boxes by distance of entry. Misses are infinite and go to the end

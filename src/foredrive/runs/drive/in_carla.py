@@ -13,8 +13,9 @@ from foredrive.integrations.carla.client import connect
 from foredrive.integrations.carla.simulator import CarlaSimulator
 from foredrive.runs.drive.agent_inputs import inputs_of
 from foredrive.runs.drive.agents import make_agent
+from foredrive.runs.drive.drive_setup import DriveSetup
 from foredrive.runs.drive.route_source import RouteSource
-from foredrive.runs.drive.suite import DriveJob, DriveSetup, DriveSuite
+from foredrive.runs.drive.suite import DriveJob, DriveSuite
 from foredrive.scene.conditions import BackgroundTraffic
 from foredrive.sensors.rigs import camera_rig
 from foredrive.sensors.vehicle import VehicleSensors, roof_lidar

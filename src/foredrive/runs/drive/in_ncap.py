@@ -29,6 +29,7 @@ from foredrive.files import digest_of
 from foredrive.methods.reconstruction.renderer import ReconstructedRenderer
 from foredrive.runs.drive.agent_inputs import check_seeing
 from foredrive.runs.drive.agents import Sees, is_remote
+from foredrive.runs.drive.drive_setup import DriveSetup
 from foredrive.runs.drive.in_reconstruction import (
     agent_in,
     check_lidar_of,
@@ -39,7 +40,7 @@ from foredrive.runs.drive.in_reconstruction import (
     renders_for,
     shown_vehicle,
 )
-from foredrive.runs.drive.suite import ROUTES_SHA256, DriveJob, DriveSetup, DriveSuite
+from foredrive.runs.drive.suite import ROUTES_SHA256, DriveJob, DriveSuite
 from foredrive.runs.reconstruction.reconstruction_run import open_run_log
 from foredrive.runs.shipped import run_files
 from foredrive.towns.driving.drive_log import drive_log, log_frame

@@ -33,7 +33,8 @@ from foredrive.methods.reconstruction.trust import Trust
 from foredrive.methods.reconstruction.vehicle import LoggedVehicle
 from foredrive.runs.drive.agent_inputs import chosen_cameras, inputs_of, own_rig
 from foredrive.runs.drive.agents import CORRIDOR, EXPERT, REPLAY, Sees, is_remote, make_agent
-from foredrive.runs.drive.suite import ROUTES_SHA256, DriveJob, DriveSetup, DriveSuite
+from foredrive.runs.drive.drive_setup import DriveSetup
+from foredrive.runs.drive.suite import ROUTES_SHA256, DriveJob, DriveSuite
 from foredrive.runs.reconstruction.reconstruction_run import (
     OpenedReconstruction,
     edited_scene,

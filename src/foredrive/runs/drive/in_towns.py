@@ -9,8 +9,9 @@ from pathlib import Path
 from foredrive.driving.scores import timeout_s
 from foredrive.runs.drive.agent_inputs import inputs_of
 from foredrive.runs.drive.agents import make_agent
+from foredrive.runs.drive.drive_setup import DriveSetup
 from foredrive.runs.drive.route_source import RouteSource, drive_hash
-from foredrive.runs.drive.suite import DriveJob, DriveSetup, DriveSuite
+from foredrive.runs.drive.suite import DriveJob, DriveSuite
 from foredrive.scene import Trajectory
 from foredrive.scene.conditions import BackgroundTraffic
 from foredrive.sensors.rigs import camera_rig

@@ -1,11 +1,8 @@
 """A trial of an agent of another program before its first drive: two seconds, with checks of all it gets."""
 
 import statistics
-import tempfile
 import time
 from dataclasses import dataclass, field
-from pathlib import Path
-from typing import TYPE_CHECKING
 
 import torch
 
@@ -16,10 +13,8 @@ from foredrive.driving.observation import FRAME_DT_S
 from foredrive.driving.plans import waypoints_of
 from foredrive.errors import InputError
 from foredrive.runs.drive.agent_inputs import AgentInputs, inputs_of
+from foredrive.runs.drive.drive_setup import DriveSetup
 from foredrive.scene import Clip
-
-if TYPE_CHECKING:
-    from foredrive.runs.drive.suite import DriveJob, DriveSuite
 
 TRIED_S = 2.0
 """Length of the trial, s of the simulation."""
@@ -49,40 +44,42 @@ class Trial:
         return text
 
 
-def try_agent(suite: "DriveSuite", job: "DriveJob") -> Trial:
-    """Let the agent of a suite drive the first two seconds of a drive, and check what it gets and answers.
+def try_agent(agent: str, setup: DriveSetup, period_s: float, latency_s: float) -> Trial:
+    """Let an agent drive the first two seconds of a drive, and check what it gets and answers.
+
+    Args:
+        agent: its name.
+        setup: the drive.
+        period_s: time between plans.
+        latency_s: time after which a plan takes effect.
 
     Raises:
         InputError: a sensor that it declares is missing or has another size, key frames are at other times,
-            it fails, or a plan is none. The message says which, and when.
+            it fails, or what it answers is not a plan. The message says which, and when.
     """
-    inputs, trial, steps = inputs_of(suite.agent), Trial(), round(suite.period_s / STEP_S)
-    with (
-        tempfile.TemporaryDirectory(prefix="foredrive_trial_") as folder,
-        suite.source.set_up(job, suite, Path(folder)) as setup,
-    ):
-        clip = setup.simulator.reset(setup.scenario)
-        setup.log.write(setup.frame())  # a log needs a frame
-        pilot = setup.pilot or FollowingPilot(setup.simulator, suite.latency_s)
-        for step in range(round(TRIED_S / STEP_S)):
-            at_s, ego = step * STEP_S, setup.simulator.ego()
-            if step % steps == 0:
-                where = f"{suite.agent}, in the trial at {at_s:g} s"
-                _check_inputs(clip, inputs, where)
-                trial.shown, began = _shown(clip), time.perf_counter()
-                try:
-                    plan = setup.agent.act(stack_records([clip]))
-                    trial.points = len(waypoints_of(plan))
-                except InputError as error:
-                    raise InputError(f"{where}: {error}") from error
-                except Exception as error:  # any error of a foreign agent
-                    raise InputError(f"{where}: {type(error).__name__}: {error}") from error
-                trial.took_s.append(time.perf_counter() - began)
-                pilot.expect(plan, ego, at_s)
-            moved = pilot.step(ego, at_s)
-            clip = moved.clip
-            if moved.events:
-                break
+    inputs, trial, steps = inputs_of(agent), Trial(), round(period_s / STEP_S)
+    clip = setup.simulator.reset(setup.scenario)
+    setup.log.write(setup.frame())  # a log needs a frame
+    pilot = setup.pilot or FollowingPilot(setup.simulator, latency_s)
+    for step in range(round(TRIED_S / STEP_S)):
+        at_s, ego = step * STEP_S, setup.simulator.ego()
+        if step % steps == 0:
+            where = f"{agent}, in the trial at {at_s:g} s"
+            _check_inputs(clip, inputs, where)
+            trial.shown, began = _shown(clip), time.perf_counter()
+            try:
+                plan = setup.agent.act(stack_records([clip]))
+                trial.points = len(waypoints_of(plan))
+            except InputError as error:
+                raise InputError(f"{where}: {error}") from error
+            except Exception as error:  # any error of a foreign agent
+                raise InputError(f"{where}: {type(error).__name__}: {error}") from error
+            trial.took_s.append(time.perf_counter() - began)
+            pilot.expect(plan, ego, at_s)
+        moved = pilot.step(ego, at_s)
+        clip = moved.clip
+        if moved.events:
+            break
     return trial
 
 

@@ -8,6 +8,7 @@ import contextlib
 import dataclasses
 import functools
 import json
+import tempfile
 import time
 from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager
@@ -15,16 +16,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
-import numpy as np
 import torch
-from jaxtyping import Float64
 
-from foredrive.data.log_writer import Frame, LogWriter
-from foredrive.driving.drive import Drive, Pilot, PlanningTiming, drive_route
+from foredrive.driving.drive import PlanningTiming, drive_route
 from foredrive.driving.drive_record import DriveRecord, record_of
 from foredrive.driving.faults import NO_FAULTS, Faults
 from foredrive.driving.faulty_agent import FaultyAgent
-from foredrive.driving.ncap.outcome import SafetyResult
 from foredrive.engine.fan_out import fan_out, reason
 from foredrive.engine.folder import DRIVES, SUITE, SUMMARY, RunFolder, by_contents
 from foredrive.engine.interrupts import start_fork_server
@@ -32,10 +29,10 @@ from foredrive.engine.summary import write_summary
 from foredrive.errors import InputError
 from foredrive.files import atomic_path, digest_of, together
 from foredrive.runs.drive.agents import agent_folder, check_ready, find_agent, is_foreign
+from foredrive.runs.drive.drive_setup import DriveSetup
 from foredrive.runs.drive.preflight import try_agent
 from foredrive.runs.drive.records import read_drive, read_suite, summarise, write_drive
 from foredrive.runs.shipped import run_digest
-from foredrive.scene import Agent, Simulator
 
 AGENT_SHA256, ROUTES_SHA256 = "agent_sha256", "routes_sha256"
 """Digests in the file of a suite: of the agent's code and weights, and of the files of its routes."""
@@ -49,31 +46,6 @@ class DriveJob:
     """Stem of the names of the drive's files."""
     route: str
     repetition: int = 0
-
-
-@dataclass(frozen=True, eq=False)
-class DriveSetup:
-    """Everything that one drive needs, already set up."""
-
-    simulator: Simulator
-    scenario: object
-    """The argument of the simulator's `reset`."""
-    agent: Agent
-    route_xyz: Float64[np.ndarray, "N 3"]
-    length_m: float
-    """Length of the route, m."""
-    log: LogWriter
-    frame: Callable[[], Frame]
-    """Returns the frame to log for the latest key frame."""
-    town: str | None = None
-    """The town whose map is used; None: there is no map."""
-    lanes_known: bool = True
-    judge: Callable[[Drive], SafetyResult | None] = lambda drive: None
-    """Scores the drive against a threat; None: there is no threat."""
-    trusted_share: Callable[[], float | None] = lambda: None
-    """Returns the share of the drive's key frames whose images are trusted."""
-    pilot: Pilot | None = None
-    """Moves the vehicle along the plans; None: as `drive_route` does by itself."""
 
 
 @runtime_checkable
@@ -192,7 +164,11 @@ def drive_suite(
     # Before the folder is there: an agent that fails leaves nothing
     if missing and is_foreign(suite.agent):
         check_ready(suite.agent)
-        tried(try_agent(suite, missing[0]).text(suite.period_s))
+        with (
+            tempfile.TemporaryDirectory(prefix="foredrive_trial_") as trial,
+            suite.source.set_up(missing[0], suite, Path(trial)) as setup,
+        ):
+            tried(try_agent(suite.agent, setup, suite.period_s, suite.latency_s).text(suite.period_s))
     with folder_of(suite, out).claimed():
         for job in jobs:
             if _driven(out, job):
