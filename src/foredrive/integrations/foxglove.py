@@ -2,7 +2,7 @@
 
 Source: docs.foxglove.dev/docs/visualization/message-schemas. The package `foxglove-schemas-protobuf` has the
 compiled messages. Frames: "world", "ego", and "camera/NAME" with z ahead. Pixel centres are at whole numbers
-there, and at +0.5 here.
+there, and at +0.5 here. Not opened in Foxglove: `docs/how-to/other-tools.md` says what was tried.
 """
 
 import numpy as np

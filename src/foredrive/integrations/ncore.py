@@ -2,7 +2,8 @@
 
 NCore's `rig` is the ego frame, and its `world` that of the log. Each sensor has a store of its own. NCore has
 no maps, routes, traffic lights, labels of occupancy or velocities of boxes. Velocities are kept beside the
-boxes, for those who convert the sequence back.
+boxes, for those who convert the sequence back. No renderer or trainer of NCore was run on one
+(`docs/how-to/other-tools.md`).
 """
 
 import json

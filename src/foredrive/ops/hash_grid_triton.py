@@ -1,4 +1,7 @@
-"""The CUDA path of `read_hash_grid`: a program reads one level of the grid at some points."""
+"""The CUDA path of `read_hash_grid`: a program reads one level of the grid at some points.
+
+Never run on a card, but in Triton's interpreter (`docs/how-to/other-tools.md`).
+"""
 
 from collections.abc import Sequence
 from typing import Any, no_type_check

@@ -1,7 +1,8 @@
 """The CUDA path of `foredrive.ops.lifting`: Triton kernels that read only visible cameras.
 
 A program handles a few rows (a row is one head of one query). It loops over levels and cameras, skips the
-cameras that see none of its queries, and reads rows × points × channels at a time.
+cameras that see none of its queries, and reads rows × points × channels at a time. Never run on a card, but
+in Triton's interpreter (`docs/how-to/other-tools.md`).
 """
 
 from collections.abc import Sequence

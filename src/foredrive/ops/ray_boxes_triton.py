@@ -1,4 +1,7 @@
-"""The CUDA path of `cross_boxes`: a program tests some rays against all boxes."""
+"""The CUDA path of `cross_boxes`: a program tests some rays against all boxes.
+
+Never run on a card, but in Triton's interpreter (`docs/how-to/other-tools.md`).
+"""
 
 from collections.abc import Sequence
 from typing import no_type_check

@@ -1,6 +1,7 @@
 """The CUDA path of `composite_splats` for cameras: gsplat 1.5 (Ye et al., "gsplat", 2024).
 
 Its opacity thresholds and pixel centres are the same as here. It has no time, no range slope and no median.
+Never run on a card (`docs/how-to/other-tools.md`).
 """
 
 import math

@@ -1,6 +1,7 @@
 """The CUDA path of `attend_volume`: Triton kernels for sums of trilinear samples.
 
 A program handles a few rows (a row is one head of one query) and reads rows × points × channels at a time.
+Never run on a card, but in Triton's interpreter (`docs/how-to/other-tools.md`).
 """
 
 from collections.abc import Sequence

@@ -3,6 +3,7 @@
 Source: public repository NVlabs/alpasim, `egodriver.proto`, as the package carla-driver-interface has it. A
 session is a drive. Before each plan the driver is sent its images, where the vehicle is in a local frame, and
 the route; `drive` answers poses over time in that frame. Our local frame is that of the first key frame.
+AlpaSim's own drivers were never run (`docs/how-to/other-tools.md`).
 """
 
 import contextlib

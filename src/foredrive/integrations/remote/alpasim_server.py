@@ -1,4 +1,7 @@
-"""An agent of ours as a driver of AlpaSim: `egodriver.EgodriverService`, over gRPC."""
+"""An agent of ours as a driver of AlpaSim: `egodriver.EgodriverService`, over gRPC.
+
+AlpaSim's runtime was never connected (`docs/how-to/other-tools.md`).
+"""
 
 import math
 from collections.abc import Callable

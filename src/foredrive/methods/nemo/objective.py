@@ -19,7 +19,7 @@ from foredrive.methods.nemo.world_model import Nemo
 from foredrive.methods.planner.agent import PlanningAgent
 from foredrive.methods.planner.planner import set_planner_trainable
 from foredrive.ops.masked import masked_mean
-from foredrive.scene import Belief, Clip, Example
+from foredrive.scene import Belief, Clip, Decoded, Example
 
 
 @dataclass(frozen=True)
@@ -163,20 +163,8 @@ class NemoObjective(nn.Module):
                     emphasis=emphasis,
                 )
             if weights.recon > 0:
-                # Colour along the rays of each frame against its images (eq. 9)
-                rays = self.rays(clip[items], frame, self.stage.ray_stride, generator)
-                rendered = world.renderer(
-                    belief.feature, belief.occupancy_logit, rays.origin, rays.direction, generator
-                )
-                b, c, _, h, w = rays.rgb.shape
-                predicted = rendered.rgb.view(b * c, h, w, 3).permute(0, 3, 1, 2)
-                # Images that are missing are masked in both losses
-                truth, valid = rays.rgb.flatten(0, 1), rays.valid.flatten()
-                losses["l1"] = losses["l1"] + share * l1_loss(predicted, truth, valid)
-                if self.image_features is not None:
-                    losses["perc"] = losses["perc"] + share * perceptual_loss(
-                        predicted, truth, valid, self.image_features
-                    )
+                for name, error in self._colour_errors(belief, clip[items], frame, generator).items():
+                    losses[name] = losses[name] + share * error
 
         losses["loss"] = weights.occ * losses["occ"] + weights.recon * (
             losses["l1"] + weights.perc * losses["perc"]
@@ -198,6 +186,23 @@ class NemoObjective(nn.Module):
             losses |= self.tasks(output, example)
             losses["loss"] = losses["loss"] + losses["tasks"]
         return losses
+
+    def _colour_errors(
+        self, belief: Decoded, clip: Clip, frame: int, generator: torch.Generator
+    ) -> dict[str, Float[Tensor, ""]]:
+        """Return the errors of the colour along rays of a frame against its images (eq. 9)."""
+        rays = self.rays(clip, frame, self.stage.ray_stride, generator)
+        rendered = self.agent.world_model.renderer(
+            belief.feature, belief.occupancy_logit, rays.origin, rays.direction, generator
+        )
+        b, c, _, h, w = rays.rgb.shape
+        predicted = rendered.rgb.view(b * c, h, w, 3).permute(0, 3, 1, 2)
+        # Images that are missing are masked in both losses
+        truth, valid = rays.rgb.flatten(0, 1), rays.valid.flatten()
+        errors = {"l1": l1_loss(predicted, truth, valid)}
+        if self.image_features is not None:
+            errors["perc"] = perceptual_loss(predicted, truth, valid, self.image_features)
+        return errors
 
     def _ego_error(self, clip: Clip, futures: list[Belief]) -> Float[Tensor, ""]:
         """Return the mean error of the predicted ego motions, m."""
