@@ -6,6 +6,7 @@ import importlib
 import importlib.util
 import re
 import shlex
+import tomllib
 from collections.abc import Callable
 from pathlib import Path
 
@@ -89,6 +90,14 @@ def test_source_files_that_are_named_exist(page: Path) -> None:
         assert known or name.split("/")[0] not in ours, f"{page.name}: {name}"
     for name, target in re.findall(r"\[`([a-z0-9_/]+\.py)`\]\(([^)]+)\)", page.read_text()):
         assert target.endswith(f"/{name}"), f"{page.name}: {name} is linked to {target}"
+
+
+def test_readme_names_the_versions_that_the_package_asks_for() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    (torch,) = (need for need in project["dependencies"] if need.startswith("torch>="))
+    lowest, above = re.fullmatch(r"torch>=2\.(\d+),<2\.(\d+)", torch).groups()  # type: ignore[union-attr]
+    python, torch = project["requires-python"].removeprefix(">="), f"2.{lowest} to 2.{int(above) - 1}"
+    assert f"Python {python} or newer · PyTorch {torch} ·" in (ROOT / "README.md").read_text()
 
 
 def anchors(page: Path) -> set[str]:
