@@ -1,13 +1,18 @@
 """A clip from above: x (forward) points up, y (left) points left, metres."""
 
+import io
+from collections.abc import Sequence
+
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, UInt8
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection, PolyCollection
+from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Polygon
+from PIL import Image
 from torch import Tensor
 
 from foredrive.geometry.boxes import box_corners
@@ -202,3 +207,20 @@ def _polylines(patch: MapPatch, kind: MapKind) -> list[Float[np.ndarray, "V 2"]]
         if len(xy) > 1:
             lines.append(xy.flip(-1).numpy())
     return lines
+
+
+def with_legend(figure: Figure, handles: Sequence[Artist]) -> UInt8[np.ndarray, "H W 3"]:
+    """Draw a figure with a legend below."""
+    figure.legend(
+        handles=handles,
+        loc="lower center",
+        ncols=4,
+        frameon=False,
+        labelcolor=palette.INK,
+        fontsize=8.5,
+        handlelength=1.3,
+        columnspacing=1.1,
+    )
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", facecolor=palette.GROUND)
+    return np.asarray(Image.open(buffer).convert("RGB"))

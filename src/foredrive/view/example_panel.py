@@ -1,7 +1,6 @@
 """One example of a report: recorded images, rendered images, predictions and the plan."""
 
 import datetime
-import io
 from dataclasses import dataclass
 from typing import Literal
 
@@ -15,7 +14,7 @@ from foredrive.runs import ExamplePrediction
 from foredrive.scene import Clip, Command, Example, Trajectory, VoxelSpec
 from foredrive.tasks.occupancy.scores import ABOVE_GROUND_M
 from foredrive.view import palette
-from foredrive.view.bev import EGO_OUTLINE_XY, draw_bev, legend_handles, path_points
+from foredrive.view.bev import EGO_OUTLINE_XY, draw_bev, legend_handles, path_points, with_legend
 from foredrive.view.html import Picture, picture
 from foredrive.view.image_drawing import Camera, draw_path_on_image, resize, to_image
 from foredrive.view.log_sheet import camera_rows
@@ -109,19 +108,7 @@ def plan_picture(clip: Clip, plan: Trajectory, reach_m: float) -> UInt8[np.ndarr
     """Draw the scene from above with the driven future and the plan, legend below."""
     figure = Figure(figsize=(5.6, 6.3), dpi=MAP_PX / 5.6, facecolor=palette.GROUND)
     draw_bev(figure.add_axes((0.125, 0.17, 0.855, 0.76)), clip, reach_m, plan)
-    figure.legend(
-        handles=legend_handles(clip, plan)[:12],
-        loc="lower center",
-        ncols=4,
-        frameon=False,
-        labelcolor=palette.INK,
-        fontsize=8.5,
-        handlelength=1.3,
-        columnspacing=1.1,
-    )
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", facecolor=palette.GROUND)
-    return np.asarray(Image.open(buffer).convert("RGB"))
+    return with_legend(figure, legend_handles(clip, plan)[:12])
 
 
 def comparison_picture(shown: ExamplePrediction, step: int) -> UInt8[np.ndarray, "H W 3"]:

@@ -1,6 +1,5 @@
 """Results of task heads next to the ground truth: from above, in a camera, and as semantic voxels."""
 
-import io
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -14,7 +13,6 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
 from numpy import ndarray
-from PIL import Image
 from torch import Tensor
 
 from foredrive.runs import ExamplePrediction
@@ -26,7 +24,7 @@ from foredrive.scene.semantics import VOXEL_CLASSES, Taxonomy
 from foredrive.tasks.maps.lines import CLASSES
 from foredrive.tasks.predictor import Prediction
 from foredrive.view import palette
-from foredrive.view.bev import draw_boxes, draw_ego, start_bev
+from foredrive.view.bev import draw_boxes, draw_ego, start_bev, with_legend
 from foredrive.view.html import Picture, picture
 from foredrive.view.image_drawing import Camera, draw_boxes_on_image, resize
 
@@ -189,19 +187,7 @@ def scene_picture(scene: SeenScene, spec: VoxelSpec) -> UInt8[ndarray, "H W 3"]:
     if scene.agents is not None:
         draw_agents(ax, scene.agents, reach_m)
     draw_ego(ax)
-    figure.legend(
-        handles=_legend(scene),
-        loc="lower center",
-        ncols=4,
-        frameon=False,
-        labelcolor=palette.INK,
-        fontsize=8.5,
-        handlelength=1.3,
-        columnspacing=1.1,
-    )
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", facecolor=palette.GROUND)
-    return np.asarray(Image.open(buffer).convert("RGB"))
+    return with_legend(figure, _legend(scene))
 
 
 def draw_agents(ax: Axes, agents: SeenAgents, reach_m: float) -> None:
@@ -275,12 +261,7 @@ def voxels_picture(
     draw_ego(ax)
     present = [name for n, name in enumerate(names[:-1]) if bool((voxels == n).any())]
     handles = [Patch(color=palette.VOXEL_COLOURS[n], label=n.replace("_", " ")) for n in present]
-    figure.legend(
-        handles=handles, loc="lower center", ncols=4, frameon=False, labelcolor=palette.INK, fontsize=8.5
-    )
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", facecolor=palette.GROUND)
-    return np.asarray(Image.open(buffer).convert("RGB"))
+    return with_legend(figure, handles)
 
 
 def columns_rgb(voxels: UInt8[ndarray, "Z Y X"], taxonomy: Taxonomy) -> UInt8[ndarray, "Y X 3"]:
