@@ -18,11 +18,10 @@ from foredrive.engine import loop
 from foredrive.engine.learning_rates import Rate
 from foredrive.errors import InputError
 from foredrive.methods.neurad.config import FieldConfig, GridConfig, GridsConfig
-from foredrive.methods.neurad.content import field_of
 from foredrive.methods.neurad.decoders import PatchDecoderConfig
 from foredrive.methods.neurad.rays import FieldRays
 from foredrive.methods.neurad.recipes import FieldRecipe, padded_scale_m, tiny_field
-from foredrive.methods.neurad.scene import FieldScene, FieldSceneConfig
+from foredrive.methods.neurad.scene import FieldScene, FieldSceneConfig, field_of
 from foredrive.methods.neurad.training import FieldTraining
 from foredrive.methods.reconstruction.edits import Duplicate, Insert, Move, Remove, apply_edits
 from foredrive.methods.reconstruction.scene_graph import STATIC, SceneGraph
