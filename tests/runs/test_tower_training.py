@@ -46,6 +46,10 @@ def recipe(tmp_path_factory: pytest.TempPathFactory) -> TowerRecipe:
     save_tokenizer(folder)
     torch.manual_seed(0)
     BertModel(BertConfig(vocab_size=len(WORDS), **SMALL)).save_pretrained(folder)
+    return small_recipe(str(folder))
+
+
+def small_recipe(text: str) -> TowerRecipe:
     return TowerRecipe(
         contrast=Schedule(batch_size=4, lr=1e-3, steps=3),
         distil=Schedule(batch_size=4, lr=1e-3, steps=3),
@@ -53,7 +57,7 @@ def recipe(tmp_path_factory: pytest.TempPathFactory) -> TowerRecipe:
         lidar=LidarEncoderConfig(width=16, heads=2, hidden=16, blocks=2),
         stride_s=0.5,
         texts=3,
-        text=str(folder),
+        text=text,
     )
 
 

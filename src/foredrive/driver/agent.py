@@ -72,9 +72,9 @@ class Driver(nn.Module):
 
     @torch.no_grad()
     def see(self, clip: Clip) -> Sight:
-        """Return what is seen at now."""
-        sight: Sight = self.eyes(clip)
-        return sight
+        """Return what is seen at now, on the clip's device. The eyes may be on another one."""
+        sight: Sight = self.eyes(clip.to(next(self.eyes.parameters()).device))
+        return sight.to(clip.t_s.device)
 
 
 class LightMemory:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import enum
+import functools
 from dataclasses import dataclass
 
 import torch
@@ -75,17 +76,18 @@ class Clip(Record):
     """The recorded future (M = 1): target of training and evaluation, hidden from the agent."""
     map: MapPatch | None = None
 
-    @property
+    @functools.cached_property
     def now(self) -> int:
-        """Return the index of the frame at t = 0.
+        """The index of the frame at t = 0. It is read once: each read of a clip on a GPU would wait for it.
 
         Raises:
             InputError: no single frame is at t = 0, or its index differs within the batch.
         """
         # Every row of the batch must have exactly one frame at t = 0, at the same index
-        at_now = self.t_s.reshape(-1, self.t_s.shape[-1]).abs() <= NOW_TOLERANCE_S
+        t_s = self.t_s.cpu()
+        at_now = t_s.reshape(-1, t_s.shape[-1]).abs() <= NOW_TOLERANCE_S
         if not bool((at_now == at_now[:1]).all()) or int(at_now[0].sum()) != 1:
-            raise InputError(f"a clip needs one frame at t = 0, the same for the batch, got t_s = {self.t_s}")
+            raise InputError(f"a clip needs one frame at t = 0, the same for the batch, got t_s = {t_s}")
         return int(at_now[0].nonzero().item())
 
     def frames(self, index: slice | list[int]) -> "Clip":

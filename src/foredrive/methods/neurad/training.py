@@ -200,7 +200,10 @@ class FieldTraining:
         beams = self._some_beams(generator)
         # Patches first, then beams, in one batch of rays
         rays = [patch.rays for patch in patches] + [beam.rays for beam in beams]
-        joined = FieldRays(*(torch.cat(tensors).to(scene.device) for tensors in zip(*rays, strict=True)))
+        # Rays of patches are on the scene's device already, beams are kept on the host
+        joined = FieldRays(
+            *(torch.cat([part.to(scene.device) for part in parts]) for parts in zip(*rays, strict=True))
+        )
         seen = scene.look(graph, joined, mirror, generator, propose)
         losses: dict[str, Tensor] = {}
         first = 0

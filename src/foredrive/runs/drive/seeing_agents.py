@@ -100,8 +100,10 @@ def seeing_agent(folder: Path) -> SeeingAgent:
 
 @lru_cache(maxsize=1)
 def driver_of(folder: Path) -> Driver:
-    """Return the driver of a run."""
-    return load_driver(open_driver(folder))
+    """Return the driver of a run. Its eyes are on the GPU if there is one; its planner is small."""
+    driver = load_driver(open_driver(folder))
+    driver.eyes.to("cuda" if torch.cuda.is_available() else "cpu")
+    return driver
 
 
 @lru_cache(maxsize=1)
