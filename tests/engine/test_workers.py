@@ -29,7 +29,7 @@ class Workers(Dataset):
 
 if __name__ == "__main__":
     steps = [[Part(0, 1.0, [number])] for number in range(50)]
-    batches = iter(_loader(Workers(), list, steps, 2))
+    batches = iter(_loader(Workers(), list, steps, 2, pinned=False))
     Path("workers").write_text(f"{next(batches)[0]} {next(batches)[0]}")
     os.kill(os.getpid(), 9)
 """

@@ -42,6 +42,7 @@ from foredrive.cli.train import train
 from foredrive.cli.trust import trust
 from foredrive.cli.view import view
 from foredrive.debugging import debugging, is_verbose, take_debugging
+from foredrive.devices import take_device
 from foredrive.errors import InputError
 from foredrive.files import WHILE_WRITING
 from foredrive.interrupts import LastingInterrupt
@@ -108,7 +109,8 @@ SERVERS = ("view", "serve", "search page")
 DESCRIPTION = (
     "The learning loop of autonomous driving: logs in, 3-D world models and plans out, judged honestly. "
     "--version says which version this is. With every verb, --verbose logs what is done and shows where "
-    "errors come from, and --profile FILE.json.gz records a trace that ui.perfetto.dev opens."
+    "errors come from, --profile FILE.json.gz records a trace that ui.perfetto.dev opens, and --device cpu "
+    "or cuda:1 says where it computes; by default on a GPU, if there is one."
 )
 # OpenMP threads spin while they wait, which would take the cores from kernels and data workers
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
@@ -152,7 +154,7 @@ def main(args: Sequence[str] | None = None) -> int:
         verb.__doc__ = _reflowed(verb.__doc__ or "")
     try:
         _check_flags(args)
-        args = take_debugging(args)
+        args = take_device(take_debugging(args))
         if " ".join(args[:2]) in VERBS:  # A verb of two words, such as `search index`
             args = [" ".join(args[:2]), *args[2:]]
         if not args or args[0] not in SERVERS:

@@ -1,5 +1,6 @@
 """Fabric for training: devices, processes, and mixed precision that does not change the inputs."""
 
+import os
 import warnings
 from datetime import timedelta
 from typing import TYPE_CHECKING, Any, Literal
@@ -10,6 +11,7 @@ from lightning_fabric.plugins import MixedPrecision
 from lightning_fabric.strategies import DDPStrategy, ModelParallelStrategy
 from torch import nn
 
+from foredrive.devices import DEVICE, chosen_device
 from foredrive.engine.processes import processes_of_launcher
 from foredrive.errors import InputError
 from foredrive.ops.precision import computes_bfloat16
@@ -35,7 +37,7 @@ class _Autocast(MixedPrecision):
 
 
 def make_fabric(precision: Literal["32-true", "bf16-mixed"], sharing: Sharing | None = None) -> Fabric:
-    """Return a Fabric on a GPU, or on the CPU if there is none.
+    """Return a Fabric on the device of this process, see `chosen_device`.
 
     Args:
         precision: "bf16-mixed" uses bfloat16 autocast, unless that would be slower.
@@ -44,17 +46,22 @@ def make_fabric(precision: Literal["32-true", "bf16-mixed"], sharing: Sharing | 
     Raises:
         InputError: torchrun started more processes than this machine has GPUs.
     """
-    device = "cuda" if torch.cuda.is_available() else "cpu"
+    device, _, number = chosen_device().partition(":")
     gpus = torch.cuda.device_count()
-    machines, per_machine = (processes_of_launcher() or (1, max(1, gpus))) if sharing else (1, 1)
+    # A device that is named is used alone, unless torchrun has started processes for all
+    named = DEVICE in os.environ
+    alone = (1, 1) if named else (1, max(1, gpus))
+    machines, per_machine = (processes_of_launcher() or alone) if sharing else (1, 1)
     if 0 < gpus < per_machine:
         raise InputError(
             f"{per_machine} processes, but this machine has {gpus} GPUs: --nproc-per-node {gpus}"
         )
     mixed = precision == "bf16-mixed" and computes_bfloat16(device)
+    if device == "cuda":
+        torch.set_float32_matmul_precision("high")  # TF32 in what stays in 32 bits
     return Fabric(
         accelerator=device,
-        devices=per_machine,
+        devices=[int(number)] if number and per_machine == 1 and machines == 1 else per_machine,
         num_nodes=machines,
         strategy=_strategy(sharing, machines * per_machine) if sharing else "auto",
         plugins=[_Autocast("bf16-mixed", device)] if mixed else [],

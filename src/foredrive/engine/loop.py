@@ -205,7 +205,8 @@ def train(
         # Process r of n computes the parts r, r + n, ... of each step
         mine = [parts_of_step(batch, parts)[fabric.global_rank :: fabric.world_size] for batch in batches]
         loader: Any = fabric.setup_dataloaders(
-            _loader(dataset, collate, mine, schedule.workers), use_distributed_sampler=False
+            _loader(dataset, collate, mine, schedule.workers, pinned=fabric.device.type == "cuda"),
+            use_distributed_sampler=False,
         )
         model.train()
         steps = _Steps(
@@ -284,7 +285,12 @@ def step_counter(
 
 
 def _loader(
-    dataset: Dataset[B], collate: Callable[[list[B]], B], steps: Sequence[Sequence[Part]], workers: int
+    dataset: Dataset[B],
+    collate: Callable[[list[B]], B],
+    steps: Sequence[Sequence[Part]],
+    workers: int,
+    *,
+    pinned: bool,
 ) -> DataLoader[B]:
     """Return the parts of steps, one after the other."""
     if workers:
@@ -294,6 +300,7 @@ def _loader(
         batch_sampler=[part.items for parts in steps for part in parts],
         collate_fn=collate,
         num_workers=workers,
+        pin_memory=pinned,
         worker_init_fn=end_with_parent,
         # Forked workers crash if numba's threads have run in the parent.
         multiprocessing_context="forkserver" if workers else None,
@@ -360,7 +367,7 @@ class _Steps:
         losses: dict[str, Tensor] = self.model(example, torch.Generator().manual_seed(seed))
         # Fabric averages the gradients over processes, but the parts' weights already add up to 1
         self.fabric.backward(losses["loss"] * (part.weight * self.fabric.world_size))
-        return {name: value.detach() for name, value in losses.items()}
+        return on_host(losses)
 
 
 def _parts_before(folder: Path) -> int:
@@ -386,6 +393,12 @@ def write_conditions(folder: Path, fabric: "Fabric", parts: int) -> None:
     }
     with atomic_path(folder / CONDITIONS) as temporary:
         temporary.write_text(json.dumps(conditions) + "\n")
+
+
+def on_host(losses: dict[str, Tensor]) -> dict[str, Tensor]:
+    """Return the losses of a step on the CPU. A GPU is waited for once, not once for each."""
+    values = torch.stack([value.detach().double() for value in losses.values()]).cpu()
+    return dict(zip(losses, values, strict=True))
 
 
 def check_finite(losses: dict[str, Tensor], step: int, source: str) -> None:

@@ -134,4 +134,8 @@ def _enter_boxes(
         near, far = _slab(qy, ey, tl.load(half_size + 3 * a + 1), near, far)
         near, far = _slab(qz, ez, tl.load(half_size + 3 * a + 2), near, far)
         present = tl.load(shown + a * segments + k, mask=inside, other=0) != 0
-        tl.store(enter + r * boxes + a, tl.where(present & (near < far), near, float("inf")), mask=inside)
+        tl.store(
+            enter + r.to(tl.int64) * boxes + a,
+            tl.where(present & (near < far), near, float("inf")),
+            mask=inside,
+        )

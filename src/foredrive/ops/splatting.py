@@ -90,7 +90,8 @@ def composite_splats(
     """Composite the splats at all points.
 
     Gradients reach every field of `splats`. On a GPU, gsplat renders images of one instant if the median
-    range is not requested. All other cases on a GPU use plain PyTorch.
+    range is not requested and its kernels are there (`gsplat_compiles`). All other cases on a GPU use plain
+    PyTorch.
 
     Args:
         points: result of `pixel_points` or `beam_points`, on the device of the splats.
@@ -101,11 +102,13 @@ def composite_splats(
 
     Raises:
         ValueError: values are not finite, or the number of hits is not that of the points.
-        InputError: gsplat is needed and not installed.
     """
     _check(splats, points, hit_range_m)
     if splats.mean.is_cuda and points.single_instant and hit_range_m is None and not median:
-        return _composite_image(splats, points)
+        from foredrive.ops.splatting_gsplat import gsplat_compiles  # It is optional
+
+        if gsplat_compiles():
+            return _composite_image(splats, points)
     result = _composite(splats, points, hit_range_m, before_hit)
     return result if median else result._replace(median_range_m=torch.full_like(result.alpha, math.nan))
 

@@ -4,14 +4,37 @@ Its opacity thresholds and pixel centres are the same as here. It has no time, n
 Never run on a card (`docs/how-to/other-tools.md`).
 """
 
+import functools
+import importlib
+import logging
 import math
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from foredrive.errors import InputError
 from foredrive.ops.splat_points import SIDE_PX
+
+_log = logging.getLogger(__name__)
+
+
+@functools.cache
+def gsplat_compiles() -> bool:
+    """Return whether gsplat's kernels are there; say once what is missing otherwise.
+
+    gsplat comes as source. It builds its kernels at the first import, with the CUDA toolkit's nvcc, which
+    takes minutes; without nvcc the import succeeds, and every call would fail.
+    """
+    try:
+        built = importlib.import_module("gsplat.cuda._backend")._C is not None
+        reason = "gsplat has found no nvcc to build its kernels with"
+    except ImportError:
+        built, reason = False, "gsplat is not installed (pip install 'foredrive[gsplat]')"
+    except (OSError, RuntimeError) as error:
+        built, reason = False, f"gsplat's kernels could not be built ({str(error).splitlines()[0]})"
+    if not built:
+        _log.warning("%s: images of Gaussians are made in plain PyTorch, which is slow on a GPU", reason)
+    return built
 
 
 def composite_gsplat(
@@ -22,17 +45,9 @@ def composite_gsplat(
     feature: Float[Tensor, "N D"],
     size_hw: tuple[int, int],
 ) -> tuple[Float[Tensor, "P D"], Float[Tensor, "P"], Float[Tensor, "P"]]:
-    """Return features, expected range and alpha of all pixels in row order. See `Splats` for the arguments.
+    """Return features, expected range and alpha of all pixels in row order; see `Splats` for the rest."""
+    from gsplat import isect_offset_encode, isect_tiles, rasterize_to_pixels
 
-    Raises:
-        InputError: gsplat is not installed.
-    """
-    try:
-        from gsplat import isect_offset_encode, isect_tiles, rasterize_to_pixels
-    except ImportError as error:
-        raise InputError(
-            "images of Gaussians on a GPU need gsplat: pip install 'foredrive[gsplat]'"
-        ) from error
     height, width = size_hw
     rows, columns = -(-height // SIDE_PX), -(-width // SIDE_PX)
     # Lists of splats per tile, sorted by tile and depth

@@ -26,8 +26,14 @@ class Record:
         return dataclasses.replace(self, **changed)
 
     def to(self: R, device: torch.device | str) -> R:
-        """Move every tensor to `device`."""
-        return self.map_tensors(lambda tensor: tensor.to(device))
+        """Move every tensor to `device`. A copy from pinned memory to a GPU goes on while the host works."""
+        # Never to the host: its tensors could be read before they are there
+        ahead = torch.device(device).type == "cuda"
+        return self.map_tensors(lambda tensor: tensor.to(device, non_blocking=ahead))
+
+    def pin_memory(self: R) -> R:
+        """Put every tensor into pinned memory, as `DataLoader` asks for it."""
+        return self.map_tensors(lambda tensor: tensor.pin_memory())
 
     def __getitem__(self: R, index: Any) -> R:
         """Index the leading dimension(s) of every tensor."""

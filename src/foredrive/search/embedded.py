@@ -13,6 +13,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
+from foredrive.devices import chosen_device
 from foredrive.errors import InputError
 from foredrive.files import atomic_path
 from foredrive.methods.blocks.text_encoder import TextEncoder
@@ -67,17 +68,18 @@ class SentenceTowers:
     def __init__(
         self, name: str, tower: ImageTower, text_mean: Float[Tensor, "D"], size: ImageTowerConfig, text: str
     ) -> None:
-        self.name, self.tower, self.text_mean = name, tower.eval(), text_mean
+        self.name, self.text_mean = name, text_mean
         self.size, self.text = size, text
         self.dim, self.image_side_px = len(text_mean), size.side_px
         self.fingerprint = f"{SENTENCE}{weights_digest({TEXT_MEAN: text_mean, **tower.state_dict()})}"
+        self._device = chosen_device()
+        self.tower = tower.eval().to(self._device)
 
     @torch.no_grad()
     def embed_images(self, images: UInt8[Tensor, "n 3 H W"]) -> Float[Tensor, "n D"]:
         """Embed images, see `Towers`."""
-        return torch.cat(
-            [self.tower(images[start : start + AT_ONCE]) for start in range(0, len(images), AT_ONCE)]
-        )
+        parts = [images[start : start + AT_ONCE] for start in range(0, len(images), AT_ONCE)]
+        return torch.cat([self.tower(part.to(self._device)).cpu() for part in parts])
 
     def embed_sweeps(self, sweeps: LidarSweep) -> None:
         """Return None, because there is no lidar tower."""
@@ -99,9 +101,11 @@ class LidarTowers:
     has_lidar = True
 
     def __init__(self, name: str, base: Towers, encoder: LidarEncoder) -> None:
-        self.name, self.base, self.encoder = name, base, encoder.eval()
+        self.name, self.base = name, base
         self.dim, self.image_side_px, self.crop = base.dim, base.image_side_px, base.crop
         self.fingerprint = f"{base.fingerprint}-lidar-{weights_digest(encoder.state_dict())}"
+        self._device = chosen_device()
+        self.encoder = encoder.eval().to(self._device)
 
     def embed_images(self, images: UInt8[Tensor, "n 3 H W"]) -> Float[Tensor, "n D"]:
         """Embed images, see `Towers`."""
@@ -112,7 +116,8 @@ class LidarTowers:
         """Embed sweeps, see `Towers`."""
         rows = len(sweeps.valid)
         parts = [sweeps[start : start + AT_ONCE] for start in range(0, rows, AT_ONCE)]
-        return torch.cat([self.encoder(PointCloud.from_sweeps(part), len(part.valid)) for part in parts])
+        clouds = [(PointCloud.from_sweeps(part).to(self._device), len(part.valid)) for part in parts]
+        return torch.cat([self.encoder(cloud, count).cpu() for cloud, count in clouds])
 
     def embed_text(self, texts: Sequence[str]) -> Float[Tensor, "n D"]:
         """Embed texts, see `Towers`."""

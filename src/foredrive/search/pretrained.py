@@ -10,6 +10,7 @@ import torch.nn.functional as F
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
+from foredrive.devices import chosen_device
 from foredrive.errors import InputError
 from foredrive.scene import LidarSweep
 from foredrive.search.crops import Crop
@@ -52,13 +53,17 @@ class PretrainedTowers:
         kind = f"clip-{self.crop}" if self.is_clip else config.model_type
         self.fingerprint = f"{kind}-{weights_digest(self.model.state_dict())}"
         mean, std = (CLIP_MEAN, CLIP_STD) if self.is_clip else (SIGLIP_MEAN, SIGLIP_STD)
-        self._mean, self._std = (torch.tensor(values).view(3, 1, 1) for values in (mean, std))
+        self._device = chosen_device()
+        self.model.to(self._device)
+        self._mean, self._std = (
+            torch.tensor(values, device=self._device).view(3, 1, 1) for values in (mean, std)
+        )
 
     @torch.no_grad()
     def embed_images(self, images: UInt8[Tensor, "n 3 H W"]) -> Float[Tensor, "n D"]:
         """Embed images, see `Towers`."""
         side = self.image_side_px
-        pixels = images.float() / 255
+        pixels = images.to(self._device).float() / 255
         if images.shape[-2:] != (side, side):
             pixels = F.interpolate(pixels, size=(side, side), mode="bicubic", antialias=True).clamp(0, 1)
         features = self.model.get_image_features(pixel_values=(pixels - self._mean) / self._std)
@@ -76,14 +81,14 @@ class PretrainedTowers:
             "padding": "max_length", "max_length": min(SIGLIP_TOKENS, longest)
         }  # fmt: skip
         tokens = self.tokenizer(list(texts), truncation=True, return_tensors="pt", **padded)
-        kept = {key: tokens[key] for key in ("input_ids", "attention_mask") if key in tokens}
+        kept = {key: tokens[key].to(self._device) for key in ("input_ids", "attention_mask") if key in tokens}
         if not self.is_clip:
             kept.pop("attention_mask", None)  # SigLIP is trained to read the padding too
         return _features(self.model.get_text_features(**kept))
 
 
 def _features(output: Any) -> Float[Tensor, "n D"]:
-    return (output if isinstance(output, Tensor) else output.pooler_output).float()
+    return (output if isinstance(output, Tensor) else output.pooler_output).float().cpu()
 
 
 def _not_loaded(model: str, error: Exception) -> InputError:

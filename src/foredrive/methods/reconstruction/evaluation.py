@@ -143,13 +143,14 @@ def evaluate_sweeps(
         points = scene.prepare_sweep(view)
         started = time.perf_counter()
         seen = scene.sweep(graph, points, view.t_s)
+        range_m = seen.hit_range_m.cpu()  # Waits until a GPU has finished
         took_s += time.perf_counter() - started
         beams_seen += len(view.beams.dt_s)
         some = slice(None) if where is None else where[number]
         beams = view.beams[some]
         scores.append(
             score_sweep(
-                range_m=seen.hit_range_m.cpu()[some],
+                range_m=range_m[some],
                 intensity=seen.intensity.cpu()[some],
                 # A beam is lost if the scene says so, and `drop` asks for it
                 dropped=~seen.returned.cpu()[some] & drop,

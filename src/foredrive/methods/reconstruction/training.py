@@ -17,7 +17,7 @@ from torch.optim import Adam, Optimizer
 
 from foredrive.engine.checkpoints import latest_checkpoint, load_checkpoint, remove_older
 from foredrive.engine.learning_rates import Rate
-from foredrive.engine.loop import CHECKPOINTS, check_finite, step_counter
+from foredrive.engine.loop import CHECKPOINTS, check_finite, on_host, step_counter
 from foredrive.errors import InputError
 from foredrive.methods.reconstruction.reconstructed import ReconstructedScene
 from foredrive.methods.reconstruction.views import CameraView, SweepView
@@ -157,7 +157,7 @@ def _one_step(training: SceneTraining, optimizer: Optimizer, step: int) -> dict[
     losses["loss"].backward()
     optimizer.step()
     training.evolve(step, optimizer, generator)
-    return {name: value.detach() for name, value in losses.items()}
+    return on_host(losses)
 
 
 @dataclass(frozen=True)

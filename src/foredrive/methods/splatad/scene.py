@@ -166,7 +166,8 @@ class GaussianScene(ReconstructedScene):
                 near_m=self.config.camera_near_m,
             ),
         )
-        seen = composite_splats(splats, _pixels(view.size_hw, view.readout_s if self.config.rolling else 0.0))
+        readout_s = view.readout_s if self.config.rolling else 0.0
+        seen = composite_splats(splats, _pixels(view.size_hw, readout_s), median=False)
         feature = seen.feature
         # Where light passes through, grey albedo fills up the rest before decoding
         if self.config.background == "albedo":

@@ -9,6 +9,7 @@ from typing import Any
 import torch
 
 from foredrive.data.resizing import shrink_images
+from foredrive.devices import chosen_device
 from foredrive.driver.agent import Driver
 from foredrive.driving.restarts import is_free_ahead
 from foredrive.heads.following import AgentFollower
@@ -94,7 +95,7 @@ def following(seeing: SeeingAgent, clock: Callable[[], float]) -> Agent:
 @lru_cache(maxsize=1)  # a worker drives many routes with the same agent
 def seeing_agent(folder: Path) -> SeeingAgent:
     """Return the agent of a run."""
-    run, device = open_run(folder), "cuda" if torch.cuda.is_available() else "cpu"
+    run, device = open_run(folder), chosen_device()
     return SeeingAgent(load_agent(run).to(device), run.recipe.clips.image_hw, device)
 
 
@@ -102,7 +103,7 @@ def seeing_agent(folder: Path) -> SeeingAgent:
 def driver_of(folder: Path) -> Driver:
     """Return the driver of a run. Its eyes are on the GPU if there is one; its planner is small."""
     driver = load_driver(open_driver(folder))
-    driver.eyes.to("cuda" if torch.cuda.is_available() else "cpu")
+    driver.eyes.to(chosen_device())
     return driver
 
 

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from foredrive.data import LogPath, collate
 from foredrive.data.logs import Log
+from foredrive.devices import chosen_device
 from foredrive.errors import InputError
 from foredrive.methods.blocks.training_rays import thinned_rays
 from foredrive.runs.open_clips import open_clips
@@ -52,7 +53,8 @@ def imagine_run(
             imagine that far.
     """
     clips = run.recipe.clips
-    world = load_agent(run).world_model
+    device = chosen_device()
+    world = load_agent(run).world_model.to(device)
     steps = round((MAX_DEFAULT_S if seconds is None else seconds) / clips.frame_dt_s)
     # The longest future in which the log shows what the model is to be compared with
     recorded = Log(log)
@@ -77,13 +79,14 @@ def imagine_run(
     count = min(moments, len(dataset))
     for k in range(count):
         item = dataset[int((k + 0.5) * len(dataset) / count)]
-        observed = collate([item]).clip.observed()
+        observed = collate([item]).clip.observed().to(device)
         now = world.observe(observed)
         futures = samples if world.samples_futures else 1
         drawn = [[now, *world.imagine(now, steps, generator=generator)] for _ in range(futures)]
         renderer = world.renderer
         rendered = None if renderer is None else _views(world, renderer, drawn[0], observed, ray_stride)
-        yield ImaginedFutures(item, torch.stack([_occupied(world, beliefs) for beliefs in drawn]), rendered)
+        occupied = torch.stack([_occupied(world, beliefs) for beliefs in drawn]).cpu()
+        yield ImaginedFutures(item, occupied, None if rendered is None else rendered.cpu())
 
 
 def _occupied(world: WorldModel, beliefs: list[Belief]) -> Bool[Tensor, "F Z Y X"]:

@@ -8,10 +8,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import torch
-
 from foredrive.data import ClipDataset, LogPath, collate
 from foredrive.data.clip_config import TaskTruthConfig
+from foredrive.devices import chosen_device
 from foredrive.methods.planner.agent import PlanningAgent
 from foredrive.runs.evaluate.predict import AgentPredictor
 from foredrive.runs.open_clips import open_clips
@@ -124,7 +123,7 @@ def open_inputs(run: Run, source: EvaluationSource) -> EvaluationInputs:
     agent, heads = load_agent(run), load_heads(run)
     truth = None if heads is None else heads.recipe.truth
     dataset = evaluation_data(run, source.logs, source.stride_s, truth)
-    device = "cuda" if torch.cuda.is_available() else "cpu"
+    device = chosen_device()
     ray_stride, steps = RENDER_STRIDE if source.views else 0, run.recipe.clips.future_frames
     predictor = agent_predictor(agent.to(device), heads, steps, ray_stride, FUTURES)
     return EvaluationInputs(source, dataset, predictor, heads, device)

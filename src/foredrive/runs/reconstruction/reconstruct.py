@@ -15,6 +15,7 @@ from foredrive.data import LogPath
 from foredrive.data.cameras import names_of_camera, pinhole_cameras
 from foredrive.data.drives import lidar_of, read_drive
 from foredrive.data.logs import Log
+from foredrive.devices import chosen_device
 from foredrive.engine.checkpoints import load_weights, save_weights
 from foredrive.engine.config import save_recipe
 from foredrive.engine.folder import CONFIG, LOG, SUMMARY, WEIGHTS, RunFolder
@@ -128,7 +129,7 @@ def _reconstruct(
     """Do the steps of a reconstruction that are not done yet."""
     save_vehicle(data.vehicle, folder / VEHICLE)
     representation: Representation = recipe.representation
-    weights, device = folder / WEIGHTS, "cuda" if torch.cuda.is_available() else "cpu"
+    weights, device = folder / WEIGHTS, chosen_device()
     if weights.is_file():
         # A trained scene needs no seeding, which takes longer than everything else here
         scene = open_scene(recipe, weights, data.vehicle).to(device)
@@ -243,8 +244,8 @@ def memory_needed_gib(recipe: ReconstructionRecipe[Any], *, frames: int, cameras
 
 
 def _free_memory_gib() -> float:
-    if torch.cuda.is_available():
-        return torch.cuda.mem_get_info()[0] / 1024**3
+    if (device := chosen_device()) != "cpu":
+        return torch.cuda.mem_get_info(device)[0] / 1024**3
     meminfo = Path("/proc/meminfo")
     if meminfo.is_file():
         for line in meminfo.read_text().splitlines():
