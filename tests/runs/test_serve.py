@@ -22,8 +22,8 @@ from foredrive.driving.ncap.outcome import Outcome
 from foredrive.engine.summary import read_summary
 from foredrive.errors import InputError
 from foredrive.integrations.remote import planner_client
-from foredrive.integrations.remote.json_http import ask
-from foredrive.json_server import Address, JsonServer
+from foredrive.json_http import Address, ask
+from foredrive.json_server import JsonServer
 from foredrive.methods.reconstruction.trust import TRUSTED_LOSS_DB
 from foredrive.runs.drive.in_ncap import SafetyTests
 from foredrive.runs.drive.in_reconstruction import opened_reconstruction

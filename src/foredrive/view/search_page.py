@@ -10,7 +10,8 @@ from dataclasses import dataclass, fields
 from PIL import Image
 
 from foredrive.errors import InputError
-from foredrive.json_server import Answer, JsonServer, Raw, validated
+from foredrive.json_http import validated
+from foredrive.json_server import Answer, JsonServer, Raw
 from foredrive.runs.search.searching import answer_notes, ask, listed_clips
 from foredrive.search.find import Hit
 from foredrive.search.index import FrameIndex

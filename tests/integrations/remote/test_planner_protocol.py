@@ -23,7 +23,8 @@ from foredrive.integrations.remote.planner_client import HttpPlanner, check_plan
 from foredrive.integrations.remote.planner_messages import PlannerInput, T_ego_lidar, canbus, planner_input
 from foredrive.integrations.remote.planner_server import PlannerNeeds, PlannerService
 from foredrive.integrations.remote.sent_tensors import decode_image, encode_tensors
-from foredrive.json_server import Address, JsonServer
+from foredrive.json_http import Address
+from foredrive.json_server import JsonServer
 from foredrive.scene import CameraRig, Clip, Command, LidarSweep, Trajectory
 
 YAW = 0.5
