@@ -78,10 +78,11 @@ def test_a_server_refuses_requests_of_other_forms(head: bytes, body: bytes, told
 
 
 def test_a_taken_port_is_one_line() -> None:
-    server = JsonServer({})
-    with pytest.raises(InputError, match="cannot be served"):
-        JsonServer({}, port=server.address.port)
-    server.close()
+    with (
+        JsonServer({}).in_background() as address,
+        pytest.raises(InputError, match="cannot be served"),
+    ):
+        JsonServer({}, port=address.port)
 
 
 @pytest.mark.parametrize(

@@ -36,7 +36,7 @@ BACKLOG = 512
 _BUSY = b"HTTP/1.1 503 Service Unavailable\r\nContent-Length: 0\r\nConnection: close\r\n\r\n"
 _log = logging.getLogger(__name__)
 # A request that is no HTTP is an error of the client and not worth a line
-_log.addFilter(lambda record: record.msg != "Error handling request from %s")
+_log.addFilter(lambda record: not str(record.msg).startswith("Error handling request"))
 
 
 @dataclass(frozen=True)
@@ -90,16 +90,12 @@ class JsonServer:
 
     @contextlib.contextmanager
     def in_background(self) -> Iterator[Address]:
-        """Answer requests in a thread while the context lasts."""
+        """Answer requests in a thread while the context lasts. Its end releases the port."""
         sync(get_loop(), self._start)
         try:
             yield self.address
         finally:
             sync(get_loop(), self._stop)
-
-    def close(self) -> None:
-        """Release the port."""
-        self._socket.close()
 
     async def _start(self) -> None:
         self._clients = _Clients(self._respond, BODIES * self._max_bytes)

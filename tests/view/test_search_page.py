@@ -38,7 +38,7 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[SearchPage]:
     log = write_log(root, frames=11)
     index_logs([log], str(root / "index"), str(save_clip(root / "clip")), 0.5, 1)
     served = SearchPage(FrameIndex(str(root / "index")), None, "localhost", 0)
-    with served.in_background():
+    with served.server.in_background():
         yield served
 
 

@@ -196,9 +196,8 @@ def test_longer_plans_count_for_3_s() -> None:
 
 
 def test_a_planner_that_is_not_there_is_told_before_the_drives() -> None:
-    server = JsonServer({})
-    address = dataclasses.replace(server.address, answer_s=0.2)
-    server.close()
+    with JsonServer({}).in_background() as served:
+        address = dataclasses.replace(served, answer_s=0.2)
     with pytest.raises(InputError, match=rf"no planner is alive: http://127\.0\.0\.1:{address.port}/alive"):
         check_planner(address, within_s=0.2)
 

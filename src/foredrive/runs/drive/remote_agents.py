@@ -4,6 +4,7 @@ import importlib.util
 from typing import TYPE_CHECKING
 
 from foredrive.errors import InputError
+from foredrive.json_http import read_address
 
 if TYPE_CHECKING:
     from foredrive.runs.drive.agents import AgentSetup
@@ -23,7 +24,6 @@ def require_alpasim() -> None:
 def build_http(setup: "AgentSetup") -> "Agent":
     """Build the client of a planner behind neuro-ncap's protocol."""
     from foredrive.integrations.remote.planner_client import HttpPlanner
-    from foredrive.json_http import read_address
 
     cameras, lidar = setup.sees != "lidar", setup.sees in ("lidar", "both")
     return HttpPlanner(read_address(setup.agent, "http"), setup.clock, cameras=cameras, lidar=lidar)
@@ -33,7 +33,6 @@ def build_grpc(setup: "AgentSetup") -> "Agent":
     """Build the client of a driver behind AlpaSim's contract."""
     require_alpasim()
     from foredrive.integrations.remote.alpasim_client import GrpcDriver
-    from foredrive.json_http import read_address
 
     return GrpcDriver(read_address(setup.agent, "grpc"), setup.clock)
 
@@ -41,7 +40,6 @@ def build_grpc(setup: "AgentSetup") -> "Agent":
 def check_http(agent: str) -> None:
     """Wait for a planner. Raise `InputError` if it does not answer."""
     from foredrive.integrations.remote.planner_client import check_planner
-    from foredrive.json_http import read_address
 
     check_planner(read_address(agent, "http"))
 
@@ -51,6 +49,5 @@ def check_grpc(agent: str) -> None:
     require_alpasim()
     from foredrive.integrations.remote.alpasim_client import check_driver
     from foredrive.integrations.remote.planner_client import ALIVE_S
-    from foredrive.json_http import read_address
 
     check_driver(read_address(agent, "grpc"), ALIVE_S)
