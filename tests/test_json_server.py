@@ -8,6 +8,7 @@ import socket
 import threading
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from http.client import HTTPConnection
 
 import pytest
@@ -205,6 +206,24 @@ def test_clients_that_work_is_done_for_are_not_closed(monkeypatch: pytest.Monkey
         for thread in threads:
             thread.join()
     assert answers == [True, True]
+
+
+@pytest.mark.parametrize("one_at_a_time", [True, False])
+def test_functions_run_one_after_the_other_if_they_have_to(one_at_a_time: bool) -> None:
+    running, most = 0, 0
+
+    def counts(_: object) -> bool:
+        nonlocal running, most
+        running += 1
+        most = max(most, running)
+        time.sleep(0.2)
+        running -= 1
+        return True
+
+    server = JsonServer({("GET", "/count"): counts}, one_at_a_time=one_at_a_time)
+    with server.in_background() as address, ThreadPoolExecutor(3) as clients:
+        assert list(clients.map(lambda _: ask(address, "/count"), range(3))) == [True] * 3
+    assert (most == 1) is one_at_a_time
 
 
 def test_bodies_together_are_bounded() -> None:

@@ -104,7 +104,8 @@ class JsonServer:
 
     async def _stop(self) -> None:
         self._listening.close()
-        self._clients.drop_all()
+        for handler in self._clients.connections:
+            self._clients.drop(handler)
 
     async def _respond(self, request: web.BaseRequest) -> web.StreamResponse:
         status, answer = await self._answered(request)
@@ -156,12 +157,9 @@ class JsonServer:
         if request.content_type != "application/json":
             raise InputError("a request has to be application/json")
         body = bytearray()
-        try:
-            async for part in request.content.iter_any():
-                body += part
-                self._clients.hold(request.protocol, len(body))
-        except web.RequestPayloadError as error:
-            raise ConnectionAbortedError from error
+        async for part in request.content.iter_any():
+            body += part
+            self._clients.hold(request.protocol, len(body))
         return bytes(body)
 
 
@@ -195,12 +193,12 @@ class _Clients(web.Server):
     def connection_lost(self, handler: web.RequestHandler, exc: BaseException | None = None) -> None:
         """Forget a connection."""
         super().connection_lost(handler, exc)
-        self._drop(handler)
+        self.drop(handler)
 
     def wait_for(self, handler: web.RequestHandler, limit_s: float) -> None:
         """Close a connection after some time, or earlier for another one."""
         self.work_for(handler)
-        self._waited_for[handler] = self._loop.call_later(limit_s, self._drop, handler)
+        self._waited_for[handler] = self._loop.call_later(limit_s, self.drop, handler)
 
     def work_for(self, handler: web.RequestHandler) -> None:
         """Keep a connection from being closed.
@@ -226,18 +224,14 @@ class _Clients(web.Server):
         if handler not in self._held_bytes:
             raise ConnectionAbortedError
 
-    def drop_all(self) -> None:
-        """Close all connections."""
-        for handler in list(self._held_bytes):
-            self._drop(handler)
-
     def _drop_longest_waited_for(self) -> bool:
         handler = next(iter(self._waited_for), None)
         if handler is not None:
-            self._drop(handler)
+            self.drop(handler)
         return handler is not None
 
-    def _drop(self, handler: web.RequestHandler) -> None:
+    def drop(self, handler: web.RequestHandler) -> None:
+        """Close a connection at once."""
         self._held_bytes.pop(handler, None)
         if handler in self._waited_for:
             self._waited_for.pop(handler).cancel()
