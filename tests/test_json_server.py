@@ -1,23 +1,26 @@
 """JSON over real loopback sockets: what is answered, and what many bad clients cannot do."""
 
 import contextlib
+import gzip
 import json
 import logging
 import socket
 import threading
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from http.client import HTTPConnection
 
 import pytest
 
-from foredrive import bounded_server, json_server
+from foredrive import json_server
 from foredrive.errors import InputError
-from foredrive.integrations.remote.json_http import ask
-from foredrive.json_server import Address, JsonServer, Raw
+from foredrive.json_http import Address, ask
+from foredrive.json_server import JsonServer, Raw
 
 BAD_CLIENTS = 200
-POST = b"POST /twice HTTP/1.1\r\nContent-Type: application/json\r\n"
+PACKED = gzip.compress(b" " * 5000 + b"1")
+POST = b"POST /twice HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\n"
 
 
 def test_values_errors_and_other_content_are_answered() -> None:
@@ -50,30 +53,37 @@ def test_values_errors_and_other_content_are_answered() -> None:
 
 
 @pytest.mark.parametrize(
-    ("head", "told"),
+    ("head", "body", "told"),
     [
-        (b"Content-Type: application/json\r\n", "needs a Content-Length"),
-        (b"Content-Type: text/plain\r\nContent-Length: 2\r\n", "application/json"),
-        (b"Content-Type: application/json\r\nContent-Length: 2\r\n", "not JSON"),
-        (b"Content-Type: application/json\r\nContent-Length: -1\r\n", "needs a Content-Length"),
+        (b"Content-Type: application/json\r\n", b"", "needs a Content-Length"),
+        (b"Content-Type: application/json\r\nTransfer-Encoding: chunked\r\n", b"0\r\n\r\n", "Content-Length"),
+        (b"Content-Type: text/plain\r\nContent-Length: 2\r\n", b"{,", "application/json"),
+        (b"Content-Type: application/json\r\nContent-Length: 2\r\n", b"{,", "not JSON"),
+        (
+            b"Content-Type: application/json\r\nContent-Encoding: gzip\r\nContent-Length: %d\r\n"
+            % len(PACKED),
+            PACKED,
+            "not JSON",
+        ),
     ],
 )
-def test_a_server_refuses_requests_of_other_forms(head: bytes, told: str) -> None:
+def test_a_server_refuses_requests_of_other_forms(head: bytes, body: bytes, told: str) -> None:
     with (
         JsonServer({("POST", "/x"): lambda body: body}).in_background() as address,
         socket.create_connection((address.host, address.port)) as connection,
     ):
-        connection.sendall(b"POST /x HTTP/1.1\r\n" + head + b"\r\n{,")
+        connection.sendall(b"POST /x HTTP/1.1\r\nHost: localhost\r\n" + head + b"\r\n" + body)
         answer = connection.makefile("rb").read()
     assert b" 422 " in answer.splitlines()[0]
     assert told in json.loads(answer.partition(b"\r\n\r\n")[2])["detail"]
 
 
 def test_a_taken_port_is_one_line() -> None:
-    server = JsonServer({})
-    with pytest.raises(InputError, match="cannot be served"):
-        JsonServer({}, port=server.address.port)
-    server.close()
+    with (
+        JsonServer({}).in_background() as address,
+        pytest.raises(InputError, match="cannot be served"),
+    ):
+        JsonServer({}, port=address.port)
 
 
 @pytest.mark.parametrize(
@@ -116,6 +126,12 @@ def bad_clients(address: Address, sent: bytes) -> Iterator[list[socket.socket]]:
         yield clients
 
 
+def is_closed(client: socket.socket) -> bool:
+    with contextlib.suppress(ConnectionResetError):
+        return client.recv(1) == b""
+    return True
+
+
 @pytest.mark.parametrize(
     "sent",
     [
@@ -134,25 +150,44 @@ def test_a_good_client_is_answered_beside_two_hundred_bad_ones(sent: bytes) -> N
         assert ask(address, "/alive") is True
         assert ask(address, "/twice", "x" * 5000) == ["x" * 5000] * 2
         assert time.monotonic() - began_s < 1.0
-        while threading.active_count() - before > bounded_server.MAX_CONNECTIONS + 1:  # the server's own
+        while threading.active_count() - before > json_server.MAX_CONNECTIONS + 1:  # the server's own
             assert time.monotonic() - began_s < 5.0
             time.sleep(0.01)
-        assert clients[0].recv(1) == b""  # the first ones were closed for the others
+        assert is_closed(clients[0])  # the first ones were closed for the others
 
 
-def test_a_request_that_comes_byte_by_byte_ends_in_time(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(bounded_server, "REQUEST_S", 0.5)
+@pytest.mark.parametrize("head", [POST, POST + b"Content-Length: 9000\r\n\r\n"], ids=["head", "body"])
+def test_a_request_that_comes_byte_by_byte_ends_in_time(head: bytes, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Others are answered beside it."""
+    monkeypatch.setattr(json_server, "REQUEST_S", 0.5)
     with served() as address, socket.create_connection((address.host, address.port), timeout=20) as client:
         began_s = time.monotonic()
+        client.sendall(head)
         with contextlib.suppress(OSError):
             while time.monotonic() - began_s < 20:
-                client.sendall(b"G")
+                client.sendall(b"1")
+                assert ask(address, "/twice", 1) == [1, 1]
                 time.sleep(0.02)
-        assert time.monotonic() - began_s < 10
+        assert 0.4 < time.monotonic() - began_s < 10
+
+
+def test_an_answer_that_nobody_takes_ends_in_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(json_server, "SEND_S", 0.5)
+    large = {("GET", "/large"): lambda _: "x" * 2**25}  # more than the sockets of both sides keep
+    with JsonServer(large).in_background() as address:
+        assert ask(address, "/large") == "x" * 2**25
+        with socket.create_connection((address.host, address.port), timeout=20) as client:
+            client.sendall(b"GET /large HTTP/1.1\r\nHost: localhost\r\n\r\n")
+            time.sleep(1.0)
+            taken = 0
+            with contextlib.suppress(ConnectionResetError):
+                while part := client.recv(2**20):
+                    taken += len(part)
+        assert taken < 2**25
 
 
 def test_clients_that_work_is_done_for_are_not_closed(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(bounded_server, "MAX_CONNECTIONS", 2)
+    monkeypatch.setattr(json_server, "MAX_CONNECTIONS", 2)
     begun, go_on = threading.Semaphore(0), threading.Event()
 
     def slow(_: object) -> bool:
@@ -173,6 +208,24 @@ def test_clients_that_work_is_done_for_are_not_closed(monkeypatch: pytest.Monkey
     assert answers == [True, True]
 
 
+@pytest.mark.parametrize("one_at_a_time", [True, False])
+def test_functions_run_one_after_the_other_if_they_have_to(one_at_a_time: bool) -> None:
+    running, most = 0, 0
+
+    def counts(_: object) -> bool:
+        nonlocal running, most
+        running += 1
+        most = max(most, running)
+        time.sleep(0.2)
+        running -= 1
+        return True
+
+    server = JsonServer({("GET", "/count"): counts}, one_at_a_time=one_at_a_time)
+    with server.in_background() as address, ThreadPoolExecutor(3) as clients:
+        assert list(clients.map(lambda _: ask(address, "/count"), range(3))) == [True] * 3
+    assert (most == 1) is one_at_a_time
+
+
 def test_bodies_together_are_bounded() -> None:
     """Of bodies of 9 kB that do not end, those that came first are given up for the next."""
     with served(max_bytes=9000) as address, contextlib.ExitStack() as stack:
@@ -182,7 +235,7 @@ def test_bodies_together_are_bounded() -> None:
             client.sendall(POST + b"Content-Length: 9000\r\n\r\n" + b" " * 8999)
             clients.append(client)
             time.sleep(0.05)
-        assert [client.recv(1) for client in clients[:2]] == [b"", b""]
+        assert all(map(is_closed, clients[:2]))
         clients[-1].sendall(b"7")
         assert clients[-1].makefile("rb").read().endswith(b"\r\n\r\n[7, 7]")
 

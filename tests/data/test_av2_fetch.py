@@ -3,6 +3,7 @@
 import hashlib
 import threading
 from collections.abc import Iterator
+from dataclasses import replace
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from urllib.parse import parse_qs, unquote, urlsplit
@@ -12,7 +13,7 @@ import pytest
 
 from foredrive.cli.main import main
 from foredrive.data.formats import av2_fetch
-from foredrive.data.formats.av2_fetch import ROOT, fetch_log, find_log, log_ids
+from foredrive.data.formats.av2_fetch import ROOT, RemoteLog, fetch_log, find_log, log_ids
 from foredrive.errors import InputError
 
 LOG, OTHER = "00a6ffc1-6ce9-3bc3-a060-6006e9893a1a", "11a6ffc1-6ce9-3bc3-a060-6006e9893a1a"
@@ -98,6 +99,7 @@ def bucket(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[Bucket, str]]:
         held.objects[sweep], held.objects[image] = bytes([k]) * 3000, bytes([k]) * 5000
     held.objects[f"{ROOT}/train/{OTHER}/annotations.feather"] = b"x"
     monkeypatch.setattr(av2_fetch, "CHUNK_BYTES", 512)
+    monkeypatch.setattr(av2_fetch, "PAUSE_S", 0.0)
     yield held, f"http://127.0.0.1:{server.server_address[1]}"
     server.shutdown()
     thread.join()
@@ -147,45 +149,61 @@ def test_a_part_goes_on_where_it_was(bucket: tuple[Bucket, str], tmp_path: Path)
     assert not part.exists()
 
 
+def one_file(url: str, size: int | None = None) -> RemoteLog:
+    """The log's annotations alone."""
+    log = find_log(LOG, url)
+    (file,) = [file for file in log.files if "annotations" in file.key]
+    return replace(log, files=[replace(file, size=file.size if size is None else size)])
+
+
 def test_a_connection_that_breaks_is_taken_up_again(bucket: tuple[Bucket, str], tmp_path: Path) -> None:
     held, url = bucket
-    (found,) = av2_fetch.list_objects(url, f"{ROOT}/val/{LOG}/annotations")
-    held.cut_at[found.key], held.fail[found.key] = 100, []
-    av2_fetch.download(url, found, tmp_path / "a", none, pause_s=0.0)
-    assert held.asked == [(found.key, None), (found.key, "bytes=100-")]
-    assert (tmp_path / "a").read_bytes() == held.objects[found.key]
-    held.fail[found.key] = [503] * 3
-    av2_fetch.download(url, found, tmp_path / "b", none, pause_s=0.0)
-    held.fail[found.key] = [503] * 4
-    with pytest.raises(InputError, match=r"error 503 \(4 tries\); start again to go on"):
-        av2_fetch.download(url, found, tmp_path / "c", none, pause_s=0.0)
-    assert not (tmp_path / "c").exists()
-
-
-def test_an_object_that_changed_is_fetched_anew(bucket: tuple[Bucket, str], tmp_path: Path) -> None:
-    held, url = bucket
-    (found,) = av2_fetch.list_objects(url, f"{ROOT}/val/{LOG}/annotations")
-    (tmp_path / "a.part").write_bytes(b"old" * 40)
+    log = one_file(url)
+    key, file = log.files[0].key, Path("val") / LOG / "annotations.feather"
+    held.cut_at[key] = 100
     came = []
-    old = av2_fetch.S3Object(found.key, found.size, found.etag)
-    held.etags[found.key] = "0" * 32  # the server's object is another one now
-    held.objects[found.key] = b"y" * found.size
+    fetch_log(log, tmp_path / "a", 1, came.append, url)
+    assert held.asked == [(key, None), (key, "bytes=100-")]
+    assert (tmp_path / "a" / file).read_bytes() == held.objects[key]
+    assert sum(came) == log.size
+    held.fail[key] = [503] * 3
+    fetch_log(log, tmp_path / "b", 1, none, url)
+    assert (tmp_path / "b" / file).read_bytes() == held.objects[key]
+    held.fail[key] = [503] * 4
+    with pytest.raises(InputError, match=r"error 503 \(4 tries\); start again to go on"):
+        fetch_log(log, tmp_path / "c", 1, none, url)
+    assert not (tmp_path / "c" / file).exists()
+    held.fail[key] = [404]
+    with pytest.raises(InputError, match=r"annotations.feather: error 404 Not Found"):
+        fetch_log(log, tmp_path / "c", 1, none, url)
+
+
+@pytest.mark.parametrize("left", [120, 5000])
+def test_an_object_that_changed_is_fetched_anew(
+    left: int, bucket: tuple[Bucket, str], tmp_path: Path
+) -> None:
+    held, url = bucket
+    log = one_file(url)
+    key, folder = log.files[0].key, tmp_path / "val" / LOG
+    folder.mkdir(parents=True)
+    (folder / "annotations.feather.part").write_bytes(b"x" * left)
+    came = []
+    held.etags[key] = "0" * 32  # the server's object is another one now
+    held.objects[key] = b"y" * log.size
     with pytest.raises(InputError, match="not what the listing says"):
-        av2_fetch.download(url, old, tmp_path / "a", came.append, pause_s=0.0)
-    assert sum(came) == found.size
-    assert not list(tmp_path.iterdir())
+        fetch_log(log, tmp_path, 1, came.append, url)
+    assert sum(came) == log.size
+    assert not list(folder.iterdir())
 
 
 def test_objects_uploaded_in_parts_are_checked_by_size(bucket: tuple[Bucket, str], tmp_path: Path) -> None:
     held, url = bucket
-    key = f"{ROOT}/val/{LOG}/annotations.feather"
-    held.etags[key] = "0123456789abcdef0123456789abcdef-2"
-    (found,) = av2_fetch.list_objects(url, key)
-    assert found.md5 is None
-    av2_fetch.download(url, found, tmp_path / "a", none)
-    smaller = av2_fetch.S3Object(key, found.size - 5, found.etag)
+    log = one_file(url)
+    held.etags[log.files[0].key] = "0123456789abcdef0123456789abcdef-2"
+    fetch_log(one_file(url), tmp_path / "a", 1, none, url)
+    assert fetched(tmp_path / "a") == {log.files[0].key: held.objects[log.files[0].key]}
     with pytest.raises(InputError, match="more than the"):
-        av2_fetch.download(url, smaller, tmp_path / "b", none)
+        fetch_log(one_file(url, size=log.size - 5), tmp_path / "b", 1, none, url)
 
 
 def test_a_few_seconds_without_images(bucket: tuple[Bucket, str]) -> None:
@@ -235,9 +253,11 @@ def test_what_is_no_bucket_is_told(bucket: tuple[Bucket, str], monkeypatch: pyte
     ):
         monkeypatch.setattr(held, "listing", lambda _, answer=answer: answer)
         with pytest.raises(InputError, match=told):
-            list(av2_fetch.list_objects(url, "x"))
+            find_log(LOG, url)
     with pytest.raises(InputError, match="not an address"):
-        list(av2_fetch.list_objects("nowhere", "x"))
+        find_log(LOG, "nowhere")
+    with pytest.raises(InputError, match=r"Connection refused \(4 tries\)"):
+        log_ids("val", "http://127.0.0.1:1")
 
 
 def test_a_disk_that_is_too_small_is_told_first(bucket: tuple[Bucket, str], tmp_path: Path) -> None:

@@ -22,8 +22,8 @@ from foredrive.driving.ncap.outcome import Outcome
 from foredrive.engine.summary import read_summary
 from foredrive.errors import InputError
 from foredrive.integrations.remote import planner_client
-from foredrive.integrations.remote.json_http import ask
-from foredrive.json_server import Address, JsonServer
+from foredrive.json_http import Address, ask
+from foredrive.json_server import JsonServer
 from foredrive.methods.reconstruction.trust import TRUSTED_LOSS_DB
 from foredrive.runs.drive.in_ncap import SafetyTests
 from foredrive.runs.drive.in_reconstruction import opened_reconstruction
@@ -106,8 +106,8 @@ def test_who_is_not_there_is_told_before_driving(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(planner_client, "check_planner", partial(planner_client.check_planner, within_s=0.1))
-    server = JsonServer({})
-    server.close()
+    with JsonServer({}).in_background() as address:
+        pass
     command = [
         "ncap",
         str(reconstructed),
@@ -118,7 +118,7 @@ def test_who_is_not_there_is_told_before_driving(
         "--runs",
         "1",
     ]
-    assert main([*command, "--agent", f"http://{server.address}"]) == 2
+    assert main([*command, "--agent", f"http://{address}"]) == 2
     assert "no planner is alive" in capsys.readouterr().err
     assert main([*command, "--agent", "http://nowhere"]) == 2
     assert "not an address of the form http://HOST:PORT" in capsys.readouterr().err

@@ -15,10 +15,10 @@ from miniature import miniature, write_log
 from PIL import Image
 from test_task_pictures import agents
 
-from foredrive.bounded_server import REQUEST_S
 from foredrive.cli.main import main
 from foredrive.data import CameraSpec, LogPath, Points
 from foredrive.data import write_log as write_recorded
+from foredrive.json_http import REQUEST_S
 from foredrive.runs import Run, train_run
 from foredrive.runs.evaluate.display import DisplayPrediction
 from foredrive.scene import Trajectory, VoxelSpec

@@ -87,10 +87,7 @@ def search_page(index: Place = INDEX, towers: Name = None, host: str = "localhos
 
     page = SearchPage(FrameIndex(index), towers, host, port)
     print(f"serving the search page of {index} at {page.url}; press Ctrl-C to stop", flush=True)
-    try:
-        page.serve()
-    finally:
-        page.close()
+    page.server.serve()
 
 
 def _saved(index: str, name: str) -> "Query":

@@ -50,9 +50,6 @@ def serve(
     answers = renderer_of(folder) if renders else planner_of(run)
     usual = 8000 if renders else 9000
     server = JsonServer(answers, host, usual if port is None else port)
-    try:
-        what = "renderer" if renders else "planner"
-        print(f"{folder.name} is a {what} at http://{server.address} until you press Ctrl-C", flush=True)
-        server.serve()
-    finally:
-        server.close()
+    what = "renderer" if renders else "planner"
+    print(f"{folder.name} is a {what} at http://{server.address} until you press Ctrl-C", flush=True)
+    server.serve()

@@ -14,8 +14,8 @@ import websockets.asyncio.server
 from websockets import Request, Response, State
 from websockets.asyncio.server import ServerConnection
 
-from foredrive.bounded_server import MAX_CONNECTIONS, REQUEST_S, refusal
 from foredrive.errors import InputError
+from foredrive.json_http import MAX_CONNECTIONS, REQUEST_S, refusal
 
 PORTS, PORTS_TRIED = 65536, 100
 AMBIENT_LIGHT = 0.7

@@ -4,13 +4,13 @@ import functools
 import io
 import threading
 from collections.abc import Mapping, Sequence
-from contextlib import AbstractContextManager
 from dataclasses import dataclass, fields
 
 from PIL import Image
 
 from foredrive.errors import InputError
-from foredrive.json_server import Answer, JsonServer, Raw, validated
+from foredrive.json_http import validated
+from foredrive.json_server import Answer, JsonServer, Raw
 from foredrive.runs.search.searching import answer_notes, ask, listed_clips
 from foredrive.search.find import Hit
 from foredrive.search.index import FrameIndex
@@ -131,7 +131,7 @@ class SentQuery:
 
 
 class SearchPage:
-    """Serves the page until it is closed.
+    """Serves the page by `server`.
 
     Args:
         towers: folder or name of the towers that made the index; by default as noted in the index.
@@ -155,20 +155,8 @@ class SearchPage:
             ("POST", "/clips"): self._clips,
             ("POST", "/queries"): self._save,
         }
-        self._server = JsonServer(answers, host, port, MAX_BODY_BYTES, one_at_a_time=False)
-        self.url = f"http://{host}:{self._server.address.port}"
-
-    def serve(self) -> None:
-        """Answer requests in this thread until it is interrupted."""
-        self._server.serve()
-
-    def in_background(self) -> AbstractContextManager[object]:
-        """Answer requests in a thread while the context lasts."""
-        return self._server.in_background()
-
-    def close(self) -> None:
-        """Release the port."""
-        self._server.close()
+        self.server = JsonServer(answers, host, port, MAX_BODY_BYTES, one_at_a_time=False)
+        self.url = f"http://{host}:{self.server.address.port}"
 
     def _find(self, asked: Mapping[str, str]) -> ShownHits:
         query = query_of(asked)

@@ -24,7 +24,7 @@ from foredrive.errors import InputError
 from foredrive.integrations.remote.alpasim_client import GrpcDriver, check_driver, points_of
 from foredrive.integrations.remote.alpasim_server import AlpasimDriver, route_of, serve_alpasim
 from foredrive.integrations.remote.planner_server import PlannerNeeds
-from foredrive.json_server import Address
+from foredrive.json_http import Address
 from foredrive.scene import Clip, Command, Trajectory
 from foredrive.scene.clip import TARGET
 

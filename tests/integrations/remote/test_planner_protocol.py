@@ -23,7 +23,8 @@ from foredrive.integrations.remote.planner_client import HttpPlanner, check_plan
 from foredrive.integrations.remote.planner_messages import PlannerInput, T_ego_lidar, canbus, planner_input
 from foredrive.integrations.remote.planner_server import PlannerNeeds, PlannerService
 from foredrive.integrations.remote.sent_tensors import decode_image, encode_tensors
-from foredrive.json_server import Address, JsonServer
+from foredrive.json_http import Address
+from foredrive.json_server import JsonServer
 from foredrive.scene import CameraRig, Clip, Command, LidarSweep, Trajectory
 
 YAW = 0.5
@@ -195,9 +196,8 @@ def test_longer_plans_count_for_3_s() -> None:
 
 
 def test_a_planner_that_is_not_there_is_told_before_the_drives() -> None:
-    server = JsonServer({})
-    address = dataclasses.replace(server.address, answer_s=0.2)
-    server.close()
+    with JsonServer({}).in_background() as served:
+        address = dataclasses.replace(served, answer_s=0.2)
     with pytest.raises(InputError, match=rf"no planner is alive: http://127\.0\.0\.1:{address.port}/alive"):
         check_planner(address, within_s=0.2)
 

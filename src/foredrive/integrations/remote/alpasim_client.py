@@ -30,7 +30,7 @@ from foredrive.driving.simple_agents import plan_of
 from foredrive.errors import InputError
 from foredrive.geometry.polylines import arc_lengths, points_at
 from foredrive.integrations.remote.planner_client import FIRST_US
-from foredrive.json_server import Address
+from foredrive.json_http import Address
 from foredrive.scene import CameraRig, Clip, Command, Trajectory
 
 STEP_M, LENGTH_M = 2.0, 40.0

@@ -6,9 +6,8 @@ from collections.abc import Callable
 
 from foredrive.driving.simple_agents import plan_of
 from foredrive.errors import InputError
-from foredrive.integrations.remote.json_http import ask
 from foredrive.integrations.remote.planner_messages import PlannerOutput, planner_input, waypoints
-from foredrive.json_server import Address, validated
+from foredrive.json_http import Address, ask, validated
 from foredrive.scene import Clip, Trajectory
 
 FIRST_US = 1_000_000_000

@@ -17,7 +17,8 @@ from foredrive.errors import InputError
 from foredrive.integrations.remote.planner_messages import COMMANDS, PlannerInput, nuscenes_name
 from foredrive.integrations.remote.sent_matrices import read_matrix
 from foredrive.integrations.remote.sent_tensors import decode_image
-from foredrive.json_server import Answer, validated
+from foredrive.json_http import validated
+from foredrive.json_server import Answer
 from foredrive.scene import Agent, CameraRig, Clip, Command, Trajectory
 
 COMMAND_OF = {number: command for command, number in COMMANDS.items()}

@@ -23,7 +23,8 @@ from foredrive.geometry.se3 import inverse_se3, transform_points
 from foredrive.integrations.remote.planner_messages import nuscenes_name
 from foredrive.integrations.remote.sent_matrices import read_pose
 from foredrive.integrations.remote.sent_tensors import encode_tensors
-from foredrive.json_server import Answer, Raw, validated
+from foredrive.json_http import validated
+from foredrive.json_server import Answer, Raw
 from foredrive.methods.reconstruction.edits import Edit, Remove, apply_edits
 from foredrive.methods.reconstruction.novel_views import novel_camera_view
 from foredrive.methods.reconstruction.reconstructed import ReconstructedScene

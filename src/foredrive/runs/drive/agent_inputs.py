@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from foredrive.driving.observation import FRAME_DT_S
 from foredrive.errors import InputError
 from foredrive.integrations.own_agents import needs_of
-from foredrive.integrations.remote.json_http import read_address
+from foredrive.json_http import read_address
 from foredrive.methods.reconstruction.vehicle import LoggedVehicle
 from foredrive.runs.drive.agents import Sees, agent_folder, find_agent, is_remote
 from foredrive.runs.train.driver import is_driver, open_driver

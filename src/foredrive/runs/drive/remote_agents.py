@@ -4,6 +4,7 @@ import importlib.util
 from typing import TYPE_CHECKING
 
 from foredrive.errors import InputError
+from foredrive.json_http import read_address
 
 if TYPE_CHECKING:
     from foredrive.runs.drive.agents import AgentSetup
@@ -22,7 +23,6 @@ def require_alpasim() -> None:
 
 def build_http(setup: "AgentSetup") -> "Agent":
     """Build the client of a planner behind neuro-ncap's protocol."""
-    from foredrive.integrations.remote.json_http import read_address
     from foredrive.integrations.remote.planner_client import HttpPlanner
 
     cameras, lidar = setup.sees != "lidar", setup.sees in ("lidar", "both")
@@ -33,14 +33,12 @@ def build_grpc(setup: "AgentSetup") -> "Agent":
     """Build the client of a driver behind AlpaSim's contract."""
     require_alpasim()
     from foredrive.integrations.remote.alpasim_client import GrpcDriver
-    from foredrive.integrations.remote.json_http import read_address
 
     return GrpcDriver(read_address(setup.agent, "grpc"), setup.clock)
 
 
 def check_http(agent: str) -> None:
     """Wait for a planner. Raise `InputError` if it does not answer."""
-    from foredrive.integrations.remote.json_http import read_address
     from foredrive.integrations.remote.planner_client import check_planner
 
     check_planner(read_address(agent, "http"))
@@ -50,7 +48,6 @@ def check_grpc(agent: str) -> None:
     """Wait for a driver. Raise `InputError` if it does not answer."""
     require_alpasim()
     from foredrive.integrations.remote.alpasim_client import check_driver
-    from foredrive.integrations.remote.json_http import read_address
     from foredrive.integrations.remote.planner_client import ALIVE_S
 
     check_driver(read_address(agent, "grpc"), ALIVE_S)
