@@ -148,6 +148,12 @@ def foredrive_files(path: Path) -> set[Path]:
     return found
 
 
+def test_no_two_files_import_each_other() -> None:
+    """Not even late, or for their types alone: who reads one would have to know the other first."""
+    of = {path: foredrive_files(path) - {path} for path in ROOT.rglob("*.py") if path.name != "__init__.py"}
+    assert [(a, b) for a, others in of.items() for b in others if a in of.get(b, ())] == []
+
+
 def test_carla_is_driven_in_without_the_embedded_towns() -> None:
     todo, reached = set((ROOT / "integrations" / "carla").rglob("*.py")), set[Path]()
     while todo:

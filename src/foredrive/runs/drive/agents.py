@@ -249,7 +249,12 @@ AGENTS: tuple[AgentKind, ...] = (
         "http://",
         "a planner in another process, behind neuro-ncap's model server protocol; ?timeout=S behind the "
         "address changes the 60 s in which it has to answer",
-        remote_agents.build_http,
+        lambda setup: remote_agents.build_http(
+            setup.agent,
+            setup.clock,
+            cameras=setup.sees != "lidar",
+            lidar=setup.sees in ("lidar", "both"),
+        ),
         "HOST:PORT",
         "remote",
         ready=remote_agents.check_http,
@@ -257,7 +262,7 @@ AGENTS: tuple[AgentKind, ...] = (
     AgentKind(
         "grpc://",
         "a driver in another process, behind AlpaSim's contract",
-        remote_agents.build_grpc,
+        lambda setup: remote_agents.build_grpc(setup.agent, setup.clock),
         "HOST:PORT",
         "remote",
         ready=remote_agents.check_grpc,

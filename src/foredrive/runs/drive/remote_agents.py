@@ -1,14 +1,17 @@
 """Agents in other processes: their clients, and the check that they are alive."""
 
 import importlib.util
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from foredrive.errors import InputError
 from foredrive.json_http import read_address
 
 if TYPE_CHECKING:
-    from foredrive.runs.drive.agents import AgentSetup
     from foredrive.scene import Agent
+
+Clock = Callable[[], float]
+"""Returns the time of the drive, s."""
 
 
 def require_alpasim() -> None:
@@ -21,20 +24,19 @@ def require_alpasim() -> None:
         raise InputError("AlpaSim's driver contract is missing: pip install 'foredrive[alpasim]'")
 
 
-def build_http(setup: "AgentSetup") -> "Agent":
+def build_http(agent: str, clock: Clock, *, cameras: bool, lidar: bool) -> "Agent":
     """Build the client of a planner behind neuro-ncap's protocol."""
     from foredrive.integrations.remote.planner_client import HttpPlanner
 
-    cameras, lidar = setup.sees != "lidar", setup.sees in ("lidar", "both")
-    return HttpPlanner(read_address(setup.agent, "http"), setup.clock, cameras=cameras, lidar=lidar)
+    return HttpPlanner(read_address(agent, "http"), clock, cameras=cameras, lidar=lidar)
 
 
-def build_grpc(setup: "AgentSetup") -> "Agent":
+def build_grpc(agent: str, clock: Clock) -> "Agent":
     """Build the client of a driver behind AlpaSim's contract."""
     require_alpasim()
     from foredrive.integrations.remote.alpasim_client import GrpcDriver
 
-    return GrpcDriver(read_address(setup.agent, "grpc"), setup.clock)
+    return GrpcDriver(read_address(agent, "grpc"), clock)
 
 
 def check_http(agent: str) -> None:
