@@ -33,7 +33,7 @@ RECONSTRUCTED_BY = (
     *(
         f"foredrive.methods.neurad.{module}"
         for module in (
-            *("config", "content", "decoders", "losses", "network", "rays", "recipes"),
+            *("config", "decoders", "losses", "network", "rays", "recipes"),
             *("render", "sampling", "scene", "training"),
         )
     ),
