@@ -6,7 +6,9 @@ from pathlib import Path
 import pytest
 from miniature import miniature
 
-from benchmarks.common.study import StudyLogs, pandaset_log, run_arm, seeded, share_of
+from benchmarks.common.benchmark import study_identity
+from benchmarks.common.study import RECONSTRUCTED_BY, StudyLogs, pandaset_log, run_arm, seeded, share_of
+from benchmarks.common.world_models import DECIDED_BY, TASKS_DECIDED_BY
 from foredrive.data import LogPath
 from foredrive.engine.metrics_log import read_metrics
 from foredrive.errors import InputError
@@ -57,3 +59,8 @@ def test_an_arm_is_trained_and_judged_once(trained: Run, tmp_path: Path) -> None
     assert {"above_ground.iou_now.best_constant", "iou_future_1s"} <= set(figures)
     lines = read_metrics(tmp_path / "few" / "finetune" / "metrics.jsonl")
     assert figures["train_s"] == pytest.approx(sum(line["step_s"] for line in lines))
+
+
+@pytest.mark.parametrize("entry", [*RECONSTRUCTED_BY, *DECIDED_BY, *TASKS_DECIDED_BY])
+def test_code_that_decides_figures_exists(entry: str) -> None:
+    assert len(study_identity({}, (entry,))) == 16
