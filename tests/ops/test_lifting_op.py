@@ -1,6 +1,6 @@
 """Deformable lifting: hand-computed cases, the reference's gradients, the fast paths against it."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import pytest
@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from foredrive.ops.lifting import lift, lift_reference
+from foredrive.ops.lifting import join_levels, lift, lift_reference
 
 Parity = Callable[..., None]
 Op = Callable[..., Tensor]
@@ -18,7 +18,17 @@ Op = Callable[..., Tensor]
 @pytest.fixture(scope="session", params=["numba", "triton"])
 def op(request: pytest.FixtureRequest, triton_op: Callable[[str, str], Op]) -> Op:
     """The fast paths."""
-    return lift if request.param == "numba" else triton_op("lifting_triton", "lift_triton")
+    return lift if request.param == "numba" else joined(triton_op("lifting_triton", "lift_triton"))
+
+
+def joined(op: Op) -> Op:
+    """The op for feature maps that are not joined yet."""
+
+    def lifted(values: Sequence[Tensor], *others: Tensor) -> Tensor:
+        maps, sizes = join_levels(values)
+        return op(maps, tuple(sizes), *others)
+
+    return lifted
 
 
 def flat_lift(op: Callable[..., Tensor], uv: Tensor, visible: Tensor) -> Callable[..., Tensor]:
@@ -153,7 +163,7 @@ def test_triton_is_the_reference(
     parity: Parity, triton_op: Callable[[str, str], Op], shape: dict[str, Any]
 ) -> None:
     inputs, uv, visible = case(3, **shape)
-    fast = triton_op("lifting_triton", "lift_triton")
+    fast = joined(triton_op("lifting_triton", "lift_triton"))
     parity(flat_lift(fast, uv, visible), flat_lift(lift_reference, uv, visible), inputs)
 
 

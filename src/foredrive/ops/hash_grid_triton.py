@@ -31,7 +31,12 @@ def read_hash_grid_triton(
     """Compute `read_hash_grid` on a GPU. Half precision is read as it is and summed in float32.
 
     The gradient of the table is summed by atomics, so its last bits differ from run to run.
+
+    Raises:
+        ValueError: the number of features is not a power of two.
     """
+    if (features := table.shape[1]) & (features - 1):
+        raise ValueError(f"on a GPU, a level of a hash grid has 1, 2, 4 or 8 features, not {features}")
     # Row k of `shape` holds field k of all levels.
     shape = torch.tensor([tuple(int(x) for x in level) for level in levels], dtype=torch.int64).T.contiguous()
     if footprint is not None:

@@ -13,9 +13,9 @@ from torch import Tensor
 
 TILE = 1024
 """Numbers in a tile: eight per thread."""
-MAX_PLACES, MAX_POINTS = 256, 16
-"""Maximum number of places (rows times points) and of points in a tile. A place needs more registers than a
-number that is read there."""
+MAX_POINTS, PLACE = 16, 4
+"""Maximum number of points in a tile; the numbers that a place (a point of a row) counts as at least, because
+it needs more registers than a number that is read there."""
 
 
 class TileShape(NamedTuple):
@@ -26,12 +26,12 @@ class TileShape(NamedTuple):
     channels: int
 
 
-def tile_shape(points: int, channels: int) -> TileShape:
+def tile_shape(points: int, channels: int, numbers: int = TILE) -> TileShape:
     """Return the tile for rows of given size: it has all channels, some points and some rows."""
     # All channels in a tile; then as many points as fit; then as many rows
     wide = int(triton.next_power_of_2(channels))
-    count = min(int(triton.next_power_of_2(points)), MAX_POINTS, max(TILE // wide, 1))
-    return TileShape(rows=max(min(TILE // wide, MAX_PLACES) // count, 1), points=count, channels=wide)
+    count = min(int(triton.next_power_of_2(points)), MAX_POINTS, max(numbers // wide, 1))
+    return TileShape(rows=max(numbers // max(wide, PLACE) // count, 1), points=count, channels=wide)
 
 
 def launch(
@@ -40,6 +40,7 @@ def launch(
     sizes: Sequence[int],
     weights: Tensor,
     channels: int,
+    numbers: int = TILE,
     **flags: bool,
 ) -> None:
     """Run a kernel over all rows.
@@ -49,10 +50,11 @@ def launch(
         sizes: the next arguments.
         weights: attention weights [b Q H … P].
         channels: number of channels of all heads together.
+        numbers: maximum number of numbers in a tile.
     """
     (queries, heads), points = weights.shape[1:3], weights.shape[-1]
     rows, width = len(weights) * queries * heads, channels // heads
-    tile = tile_shape(points, width)
+    tile = tile_shape(points, width, numbers)
     if rows:
         # One program for each tile of rows
         kernel[(triton.cdiv(rows, tile.rows),)](

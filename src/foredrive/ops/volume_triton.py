@@ -14,7 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from foredrive.ops.tiles import launch, neighbours, read, read_back, rows_of_program
+from foredrive.ops.tiles import TILE, launch, neighbours, read, read_back, rows_of_program
 
 
 def attend_volume_triton(
@@ -71,7 +71,9 @@ class _AttendVolume(torch.autograd.Function):
 
 def _launch(kernel: Any, inputs: Sequence[Tensor], outputs: Sequence[Tensor | None], **flags: bool) -> None:
     values, _, weights = inputs
-    launch(kernel, [*inputs, *outputs], values.shape[1:4], weights, values.shape[-1], **flags)
+    # Eight corners with their slopes take many registers: of a larger tile, some would be spilled
+    numbers = TILE // 2 if kernel is _attend_rows_back else TILE
+    launch(kernel, [*inputs, *outputs], values.shape[1:4], weights, values.shape[-1], numbers, **flags)
 
 
 @triton.jit
