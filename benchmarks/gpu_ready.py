@@ -7,6 +7,7 @@ CPU are counted, and how often the host waits for the card in a step of training
 """
 
 import functools
+import importlib
 import json
 import math
 import subprocess
@@ -28,8 +29,7 @@ CLOSE = 1e-2
 def paths(_: int) -> dict[str, float]:
     """Return the number of cases that agree, of all cases, and the waits of a step."""
     sys.path.insert(0, str(CASES.parent))
-    import emulation
-
+    emulation = importlib.import_module("emulation")
     hooks = emulation.built_hooks(WORK)
     on_cpu, on_card = (_outcomes([str(CASES), device, str(hooks)]) for device in ("cpu", "cuda"))
     agreeing = [

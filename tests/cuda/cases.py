@@ -53,6 +53,8 @@ from foredrive.engine.summary import Summary, numbers, read_summary  # noqa: E40
 from foredrive.methods.lidarclip import LidarEncoder, LidarEncoderConfig, PointCloud  # noqa: E402
 from foredrive.methods.lidarclip.alignment import DistillationObjective, ImagedSweeps  # noqa: E402
 from foredrive.methods.recipe import Recipe  # noqa: E402
+from foredrive.ops import splatting, splatting_gsplat  # noqa: E402
+from foredrive.ops.splat_points import pixel_points  # noqa: E402
 from foredrive.runs.build import build_agent, build_objective  # noqa: E402
 from foredrive.runs.drive.agents import make_agent  # noqa: E402
 from foredrive.runs.evaluate.imagination import imagine_run  # noqa: E402
@@ -173,6 +175,25 @@ def gaussians(folder: Path) -> Figures:
     return numbers_of(done.summary)
 
 
+def gsplat(folder: Path) -> Figures:
+    """The same with gsplat installed, for whose kernels the reference stands: images have to reach it."""
+    reached = []
+
+    def composite(*parts: torch.Tensor, size_hw: tuple[int, int]) -> tuple[torch.Tensor, ...]:
+        reached.append(size_hw)
+        mean, inverse_covariance, opacity, range_m, feature = parts
+        still = (torch.zeros_like(mean), torch.zeros_like(mean), torch.zeros_like(range_m))
+        splats = splatting.Splats(mean, inverse_covariance, opacity, range_m, *still, feature)
+        seen = splatting.composite_splats_reference(splats, pixel_points(size_hw).to(DEVICE))
+        return seen.feature, seen.expected_range_m, seen.alpha
+
+    splatting_gsplat.gsplat_compiles = lambda: True  # type: ignore[assignment]
+    splatting_gsplat.composite_gsplat = lambda *given: composite(*given[:5], size_hw=given[5])  # type: ignore
+    figures = gaussians(folder)
+    assert bool(reached) == (DEVICE == "cuda"), reached
+    return figures
+
+
 def field(folder: Path) -> Figures:
     """`reconstruct` with a neural field, from end to end."""
     (log,) = find_logs(synthetic_log.write(folder, frames=5))
@@ -224,6 +245,7 @@ def alignment(_: Path) -> Figures:
 
 
 CASES |= {"nemo": nemo, "driveworld": driveworld, "heads": heads, "run": run, "gaussians": gaussians}
+CASES["gsplat"] = gsplat
 CASES |= {"field": field, "sets": sets, "alignment": alignment, "driver": driver, "search": search}
 
 

@@ -12,9 +12,12 @@ import emulation
 import pytest
 
 HERE = Path(__file__).parent
-CASES = ("nemo", "driveworld", "heads", "run", "gaussians", "field", "sets", "alignment", "driver", "search")
+CASES = (
+    *("nemo", "driveworld", "heads", "run", "gaussians", "gsplat"),
+    *("field", "sets", "alignment", "driver", "search"),
+)
 CACHE = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "foredrive" / "tests"
-CLOSE = {"gaussians": 1e-3, "field": 1e-3, "search": 1e-2, "run": 1e-3}
+CLOSE = {"gaussians": 1e-3, "gsplat": 1e-3, "field": 1e-3, "search": 1e-2, "run": 1e-3}
 """Relative differences where kernels of the CPU and plain PyTorch add up in another order."""
 MOST_WAITS = {"nemo": 14, "driveworld": 20, "heads": 80}
 """Waits of the host in a step of fine-tuning and a plan."""
