@@ -1,5 +1,6 @@
 """Small made-up drives with everything that an evaluation reads."""
 
+import dataclasses
 import math
 
 import torch
@@ -109,7 +110,8 @@ def join(examples: list[Example]) -> Example:
         if isinstance(first, torch.Tensor):
             return torch.cat(values)
         if hasattr(first, "map_tensors"):
-            return type(first)(**{name: cat([getattr(v, name) for v in values]) for name in vars(first)})
+            names = [field.name for field in dataclasses.fields(first)]
+            return type(first)(**{name: cat([getattr(v, name) for v in values]) for name in names})
         return first
 
     joined = cat(examples)

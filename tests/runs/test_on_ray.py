@@ -2,6 +2,7 @@
 
 import os
 import signal
+import sys
 import threading
 import time
 from pathlib import Path
@@ -11,6 +12,7 @@ from file_digests import digests
 
 from benchmarks.common.process_tree import descendants
 from foredrive.data import LogPath
+from foredrive.engine.fan_out import fan_out
 from foredrive.runs import Run, evaluate_run
 from foredrive.runs.drive.recording import record_drives, record_plan
 from foredrive.sensors.rigs import SURROUND
@@ -77,3 +79,32 @@ def test_an_evaluation_has_the_figures_of_one_process(trained: Run, log: LogPath
     for key, value in alone.summary.items():
         if isinstance(value, float) and key not in ("wall_s", "peak_rss_gib"):
             assert on_ray.summary[key] == pytest.approx(value, rel=1e-6, nan_ok=True), key
+
+
+def cards_of_job(number: int) -> str:
+    """Return the GPUs that Ray shows to a job, after others had time to begin."""
+    time.sleep(0.3)
+    return os.environ.get("CUDA_VISIBLE_DEVICES", "")
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::ResourceWarning")
+def test_a_job_has_a_card_of_its_own() -> None:
+    """A cluster of four cores that says it has two GPUs; no job looks for them."""
+    import ray
+
+    paths = {"PYTHONPATH": os.pathsep.join(sys.path)}  # Workers import this file
+    ray.init(
+        num_cpus=4,
+        num_gpus=2,
+        include_dashboard=False,
+        log_to_driver=False,
+        runtime_env={"env_vars": paths},
+    )
+    try:
+        cards = [card for _, card in fan_out(range(6), cards_of_job, 4, on_ray=True, on_gpu=True)]
+        assert set(cards) == {"0", "1"}
+        without = [card for _, card in fan_out(range(2), cards_of_job, 4, on_ray=True)]
+        assert set(without) == {""}
+    finally:
+        ray.shutdown()

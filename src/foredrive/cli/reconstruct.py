@@ -161,7 +161,7 @@ def _reconstruct_logs(
     # The logs that are reconstructed at the same time share the cores
     work = functools.partial(work, threads=max(1, torch.get_num_threads() // workers))
     failed = {}
-    results = fan_out(jobs, work, workers, on_ray=on_ray)
+    results = fan_out(jobs, work, workers, on_ray=on_ray, on_gpu=True)
     with contextlib.closing(results), job_progress("reconstructing logs", len(jobs)) as tick:
         for (log, _), result in results:
             if isinstance(result, BaseException):

@@ -46,7 +46,7 @@ R = TypeVar("R")
 
 
 def fan_out(
-    jobs: Sequence[J], work: Callable[[J], R], workers: int, *, on_ray: bool = False
+    jobs: Sequence[J], work: Callable[[J], R], workers: int, *, on_ray: bool = False, on_gpu: bool = False
 ) -> Generator[tuple[J, R | BaseException], None, None]:
     """Yield each job when it ends, with its result or its error; submit only as many jobs as run at a time.
 
@@ -56,11 +56,14 @@ def fan_out(
         work: must be picklable, as must the jobs and the results.
         workers: jobs at a time. On Ray it is the size of a cluster that is started here; a cluster that
             RAY_ADDRESS names is used as it is.
+        on_gpu: whether a job computes on a GPU where there is one. In a cluster with GPUs each job then has
+            one of its own; workers of this machine take them in turn, see `chosen_device`.
     """
     waiting, lost, running = deque(jobs), deque[J](), dict[Future[R], J]()
     if not jobs:
         return
-    with (_on_ray if on_ray else _on_processes)(work, workers) as (submit, width):
+    pool = _on_ray(work, workers, on_gpu=on_gpu) if on_ray else _on_processes(work, workers)
+    with pool as (submit, width):
         _log.info("%d jobs, %d at a time", len(jobs), width)
         while waiting or lost or running:
             # Jobs that were lost with a process run one by one; new jobs start when none of them is left
@@ -180,7 +183,9 @@ def _unless_stopped(work: Callable[[J], R], job: J) -> R:
 
 
 @contextlib.contextmanager
-def _on_ray(work: Callable[[J], R], workers: int) -> Iterator[tuple[Callable[[J], Future[R]], int]]:
+def _on_ray(
+    work: Callable[[J], R], workers: int, *, on_gpu: bool
+) -> Iterator[tuple[Callable[[J], Future[R]], int]]:
     """Run jobs as Ray tasks of one core each. At the end the tasks have removed their unfinished files."""
     import ray  # The import takes a second
 
@@ -188,7 +193,12 @@ def _on_ray(work: Callable[[J], R], workers: int) -> Iterator[tuple[Callable[[J]
     if started_here:
         cpus = None if "RAY_ADDRESS" in os.environ else workers
         ray.init(num_cpus=cpus, include_dashboard=False, log_to_driver=False, logging_level=logging.ERROR)
-    task: Any = ray.remote(num_cpus=1, max_retries=1)(_quietly)  # Ray retries only if the process dies
+    cluster = ray.cluster_resources()
+    # Ray shows a task with a GPU that one alone
+    gpus = int(cluster.get("GPU", 0)) if on_gpu else 0
+    width = min(int(cluster["CPU"]), gpus) if gpus else int(cluster["CPU"])
+    # Ray retries only if the process dies
+    task: Any = ray.remote(num_cpus=1, num_gpus=1 if gpus else 0, max_retries=1)(_quietly)
     refs = {}
 
     def submit(job: J) -> Future[R]:
@@ -198,7 +208,7 @@ def _on_ray(work: Callable[[J], R], workers: int) -> Iterator[tuple[Callable[[J]
         return future
 
     try:
-        yield submit, int(ray.cluster_resources()["CPU"])
+        yield submit, width
     finally:
         # Cancel what still runs, and wait while the tasks remove their unfinished files
         under_way = [ref for future, ref in refs.items() if not future.done()]

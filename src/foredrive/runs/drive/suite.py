@@ -28,6 +28,7 @@ from foredrive.engine.interrupts import start_fork_server
 from foredrive.engine.summary import write_summary
 from foredrive.errors import InputError
 from foredrive.files import atomic_path, digest_of, together
+from foredrive.runs.drive.agent_inputs import inputs_of
 from foredrive.runs.drive.agents import agent_folder, check_ready, find_agent, is_foreign
 from foredrive.runs.drive.drive_setup import DriveSetup
 from foredrive.runs.drive.preflight import try_agent
@@ -178,7 +179,11 @@ def drive_suite(
         todo = [job for job in jobs if job not in drives]
         if not in_turn:
             start_fork_server(preload=type(suite.source).__module__)  # workers share the imported modules
-        results = _in_turn(todo, work) if in_turn else fan_out(todo, work, workers, on_ray=on_ray)
+        inputs = inputs_of(suite.agent)
+        sees = inputs.cameras or inputs.lidar
+        results = (
+            _in_turn(todo, work) if in_turn else fan_out(todo, work, workers, on_ray=on_ray, on_gpu=sees)
+        )
         with contextlib.closing(results):
             for job, result in results:
                 if isinstance(result, BaseException):

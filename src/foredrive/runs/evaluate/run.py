@@ -79,7 +79,7 @@ def predict_shards(
     threads = max(1, torch.get_num_threads() // workers)
     work = functools.partial(predict_shard, source=inputs.source, asked=asked, threads=threads)
     waiting, following = dict[int, list[PredictedBatch]](), 0
-    with contextlib.closing(fan_out(shards, work, workers, on_ray=on_ray)) as results:
+    with contextlib.closing(fan_out(shards, work, workers, on_ray=on_ray, on_gpu=True)) as results:
         for shard, result in results:
             if isinstance(result, BaseException):
                 why = reason(f"shard {shard.number}", result)
