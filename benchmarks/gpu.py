@@ -8,7 +8,7 @@ out, and this is said. `nemo_base` is a training step of the paper's size.
 training step in a group of one process with a step without a group.
 
 It runs as `python -m benchmarks.gpu` too, on a machine with PyTorch, Triton and numba, and little else:
-docs/scale.md names the packages.
+docs/how-to/first-gpu-run.md names the packages.
 """
 
 import json

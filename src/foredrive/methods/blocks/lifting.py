@@ -245,14 +245,30 @@ def refine(
     *,
     recompute: bool,
 ) -> Float[Tensor, "_b Q D"]:
-    """Return the queries after all `LiftingLayer`s. `recompute` keeps only the input of each round."""
+    """Return the queries after all `LiftingLayer`s.
+
+    `recompute` keeps only the input of each round. A round then goes through the batch item by item, so that
+    what is computed again is in memory for one item at a time.
+    """
+    if not (recompute and torch.is_grad_enabled()):
+        for layer in layers:
+            query = layer(query, shape_zyx, place, features, uv, visible)
+        return query
+    queries = query.split(1) if len(query) == len(uv) else (query,) * len(uv)
+    seen = list(
+        zip(
+            zip(*(level.split(1) for level in features), strict=True),
+            uv.split(1),
+            visible.split(1),
+            strict=True,
+        )
+    )
     for layer in layers:
-        inputs = (query, shape_zyx, place, features, uv, visible)
-        if recompute and torch.is_grad_enabled():
-            query = checkpoint(layer, *inputs, use_reentrant=False)
-        else:
-            query = layer(*inputs)
-    return query
+        queries = tuple(
+            checkpoint(layer, one, shape_zyx, place, *of_item, use_reentrant=False)
+            for one, of_item in zip(queries, seen, strict=True)
+        )
+    return torch.cat(queries)
 
 
 def project_to_cameras(
