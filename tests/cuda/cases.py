@@ -46,9 +46,11 @@ import test_likelihood  # noqa: E402
 import test_tower_training  # noqa: E402
 from transformers import BertConfig, BertModel  # noqa: E402
 
+from foredrive.cli.main import main as program  # noqa: E402
 from foredrive.data import ClipDataset, find_logs  # noqa: E402
 from foredrive.driver.judging import judge_sight  # noqa: E402
 from foredrive.driver.packed import PackedClips, join  # noqa: E402
+from foredrive.engine.config import save_recipe  # noqa: E402
 from foredrive.engine.summary import Summary, numbers, read_summary  # noqa: E402
 from foredrive.methods.lidarclip import LidarEncoder, LidarEncoderConfig, PointCloud  # noqa: E402
 from foredrive.methods.lidarclip.alignment import DistillationObjective, ImagedSweeps  # noqa: E402
@@ -58,13 +60,12 @@ from foredrive.ops.splat_points import pixel_points  # noqa: E402
 from foredrive.runs.build import build_agent, build_objective  # noqa: E402
 from foredrive.runs.drive.agents import make_agent  # noqa: E402
 from foredrive.runs.evaluate.imagination import imagine_run  # noqa: E402
-from foredrive.runs.evaluate.run import evaluate_run  # noqa: E402
 from foredrive.runs.reconstruction.reconstruct import reconstruct  # noqa: E402
 from foredrive.runs.search.indexing import index_logs  # noqa: E402
 from foredrive.runs.search.searching import ask  # noqa: E402
 from foredrive.runs.search.tower_training import train_towers  # noqa: E402
 from foredrive.runs.train.driver import load_driver, train_driver  # noqa: E402
-from foredrive.runs.train.run import train_run  # noqa: E402
+from foredrive.runs.train.run import open_run  # noqa: E402
 from foredrive.scene import Example  # noqa: E402
 from foredrive.search.index import FrameIndex  # noqa: E402
 from foredrive.search.query import Query  # noqa: E402
@@ -130,20 +131,25 @@ def numbers_of(summary: Summary) -> Figures:
     return {key: value for key, value in kept.items() if math.isfinite(value)}
 
 
+def verb(*words: object) -> None:
+    """Run a verb on the device."""
+    device = "cuda:0" if DEVICE == "cuda" else "cpu"
+    assert program([*map(str, words), "--device", device]) == 0, words
+
+
 def run(folder: Path) -> Figures:
-    """`train`, `evaluate` and `imagine` of a run with heads."""
+    """`train` and `evaluate` of a run with heads, and its futures as `imagine` makes them."""
     log = miniature.with_map(miniature.write_log(folder), folder)
-    recipe = joint_heads.with_small_heads(miniature.miniature())
-    made = train_run(recipe, [log], folder / "run")
-    evaluate_run(made, [log], folder / "run")
-    figures = numbers_of(read_summary(folder / "run" / "summary.json"))
-    (imagined,) = imagine_run(made, log, samples=1, moments=1, ray_stride=4)
+    save_recipe(joint_heads.with_small_heads(miniature.miniature()), folder / "own.yaml")
+    made, split = folder / "run", log.folder.parent
+    verb("train", folder / "own.yaml", "--logs", split, "--out", made)
+    verb("evaluate", made, "--logs", split, "--examples", 0)
+    figures = numbers_of(read_summary(made / "summary.json"))
+    verb("imagine", made, log.folder, "--out", folder / "futures.webp", "--moments", 1)
+    (imagined,) = imagine_run(open_run(made), log, samples=1, moments=1, ray_stride=4)
+    figures["imagined"] = float(imagined.futures.float().mean())
     assert imagined.rendered is not None
-    figures |= {
-        "imagined": float(imagined.futures.float().mean()),
-        "rendered": float(imagined.rendered.mean()),
-    }
-    return figures
+    return figures | {"rendered": float(imagined.rendered.mean())}
 
 
 def driver(folder: Path) -> Figures:
