@@ -41,8 +41,9 @@ def paths(_: int) -> dict[str, float]:
             for key, value in outcome["figures"].items()
         )
     ]
+    kinds = (emulation.WAIT, emulation.TO_HOST)
     waits = {
-        name: sum(n for line, n in on_card[name]["counts"].items() if line.startswith(emulation.WAIT))
+        name: sum(n for line, n in on_card[name]["counts"].items() if line.startswith(kinds))
         for name in STEPS
     }
     figures = {f"waits_{name}": float(count) for name, count in waits.items()}

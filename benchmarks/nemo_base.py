@@ -19,7 +19,6 @@ from torch import Tensor
 from torch.utils.flop_counter import FlopCounterMode, sdpa_flop_count
 
 from benchmarks.common.benchmark import Benchmark
-from benchmarks.common.live_memory import LiveMemory
 from benchmarks.common.measuring import forget_peak, in_a_process, measure, peak_mib
 from foredrive.engine.fabric import make_fabric
 from foredrive.geometry.se3 import matrix_from_yaw
@@ -40,8 +39,6 @@ STEPS = 5 if DEVICE == "cuda" else 1
 """Number of timed steps."""
 FULL_M, COARSER_M = 0.5, {"cuda": (0.5, 1.0, 2.0), "cpu": (2.0,)}[DEVICE]
 """Voxel size, m, and the voxel sizes for which the plain references may have enough memory."""
-MEMORY_M = (2.0, 1.25)
-"""Voxel sizes from whose memory that of the full size follows: it grows with the number of voxels."""
 CAMERAS, FIELD_OF_VIEW_DEG, CAMERA_HEIGHT_M = 6, 74.0, 1.6
 
 
@@ -254,34 +251,6 @@ def training_step(voxel_m: float, path: str) -> dict[str, float]:
     return {"step_s": took.wall_s, "step_cpu_s": took.cpu_s, "peak_gib": peak_mib(DEVICE) / 1024}
 
 
-def live_memory(voxel_m: float) -> dict[str, float]:
-    """Return the peak of the bytes of live tensors in a training step, GiB, and the number of voxels."""
-    recipe = recipe_at(voxel_m)
-    bench = Bench(recipe)
-    # The first step makes the optimizer's moments, which a card holds from then on
-    bench.step()
-    state = [value for values in bench.optimizer.state.values() for value in values.values()]
-    there = [*bench.objective.parameters(), *bench.objective.buffers(), *filter(torch.is_tensor, state)]
-    memory = LiveMemory([*there, bench.example.clip.images])
-    with memory:
-        bench.step()
-    return {"peak_gib": memory.peak_bytes / 2**30, "voxels": float(math.prod(recipe.clips.voxels.shape_zyx))}
-
-
-def measure_memory(seed: int) -> dict[str, float]:
-    """Return the peak memory of a training step at full size, on the line through two coarser grids."""
-    coarse, finer = (in_a_process(__file__, "memory", str(voxel_m)) for voxel_m in MEMORY_M)
-    slope = (finer["peak_gib"] - coarse["peak_gib"]) / (finer["voxels"] - coarse["voxels"])
-    full = math.prod(recipe_at(FULL_M).clips.voxels.shape_zyx)
-    return {
-        "peak_gib": finer["peak_gib"] + slope * (full - finer["voxels"]),
-        **{
-            f"peak_{metres:g}m_gib": part["peak_gib"]
-            for metres, part in zip(MEMORY_M, (coarse, finer), strict=True)
-        },
-    }
-
-
 def measure_step(seed: int) -> dict[str, float]:
     """Measure a training step at full size."""
     return in_a_process(__file__, "step", str(FULL_M), "fast")
@@ -301,11 +270,7 @@ def measure_speedup(seed: int) -> dict[str, float]:
     return figures | {"voxel_m": voxel_m, "speedup_over_reference": reference["step_s"] / fast["step_s"]}
 
 
-ARMS = {
-    "forward": lambda seed: in_a_process(__file__, "forward"),
-    "speedup": measure_speedup,
-    "memory": measure_memory,
-}
+ARMS = {"forward": lambda seed: in_a_process(__file__, "forward"), "speedup": measure_speedup}
 BENCHMARK = Benchmark(
     question="What does nemo_base take, and how much faster do the kernels make it?",
     arms=ARMS | ({"step": measure_step} if DEVICE == "cuda" else {}),
@@ -316,7 +281,5 @@ BENCHMARK = Benchmark(
 if __name__ == "__main__":
     if sys.argv[1] == "forward":
         print(json.dumps(forward_pass()))
-    elif sys.argv[1] == "memory":
-        print(json.dumps(live_memory(float(sys.argv[2]))))
     else:
         print(json.dumps(training_step(float(sys.argv[2]), sys.argv[3])))

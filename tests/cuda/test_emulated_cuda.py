@@ -19,7 +19,7 @@ CASES = (
 CACHE = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "foredrive" / "tests"
 CLOSE = {"gaussians": 1e-3, "gsplat": 1e-3, "field": 1e-3, "search": 1e-2, "run": 1e-3}
 """Relative differences where kernels of the CPU and plain PyTorch add up in another order."""
-MOST_WAITS = {"nemo": 14, "driveworld": 20, "heads": 80}
+MOST_WAITS = {"nemo": 16, "driveworld": 20, "heads": 80}
 """Waits of the host in a step of fine-tuning and a plan."""
 
 Outcome = dict[str, Any]
@@ -59,7 +59,8 @@ def test_a_card_gives_the_figures_of_the_cpu(case: str, outcomes: dict[str, dict
 @pytest.mark.parametrize("case", MOST_WAITS)
 def test_a_step_makes_the_host_wait_seldom(case: str, outcomes: dict[str, dict[str, Outcome]]) -> None:
     counts = outcomes["cuda"][case]["counts"]
-    waits = {line: count for line, count in counts.items() if line.startswith(emulation.WAIT)}
+    kinds = (emulation.WAIT, emulation.TO_HOST)  # A copy to the host is waited for too
+    waits = {line: count for line, count in counts.items() if line.startswith(kinds)}
     assert sum(waits.values()) <= MOST_WAITS[case], waits
 
 
