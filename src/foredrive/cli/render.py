@@ -50,7 +50,7 @@ def render(
         start: Start of the video, s since the start of the log.
         seconds: Length of the video, s; by default until the end of the log.
         rate_hz: Frames per second, shown in real time; by default the rate of the log.
-        dim_unseen: Darken what no image that the reconstruction was made from shows.
+        dim_unseen: Darken surfaces that no image of the training shows.
     """
     from foredrive.view.video import check_video
 

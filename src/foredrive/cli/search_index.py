@@ -86,7 +86,7 @@ def search_train(
         cache: Folder for views; by default "cache" in the run's folder.
         beside: Towers whose image embeddings train the lidar tower: embedded, a folder, or a CLIP or SigLIP
             model.
-        size: Lidar tower: tiny, like the shipped one, for processors; or base, that of LidarCLIP with its
+        size: Lidar tower: tiny, like the shipped one, for CPUs; or base, that of LidarCLIP with its
             schedule, for a GPU. By default base beside other towers than the shipped ones, and else tiny.
         loss: Loss of the lidar tower: mean squared error, or 1 - cosine.
         image_steps: Training steps of the image tower; by default 20 epochs.

@@ -7,7 +7,8 @@ open are removed.
 
 Several processes share the mirror. Each file under FOLDER/.locks is the lock of one log or of one folder of
 maps: shared while it is open, exclusive while it is fetched or removed. The operating system releases the
-locks of a killed process.
+locks of a killed process. Tried with a server of S3's interface, never with a public bucket
+(`docs/how-to/other-tools.md`).
 """
 
 import contextlib

@@ -1,7 +1,8 @@
 """Download Argoverse 2 sensor logs from their public S3 bucket, over plain HTTPS and without credentials.
 
 Downloads resume. The listing is S3's ListObjectsV2. The ETag of an object is its MD5 unless it was uploaded
-in parts (AWS, "Amazon S3 API Reference", Object).
+in parts (AWS, "Amazon S3 API Reference", Object). Tried with a server of the tests, never with the bucket
+itself (`docs/how-to/other-tools.md`).
 """
 
 import hashlib
