@@ -42,9 +42,7 @@ def converted() -> LogPath:
             ["export", "nuscenes", log.folder, "--out", raw, "--name", "made", "--workers", 1],
             ["convert", "nuscenes", raw, "--out", data, "--workers", 1],
         ):
-            with contextlib.redirect_stdout(sys.stderr):  # Figures alone are printed
-                failed = program([str(word) for word in line])
-            if failed:
+            if program([str(word) for word in line]):
                 raise InputError(f"failed: {line[:2]}")
     (log,) = find_logs(data)
     return log
@@ -97,4 +95,6 @@ BENCHMARK = Benchmark(
 )
 
 if __name__ == "__main__":
-    print(json.dumps(step(sys.argv[1])))
+    with contextlib.redirect_stdout(sys.stderr):  # Figures alone are printed
+        figures = step(sys.argv[1])
+    print(json.dumps(figures))
