@@ -4,7 +4,8 @@ A drive of 10 s through a town is written with six images of 900 x 1600 pixels a
 as nuScenes' format and converted, as a user's own data are. Each recipe of the papers' sizes then takes a
 step of one sample: `nemo_base` and `driveworld_base` one of pre-training, without named weights and
 perceptual loss, `gaussians_base` and `field_base` two of a reconstruction. It shows that the whole way goes
-at these sizes, and what it takes on a core; nothing useful is learned. Runs are kept in runs/full_size.
+at these sizes, and what it takes on a core; nothing useful is learned. `loading` counts the clips that a
+core loads. Runs are kept in runs/full_size.
 """
 
 import contextlib
@@ -13,23 +14,31 @@ import functools
 import json
 import shutil
 import sys
+import tempfile
 import time
 from pathlib import Path
 from typing import Any
 
 from benchmarks.common.benchmark import Benchmark
 from benchmarks.common.measuring import forget_peak, in_a_process, peak_mib
-from benchmarks.loading import nuscenes_like
 from foredrive.cli.main import main as program
-from foredrive.data import LogPath, find_logs
+from foredrive.data import CameraSpec, ClipDataset, LogPath, find_logs, write_log
+from foredrive.data.cameras import pinhole_cameras, read_camera
+from foredrive.data.lidar import read_sweep
+from foredrive.data.logs import Log
 from foredrive.engine.metrics_log import read_metrics
 from foredrive.errors import InputError
 from foredrive.runs.recipes.known import find_recipe
 from foredrive.runs.recipes.reconstruction import ReconstructionRecipe, rescheduled_recipe
 from foredrive.runs.reconstruction.reconstruct import reconstruct
 from foredrive.runs.train.run import train_run
+from foredrive.sensors.rigs import SURROUND, camera_rig
+from foredrive.sensors.vehicle import roof_lidar
+from foredrive.towns.recorder import record
+from foredrive.towns.sensing.capture import SensorSuite
 
 WORK = Path("runs/full_size").absolute()
+TOWN, SECONDS, FULL_HW = "Town02", 10.0, (900, 1600)
 WORLD_MODELS, RECONSTRUCTIONS = ("nemo_base", "driveworld_base"), ("gaussians_base", "field_base")
 
 
@@ -46,6 +55,37 @@ def converted() -> LogPath:
                 raise InputError(f"failed: {line[:2]}")
     (log,) = find_logs(data)
     return log
+
+
+def nuscenes_like(folder: Path, seed: int) -> LogPath:
+    """Write a drive through a town with images of nuScenes' size, enlarged from smaller ones."""
+    sensors = SensorSuite(camera_rig(plan=SURROUND.of_size((225, 400))), roof_lidar())
+    small = Log(record(TOWN, SECONDS, seed, folder / "small", rate_hz=2.0, sensors=sensors))
+    frames, specs, images = range(len(small)), [], {}
+    for name, camera in pinhole_cameras(small).items():
+        row = [read_camera(small, frame, camera, FULL_HW, True) for frame in frames]
+        K, T_ego_cam = row[0].K.double().numpy(), row[0].T_ego_cam.double().numpy()
+        specs.append(CameraSpec(name, K, T_ego_cam, FULL_HW))
+        images[name] = [shown.image.permute(1, 2, 0).numpy() for shown in row if shown.image is not None]
+    sweeps = [seen[0] for frame in frames if (seen := read_sweep(small, frame)) is not None]
+    t_s, T_world_ego = (small.t_us - small.t_us[0]) * 1e-6, small.T_world_ego
+    return write_log(folder, "full", t_s, T_world_ego, cameras=specs, images=images, sweeps=sweeps)
+
+
+def loading(_: int) -> dict[str, float]:
+    """Return the clips of `nemo_base` that a core loads in a second of CPU time.
+
+    The first epoch decodes and shrinks the images and makes the labels, later ones read what it has kept.
+    """
+    with tempfile.TemporaryDirectory() as cache:
+        dataset = ClipDataset([converted()], find_recipe("nemo_base").clips, Path(cache))
+        figures = {}
+        for key in ("full_size_clips_per_cpu_s", "later_clips_per_cpu_s"):
+            began_s = time.process_time()
+            for index in range(len(dataset)):
+                dataset[index]
+            figures[key] = len(dataset) / (time.process_time() - began_s)
+    return figures
 
 
 def step(name: str) -> dict[str, float]:
@@ -89,7 +129,10 @@ def arm(name: str, _: int) -> dict[str, float]:
 
 BENCHMARK = Benchmark(
     question="Does the whole way go at full size, and what does a step take on the CPU?",
-    arms={name: functools.partial(arm, name) for name in (*WORLD_MODELS, *RECONSTRUCTIONS)},
+    arms={
+        "loading": loading,
+        **{name: functools.partial(arm, name) for name in (*WORLD_MODELS, *RECONSTRUCTIONS)},
+    },
     seeds=(0,),
     decided_by=("benchmarks.full_size", "foredrive.methods", "foredrive.ops", "foredrive.data"),
 )

@@ -17,21 +17,14 @@ from torch.utils.data import DataLoader
 
 from benchmarks.common.benchmark import Benchmark
 from benchmarks.common.process_tree import tree_use
-from foredrive.data import CameraSpec, ClipDataset, LogPath, collate, find_logs, write_log
-from foredrive.data.cameras import pinhole_cameras, read_camera
-from foredrive.data.lidar import read_sweep
-from foredrive.data.logs import Log
+from foredrive.data import ClipDataset, collate, find_logs
 from foredrive.engine.interrupts import start_fork_server
 from foredrive.runs.recipes.known import find_recipe
 from foredrive.scene import Example
-from foredrive.sensors.rigs import SURROUND, camera_rig
-from foredrive.sensors.vehicle import roof_lidar
 from foredrive.towns.recorder import record
-from foredrive.towns.sensing.capture import SensorSuite
 
 TOWN, SECONDS = "Town02", 30.0
 WORKERS, BATCH_SIZE, CLIPS, LOGS = 2, 4, 5000, 40
-FULL_HW, FULL_SIZE_S = (900, 1600), 10.0
 COUNTED_FROM = 0.2
 """Share of the clips after which memory is compared; before it, caches of the libraries fill."""
 
@@ -52,39 +45,6 @@ def forty_logs(seed: int) -> dict[str, float]:
             shutil.copytree(log.folder, there, copy_function=os.link)
         logs = find_logs(Path(folder))
         return _measure(ClipDataset(logs, find_recipe("nemo_town").clips, Path(folder, "cache")))
-
-
-def full_size(seed: int) -> dict[str, float]:
-    """Return the clips of `nemo_base` that a core loads in a second, by its CPU time.
-
-    The log has six cameras of 900 x 1600 pixels and a lidar at 2 Hz, as nuScenes' key frames do. The first
-    epoch decodes and shrinks the images and makes the labels, the later ones read what it has kept.
-    """
-    clips = find_recipe("nemo_base").clips
-    with tempfile.TemporaryDirectory() as folder:
-        dataset = ClipDataset([nuscenes_like(Path(folder), seed)], clips, Path(folder, "cache"))
-        figures = {}
-        for epoch in ("first", "later"):
-            began_s = time.process_time()
-            for index in range(len(dataset)):
-                dataset[index]
-            figures[f"{epoch}_clips_per_cpu_s"] = len(dataset) / (time.process_time() - began_s)
-    return figures | {"full_size_clips_per_cpu_s": figures["first_clips_per_cpu_s"]}
-
-
-def nuscenes_like(folder: Path, seed: int) -> LogPath:
-    """Write a drive through a town with images of nuScenes' size, enlarged from smaller ones."""
-    sensors = SensorSuite(camera_rig(plan=SURROUND.of_size((225, 400))), roof_lidar())
-    small = Log(record(TOWN, FULL_SIZE_S, seed, folder / "small", rate_hz=2.0, sensors=sensors))
-    frames, specs, images = range(len(small)), [], {}
-    for name, camera in pinhole_cameras(small).items():
-        row = [read_camera(small, frame, camera, FULL_HW, True) for frame in frames]
-        K, T_ego_cam = row[0].K.double().numpy(), row[0].T_ego_cam.double().numpy()
-        specs.append(CameraSpec(name, K, T_ego_cam, FULL_HW))
-        images[name] = [shown.image.permute(1, 2, 0).numpy() for shown in row if shown.image is not None]
-    sweeps = [seen[0] for frame in frames if (seen := read_sweep(small, frame)) is not None]
-    t_s, T_world_ego = (small.t_us - small.t_us[0]) * 1e-6, small.T_world_ego
-    return write_log(folder, "full", t_s, T_world_ego, cameras=specs, images=images, sweeps=sweeps)
 
 
 def _measure(dataset: ClipDataset) -> dict[str, float]:
@@ -129,7 +89,7 @@ def _batches(dataset: ClipDataset) -> Iterator[Example]:
 
 BENCHMARK = Benchmark(
     question="How many clips per second do two workers load, and is their memory flat?",
-    arms={"nemo_tiny": one_log, "nemo_town": forty_logs, "full_size": full_size},
+    arms={"nemo_tiny": one_log, "nemo_town": forty_logs},
     seeds=(0,),
     config={
         "town": TOWN,
