@@ -19,7 +19,7 @@ from foredrive.json_http import Address, ask
 from foredrive.json_server import JsonServer, Raw
 
 BAD_CLIENTS = 200
-PACKED = gzip.compress(b" " * 5000 + b"1")
+PACKED = gzip.compress(b" " * 5000 + b"1", mtime=0)  # without the time: it names a test
 POST = b"POST /twice HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\n"
 
 
@@ -66,6 +66,7 @@ def test_values_errors_and_other_content_are_answered() -> None:
             "not JSON",
         ),
     ],
+    ids=["no length", "chunked", "text", "no JSON", "packed"],
 )
 def test_a_server_refuses_requests_of_other_forms(head: bytes, body: bytes, told: str) -> None:
     with (
