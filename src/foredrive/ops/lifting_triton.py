@@ -176,7 +176,9 @@ def _lift_rows(
                     for corner in tl.static_range(4):
                         cx, wx = (x1, wx1) if corner % 2 else (x0, wx0)
                         cy, wy = (y1, wy1) if corner // 2 else (y0, wy0)
-                        total += read(values, base + (cy * width + cx) * CHANNELS, w * wy * wx, c, WIDTH)
+                        total += read(
+                            values, base + (cy * width + cx).to(tl.int64) * CHANNELS, w * wy * wx, c, WIDTH
+                        )
     to = (query * CHANNELS + head * WIDTH)[:, None] + c[None, :]
     tl.store(out + to, total, mask=exists[:, None] & (c < WIDTH)[None, :])
 
@@ -241,7 +243,7 @@ def _lift_rows_back(
                     for corner in tl.static_range(4):
                         cx, wx, sx = (x1, wx1, sx1) if corner % 2 else (x0, wx0, sx0)
                         cy, wy, sy = (y1, wy1, sy1) if corner // 2 else (y0, wy0, sy0)
-                        cell = base + (cy * width + cx) * CHANNELS
+                        cell = base + (cy * width + cx).to(tl.int64) * CHANNELS
                         dot = read_back(
                             values, grad_values, cell, w * wy * wx, seen, g, c, WIDTH, TO_VALUES, TO_POINTS
                         )

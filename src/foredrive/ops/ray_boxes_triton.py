@@ -104,7 +104,7 @@ def _enter_boxes(
     segments,
     RAYS: tl.constexpr,
 ):
-    r = tl.program_id(0) * RAYS + tl.arange(0, RAYS)
+    r = tl.program_id(0).to(tl.int64) * RAYS + tl.arange(0, RAYS)
     inside = r < rays
     ox, oy, oz = _row_of(origin, r, inside)
     dx, dy, dz = _row_of(direction, r, inside)
@@ -135,7 +135,7 @@ def _enter_boxes(
         near, far = _slab(qz, ez, tl.load(half_size + 3 * a + 2), near, far)
         present = tl.load(shown + a * segments + k, mask=inside, other=0) != 0
         tl.store(
-            enter + r.to(tl.int64) * boxes + a,
+            enter + r * boxes + a,
             tl.where(present & (near < far), near, float("inf")),
             mask=inside,
         )

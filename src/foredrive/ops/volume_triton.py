@@ -126,7 +126,8 @@ def _attend_rows(
             cx, wx = (x1, wx1) if corner % 2 else (x0, wx0)
             cy, wy = (y1, wy1) if corner // 2 % 2 else (y0, wy0)
             cz, wz = (z1, wz1) if corner // 4 else (z0, wz0)
-            voxel = (cz * height + cy) * width + cx
+            # 64-bit before it counts channels: a volume may have more than 2³¹ numbers
+            voxel = ((cz * height + cy) * width + cx).to(tl.int64)
             total += read(values, base + voxel * CHANNELS, w * wz * wy * wx, c, WIDTH)
     to = (query * CHANNELS + head * WIDTH)[:, None] + c[None, :]
     tl.store(out + to, total, mask=exists[:, None] & (c < WIDTH)[None, :])
@@ -178,7 +179,7 @@ def _attend_rows_back(
             cx, wx, sx = (x1, wx1, sx1) if corner % 2 else (x0, wx0, sx0)
             cy, wy, sy = (y1, wy1, sy1) if corner // 2 % 2 else (y0, wy0, sy0)
             cz, wz, sz = (z1, wz1, sz1) if corner // 4 else (z0, wz0, sz0)
-            at_corner = base + ((cz * height + cy) * width + cx) * CHANNELS
+            at_corner = base + ((cz * height + cy) * width + cx).to(tl.int64) * CHANNELS
             part = wz * wy * wx
             dot = read_back(
                 values, grad_values, at_corner, w * part, inside, grad, c, WIDTH, TO_VALUES, TO_POINTS
