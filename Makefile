@@ -60,7 +60,7 @@ test: install lint
 quick: install
 	$(PYTEST) -m "not slow" $(QUICK)
 
-# Kernels against their references, then speeds, on a GPU: about 8 minutes. The figures go to benchmarks/results/gpu.json.
+# Kernels against their references, then speeds, on a GPU; sized for 8 minutes. The figures go to benchmarks/results/gpu.json.
 gpu: install
 	@$(BIN)/python -c 'import sys, torch; sys.exit(0 if torch.cuda.is_available() else f"no GPU here that PyTorch {torch.__version__} can use: nothing was measured")'
 	$(BIN)/python -m pytest tests/ops

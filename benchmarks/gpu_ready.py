@@ -1,4 +1,4 @@
-"""How far the paths for GPUs are checked without one: `foredrive bench gpu-ready`.
+"""Counts the paths for GPUs that are checked without one: `foredrive bench gpu-ready`.
 
 `paths` runs the cases of tests/cuda on an emulated card (g++ builds it): those that give the figures of the
 CPU are counted, and how often the host waits for the card in a step of training and a plan. `sm_80` and

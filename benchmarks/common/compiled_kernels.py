@@ -37,7 +37,7 @@ class NoCard:
     """A driver of a card that compiles for it and starts nothing."""
 
     class utils:  # noqa: N801
-        """What Triton asks of the card."""
+        """Answers Triton's questions about the card."""
 
         @staticmethod
         def get_device_properties(device: int) -> dict[str, int]:

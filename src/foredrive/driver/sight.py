@@ -147,7 +147,7 @@ class RouteReader(nn.Module):
 
 
 class LampReading(NamedTuple):
-    """What lamps show, as parts of `Sight`."""
+    """Holds what lamps show, as parts of `Sight`."""
 
     light_logits: Float[Tensor, "b 4"]
     lamp_logits: Float[Tensor, "b C 3 h w"]

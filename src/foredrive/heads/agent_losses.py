@@ -239,7 +239,7 @@ def motion_losses(
     Only the mode with the least mean distance over the valid steps learns the path (winner takes all). Means
     are over agents with a valid step; without any, both are 0.
     """
-    known = valid.any(dim=-1)
+    known_agents = valid.any(dim=-1)
     steps = valid.sum(dim=-1).clamp_min(1)
     with torch.no_grad():
         # The mode with the least mean distance over known steps wins, without gradient
@@ -250,8 +250,8 @@ def motion_losses(
     per_agent = torch.where(valid, error, 0.0).sum(-1) / steps
     # Agents without a known step have no loss
     return MotionLosses(
-        distance=masked_mean(per_agent, known),
-        mode=masked_mean(F.nll_loss(log_prob, best, reduction="none"), known),
+        distance=masked_mean(per_agent, known_agents),
+        mode=masked_mean(F.nll_loss(log_prob, best, reduction="none"), known_agents),
     )
 
 

@@ -166,8 +166,8 @@ def instance_loss(
         # Track ids are stored plus 1, as 0 is no vehicle
         masks = cells == (track_id + 1)[:, None, None, None]
         whole = logits.unflatten(-1, points.shape[:2])[:, steps]
-        known = torch.ones(len(query), dtype=torch.bool, device=whole.device)
-        losses.append(raster_loss(whole, masks[:, steps], known, OCCUPIED_WEIGHT))
+        all_vehicles = torch.ones(len(query), dtype=torch.bool, device=whole.device)
+        losses.append(raster_loss(whole, masks[:, steps], all_vehicles, OCCUPIED_WEIGHT))
     # Zero with a gradient, for batches without matched vehicles
     return torch.stack(losses).mean() if losses else instances.embedding.sum() * 0
 

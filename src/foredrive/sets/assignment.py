@@ -55,7 +55,7 @@ class _Solution(NamedTuple):
     """C: no column."""
     row_price: Float[ndarray, "R"]
     node_price: Float[ndarray, "C_R"]
-    """Of the columns, then of each row's "no column"."""
+    """The price of each column, then of each row's "no column"."""
 
 
 class _Path(NamedTuple):

@@ -245,12 +245,12 @@ def _calibration(camera: CameraTopics, index: BagIndex) -> Calibration:
 
 @dataclass(frozen=True)
 class _Clouds:
-    """How the clouds of a lidar are read."""
+    """Reads the clouds of a lidar."""
 
     lidar: LidarTopic
     mounts: Mounts
     unit: str | None
-    """Of the points' times; None: they are not used."""
+    """The unit of the points' times; None: the times are not used."""
 
     def decoded(self, message: Any, t_us: int) -> Points:
         """Return the points of a message, stamped `t_us`, in the log's ego frame at their own times."""
@@ -277,7 +277,7 @@ class _Clouds:
 
 @dataclass(frozen=True)
 class _Images:
-    """How the images of a camera are read."""
+    """Reads the images of a camera."""
 
     size_hw: tuple[int, int]
     value_range: tuple[float, float] | None

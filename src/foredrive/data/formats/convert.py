@@ -34,7 +34,7 @@ class RawDataset(NamedTuple):
     find: Callable[[Path], Iterator[RawLog]]
     """Yields the raw logs of a folder: of its root, of one log, or of one or two levels above them."""
     layout: str
-    """What a folder of the data set contains, for messages."""
+    """Names what a folder of the data set contains, for messages."""
 
 
 DATASETS = {

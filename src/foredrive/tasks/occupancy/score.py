@@ -327,9 +327,10 @@ def count_voxels(
 
 def count_semantics(predicted: UInt8[Tensor, "*b Z Y X"], truth: SemanticVoxels) -> Int64[ndarray, "2 2 C C"]:
     """Count the known voxels of a batch likewise. Where there is no truth, no protocol can judge."""
-    known = truth.known.cpu().numpy()
+    known_voxels = truth.known.cpu().numpy()
     labels, true, camera, lidar = (
-        part.cpu().numpy()[known] for part in (predicted, truth.index, truth.camera_mask, truth.lidar_mask)
+        part.cpu().numpy()[known_voxels]
+        for part in (predicted, truth.index, truth.camera_mask, truth.lidar_mask)
     )
     return count_voxels(labels, true, camera, lidar, len(VOXEL_CLASSES[truth.taxonomy]))
 
@@ -343,8 +344,8 @@ def voxel_ious(counts: Int64[ndarray, "2 2 C C"], protocol: VoxelProtocol) -> Fl
     # Diagonal: right voxels; rows: truth; columns: prediction
     hits, true, predicted = np.diag(table), table.sum(axis=1), table.sum(axis=0)
     either = true + predicted - hits
-    known = true > 0 if protocol.absent == "in truth" else either > 0
-    return np.divide(hits, either, out=np.full(len(hits), np.nan), where=known)
+    judged_classes = true > 0 if protocol.absent == "in truth" else either > 0
+    return np.divide(hits, either, out=np.full(len(hits), np.nan), where=judged_classes)
 
 
 def mean_iou(ious: Float64[ndarray, "*T C"]) -> float:
