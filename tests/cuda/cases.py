@@ -26,7 +26,12 @@ sys.path[:0] = [
 
 import emulation  # noqa: E402
 
-COUNTS = emulation.start(Path(HOOKS)) if DEVICE == "cuda" else emulation.Counts()
+COUNTS = emulation.Counts()
+if DEVICE == "cuda":
+    emulation.start(Path(HOOKS))
+    import emulated_card
+
+    COUNTS = emulated_card.begin()
 
 import numpy as np  # noqa: E402
 import shape_checks  # noqa: E402

@@ -81,7 +81,8 @@ import sys
 sys.path.insert(0, {str(HERE)!r})
 import emulation, pathlib
 emulation.start(pathlib.Path({str(hooks)!r}))
-import numpy, torch
+import emulated_card, numpy, torch
+emulated_card.begin()
 x = torch.arange(3.0, device="cuda")
 for name, line in {REFUSED!r}.items():
     try:
