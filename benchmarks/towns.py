@@ -25,7 +25,7 @@ from foredrive.sensors.rigs import camera_rig
 from foredrive.sensors.vehicle import roof_lidar
 from foredrive.towns import recorder
 from foredrive.towns.labels import captions, frame_facts, occupancy, semantics, visibility
-from foredrive.towns.map.town_map import load_town_map
+from foredrive.towns.map.loading import load_town_map
 from foredrive.towns.recorder import record
 from foredrive.towns.sensing import capture, raycast
 from foredrive.towns.sensing.capture import SensorSuite

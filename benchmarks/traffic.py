@@ -11,8 +11,8 @@ import numpy as np
 
 from benchmarks.common.benchmark import Benchmark
 from benchmarks.common.traffic_audit import Audit
+from foredrive.towns.map.loading import load_town_map
 from foredrive.towns.map.names import TOWNS
-from foredrive.towns.map.town_map import load_town_map
 from foredrive.towns.traffic.expert import ExpertDrive
 from foredrive.towns.traffic.traffic import Traffic
 

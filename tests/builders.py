@@ -14,7 +14,7 @@ from foredrive.methods.splatad.scene_config import GaussianSceneConfig
 from foredrive.methods.splatad.training import GaussianSchedule
 from foredrive.runs.recipes.reconstruction import ReconstructionRecipe
 from foredrive.runs.reconstruction.reconstruct import Reconstruction, reconstruct
-from foredrive.towns.map.town_map import load_town_map
+from foredrive.towns.map.loading import load_town_map
 from foredrive.towns.traffic.lane_graph import build_lane_graph
 
 SMALLEST = ReconstructionRecipe(

@@ -246,7 +246,7 @@ def small_run(tmp_path_factory: pytest.TempPathFactory) -> "Reconstruction":
 @pytest.fixture(scope="session")
 def town_of() -> "Callable[[str], TownMap]":
     """The map of a town by its name; all of them together take some tens of MB."""
-    from foredrive.towns.map.town_map import load_town_map
+    from foredrive.towns.map.loading import load_town_map
 
     return functools.cache(load_town_map)
 

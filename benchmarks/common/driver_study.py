@@ -15,9 +15,9 @@ from foredrive.runs.drive.recording import EgosPlan, record_egos
 from foredrive.runs.open_clips import open_clips
 from foredrive.runs.train.driver import DriverRun, load_driver, train_driver
 from foredrive.sensors.rigs import FRONT_TELE
-from foredrive.towns.map.names import TEST_TOWNS, TOWNS
+from foredrive.towns.map.names import TEST_TOWNS, TOWNS, is_held_out
 
-TRAINING_TOWNS = tuple(town for town in TOWNS if town not in TEST_TOWNS)
+TRAINING_TOWNS = tuple(town for town in TOWNS if not is_held_out(town))
 EGOS, TEST_EGOS = 60, 300
 """Logs of virtual egos of each training town and seed, and of Town05: five clips each."""
 PRETRAINED = "embedded:nemo_town"

@@ -1,11 +1,12 @@
-"""Foredrive's own routes in the training towns, drawn from a seed and kept in the package's data file.
+"""Foredrive's own routes, drawn from a seed and kept in the package's data file.
 
-`python -m benchmarks.common.training_routes` draws all of them again and writes them there.
+Those of the towns for training are trained on. Those of the unseen towns are driven to judge, and nothing is
+chosen by what comes out. `python -m benchmarks.common.own_routes` draws all again and writes them there.
 """
 
 import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from importlib import resources
 from pathlib import Path
 from typing import NamedTuple
@@ -15,8 +16,8 @@ import numpy as np
 from foredrive.driving.route_sets import SHIPPED, RouteWaypoints, shipped_sets, write_shipped
 from foredrive.errors import InputError
 from foredrive.towns.driving.routes import DriveRoute, RouteOption, snap_route
-from foredrive.towns.map.names import TEST_TOWNS, TOWNS
-from foredrive.towns.map.town_map import load_town_map
+from foredrive.towns.map.loading import load_town_map
+from foredrive.towns.map.names import TILE_EDGE_M, TOWNS, is_held_out, tile_bounds_m
 from foredrive.towns.traffic.fleet import find_start_points
 from foredrive.towns.traffic.lane_graph import LaneGraph, build_lane_graph
 from foredrive.towns.traffic.routes import Route, draw_route
@@ -31,26 +32,35 @@ APART_M = 300.0
 
 
 class RouteSetSpec(NamedTuple):
-    """Number and lengths of the routes of a set."""
+    """Places and lengths of the routes of a set."""
 
-    per_town: int
+    towns: Mapping[str, int]
+    """Number of routes in each town or tile."""
     min_m: float
     max_m: float
 
 
-ROUTE_SETS = {"training-short": RouteSetSpec(8, 80.0, 150.0), "training-long": RouteSetSpec(3, 500.0, 1500.0)}
+TILES = tuple(f"Town13_Tile_{x}_{y}" for x, y in ((14, -16), (-17, -18), (12, -8), (-9, 1), (11, -20)))
+"""Tiles of the five districts of Town13, chosen on its plan."""
+TRAINING = tuple(town for town in TOWNS if not is_held_out(town))
+ROUTE_SETS = {
+    "training-short": RouteSetSpec(dict.fromkeys(TRAINING, 8), 80.0, 150.0),
+    "training-long": RouteSetSpec(dict.fromkeys(TRAINING, 3), 500.0, 1500.0),
+    "unseen-short": RouteSetSpec({"Town15": 17, **dict.fromkeys(TILES, 3)}, 80.0, 150.0),
+    "unseen-long": RouteSetSpec({"Town15": 5, **dict.fromkeys(TILES, 1)}, 500.0, 1500.0),
+}
 
 
 def draw_routes(town: str, spec: RouteSetSpec, seed: int = 0) -> list[RouteWaypoints]:
-    """Draw routes that are spread over a town.
+    """Draw the routes of a set in one town. They are spread over it.
 
     Turns, straight crossings and lane changes are mixed as evenly as possible.
     """
     graph = build_lane_graph(load_town_map(town))
-    starts, rng = find_start_points(graph), np.random.default_rng((seed, *town.encode(), spec.per_town))
+    starts, rng = find_start_points(graph), np.random.default_rng((seed, *town.encode(), spec.towns[town]))
     chosen: list[tuple[RouteWaypoints, DriveRoute]] = []
     met: Counter[int] = Counter()
-    while len(chosen) < spec.per_town:
+    while len(chosen) < spec.towns[town]:
         best, best_worth = None, -math.inf
         # Draw until one candidate is valid, then take the one that adds most
         while best is None:
@@ -94,9 +104,18 @@ def _checked(
         route = snap_route(waypoints)
     except InputError:
         return None
-    fits = spec.min_m <= route.length_m <= spec.max_m
+    fits = spec.min_m <= route.length_m <= spec.max_m and _has_road_around(route)
     # The lanes that were drawn must all be on the way that the matching finds
     return (waypoints, route) if fits and set(lanes.tolist()) <= {leg.lane for leg in route.legs} else None
+
+
+def _has_road_around(route: DriveRoute) -> bool:
+    """Return whether a route keeps away from the edge of its tile."""
+    bounds_m = tile_bounds_m(route.town)
+    if bounds_m is None:
+        return True
+    lower, upper = np.array(bounds_m[:2]) + TILE_EDGE_M, np.array(bounds_m[2:]) - TILE_EDGE_M
+    return bool(((route.xyz[:, :2] > lower) & (route.xyz[:, :2] < upper)).all())
 
 
 def _worth(route: DriveRoute, others: Sequence[DriveRoute], met: Counter[int]) -> float:
@@ -114,8 +133,7 @@ def main() -> None:
     """Draw these sets anew and write the data file. All other sets stay as they are."""
     sets: dict[str, Sequence[RouteWaypoints]] = dict(shipped_sets())
     for name, spec in ROUTE_SETS.items():
-        towns = [town for town in TOWNS if town not in TEST_TOWNS]
-        sets[name] = [route for town in towns for route in draw_routes(town, spec)]
+        sets[name] = [route for town in spec.towns for route in draw_routes(town, spec)]
     write_shipped(Path(str(resources.files("foredrive.driving").joinpath(SHIPPED))), sets)
 
 

@@ -22,7 +22,7 @@ from foredrive.scene.actors import ActorState
 from foredrive.scene.conditions import BackgroundTraffic
 from foredrive.sensors.rigs import SURROUND, RigPlan, camera_rig
 from foredrive.sensors.vehicle import find_lidar
-from foredrive.towns.map.town_map import load_town_map
+from foredrive.towns.map.loading import load_town_map
 from foredrive.towns.recorder import LabelOptions, record, split_of
 from foredrive.towns.sensing.capture import SensorSuite
 from foredrive.towns.traffic.expert import DriveSnapshot, ExpertDrive

@@ -13,8 +13,8 @@ from foredrive.scene import LidarSweep
 from foredrive.scene.conditions import CONDITIONS, Conditions
 from foredrive.sensors.rigs import camera_rig
 from foredrive.sensors.vehicle import roof_lidar
+from foredrive.towns.map.loading import load_town_map
 from foredrive.towns.map.names import TOWNS
-from foredrive.towns.map.town_map import load_town_map
 from foredrive.towns.sensing.capture import SensorSuite
 from foredrive.towns.traffic.expert import ExpertDrive
 from foredrive.towns.traffic.traffic import Traffic

@@ -23,7 +23,7 @@ from foredrive.scene.conditions import BackgroundTraffic
 from foredrive.scene.traffic_light import LightState
 from foredrive.towns.driving.town import TownScenario, TownSimulator
 from foredrive.towns.driving.town_expert import TownExpert
-from foredrive.towns.map.town_map import load_town_map
+from foredrive.towns.map.loading import load_town_map
 from foredrive.towns.traffic.traffic import Traffic
 
 SEED = 3

@@ -14,7 +14,8 @@ from foredrive.scene import BicycleState, Command, Event
 from foredrive.scene.traffic_light import LightState
 from foredrive.towns.driving.road_users import road_users
 from foredrive.towns.driving.town_lanes import TownLaneRules, stop_lines
-from foredrive.towns.map.town_map import TownMap, load_town_map
+from foredrive.towns.map.loading import load_town_map
+from foredrive.towns.map.town_map import TownMap
 from foredrive.towns.traffic.traffic import Traffic
 
 

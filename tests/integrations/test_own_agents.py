@@ -186,7 +186,7 @@ def test_towns_have_the_cameras_that_are_declared(tmp_path: Path) -> None:
 @pytest.fixture(scope="module")
 def route(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A short route of Town02 along a lane; CARLA's y points to the right."""
-    from foredrive.towns.map.town_map import load_town_map
+    from foredrive.towns.map.loading import load_town_map
     from foredrive.towns.traffic.lane_graph import build_lane_graph
 
     graph = build_lane_graph(load_town_map("Town02"))

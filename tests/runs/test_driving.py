@@ -43,7 +43,7 @@ from foredrive.scene.conditions import CONDITIONS, carla_weather, conditions_of_
 from foredrive.sensors.rigs import SURROUND
 from foredrive.towns.driving.routes import snap_route
 from foredrive.towns.driving.town import grow
-from foredrive.towns.map.town_map import load_town_map
+from foredrive.towns.map.loading import load_town_map
 from foredrive.towns.scenarios.places import scenarios_on
 from foredrive.towns.traffic.lane_graph import build_lane_graph
 from foredrive.view.drive_report import write_drive_report
@@ -61,9 +61,9 @@ def test_what_a_route_file_asks_for_and_is_not_here_is_told(
     first, second = routes.read_text().split("</route>", 1)
     file = tmp_path / "bench.xml"
     file.write_text(
-        f"{first}{scenario}</route>{second}".replace('id="b" town="Town02"', 'id="b" town="Town12"')
+        f"{first}{scenario}</route>{second}".replace('id="b" town="Town02"', 'id="b" town="Town99"')
     )
-    with pytest.raises(InputError, match=r"not here: Town12 \(1 of 2\); the towns are Town01, .*--only"):
+    with pytest.raises(InputError, match=r"not here: Town99 \(1 of 2\); the towns are Town01, .*--only"):
         TownRoutes(str(file)).jobs("stop")
     source = TownRoutes(str(file), only=("a",))
     assert [job.route for job in (*source.jobs("stop"), *source.jobs("stop"))] == ["a", "a"]

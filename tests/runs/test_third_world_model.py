@@ -29,7 +29,7 @@ from foredrive.runs.export import export_run
 from foredrive.runs.recipes.world_models import WORLD_MODELS, WorldModelEntry, load_recipe
 from foredrive.scene import Belief, Clip, Decoded, Example, Frames, Task, VoxelSpec, WorldModel, last_frames
 from foredrive.sensors.rigs import SURROUND
-from foredrive.towns.map.town_map import load_town_map
+from foredrive.towns.map.loading import load_town_map
 from foredrive.towns.traffic.lane_graph import build_lane_graph
 from foredrive.view.log_frames import LogFrames
 from foredrive.view.viewer import Viewer

@@ -17,7 +17,7 @@ from foredrive.towns.campaign import (
     plan_drives,
     select_balanced,
 )
-from foredrive.towns.map.town_map import load_town_map
+from foredrive.towns.map.loading import load_town_map
 from foredrive.towns.traffic.expert import ExpertDrive
 from foredrive.towns.traffic.traffic import Traffic
 

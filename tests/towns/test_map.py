@@ -8,10 +8,11 @@ from py123d.datatypes import Lane, RoadEdge
 from scipy.spatial import cKDTree
 
 from foredrive.errors import InputError
-from foredrive.towns.map import town_map
+from foredrive.towns.map import opendrive
 from foredrive.towns.map.junction_heights import level_junction
+from foredrive.towns.map.loading import load_roads, load_town_map
 from foredrive.towns.map.map_objects import map_objects
-from foredrive.towns.map.town_map import MarkingKind, StopZoneKind, StripKind, TownMap, load_town_map
+from foredrive.towns.map.town_map import MarkingKind, StopZoneKind, StripKind, TownMap
 
 
 def test_an_unknown_town_is_named_with_those_there_are() -> None:
@@ -113,7 +114,7 @@ def test_crossing_roads_of_a_junction_agree_on_their_height() -> None:
 def test_a_lane_without_road_marks_has_no_markings(monkeypatch: pytest.MonkeyPatch) -> None:
     """As on roads of Town13: OpenDRIVE does not ask for marks. The painted neighbours keep theirs."""
     painted = load_town_map("Town02")
-    collect = town_map.collect_element_helpers
+    collect = opendrive.collect_element_helpers
 
     def without_marks_of_road_0(*arguments: object) -> object:
         elements = collect(*arguments)
@@ -122,8 +123,8 @@ def test_a_lane_without_road_marks_has_no_markings(monkeypatch: pytest.MonkeyPat
                 helper.open_drive_lane.road_marks.clear()
         return elements
 
-    monkeypatch.setattr(town_map, "collect_element_helpers", without_marks_of_road_0)
-    bare = {strip.id: strip for strip in load_town_map.__wrapped__("Town02").strips}
+    monkeypatch.setattr(opendrive, "collect_element_helpers", without_marks_of_road_0)
+    bare = {strip.id: strip for strip in load_roads.__wrapped__("Town02").strips}
     of_road_0 = [strip for strip in painted.strips if strip.id.startswith("0_")]
     assert any(strip.right_markings for strip in of_road_0)
     assert not any(bare[strip.id].right_markings for strip in of_road_0)

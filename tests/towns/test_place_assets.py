@@ -5,13 +5,12 @@ import pytest
 
 from foredrive.scene import Category
 from foredrive.scene.actors import ActorState
-from foredrive.towns.map.names import TEST_TOWNS, TOWNS
+from foredrive.towns.map.names import LARGE_TOWNS, TEST_TOWNS, TOWNS, UNSEEN_TOWNS
 from foredrive.towns.map.town_map import TownMap
 from foredrive.towns.place.actor_materials import MeshMaterials
 from foredrive.towns.place.actor_meshes import PEOPLE, SHAPES_OF_KIND, VEHICLES
 from foredrive.towns.place.assets import AssetSet, asset_set_of, assets_of
 from foredrive.towns.place.materials import MaterialTable, Surface, Texture
-from foredrive.towns.place.styles import STYLES
 from foredrive.towns.sensing.actor_shapes import make_shape_library, unit_to_world
 from foredrive.towns.world import World
 
@@ -42,8 +41,10 @@ def actor(category: Category, style: int, **changes: object) -> ActorState:
 
 
 def test_held_out_towns_have_the_test_assets() -> None:
-    assert {town for town in TOWNS if asset_set_of(town) is AssetSet.TEST} == set(TEST_TOWNS)
-    assert set(STYLES) == set(TOWNS)
+    held_out = {*TEST_TOWNS, *UNSEEN_TOWNS}
+    assert {town for town in (*TOWNS, *LARGE_TOWNS) if asset_set_of(town) is AssetSet.TEST} == held_out
+    assert asset_set_of("Town13_Tile_3_-4") is AssetSet.TEST
+    assert asset_set_of("Town12_Tile_3_-4") is AssetSet.TRAIN
 
 
 def test_no_asset_is_in_both_sets() -> None:

@@ -10,7 +10,7 @@ import numpy as np
 from foredrive.errors import InputError
 from foredrive.scene import Command
 from foredrive.scene.conditions import ANY_CONDITIONS, CONDITIONS, BackgroundTraffic, find_conditions
-from foredrive.towns.map.town_map import load_town_map
+from foredrive.towns.map.loading import load_town_map
 from foredrive.towns.recorder import MAX_RATE_HZ
 from foredrive.towns.traffic.expert import SETTLE_S, ExpertDrive, plan_route
 from foredrive.towns.traffic.fleet import find_start_points

@@ -34,9 +34,10 @@ from foredrive.towns.labels.semantics import (
     z_depth,
 )
 from foredrive.towns.labels.visibility import is_point_visible
+from foredrive.towns.map.loading import load_town_map
 from foredrive.towns.map.map_objects import map_objects
-from foredrive.towns.map.names import TEST_TOWNS
-from foredrive.towns.map.town_map import TownMap, load_town_map
+from foredrive.towns.map.names import is_held_out
+from foredrive.towns.map.town_map import TownMap
 from foredrive.towns.sensing.capture import SensorSuite
 from foredrive.towns.traffic.expert import DriveSnapshot, ExpertDrive
 from foredrive.towns.traffic.traffic import Traffic
@@ -78,7 +79,7 @@ LAMPS_M = 90.0
 
 def split_of(town: str) -> str:
     """Return the 123D split of a town's recordings."""
-    return "town_test" if town in TEST_TOWNS else "town_train"
+    return "town_test" if is_held_out(town) else "town_train"
 
 
 def record(

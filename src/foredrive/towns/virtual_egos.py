@@ -19,8 +19,9 @@ from foredrive.geometry.polylines import arc_lengths, points_at
 from foredrive.scene import Category, VoxelSpec
 from foredrive.scene.actors import ActorState, boxes_in_ego_frame, in_box_range
 from foredrive.scene.conditions import Conditions, draw_daylight
-from foredrive.towns.map.names import TEST_TOWNS
-from foredrive.towns.map.town_map import TownMap, load_town_map
+from foredrive.towns.map.loading import load_town_map
+from foredrive.towns.map.names import is_held_out
+from foredrive.towns.map.town_map import TownMap
 from foredrive.towns.recorder import (
     FIRST_TIME_US,
     camera_specs,
@@ -185,7 +186,7 @@ def record_virtual_egos(
 
 def split_of(town: str) -> str:
     """Return the 123D split of a town's virtual egos."""
-    return f"town-egos_{'test' if town in TEST_TOWNS else 'train'}"
+    return f"town-egos_{'test' if is_held_out(town) else 'train'}"
 
 
 @dataclass(frozen=True)

@@ -43,7 +43,7 @@ from foredrive.towns.place.props import (
 from foredrive.towns.place.road_mesh import build_roads
 from foredrive.towns.place.site import Site
 from foredrive.towns.place.street_furniture import build_street_furniture
-from foredrive.towns.place.styles import STYLES
+from foredrive.towns.place.styles import style_of
 from foredrive.towns.place.terrain import build_terrain, make_terrain
 from foredrive.towns.place.vegetation import build_vegetation
 from foredrive.towns.sensing import capture, lens, raycast, shading
@@ -372,7 +372,7 @@ def build_static(
     )
     furniture, details = build_street_furniture(town, site, table, rng)
     lamps = build_street_lamps(site, table, rng)
-    fields = lay_out_fields(site, table, rng) if STYLES[town.name].farmland else ()
+    fields = lay_out_fields(site, table, rng) if style_of(town.name).farmland else ()
     land = build_terrain(terrain, plan, table, fields)
     farm, fences = build_on_fields(fields, site, table, rng)
     plants, trunks = build_vegetation(site, assets, table, rng)

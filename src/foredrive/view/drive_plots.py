@@ -15,7 +15,7 @@ from foredrive.driving.drive_record import DriveRecord
 from foredrive.driving.observation import FRAME_DT_S
 from foredrive.driving.scores import InfractionKind
 from foredrive.driving.time_to_collision import NEAR_COLLISION_S
-from foredrive.towns.map.town_map import load_town_map
+from foredrive.towns.map.loading import load_town_map
 from foredrive.view import palette
 from foredrive.view.bev import start_path_map
 from foredrive.view.html import style_axes

@@ -23,7 +23,7 @@ from foredrive.geometry.polylines import arc_lengths, points_at
 from foredrive.scene import Boxes
 from foredrive.scene.affordances import CELL_M
 from foredrive.scene.traffic_light import LightState
-from foredrive.towns.map.town_map import load_town_map
+from foredrive.towns.map.loading import load_town_map
 from foredrive.view import palette
 from foredrive.view.bev import EGO_OUTLINE_XY
 from foredrive.view.image_drawing import Camera, draw_boxes_on_image, draw_path_on_image

@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from foredrive.towns.map.town_map import MAP_FOLDER
+from foredrive.towns.map.loading import MAP_FOLDER
 
 
 @pytest.fixture(scope="session")

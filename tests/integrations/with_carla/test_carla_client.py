@@ -13,7 +13,7 @@ from foredrive.integrations.carla.road import CarlaLaneRules
 from foredrive.integrations.carla.session import CarlaSession
 from foredrive.integrations.carla.simulator import weather_of
 from foredrive.scene.conditions import CONDITIONS
-from foredrive.towns.map.town_map import load_town_map
+from foredrive.towns.map.loading import load_town_map
 
 from carla_stand_in import Client, World  # isort: skip
 

@@ -16,7 +16,7 @@ from foredrive.scene.conditions import BackgroundTraffic
 from foredrive.scene.traffic_light import LightState
 from foredrive.towns.driving.idm_agent import IdmAgent, TruePerception, estimated_view, true_view
 from foredrive.towns.driving.town import TownScenario, TownSimulator
-from foredrive.towns.map.town_map import load_town_map
+from foredrive.towns.map.loading import load_town_map
 from foredrive.towns.traffic.traffic import Traffic
 
 FRONT_M = 4.1

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from benchmarks.common.training_routes import ROUTE_SETS
+from benchmarks.common.own_routes import ROUTE_SETS
 from foredrive.driving.route_sets import (
     RouteWaypoints,
     load_route_set,
@@ -19,8 +19,8 @@ from foredrive.driving.route_sets import (
 from foredrive.errors import InputError
 from foredrive.towns.driving.lane_search import find_way, places_near
 from foredrive.towns.driving.routes import DriveRoute, RouteOption, route_line, snap_route
-from foredrive.towns.map.names import TEST_TOWNS, TOWNS
-from foredrive.towns.map.town_map import load_town_map
+from foredrive.towns.map.loading import load_town_map
+from foredrive.towns.map.names import is_held_out
 from foredrive.towns.traffic.lane_graph import LaneGraph, build_lane_graph
 
 XML = """<?xml version='1.0'?>
@@ -111,12 +111,13 @@ def test_the_sets_that_come_along_have_the_published_sizes() -> None:
 
 
 @pytest.mark.parametrize("name", list(ROUTE_SETS))
-def test_the_training_towns_have_routes_of_their_own(name: str) -> None:
+def test_foredrive_has_routes_of_its_own(name: str) -> None:
     spec, routes = ROUTE_SETS[name], load_route_set(name)
-    towns = [town for town in TOWNS if town not in TEST_TOWNS]
-    assert Counter(route.town for route in routes) == dict.fromkeys(towns, spec.per_town)
+    assert Counter(route.town for route in routes) == spec.towns
+    assert {is_held_out(town) for town in spec.towns} == {name.startswith("unseen")}
+    assert "Town05" not in spec.towns
     assert len({route.id for route in routes}) == len(routes)
-    here = [snap_route(route) for route in routes if route.town == "Town02"]
+    here = [snap_route(route) for route in routes if route.town in ("Town02", "Town15")]
     assert all(spec.min_m <= route.length_m <= spec.max_m for route in here)
     assert max(route.aside_m for route in here) < 0.5
     met = set(np.concatenate([route.option for route in here]).tolist())

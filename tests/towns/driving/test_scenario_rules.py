@@ -8,7 +8,7 @@ import pytest
 from foredrive.driving.time_to_collision import MovingBoxes
 from foredrive.scene import Category
 from foredrive.scene.traffic_light import LightState
-from foredrive.towns.map.town_map import load_town_map
+from foredrive.towns.map.loading import load_town_map
 from foredrive.towns.scenarios.context import ScenarioContext, ScenarioEgo, ScenarioProgress
 from foredrive.towns.scenarios.director import pace_among
 from foredrive.towns.scenarios.kinematics import arrival_s, cruise_mps, stopping_m

@@ -12,7 +12,7 @@ from foredrive.driving.route_sets import RouteWaypoints, load_route_set
 from foredrive.towns.driving.routes import DriveRoute, snap_route
 from foredrive.towns.driving.town import TownSimulator, grow
 from foredrive.towns.driving.town_expert import TownExpert
-from foredrive.towns.map.town_map import load_town_map
+from foredrive.towns.map.loading import load_town_map
 from foredrive.towns.scenarios.kinematics import REACTION_S
 from foredrive.towns.scenarios.places import possible_scenarios, scenarios_on
 from foredrive.towns.scenarios.scenario import Scenario, ScenarioKind

@@ -19,7 +19,8 @@ from foredrive.sensors.rigs import camera_rig
 from foredrive.sensors.vehicle import roof_lidar
 from foredrive.towns.driving import town
 from foredrive.towns.driving.town import TownScenario, TownSimulator
-from foredrive.towns.map.town_map import TownMap, load_town_map
+from foredrive.towns.map.loading import load_town_map
+from foredrive.towns.map.town_map import TownMap
 from foredrive.towns.sensing.capture import SensorSuite
 from foredrive.towns.traffic.traffic import Traffic
 from foredrive.towns.world import World

@@ -13,7 +13,7 @@ from foredrive.scene.conditions import BackgroundTraffic
 from foredrive.scene.traffic_light import LightState
 from foredrive.towns.driving.town import TownScenario, TownSimulator
 from foredrive.towns.driving.town_expert import TownExpert, _is_free, _is_too_late, _rejoined
-from foredrive.towns.map.town_map import load_town_map
+from foredrive.towns.map.loading import load_town_map
 from foredrive.towns.traffic.external_ego import EgoPose
 from foredrive.towns.traffic.fleet import ego_vehicle
 from foredrive.towns.traffic.lane_graph import LaneControl

@@ -25,7 +25,7 @@ from foredrive.scene.conditions import (
 )
 from foredrive.sensors.rigs import SURROUND, RigPlan
 from foredrive.towns.driving.routes import DriveRoute, snap_route
-from foredrive.towns.map.names import TOWNS
+from foredrive.towns.map.names import LARGE_TOWNS, TOWNS, town_of
 
 _log = logging.getLogger(__name__)
 
@@ -110,11 +110,12 @@ class RouteSource:
 
 
 def _check_towns(name: str, routes: Sequence[RouteWaypoints]) -> None:
-    elsewhere = Counter(route.town for route in routes if route.town not in TOWNS)
+    towns = (*TOWNS, *LARGE_TOWNS)
+    elsewhere = Counter(route.town for route in routes if town_of(route.town) not in towns)
     if elsewhere:
         counted = ", ".join(f"{town} ({count} of {len(routes)})" for town, count in sorted(elsewhere.items()))
         raise InputError(
-            f"{name}: routes in towns that are not here: {counted}; the towns are {', '.join(TOWNS)}. "
+            f"{name}: routes in towns that are not here: {counted}; the towns are {', '.join(towns)}. "
             "--only ROUTE … drives some routes"
         )
 

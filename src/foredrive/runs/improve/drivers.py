@@ -31,7 +31,7 @@ from foredrive.runs.reconstruction.reconstruction_run import open_run_log
 from foredrive.runs.train.driver import load_driver, open_driver, train_driver
 from foredrive.search.find import Hit
 from foredrive.search.index import FrameIndex
-from foredrive.towns.map.names import TEST_TOWNS
+from foredrive.towns.map.names import is_held_out
 
 ROUND = ("emphasis=1", "see.epochs=4", "see.lr=3e-3")
 """Settings of a round's training. Drawn three times as often (`DriverRecipe.emphasis`), clips in which the
@@ -71,7 +71,7 @@ class DriverPupil(Pupil):
             for source in sources
             if isinstance(source, TownRoutes)
             for route in load_route_set(source.routes)
-            if source is self._of.held_out or route.town in TEST_TOWNS
+            if source is self._of.held_out or is_held_out(route.town)
         }
         rebuilt = {
             open_run_log(Path(source.run))[1].name

@@ -11,7 +11,7 @@ from foredrive.driving.dynamics import yaw_rate_radps
 from foredrive.driving.observation import KeyFrame
 from foredrive.scene import BicycleState, CameraRig, Trajectory
 from foredrive.towns.driving.town import TownSimulator
-from foredrive.towns.map.town_map import load_town_map
+from foredrive.towns.map.loading import load_town_map
 from foredrive.towns.recorder import (
     FIRST_TIME_US,
     camera_specs,

@@ -23,7 +23,7 @@ from foredrive.scene.affordances import (
 from foredrive.scene.traffic_light import LightState
 from foredrive.towns.driving.town import TownSimulator
 from foredrive.towns.driving.town_lanes import stop_lines
-from foredrive.towns.map.town_map import load_town_map
+from foredrive.towns.map.loading import load_town_map
 
 BESIDE_M = 1.75
 """Largest distance of a stop line from the path."""

@@ -11,7 +11,8 @@ from foredrive.driving.route_sets import RouteWaypoints
 from foredrive.errors import InputError
 from foredrive.geometry.polylines import arc_lengths
 from foredrive.towns.driving.lane_search import Leg, find_way
-from foredrive.towns.map.town_map import load_town_map
+from foredrive.towns.map.loading import load_town_map
+from foredrive.towns.map.names import tile_around
 from foredrive.towns.traffic.lane_graph import TURN_RAD, LaneGraph, build_lane_graph
 from foredrive.towns.traffic.routes import MIN_CHANGE_M, PLANNED_CHANGE_S
 
@@ -64,18 +65,22 @@ class DriveRoute:
 def snap_route(waypoints: RouteWaypoints) -> DriveRoute:
     """Compute the route through some waypoints. This takes 0.1 s, plus the loading of the town's map.
 
+    In a large town it is a route of the tile around it.
+
     Raises:
-        InputError: there is no such town, or no way through the waypoints. The error names the route.
+        InputError: there is no such town, no way through the waypoints, or they are too far apart for a tile.
+            The error names the route.
     """
     try:
-        graph = build_lane_graph(load_town_map(waypoints.town))
+        town = tile_around(waypoints.town, waypoints.xyz_m[:, :2])
+        graph = build_lane_graph(load_town_map(town))
         legs, places = find_way(graph, waypoints.xyz_m)
     except InputError as error:
         raise InputError(f"route {waypoints.id} in {waypoints.town}: {error}") from None
     xyz, option = route_line(graph, legs)
     arc_m = arc_lengths(xyz[:, :2])
     aside_m = max(place.aside_m for place in places)
-    return DriveRoute(waypoints.id, waypoints.town, xyz, arc_m, option, tuple(legs), aside_m)
+    return DriveRoute(waypoints.id, town, xyz, arc_m, option, tuple(legs), aside_m)
 
 
 def route_line(graph: LaneGraph, legs: list[Leg]) -> tuple[Float64[np.ndarray, "N 3"], Int[np.ndarray, "N"]]:

@@ -21,7 +21,7 @@ from foredrive.scene.conditions import BackgroundTraffic
 from foredrive.towns.driving.collision_sense import CollisionSense
 from foredrive.towns.driving.road_users import road_users
 from foredrive.towns.driving.town_lanes import TownLaneRules
-from foredrive.towns.map.town_map import load_town_map
+from foredrive.towns.map.loading import load_town_map
 from foredrive.towns.scenarios.context import ScenarioEgo, ScenarioProgress
 from foredrive.towns.scenarios.director import Director
 from foredrive.towns.scenarios.scenario import Scenario

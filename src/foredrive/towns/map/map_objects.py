@@ -8,7 +8,11 @@ from py123d.geometry import Polyline3D
 from py123d.parser.opendrive.opendrive_map_parser import OpenDriveMapParser
 from scipy.spatial import cKDTree
 
-from foredrive.towns.map.town_map import MAP_FOLDER, TownMap, load_town_map
+from foredrive.towns.map.loading import load_roads, load_town_map, xodr_file
+from foredrive.towns.map.names import tile_bounds_m
+from foredrive.towns.map.opendrive import CONNECTION_TOLERANCE_M
+from foredrive.towns.map.tiles import Bounds
+from foredrive.towns.map.town_map import TownMap
 
 _LINES = ("_outline", "_polyline", "_left_boundary", "_right_boundary")
 
@@ -16,16 +20,45 @@ _LINES = ("_outline", "_polyline", "_left_boundary", "_right_boundary")
 def map_objects(town: str) -> Iterator[BaseMapObject]:
     """Yield the objects of a town's map, as py123d parses them, with the heights of the town's roads.
 
-    Their order does not depend on the hashes of strings.
+    Their order does not depend on the hashes of strings. Objects that reach out of a tile are whole, but
+    lanes that a tile has not are left out.
     """
-    items = list(OpenDriveMapParser(MAP_FOLDER / f"{town}.xodr.gz").iter_map_objects())
+    with xodr_file(town) as path:
+        items = list(
+            OpenDriveMapParser(path, connection_distance_threshold=CONNECTION_TOLERANCE_M).iter_map_objects()
+        )
     for item in items:
         if isinstance(item, Lane | LaneGroup):
             # py123d collects these ids in sets, whose order differs from run to run
             item.predecessor_ids.sort()
             item.successor_ids.sort()
-    _lift(items, load_town_map(town))
-    yield from items
+    _lift(items, load_roads(town))
+    bounds_m = tile_bounds_m(town)
+    yield from items if bounds_m is None else _within(items, load_town_map(town), bounds_m)
+
+
+def _within(items: list[BaseMapObject], tile: TownMap, bounds_m: Bounds) -> Iterator[BaseMapObject]:
+    """Yield the objects of a tile."""
+    lanes, (x0, y0, x1, y1) = {lane.lane_id for lane in tile.lanes}, bounds_m
+    groups = {lane.group_id for lane in tile.lanes}
+    for item in items:
+        if isinstance(item, Lane | LaneGroup):
+            kept = lanes if isinstance(item, Lane) else groups
+            if item.object_id not in kept:
+                continue
+            item.predecessor_ids[:] = [name for name in item.predecessor_ids if name in kept]
+            item.successor_ids[:] = [name for name in item.successor_ids if name in kept]
+            if isinstance(item, LaneGroup):
+                item.lane_ids[:] = [name for name in item.lane_ids if name in lanes]
+            else:
+                item._left_lane_id = item.left_lane_id if item.left_lane_id in lanes else None
+                item._right_lane_id = item.right_lane_id if item.right_lane_id in lanes else None
+        else:
+            line = getattr(item, "outline_3d", None) or item.polyline_3d
+            x, y = line.array[:, :2].T
+            if not ((x > x0) & (x < x1) & (y > y0) & (y < y1)).any():
+                continue
+        yield item
 
 
 def _lift(items: list[BaseMapObject], town: TownMap) -> None:

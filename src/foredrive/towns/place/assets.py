@@ -3,7 +3,7 @@
 import enum
 from dataclasses import dataclass, fields
 
-from foredrive.towns.map.names import TEST_TOWNS
+from foredrive.towns.map.names import is_held_out
 from foredrive.towns.place.materials import WallKind, WindowKind
 
 Rgb = tuple[float, float, float]
@@ -179,4 +179,4 @@ def assets_of(chosen: AssetSet) -> Assets:
 
 def asset_set_of(town: str) -> AssetSet:
     """Return the default asset set of a town."""
-    return AssetSet.TEST if town in TEST_TOWNS else AssetSet.TRAIN
+    return AssetSet.TEST if is_held_out(town) else AssetSet.TRAIN

@@ -12,7 +12,7 @@ from foredrive.towns.place.materials import MaterialTable
 from foredrive.towns.place.mesh import Mesh, join
 from foredrive.towns.place.plot import Plot
 from foredrive.towns.place.site import Frontage, Site, frontages
-from foredrive.towns.place.styles import STYLES, Style
+from foredrive.towns.place.styles import Style, style_of
 
 SETBACK_M = 3.0
 CLEARANCE_M = 0.8
@@ -44,7 +44,7 @@ def build_buildings(
 
     The plots are taken from the site.
     """
-    style = STYLES[town_name]
+    style = style_of(town_name)
     builder = _Builder(site, rng, style, BuildingMaker(table, rng, assets, style))
     parts = []
     for frontage in frontages(site.plan, SETBACK_M):

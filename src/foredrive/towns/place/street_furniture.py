@@ -14,7 +14,7 @@ from foredrive.towns.place.materials import MaterialTable, Surface
 from foredrive.towns.place.mesh import Mesh, join
 from foredrive.towns.place.props import ThinPoints, join_thin_points, thin_points
 from foredrive.towns.place.site import Frontage, Site, frontages
-from foredrive.towns.place.styles import STYLES, Style
+from foredrive.towns.place.styles import Style, style_of
 
 SETBACK_M = 1.2
 WALKWAY_STEP_M, OPEN_STEP_M = (7.0, 22.0), (45.0, 140.0)
@@ -53,7 +53,7 @@ def build_street_furniture(
     # Motorways by their speed limit
     fast = [x.centreline_xyz[:, :2] for x in town.lanes if (x.speed_limit_mps or 0.0) > FAST_MPS]
     motorways = shapely.STRtree([shapely.LineString(line) for line in fast])
-    placer = _FurniturePlacer(site, motorways, STYLES[town.name], FurnitureMaterials(table), rng)
+    placer = _FurniturePlacer(site, motorways, style_of(town.name), FurnitureMaterials(table), rng)
     # Rails first, because they need continuous space; then large objects, then small ones
     lines = frontages(site.plan, SETBACK_M)
     for frontage in lines:

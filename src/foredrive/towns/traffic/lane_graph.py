@@ -362,11 +362,12 @@ def _crossable(lanes: list[Lane]) -> Bool[np.ndarray, "2 L"]:
 
 
 def lanes_for(graph: LaneGraph, min_radius_m: float) -> Bool[np.ndarray, "L"]:
-    """Return the lanes from which a vehicle can drive on for ever without a curve tighter than a radius."""
-    kept = graph.min_radius_m >= min_radius_m
-    # Remove lanes that lead to no kept lane until none is left: the rest can be driven for ever
+    """Return the lanes from which a vehicle can drive on without a curve tighter than a radius, for ever or
+    to an end of the map."""
+    kept, ends = graph.min_radius_m >= min_radius_m, graph.successor_count == 0
+    # Remove lanes that lead to no kept lane until none is left
     while True:
-        onward = (kept[graph.successors] & (graph.successors >= 0)).any(axis=1)
+        onward = ends | (kept[graph.successors] & (graph.successors >= 0)).any(axis=1)
         if not (kept & ~onward).any():
             return kept
         kept = kept & onward

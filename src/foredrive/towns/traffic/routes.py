@@ -116,9 +116,9 @@ def draw_route(
     Routes from random starts are tried. The part that counts is driven from `from_s` to `until_s`. The first
     route is taken that has a turn and at least two different commands, or on long drives all commands. If
     there is none, the route with the most different commands is taken. Ties go to routes that contain a
-    command drawn at random, then to routes with more turns.
+    command drawn at random, then to routes with more turns. Routes that end at the edge of a tile come last.
     """
-    best, best_key = None, (-1, False, -1)
+    best, best_key = None, (False, -1, False, -1)
     wanted = rng.choice(list(Command))
     change_ranges = find_change_ranges(graph)
     for start in rng.choice(len(starts.lane), CANDIDATES):
@@ -128,11 +128,13 @@ def draw_route(
         from_m, until_m = route.distance_m(graph, from_s), route.distance_m(graph, until_s)
         commands = route.commands(graph, until_m, from_m)
         turns, options = len(commands) - commands.count(Command.STRAIGHT), len(set(commands))
+        goes_on = bool(graph.successor_count[route.lanes[-1]])
         # Good enough: a turn, and the wanted variety of commands
-        if turns and options >= (len(Command) if until_m - from_m > LONG_DRIVE_M else 2):
+        if goes_on and turns and options >= (len(Command) if until_m - from_m > LONG_DRIVE_M else 2):
             return route
-        if (options, wanted in commands, turns) > best_key:
-            best, best_key = route, (options, wanted in commands, turns)
+        key = (goes_on, options, wanted in commands, turns)
+        if best is None or key > best_key:
+            best, best_key = route, key
     assert best is not None
     return best
 

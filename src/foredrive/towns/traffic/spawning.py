@@ -44,6 +44,7 @@ class Spawner:
     ) -> None:
         self._vehicle_count = vehicle_count
         self._lanes, self._walks, self._starts, self._for_large = lanes, walks, starts, for_large
+        self._is_open = bool((lanes.successor_count == 0).any())
         self._for_bicycles = lanes.limit_mps <= MOTORWAY_LIMIT_MPS
         # People appear on walkways, with a probability that grows with the length
         walkable = np.where(walks.is_crossing, 0.0, walks.length_m)
@@ -64,13 +65,20 @@ class Spawner:
         """Remove road users that are far from the ego vehicle, and add up to one vehicle and one person out
         of its sight.
 
-        Without an ego vehicle all stay.
+        Without an ego vehicle, vehicles that leave the map are the only ones to be replaced.
 
         Args:
             ego_m: position of the ego vehicle if it is driven from outside, m.
         """
+        v = state.vehicles
+        left = (
+            v.active & (v.front_m > self._lanes.length_m[v.lane]) & (self._lanes.successor_count[v.lane] == 0)
+        )
+        left[0] &= not len(state.route)
+        if left.any():
+            state = dataclasses.replace(state, vehicles=dataclasses.replace(v, active=v.active & ~left))
         if not len(state.route):
-            return state
+            return self._spawn_vehicles(state, 0.0, 1, rng, None) if self._is_open else state
         centre_m = vehicle_poses(self._lanes, state.vehicles).centre_m
         # An ego vehicle off its lane is where it was driven to
         if ego_m is not None:
