@@ -1,19 +1,25 @@
-"""Closed-loop driving on Town05: `foredrive bench drive-nemo`, 16 core hours; `--arms` measures some.
+"""Closed-loop driving by sight: `foredrive bench drive-nemo`, about 40 core hours; `--arms` measures some.
 
-Drivers learn to see from virtual egos of the training towns, then in rounds of DAgger from what they meet
-when they drive the training routes themselves, in all weathers: `small_K` has learned from K rounds, driven
-by the driver of the round before with seed 0. `small_blind` learned from all of them with black images. The
-others of `driver_nemo` have NeMo's volume as their eyes and learn from the same rounds and fewer egos; `nemo`
-starts from the world model that comes with the package. `rules_by_sight` has the rule in place of the
-planner of `small`, `true*` is told road users, lights or both as they are. `regressing` is NeMo's own
-planner, which learns from an expert's demonstrations.
+**NeMo's claim**: `same_small`, `same_nemo`, `same_nemo_scratch` and `same_nemo_blind` learn from the same
+virtual egos of the training towns for the same number of visits, and drive with the same planner and rules.
+`same_small` is `driver_small`. The others have NeMo's volume as their eyes: from the world model that comes
+with the package, from scratch, and with black images. `gain` compares the two first of these, paired over
+routes and seeds.
+
+**Rounds of DAgger**: `small_K` has learned from more egos and from K rounds of what it met when it drove the
+training routes itself, in all weathers, driven by the driver of the round before with seed 0. `small_blind`
+learned from all of them with black images. `rules_by_sight` has the rule in place of the planner of `small`,
+`true*` is told road users, lights or both as they are. `regressing` is NeMo's own planner, which learns from
+an expert's demonstrations.
 
 `shipped` is the driver that comes with the package, `shipped_*` has parts of it, or drives through the
 interface of CARLA's leaderboards.
 
-All drive the same routes in the same traffic by day: the short ones three times, and ARM@long the long ones
-once. An interrupted benchmark goes on with the next drive. Seeds are those of training. All is kept in
-runs/drive_nemo, and `foredrive compare` reads the folders of drives.
+All drive the same routes in the same traffic by day: those of Town05, on which rules were chosen, and those
+of the unseen towns, for which nothing was chosen. The short ones of Town05 are driven twice. ARM@long,
+ARM@unseen_short and ARM@unseen_long are parts of ARM. An interrupted benchmark goes on with the next drive.
+Seeds are those of training. All is kept in runs/drive_nemo, and `foredrive compare` reads the folders of
+drives.
 """
 
 import dataclasses
@@ -44,7 +50,7 @@ from foredrive.errors import InputError
 from foredrive.methods.recipe import rescheduled
 from foredrive.runs.drive.agent_inputs import rig_of
 from foredrive.runs.drive.agents import CONSTANT_VELOCITY, EXPERT, IDM, STOP
-from foredrive.runs.drive.compare import values_of
+from foredrive.runs.drive.compare import compare, read_agent, values_of
 from foredrive.runs.drive.in_towns import TownRoutes
 from foredrive.runs.drive.suite import DriveSuite, SuiteResult, drive_suite
 from foredrive.runs.recipes.known import find_recipe
@@ -54,8 +60,10 @@ from foredrive.runs.train.run import train_run
 from foredrive.sensors.rigs import FRONT_TELE, SURROUND
 from foredrive.tasks.bootstrap import bootstrap_mean
 
-EGO_SEEDS, NEMO_EGO_SEEDS = 8, 3
-"""Seeds of the towns from which the small driver learns, and from which those with NeMo's volume do."""
+EGO_SEEDS, SAME_EGO_SEEDS, SAME_EPOCHS = 8, 3, 2
+"""Seeds of the towns from which the small driver learns; those from which all drivers of NeMo's claim do, and
+how often."""
+SEEDS = (0, 1, 2)
 ROUNDS = 2
 ROUND_ROUTES, ROUND_LR, ROUND_EPOCHS = "training-short", 1e-3, 2
 """Routes of a round, and the learning rate and the epochs in which a driver goes on."""
@@ -64,13 +72,18 @@ SHIPPED, PARTS = "embedded:driver", ("true", "true-lights", "true-users", "idm")
 REGRESSING, REGRESSING_STEPS = "nemo_drive", 600
 DEMONSTRATED, ROUTES_A_TOWN = ("Town01", "Town02", "Town03", "Town04", "Town06"), 4
 """Towns of the demonstrations, and the routes in each."""
-JUDGED = {"short": "town05-short", "long": "town05-long"}
-REPETITIONS = {"short": 3, "long": 1}
+JUDGED = {
+    "short": "town05-short",
+    "long": "town05-long",
+    "unseen_short": "unseen-short",
+    "unseen_long": "unseen-long",
+}
+REPETITIONS = {"short": 2}
 CORES = len(os.sched_getaffinity(0))
 CONFIG = {
     "recipes": {name: dataclasses.asdict(recipe) for name, recipe in DRIVER_RECIPES.items()}
     | {REGRESSING: dataclasses.asdict(find_recipe(REGRESSING))},
-    "egos": [EGOS, EGO_SEEDS, NEMO_EGO_SEEDS],
+    "egos": [EGOS, EGO_SEEDS, SAME_EGO_SEEDS, SAME_EPOCHS],
     "rounds": [ROUNDS, ROUND_ROUTES, ROUND_LR, ROUND_EPOCHS],
     "demonstrations": [*DEMONSTRATED, ROUTES_A_TOWN, REGRESSING_STEPS],
     "routes": JUDGED,
@@ -137,12 +150,13 @@ def blind(seed: int) -> DriverRun:
     return trained(recipe, logs, WORK / "runs" / f"small_blind_seed{seed}", WORK / "cache")
 
 
-def nemo(name: str, seed: int, pretrained: bool = True) -> DriverRun:
-    """Return a driver with NeMo's volume."""
-    recipe = recipe_of("driver_nemo", seed)
-    logs = [*_egos(NEMO_EGO_SEEDS), *rounds_until(ROUNDS)]
-    start = run_folder(Path(PRETRAINED)) if pretrained else None
-    return trained(recipe, logs, WORK / "runs" / f"{name}_seed{seed}", WORK / "cache", start)
+def same(name: str, recipe: str, seed: int, start: Path | None = None, *, blind: bool = False) -> DriverRun:
+    """Return a driver of NeMo's claim."""
+    chosen = recipe_of(recipe, seed)
+    eyes, see = dataclasses.replace(chosen.eyes, blind=blind), chosen.see
+    chosen = dataclasses.replace(chosen, eyes=eyes, see=dataclasses.replace(see, epochs=SAME_EPOCHS))
+    folder = WORK / "runs" / f"{name}_seed{seed}"
+    return trained(chosen, _egos(SAME_EGO_SEEDS), folder, WORK / "cache", start)
 
 
 def regressing(seed: int) -> Path:
@@ -174,7 +188,7 @@ def scores(agent: str, name: str, routes: str) -> dict[str, float]:
 
 
 def _judged(agent: str, name: str, routes: str) -> SuiteResult:
-    source = TownRoutes(JUDGED[routes], repetitions=REPETITIONS[routes], rig=rig_of(agent))
+    source = TownRoutes(JUDGED[routes], repetitions=REPETITIONS.get(routes, 1), rig=rig_of(agent))
     return _driven(DriveSuite(agent, source, sensors=False), _folder(name, routes))
 
 
@@ -250,6 +264,33 @@ def by_leaderboard(seed: int, routes: str) -> Mapping[str, float]:
     return {f"{key}_{routes}": value for key, value in _figures(list(drives.values())).items()}
 
 
+WITH_NEMO: Mapping[str, Callable[[int], DriverRun]] = {
+    "same_small": lambda seed: same("same_small", "driver_small", seed),
+    "same_nemo": lambda seed: same("same_nemo", "driver_nemo", seed, run_folder(Path(PRETRAINED))),
+    "same_nemo_scratch": lambda seed: same("same_nemo_scratch", "driver_nemo", seed),
+    "same_nemo_blind": lambda seed: same("same_nemo_blind", "driver_nemo", seed, blind=True),
+}
+
+
+def gain(seed: int, routes: str) -> Mapping[str, float]:
+    """Return what pre-training gains, with 95 % intervals over routes and trainings.
+
+    All seeds are compared at once, so the seed of the benchmark only seeds the bootstrap.
+    """
+    names = ("same_nemo_scratch", "same_nemo")
+    for name in names:
+        for trained_with in SEEDS:
+            _judged(_agent(WITH_NEMO[name](trained_with)), f"{name}_seed{trained_with}", routes)
+    folders = [",".join(str(_folder(f"{name}_seed{of}", routes)) for of in SEEDS) for name in names]
+    agents = [read_agent(f"{name}={folder}") for name, folder in zip(names, folders, strict=True)]
+    differences = compare(agents, seed).differences
+    return {
+        f"{metric}_{bound}_{routes}": getattr(differences[metric]["same_nemo"], bound)
+        for metric in ("driving_score_1_0", "red_lights", "collisions")
+        for bound in ("mean", "low", "high")
+    }
+
+
 ARMS: Mapping[str, Arm] = {
     "shipped": untrained(SHIPPED, "shipped"),
     "shipped_by_leaderboard": by_leaderboard,
@@ -265,8 +306,7 @@ ARMS: Mapping[str, Arm] = {
         f"small_{rounds}": by_sight(f"small_{rounds}", partial(small, rounds)) for rounds in range(ROUNDS + 1)
     },
     "small_blind": by_sight("small_blind", blind),
-    "nemo": by_sight("nemo", lambda seed: nemo("nemo", seed)),
-    "nemo_scratch": by_sight("nemo_scratch", lambda seed: nemo("nemo_scratch", seed, pretrained=False)),
+    **{name: by_sight(name, run_of) for name, run_of in WITH_NEMO.items()},
     "rules_by_sight": by_sight("rules_by_sight", _best, "idm:"),
     "true": by_sight("true", _best, "true:"),
     "true_lights": by_sight("true_lights", _best, "true-lights:"),
@@ -280,9 +320,13 @@ def _of_routes(arm: Arm, routes: str) -> Callable[[int], Mapping[str, float]]:
 
 
 BENCHMARK = Benchmark(
-    question="How well do drivers drive Town05's routes by sight, and what does each part bring?",
-    arms={name: _of_routes(arm, "short") for name, arm in ARMS.items()}
-    | {f"{name}@long": _of_routes(arm, "long") for name, arm in ARMS.items()},
+    question="How well do drivers drive by sight, in Town05 and in towns that nothing was chosen for?",
+    arms={
+        name if routes == "short" else f"{name}@{routes}": _of_routes(arm, routes)
+        for routes in JUDGED
+        for name, arm in {**ARMS, "gain": gain}.items()
+    },
+    seeds=SEEDS,
     config=CONFIG,
     decided_by=DECIDED_BY,
 )
