@@ -9,7 +9,8 @@ import pytest
 import synthetic_log as world
 import torch
 from flat_street import street
-from py123d.datatypes import TrafficLightStatus
+from py123d.datatypes import StopZone, StopZoneType, TrafficLightStatus
+from py123d.geometry import Polyline3D
 
 from foredrive.data import LogPath, find_logs
 from foredrive.data.clip_config import TaskTruthConfig
@@ -117,6 +118,28 @@ def test_light_and_lead_vehicle_on_the_route(log: Log) -> None:
     assert bool(found.lead & found.lead_known)
     assert float(found.lead_m) == pytest.approx(LEAD_REAR_X - front_x(log), abs=0.02)
     assert float(found.lead_mps) == pytest.approx(3.0, abs=0.01)
+
+
+def test_the_next_stop_sign_is_that_of_the_map(log: Log, tmp_path: Path) -> None:
+    """The sign's lane begins at the line of the light; that of the bridge is on another level."""
+    found = read_affordances(log, FRAME // 5)
+    assert not bool(found.sign | found.sign_known)  # its map has no stop zones
+    corners = np.array([[17.0, -1.75, 0.0], [18.0, -1.75, 0.0], [18.0, 1.75, 0.0], [17.0, -1.75, 0.0]])
+    outline = Polyline3D.from_array(corners + world.WORLD_OFFSET)
+    for kind, lane, there in (
+        (StopZoneType.STOP_SIGN, 5, True),
+        (StopZoneType.TRAFFIC_LIGHT, 5, False),
+        (StopZoneType.STOP_SIGN, 6, False),
+        (StopZoneType.STOP_SIGN, 4, False),
+    ):
+        folder = tmp_path / f"{kind.name}_{lane}"
+        maps_dir = write_map([*street(), StopZone(9, kind, outline, lane_ids=[lane])], "Flatland", folder)
+        with LogWriter(folder, "flat_train", "log", [], maps_dir, "Flatland", ROUTE) as writer:
+            for index in range(0, 30, 5):
+                writer.write(frame(index))
+        found = read_affordances(Log(find_logs(folder)[0]), FRAME // 5)
+        assert (bool(found.sign_known), bool(found.sign)) == (True, there), (kind, lane)
+        assert float(found.sign_m) == pytest.approx((LINE_X - front_x(log)) * there, abs=0.02)
 
 
 def test_cells_of_the_path_are_occupied_over_time(log: Log) -> None:

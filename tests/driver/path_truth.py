@@ -19,6 +19,7 @@ def sight_of(batch: int, light: torch.Tensor | None = None, size: tuple[int, int
         torch.zeros(batch, 2, 3, *size),
         torch.zeros(batch, 2, *size),
         torch.nn.functional.one_hot(torch.full((batch,), LINE_CELLS)) * 20.0,  # no line is seen
+        torch.nn.functional.one_hot(torch.full((batch,), LINE_CELLS)) * 20.0,
         torch.zeros(batch, TIMES, CELLS),
         torch.zeros(batch, 2, len(USERS), *size),
         torch.zeros(batch, len(USERS) + 2, CELLS, len(BESIDE_M)),
@@ -39,6 +40,9 @@ def truth(batch: int = 2) -> Affordances:
         lamp_xyz=torch.tensor([[[12.0, 0.4, 1.9], [12.0, 40.0, 3.0]]]).expand(batch, 2, 3),
         lamp=torch.tensor([[True, True]]).expand(batch, 2),
         lamps_known=~none,
+        sign=~none,
+        sign_m=torch.full((batch,), 9.5),
+        sign_known=~none,
         lead=none,
         lead_m=zero,
         lead_mps=zero,

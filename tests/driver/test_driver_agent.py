@@ -20,8 +20,10 @@ from foredrive.driver.agent import (
     Perception,
     given_path,
     staying,
+    stopped_by_sign,
 )
 from foredrive.driver.eyes import CameraEyes, CameraEyesConfig
+from foredrive.driver.route_cells import LINE_CELLS
 from foredrive.driver.sight import Sight
 from foredrive.driver.speed_planner import SpeedPlanner, SpeedPlannerConfig
 from foredrive.scene import Clip, Example
@@ -250,6 +252,22 @@ def test_a_light_that_never_changes_stops_nobody_for_ever(standing: Clip) -> Non
     lights = [state(perception(standing)) for _ in range(IMPATIENT + 2)]
     assert lights[:IMPATIENT].count(LightState.RED) == IMPATIENT
     assert lights[IMPATIENT:] == [LightState.NONE] * 2
+
+
+def test_it_waits_at_a_stop_sign_and_goes_on(standing: Clip) -> None:
+    logits = torch.full((1, LINE_CELLS + 1), -20.0)
+    logits[0, 5] = 5.0  # the line is 5.5 m ahead
+    at_sign = dataclasses.replace(sight(LightState.NONE, 0.01), sign_logits=logits)
+    driving = dataclasses.replace(standing, ego_speed_mps=torch.full_like(standing.ego_speed_mps, 4.0))
+    perception = Perception(Fixed(at_sign))
+    assert state(perception(driving)) is LightState.NONE  # one reading may be wrong
+    view = perception(driving)
+    assert (state(view), float(view.light_m)) == (LightState.RED, pytest.approx(5.5 - BEFORE_LINE_M))
+    assert state(perception(standing)) is LightState.NONE
+    # A red light before the line of the sign counts first
+    nearer = stopped_by_sign(estimate(LightState.RED, 3.0), 9.0)
+    assert float(nearer.light_m) == 3.0
+    assert float(stopped_by_sign(estimate(LightState.GREEN, 3.0), 9.0).light_m) == 9.0 - BEFORE_LINE_M
 
 
 def test_parts_of_the_truth_take_the_place_of_what_is_seen(standing: Clip) -> None:

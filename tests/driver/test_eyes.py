@@ -146,6 +146,28 @@ def test_the_line_is_learned_where_it_is(make_example: Callable[..., Example]) -
     assert (grad < 0).nonzero().tolist() == [[0, 5], [1, LINE_CELLS], [2, LINE_CELLS], [3, LINE_CELLS]]
 
 
+def test_the_line_of_a_sign_is_learned_where_it_is(make_example: Callable[..., Example]) -> None:
+    clip = make_example(spec=SPEC, batch=2, past=1, future=0, cameras=2).clip
+    known = dataclasses.replace(truth(2), sign=torch.tensor([True, False]), sign_m=torch.tensor([9.5, 0.0]))
+    sight = dataclasses.replace(sight_of(2), sign_logits=torch.zeros(2, LINE_CELLS + 1, requires_grad=True))
+    sight_losses(sight, known, clip, SightWeights())["sign"].backward()
+    assert (sight.sign_logits.grad < 0).nonzero().tolist() == [[0, 9], [1, LINE_CELLS]]
+
+
+@torch.no_grad()
+def test_eyes_without_signs_see_none(make_example: Callable[..., Example]) -> None:
+    clip = make_example(spec=SPEC, batch=2, past=1, future=0, cameras=2).clip
+    torch.manual_seed(0)
+    with_signs = CameraEyes(CameraEyesConfig(signs=True)).eval()
+    assert torch.isinf(eyes()(clip).sign_m).all()
+    black = dataclasses.replace(clip, images=torch.zeros_like(clip.images))
+    assert not torch.allclose(with_signs(clip).sign_logits, with_signs(black).sign_logits)
+    logits = torch.full((2, LINE_CELLS + 1), -20.0)
+    logits[0, 8], logits[1, -1] = 5.0, 5.0
+    seen = dataclasses.replace(sight_of(2), sign_logits=logits).sign_m
+    assert seen.tolist() == [pytest.approx(8.5), float("inf")]
+
+
 @torch.no_grad()
 def test_the_ground_is_read_along_the_route(make_example: Callable[..., Example]) -> None:
     clip = make_example(spec=SPEC, batch=2, past=1, future=0, cameras=2).clip

@@ -19,6 +19,8 @@ PLAIN = Moment(
     light_error_m=0.0,
     visible=False,
     lit=True,
+    sign_m=math.inf,
+    sign_seen_m=math.inf,
     first=-1,
     first_seen=np.full(len(THRESHOLDS), -1.0),
     conflict=False,
@@ -60,6 +62,15 @@ def test_lights_within_forty_metres_whose_lamps_are_seen_are_counted() -> None:
     assert figures["green_stopped_40m"] == pytest.approx(1 / 2)
     assert figures["none_stopped"] == 1.0
     assert figures["light_error_m"] == 2.0
+
+
+def test_stop_signs_are_seen_if_their_line_is_about_where_it_is() -> None:
+    pairs = [(12.0, 15.0), (12.0, 17.0), (12.0, math.inf), (1.0, math.inf), (40.0, math.inf)]
+    pairs += [(math.inf, math.inf), (math.inf, 8.0), (math.nan, 8.0)]
+    figures = _figures([PLAIN._replace(sign_m=true_m, sign_seen_m=seen_m) for true_m, seen_m in pairs])
+    assert figures["sign_recall_30m"] == pytest.approx(1 / 3)  # one is under the image, one too far
+    assert figures["sign_false"] == 0.5
+    assert figures["signs"] == 3
 
 
 def test_recall_counts_at_the_threshold_that_is_seldom_wrong() -> None:
@@ -106,7 +117,7 @@ def test_who_is_met_beyond_a_red_light_is_no_conflict(light: LightState, met: bo
         lead_known=torch.tensor(False),
     )
     nothing = sight_of(1).estimate()[0]
-    moment = _moment(seen, nothing, 6.0, visible=True)
+    moment = _moment(seen, nothing, 6.0, visible=True, sign_seen_m=math.inf)
     assert (moment.conflict, moment.crossing) == (met, met)
 
 

@@ -16,6 +16,7 @@ from foredrive.driver.volume_eyes import VolumeEyes
 from foredrive.driving.observation import HORIZON_STEPS
 from foredrive.driving.simple_agents import plan_of
 from foredrive.driving.speed_rule import FRONT_M, curve_speed, waypoints_along
+from foredrive.driving.stop_signs import StopSigns
 from foredrive.methods.planner.ego_mlp import ego_speeds
 from foredrive.scene import Clip, Trajectory
 from foredrive.scene.affordances import PathEstimate
@@ -54,6 +55,8 @@ creeps in spite of a light: it is seen wrongly, or no light at all."""
 NEAR_CELLS, STAYS = 3, 3
 """Cells of the route next to the vehicle; who is in them now is taken to stay for so many steps of half a
 second. Who stands close ahead is often expected to leave."""
+SIGN_READINGS = 2
+"""Readings of a stop sign's line from which it counts."""
 SURE = 0.93
 """While it creeps, only road users that are as probable as this stop it."""
 
@@ -176,7 +179,7 @@ class Perception:
     """
 
     def __init__(self, driver: Driver) -> None:
-        self._driver, self._lights = driver, LightMemory()
+        self._driver, self._lights, self._signs = driver, LightMemory(), StopSigns(confirmed=SIGN_READINGS)
         self._before: Tensor | None = None
         self._stood, self._creeping, self._impatient = 0, 0, False
 
@@ -189,7 +192,9 @@ class Perception:
         self._before = here
         view = self._lights.update(view, moved_m, line_seen=line_seen)
         view = PathEstimate(view.light, view.light_m, staying(view.occupied))
-        return self._patient(view, float(ego_speeds(observation)[0, observation.now]))
+        speed_mps, sign_m = float(ego_speeds(observation)[0, observation.now]), float(sight.sign_m[0])
+        stop_m = self._signs.update(sign_m if np.isfinite(sign_m) else None, moved_m, speed_mps)
+        return stopped_by_sign(self._patient(view, speed_mps), stop_m)
 
     def _patient(self, view: PathEstimate, speed_mps: float) -> PathEstimate:
         """Return the view with less on the route where the vehicle has stood for long."""
@@ -204,6 +209,15 @@ class Perception:
         # Impatient: the light is ignored. In any case only very probable road users stop the vehicle
         light = torch.eye(4)[[LightState.NONE]].to(view.light) if self._impatient else view.light
         return PathEstimate(light, view.light_m, (view.occupied > SURE).to(view.occupied))
+
+
+def stopped_by_sign(view: PathEstimate, line_m: float | None) -> PathEstimate:
+    """Return the view of a batch of one with a red light at the line of a stop sign, if that comes first."""
+    stops = float(view.light[0, [LightState.RED, LightState.YELLOW]].sum()) > 0.5
+    if line_m is None or (stops and float(view.light_m[0]) < line_m):
+        return view
+    light = torch.eye(4)[[LightState.RED]].to(view.light)
+    return PathEstimate(light, torch.full_like(view.light_m, max(line_m - BEFORE_LINE_M, 0.0)), view.occupied)
 
 
 def staying(occupied: Float[Tensor, "b T S"]) -> Float[Tensor, "b T S"]:

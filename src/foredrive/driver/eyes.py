@@ -31,6 +31,8 @@ class CameraEyesConfig:
     """Key frames that are read, now included."""
     cameras: int = 2
     """Number of cameras that are read."""
+    signs: bool = False
+    """Whether stop signs are read too."""
     blind: bool = False
     """Images are black, to measure what follows from the route alone."""
     kind: Literal["cameras"] = "cameras"
@@ -111,6 +113,7 @@ class CameraEyes(nn.Module):
             FINE + COARSE,
             COARSE,
             config.cameras,
+            signs=config.signs,
         )
 
     def forward(self, clip: Clip) -> Sight:

@@ -13,6 +13,7 @@ from foredrive.data.truth.affordances import PathAhead
 from foredrive.driver.agent import Driver
 from foredrive.driver.losses import lamp_places
 from foredrive.driver.packed import BATCH, PackedClips, join
+from foredrive.driver.route_cells import LINE_FROM_M
 from foredrive.driving.speed_rule import FRONT_M, PathView, meets_somebody, rule_progress
 from foredrive.methods.planner.ego_mlp import ego_speeds
 from foredrive.scene.affordances import CELL_M, LATER_DT_S, TIMES, Affordances, PathEstimate
@@ -22,6 +23,8 @@ LIGHT_M, OBSTACLE_M = 40.0, 30.0
 """Distances up to which lights and the first obstacle are judged."""
 THRESHOLDS = (0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8)
 FALSE_AT_MOST = 0.1
+SIGN_ERROR_M = 4.0
+"""Error of its line within which a stop sign counts as seen."""
 
 
 class Moment(NamedTuple):
@@ -37,6 +40,9 @@ class Moment(NamedTuple):
     """True if a lamp of the light is in an image."""
     lit: bool
     """True if the log has the state of the light."""
+    sign_m: float
+    """Distance of the line of the next stop sign; infinite without one, NaN if the log does not know."""
+    sign_seen_m: float
     first: int
     """First cell of the path that is occupied now; -1 without."""
     first_seen: Float[np.ndarray, "K"]
@@ -68,12 +74,13 @@ def judge_sight(
     """Return how well a driver sees lights and road users on its route.
 
     `light_accuracy_40m` and `red_missed_40m` count lights within 40 m with a lamp in an image; a red light is
-    missed if neither red nor yellow is named. `conflict_recall` is the share that is seen of the moments in
-    which the vehicle would meet somebody if it drove on and minded its true light alone. It counts at the
-    lowest threshold at which at most 10 % of the other moments are taken for such, or at the highest one;
-    `conflict_false` is this share. `crossing_recall` counts those with somebody who is not in the path yet.
-    `first_obstacle_error_m` is the median error of the first occupied cell now, a missed one counted as the
-    distance to the end of the range.
+    missed if neither red nor yellow is named. `sign_recall_30m` is the share of stop signs whose line is seen
+    within 4 m of its place, `sign_false` the share of the moments without one in which one is seen.
+    `conflict_recall` is the share that is seen of the moments in which the vehicle would meet somebody if it
+    drove on and minded its true light alone. It counts at the lowest threshold at which at most 10 % of the
+    other moments are taken for such, or at the highest one; `conflict_false` is this share. `crossing_recall`
+    counts those with somebody who is not in the path yet. `first_obstacle_error_m` is the median error of the
+    first occupied cell now, a missed one counted as the distance to the end of the range.
 
     Args:
         driver: in evaluation mode.
@@ -148,11 +155,14 @@ def _moments(driver: Driver, clips: PackedClips, tick: Callable[[], None]) -> It
         size = (sight.lamp_logits.shape[-2], sight.lamp_logits.shape[-1])
         lamps = lamp_places(batch.truth, batch.clip.rig[:, batch.clip.now], size).inside.flatten(1).any(1)
         for row in range(len(speed)):
-            yield _moment(batch.truth[row], estimate[row], float(speed[row]), bool(lamps[row]))
+            sign_m = float(sight.sign_m[row])
+            yield _moment(batch.truth[row], estimate[row], float(speed[row]), bool(lamps[row]), sign_m)
         tick()
 
 
-def _moment(truth: Affordances, estimate: PathEstimate, speed_mps: float, visible: bool) -> Moment:
+def _moment(
+    truth: Affordances, estimate: PathEstimate, speed_mps: float, visible: bool, sign_seen_m: float
+) -> Moment:
     path = PathAhead(truth.path_xy, np.zeros(len(truth.path_xy)), truth.path_valid, FRONT_M, True)
     # Only what is known counts, in the truth and in the estimate
     occupied = (truth.occupied & truth.occupied_known).numpy()
@@ -175,6 +185,8 @@ def _moment(truth: Affordances, estimate: PathEstimate, speed_mps: float, visibl
         light_error_m=abs(float(estimate.light_m) - float(truth.light_m)),
         visible=visible,
         lit=bool(truth.light_known),
+        sign_m=_sign_m(truth),
+        sign_seen_m=sign_seen_m,
         first=_first(occupied[0]),
         first_seen=np.array([_first(p[0] >= threshold) for threshold in THRESHOLDS], dtype=float),
         conflict=conflict,
@@ -182,6 +194,12 @@ def _moment(truth: Affordances, estimate: PathEstimate, speed_mps: float, visibl
         # Meets somebody, but nobody who is in the path already now
         crossing=conflict and not meets_somebody(free_m, occupied & occupied[:1]),
     )
+
+
+def _sign_m(truth: Affordances) -> float:
+    if not bool(truth.sign_known):
+        return math.nan
+    return float(truth.sign_m) if bool(truth.sign) else math.inf
 
 
 def _first(occupied: Bool[np.ndarray, "G"]) -> int:
@@ -194,6 +212,10 @@ def _figures(moments: list[Moment]) -> dict[str, float]:
     stops = np.isin(named, [LightState.RED, LightState.YELLOW])
     red, green = near & (state == LightState.RED), near & (state == LightState.GREEN)
     none = lit & (state == LightState.NONE)
+    sign_m, sign_seen_m = (
+        np.array([getattr(m, name) for m in moments]) for name in ("sign_m", "sign_seen_m")
+    )
+    sign = (sign_m >= LINE_FROM_M) & (sign_m < OBSTACLE_M)
     right = near & (named == state)
     conflict = np.array([m.conflict for m in moments])
     crossing = np.array([m.crossing for m in moments])
@@ -213,6 +235,9 @@ def _figures(moments: list[Moment]) -> dict[str, float]:
         "none_stopped": _mean(stops[none]),
         "light_error_m": _median(np.array([m.light_error_m for m in moments])[right]),
         "lights": float(near.sum()),
+        "sign_recall_30m": _mean(np.abs(sign_seen_m[sign] - sign_m[sign]) < SIGN_ERROR_M),
+        "sign_false": _mean(np.isfinite(sign_seen_m[np.isposinf(sign_m)])),
+        "signs": float(sign.sum()),
         "conflict_recall": _mean(seen[conflict, chosen]),
         "conflict_false": float(false[chosen]),
         "crossing_recall": _mean(seen[conflict & crossing, chosen]),

@@ -30,6 +30,8 @@ class SightWeights:
     """Weight of the distance of the stop line as read at each lamp, L1 of its logarithm."""
     line: float = 1.0
     """Weight of the cell of the route in which the stop line is, cross-entropy."""
+    sign: float = 1.0
+    """Weight of the cell of the route in which the line of the next stop sign is, cross-entropy."""
     occupied: float = 5.0
     """Weight of the occupancy of the path over time, cross-entropy."""
     occupied_cells: float = 2.5
@@ -69,7 +71,12 @@ def sight_losses(
         "light": weights.light * masked_mean(error, judged),
         "lamps": weights.lamps * _lamp_loss(sight, truth, lamps),
         "light_m": weights.light_m * _lamp_line_loss(sight, truth, lamps),
-        "line": weights.line * masked_mean(_line_error(sight, truth), truth.light_known),
+        "line": weights.line
+        * masked_mean(
+            _line_error(sight.line_logits, truth.light != LightState.NONE, truth.light_m), truth.light_known
+        ),
+        "sign": weights.sign
+        * masked_mean(_line_error(sight.sign_logits, truth.sign, truth.sign_m), truth.sign_known),
         "occupied": weights.occupied * _occupancy_loss(sight, truth, weights),
         **_user_losses(sight, clip, weights),
     }
@@ -115,13 +122,15 @@ def _lamp_loss(sight: Sight, truth: Affordances, lamps: LampPlaces) -> Float[Ten
     return (wrong.square() * error * of_item).sum() / target.sum().clamp_min(1)
 
 
-def _line_error(sight: Sight, truth: Affordances) -> Float[Tensor, "b"]:
-    """Return the cross-entropy of the cell in which the stop line is."""
-    cell = (truth.light_m / LINE_CELL_M).floor().long()
+def _line_error(
+    logits: Float[Tensor, "b N"], present: Bool[Tensor, "b"], line_m: Float[Tensor, "b"]
+) -> Float[Tensor, "b"]:
+    """Return the cross-entropy of the cell in which a stop line is."""
+    cell = (line_m / LINE_CELL_M).floor().long()
     # The last class is no line in any cell
-    seen = (truth.light != LightState.NONE) & (truth.light_m >= LINE_FROM_M) & (cell < LINE_CELLS)
+    seen = present & (line_m >= LINE_FROM_M) & (cell < LINE_CELLS)
     target = torch.where(seen, cell, LINE_CELLS)
-    return F.cross_entropy(sight.line_logits, target, reduction="none")
+    return F.cross_entropy(logits, target, reduction="none")
 
 
 def _lamp_line_loss(sight: Sight, truth: Affordances, lamps: LampPlaces) -> Float[Tensor, ""]:

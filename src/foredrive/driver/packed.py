@@ -23,7 +23,7 @@ from foredrive.scene.record import Record
 
 BATCH = 32
 """Clips that are looked at together where none is trained on."""
-PACK_VERSION = 4
+PACK_VERSION = 5
 """Version in every name. Increase it when the content of the files changes."""
 R = TypeVar("R", bound=Record)
 

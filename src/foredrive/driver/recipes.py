@@ -46,7 +46,7 @@ NO_VOXELS = VoxelSpec(lower_m=(-4.0, -4.0, -1.0), voxel_m=4.0, shape_zyx=(1, 2, 
 
 def driver_small() -> DriverRecipe:
     """Return a driver of 0.7 M weights that sees two cameras and two key frames."""
-    eyes = CameraEyesConfig()
+    eyes = CameraEyesConfig(signs=True)
     return DriverRecipe(
         name="driver_small",
         about="drives along a given route by two cameras: lights, and who is on the path over time",
@@ -83,7 +83,9 @@ def driver_nemo() -> DriverRecipe:
         small,
         name="driver_nemo",
         about="driver_small with NeMo's backbone and volume as its eyes",
-        eyes=VolumeEyesConfig(world=town.model, voxels=town.clips.voxels, frames=small.eyes.frames),
+        eyes=VolumeEyesConfig(
+            world=town.model, voxels=town.clips.voxels, frames=small.eyes.frames, signs=True
+        ),
         see=replace(small.see, lr=1e-3, epochs=2),
     )
 

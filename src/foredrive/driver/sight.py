@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from foredrive.driver.road_user_targets import USERS
@@ -21,7 +21,7 @@ CONTEXT = 64
 ROUTE_SCALE_M, VELOCITY_SCALE_MPS = 20.0, 5.0
 FADES_M = 1.5
 """Distance beyond half the width of the path over which a road user beside it counts less, m."""
-RARE_LOGIT, NONE_LOGIT = -4.0, -2.0
+RARE_LOGIT, NONE_LOGIT, NO_SIGN_LOGIT = -4.0, -2.0, -20.0
 LIGHT_SCALE_M, LINE_BEFORE_LAMP_M = 20.0, 4.0
 """Scale of a stop line's distance as it is read at a lamp, where the line is not seen: log((m + 4) / 20)."""
 
@@ -38,6 +38,8 @@ class Sight(Record):
     """The distance of the stop line as it is read at each place: log((m + 4) / 20)."""
     line_logits: Float[Tensor, f"b {LINE_CELLS + 1}"]
     """Logits of the stop line of the next light in each of the `LINE_CELLS`, and of none in any."""
+    sign_logits: Float[Tensor, f"b {LINE_CELLS + 1}"]
+    """The same of the next stop sign."""
     occupied_logits: Float[Tensor, "b T G"]
     user_pixels: Float[Tensor, "b C K h w"]
     """Logits of a road user of each kind at each place of an image. They are used in training only, so that
@@ -49,27 +51,37 @@ class Sight(Record):
     @property
     def line_seen(self) -> Bool[Tensor, "b"]:
         """Return whether the stop line is seen on the ground, in one place."""
-        return self._likeliest_line()[1].sum(1) > 0.5
+        return _likeliest(self.line_logits)[1] > 0.5
 
     @property
     def light_m(self) -> Float[Tensor, "b"]:
         """Return the distance of the stop line, m: seen on the ground, or else read at the likeliest lamp."""
         at_lamp = self.lamp_logits.amax(2).flatten(1).argmax(1, keepdim=True)
         far_m = line_m(self.lamp_line.flatten(1).gather(1, at_lamp)[:, 0])
-        # The mean of the likeliest cell and its neighbours
-        cell, near = self._likeliest_line()
-        offset = (near[:, 2] - near[:, 0]) / near.sum(1).clamp_min(1e-6)
-        return torch.where(self.line_seen, LINE_CELL_M * (cell + 0.5 + offset), far_m)
+        near_m, probability = _likeliest(self.line_logits)
+        return torch.where(probability > 0.5, near_m, far_m)
 
-    def _likeliest_line(self) -> tuple[Int[Tensor, "b"], Float[Tensor, "b 3"]]:
-        """Return the likeliest cell of the line, and its probability between those of its neighbours."""
-        cells = F.pad(self.line_logits.softmax(-1)[:, :-1], (1, 1))
-        likeliest = cells[:, 1:-1].argmax(1, keepdim=True)
-        return likeliest[:, 0], cells.gather(1, likeliest + torch.arange(3, device=cells.device))
+    @property
+    def sign_m(self) -> Float[Tensor, "b"]:
+        """Return the distance of the line of the next stop sign, m; infinite where none is seen."""
+        near_m, probability = _likeliest(self.sign_logits)
+        return torch.where(probability > 0.5, near_m, torch.inf)
 
     def estimate(self) -> PathEstimate:
         """Return probabilities and distances."""
         return PathEstimate(self.light_logits.softmax(-1), self.light_m, self.occupied_logits.sigmoid())
+
+
+def _likeliest(
+    logits: Float[Tensor, f"b {LINE_CELLS + 1}"],
+) -> tuple[Float[Tensor, "b"], Float[Tensor, "b"]]:
+    """Return the likeliest place of a line, m, and how probable it is in its cell and those beside it."""
+    cells = F.pad(logits.softmax(-1)[:, :-1], (1, 1))
+    likeliest = cells[:, 1:-1].argmax(1, keepdim=True)
+    near = cells.gather(1, likeliest + torch.arange(3, device=cells.device))
+    # The mean of the likeliest cell and its neighbours
+    offset = (near[:, 2] - near[:, 0]) / near.sum(1).clamp_min(1e-6)
+    return LINE_CELL_M * (likeliest[:, 0] + 0.5 + offset), near.sum(1)
 
 
 def line_m(scaled: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
@@ -95,9 +107,12 @@ class RouteReader(nn.Module):
         fine: channels of the fine image features, in which lamps are read.
         wide: channels of the features whose mean tells that there is no light.
         cameras: number of cameras.
+        signs: whether stop signs are read.
     """
 
-    def __init__(self, cells: int, ground: int, fine: int, wide: int, cameras: int) -> None:
+    def __init__(
+        self, cells: int, ground: int, fine: int, wide: int, cameras: int, *, signs: bool = False
+    ) -> None:
         super().__init__()
         self.context = nn.Sequential(
             nn.Linear(3 * len(ROUTE_M), CONTEXT), nn.ReLU(), nn.Linear(CONTEXT, CONTEXT), nn.ReLU()
@@ -109,6 +124,7 @@ class RouteReader(nn.Module):
         self.users = nn.Conv2d(fine, len(USERS), 1)
         assert self.users.bias is not None
         nn.init.constant_(self.users.bias, RARE_LOGIT)
+        self.signs = SignHead(fine, ground, CONTEXT) if signs else None
 
     def forward(
         self,
@@ -132,6 +148,11 @@ class RouteReader(nn.Module):
         context = self.context(route.flatten(1))
         light, lamps, lines = self.lamps(fine, mean, context)
         line = self.line(ground, context)
+        # Eyes that do not know signs see none
+        sign = torch.zeros_like(line)
+        sign[:, -1] = -NO_SIGN_LOGIT
+        if self.signs is not None:
+            sign = self.signs(fine, ground, context)
         # Where each cell is: its place, and its distance beside the route
         middles = route_cells(clip.route_xy, clip.route_valid)
         place = torch.cat(
@@ -143,7 +164,7 @@ class RouteReader(nn.Module):
         )
         occupied, user_cells = self.occupancy(torch.cat([cells.to(place), place], dim=1))
         pixels = self.users(fine.flatten(0, 1)).unflatten(0, fine.shape[:2])
-        return Sight(light, lamps, lines, line, occupied, pixels.float(), user_cells)
+        return Sight(light, lamps, lines, line, sign, occupied, pixels.float(), user_cells)
 
 
 class LampReading(NamedTuple):
@@ -246,6 +267,38 @@ class LineHead(nn.Module):
         features = self.along(self.ground(torch.cat([columns, place], dim=1)))
         none = self.none(torch.cat([features.amax(-1), context], dim=-1))
         return torch.cat([self.line(features)[:, 0], none], dim=-1).float()
+
+
+class SignHead(nn.Module):
+    """Reads where the stop line of the next stop sign crosses the route.
+
+    The line looks like that of a light, so plates in the images are read too.
+
+    Args:
+        channels: channels of the fine image features.
+        ground: channels of each cell of the ground.
+        context: length of the vector of the route.
+        plates: number of features of plates.
+    """
+
+    def __init__(self, channels: int, ground: int, context: int, plates: int = 16) -> None:
+        super().__init__()
+        self.plates = nn.Sequential(
+            nn.Conv2d(channels, 32, 1), nn.ReLU(), nn.Conv2d(32, plates, 3, padding=1), nn.ReLU()
+        )
+        self.line = LineHead(ground, context + plates)
+        nn.init.constant_(self.line.none.bias, -RARE_LOGIT)
+
+    def forward(
+        self,
+        fine: Float[Tensor, "b C K h w"],
+        ground: Float[Tensor, "b E N S"],
+        context: Float[Tensor, "b V"],
+    ) -> Float[Tensor, f"b {LINE_CELLS + 1}"]:
+        """Return `Sight.sign_logits`."""
+        # The clearest plate in any image, so that few pixels count as much as a wall
+        plates = self.plates(fine.flatten(0, 1)).flatten(2).amax(-1).unflatten(0, fine.shape[:2]).amax(1)
+        return self.line(ground, torch.cat([context, plates], dim=-1))
 
 
 class OccupancyHead(nn.Module):

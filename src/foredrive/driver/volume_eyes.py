@@ -35,6 +35,8 @@ class VolumeEyesConfig:
     """Number of cameras that are read."""
     frozen: bool = False
     """The backbone and the encoder stay as they were pre-trained; what reads them is trained."""
+    signs: bool = False
+    """Whether stop signs are read too."""
     blind: bool = False
     """Images are black, to measure what follows from the route alone."""
     kind: Literal["volume"] = "volume"
@@ -59,7 +61,9 @@ class VolumeEyes(nn.Module):
         self.backbone, self.encoder, channels = world.backbone, world.encoder, world.channels
         # Per frame and height: the volume's channels, and whether the cell is in the volume
         of_cell = config.frames * len(HEIGHTS_M) * (channels + 1)
-        self.reader = RouteReader(of_cell, channels + 1, channels, channels, config.cameras)
+        self.reader = RouteReader(
+            of_cell, channels + 1, channels, channels, config.cameras, signs=config.signs
+        )
         if config.frozen:
             self.backbone.requires_grad_(False)
             self.encoder.requires_grad_(False)

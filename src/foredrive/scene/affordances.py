@@ -1,4 +1,4 @@
-"""What a driver must see of its path: the next traffic light, and the road users in the path over time."""
+"""What a driver must see of its path: the next light and stop sign, and the road users in it over time."""
 
 from dataclasses import dataclass
 
@@ -40,6 +40,11 @@ class Affordances(Record):
     lamp: Bool[Tensor, "*b L"]
     """False for padding."""
     lamps_known: Bool[Tensor, "*b"]
+    sign: Bool[Tensor, "*b"]
+    """Whether a stop sign is on the path within `LIGHT_RANGE_M`."""
+    sign_m: Float[Tensor, "*b"]
+    """Distance of the stop line of the next one, as `light_m`."""
+    sign_known: Bool[Tensor, "*b"]
     lead: Bool[Tensor, "*b"]
     """Whether a vehicle stands or drives in the path within `LEAD_RANGE_M`."""
     lead_m: Float[Tensor, "*b"]

@@ -31,6 +31,7 @@ from foredrive.towns.recorder import (
 )
 from foredrive.towns.sensing.capture import SensorSuite
 from foredrive.towns.traffic.expert import T_path_ego, ego_twist
+from foredrive.towns.traffic.lane_graph import LaneControl
 from foredrive.towns.traffic.recovery import PathDeviation
 from foredrive.towns.traffic.state import TrafficState
 from foredrive.towns.traffic.traffic import Traffic
@@ -50,8 +51,9 @@ SETTLE_S, APART_S = 8.0, 1.5
 """Time before the first window and between two of them, s."""
 WORLDS = 3
 """Kinds of daylight in which a town is seen where no conditions are given."""
-LIGHT_M, AT_LIGHT_SHARE = 45.0, 2 / 3
-"""Egos with a light within this distance ahead, m, fill this share of a window if there are enough."""
+LINE_M, AT_LINE_SHARE = 45.0, 2 / 3
+"""Egos with a light or a stop sign within this distance ahead, m, fill this share of a window if there are
+enough."""
 STANDING_MPS, STANDING_SHARE = 0.5, 0.25
 """Egos that are slower than this, m/s, are at most this share of a window: half of all traffic waits."""
 INSERTED_SHARES = (0.1, 0.35, 0.35, 0.2)
@@ -81,7 +83,8 @@ class _Ego:
     route_xyz: Float64[np.ndarray, "M 3"]
     deviation: PathDeviation
     """Deviation of the recording vehicle from the car, which drives in the middle of its lane."""
-    at_light: bool
+    at_line: bool
+    """A light or a stop sign is ahead."""
 
 
 @dataclass(frozen=True)
@@ -223,7 +226,7 @@ def _windows(
 def _choose_egos(window: _Window, rng: np.random.Generator, most: int) -> list[_Ego]:
     """Return at most `most` cars that keep their slot and lane sequence over the window, in random order.
 
-    Those that come to a light first, up to their share.
+    Those that come to a light or a stop sign first, up to their share.
     """
     first, last = window.moments[0].state.vehicles, window.moments[-1].state.vehicles
     # The slot must hold the same vehicle at the end
@@ -240,11 +243,11 @@ def _choose_egos(window: _Window, rng: np.random.Generator, most: int) -> list[_
             # Half of the egos drive a little beside the middle of the lane, or turned, as a learner does.
             lateral_m, yaw_rad = rng.normal(0.0, (0.35, 0.05)) * (rng.random(2) < 0.5)
             deviation = PathDeviation(lateral_m=float(lateral_m), yaw_rad=float(yaw_rad))
-            egos.append(_Ego(row, route, deviation, _comes_to_light(window, row)))
-    # Egos with a light ahead first, then the others
-    at_light = [ego for ego in egos if ego.at_light][: round(AT_LIGHT_SHARE * most)]
-    others = [ego for ego in egos if ego not in at_light]
-    return (at_light + others)[:most]
+            egos.append(_Ego(row, route, deviation, _comes_to_line(window, row)))
+    # Egos with a line ahead first, then the others
+    at_line = [ego for ego in egos if ego.at_line][: round(AT_LINE_SHARE * most)]
+    others = [ego for ego in egos if ego not in at_line]
+    return (at_line + others)[:most]
 
 
 def _route(window: _Window, row: int) -> Float64[np.ndarray, "M 3"] | None:
@@ -269,14 +272,15 @@ def _route(window: _Window, row: int) -> Float64[np.ndarray, "M 3"] | None:
     return xyz[arc_m <= reach_m] if arc_m[-1] > MIN_PATH_M else None
 
 
-def _comes_to_light(window: _Window, row: int) -> bool:
-    """Return whether a lane with a light begins ahead of a car within `LIGHT_M` at the beginning."""
+def _comes_to_line(window: _Window, row: int) -> bool:
+    """Return whether a lane behind a light or a stop sign begins ahead of a car within `LINE_M` at first."""
     vehicles, lanes = window.moments[0].state.vehicles, window.traffic.lanes
     path = vehicles.path[row, BEHIND:]
     path = path[path >= 0]
     # Distance from the front bumper to the end of each lane, which is the start of the next one
     gap_m = np.cumsum(lanes.length_m[path]) - vehicles.front_m[row]
-    return bool((window.traffic.signals.guarded[path[1:]] & (gap_m[:-1] < LIGHT_M)).any())
+    is_behind_line = window.traffic.signals.guarded | (lanes.control == LaneControl.STOP)
+    return bool((is_behind_line[path[1:]] & (gap_m[:-1] < LINE_M)).any())
 
 
 def _insert_all(window: _Window, ego: _Ego, rng: np.random.Generator) -> list[_Inserted]:

@@ -17,6 +17,7 @@ from foredrive.scene.traffic_light import LightState
 from foredrive.towns.driving.idm_agent import IdmAgent, TruePerception, estimated_view, true_view
 from foredrive.towns.driving.town import TownScenario, TownSimulator
 from foredrive.towns.map.loading import load_town_map
+from foredrive.towns.traffic.lane_graph import LaneControl
 from foredrive.towns.traffic.traffic import Traffic
 
 FRONT_M = 4.1
@@ -61,6 +62,31 @@ def test_boxes_go_on_at_constant_velocity() -> None:
     assert view.lead is None
     # Its ends are at 5 - 4 t ± 0.9: within 1.2 m of the path from 0.73 to 1.78 s, in cells 4 and 5 of 2 m.
     assert np.argwhere(view.occupied).tolist() == [[2, 4], [2, 5], [3, 4], [3, 5]]
+
+
+def test_it_stops_at_a_stop_sign_of_a_town_and_goes_on() -> None:
+    """30 m of a lane up to its sign, and 12 m behind the line."""
+    seed, graph = 3, Traffic(load_town_map("Town10HD"), 3, 1, 0).lanes
+    onward = int(np.flatnonzero(graph.control == LaneControl.STOP)[0])
+    lane = int(graph.predecessors[onward, 0])
+    before = graph.position(np.full(30, lane), graph.length_m[lane] - 30 + np.arange(30.0))
+    route = np.concatenate([before, graph.position(np.full(12, onward), np.arange(12.0))])
+    simulator = TownSimulator()
+    scenario = TownScenario(
+        "Town10HD",
+        route,
+        seed,
+        lanes=(lane, onward),
+        background_traffic=BackgroundTraffic(0, 0),
+        limit_s=40.0,
+    )
+    truth = TruePerception(simulator)
+    drive = drive_route(simulator, scenario, IdmAgent(truth.path, truth.view), route="r")
+    assert (drive.score.ending, drive.score.infractions) == (Ending.COMPLETED, ())
+    speed_mps = np.array([state.speed_mps for state in drive.states])
+    first_fast = int(np.flatnonzero(speed_mps > 4.0)[0])
+    assert speed_mps[first_fast:].min() < 0.1
+    assert speed_mps[-1] > 1.0
 
 
 @pytest.mark.slow

@@ -5,12 +5,14 @@ this. Other logs have no lights, and their path is the driven one.
 """
 
 import functools
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Float64, Int64
-from py123d.datatypes import Lane, MapLayer, TrafficLightStatus
+from py123d.api import MapAPI
+from py123d.datatypes import Lane, MapLayer, StopZone, StopZoneType, TrafficLightStatus
 from torch import Tensor
 
 from foredrive.data.arrow_files import reading
@@ -71,7 +73,7 @@ class PathAhead(NamedTuple):
 
 
 class _StopLines(NamedTuple):
-    """Begins of the lanes behind lights."""
+    """Begins of the lanes behind lights or signs."""
 
     lane: Int64[np.ndarray, "L"]
     xyz: Float64[np.ndarray, "L 3"]
@@ -86,6 +88,7 @@ def read_affordances(log: Log, frame: int) -> Affordances:
     """
     path = _path(log, frame)
     light, light_m, light_known, lane = _light(log, frame, path)
+    sign_m, sign_known = _sign(log, frame, path)
     lamps, lamps_known = _lamps(log, frame, lane)
     boxes = read_boxes(log, frame)
     lead, lead_m, lead_mps, lead_known = lead_of(boxes, path)
@@ -99,6 +102,9 @@ def read_affordances(log: Log, frame: int) -> Affordances:
         lamp_xyz=lamps,
         lamp=torch.ones(len(lamps), dtype=torch.bool),
         lamps_known=torch.tensor(lamps_known and light_known),
+        sign=torch.tensor(sign_m is not None),
+        sign_m=torch.tensor(sign_m or 0.0),
+        sign_known=torch.tensor(sign_known),
         lead=torch.tensor(lead),
         lead_m=torch.tensor(lead_m),
         lead_mps=torch.tensor(lead_mps),
@@ -160,8 +166,27 @@ def _light(log: Log, frame: int, path: PathAhead) -> tuple[LightState, float, bo
     if shown is None or lines is None or not path.given or not bool(path.valid.any()):
         # Lights matter on a given route only: the driven path ends where the drive does
         return LightState.NONE, 0.0, False, None
+    # The nearest line on the path whose light has a known state
+    for row, line_m in _on_path(lines, log, frame, path):
+        lane = int(lines.lane[row])
+        state = STATE_OF_STATUS.get(shown.get(lane, TrafficLightStatus.UNKNOWN))
+        if state is not None:
+            return state, line_m, True, lane
+    return LightState.NONE, 0.0, True, None
+
+
+def _sign(log: Log, frame: int, path: PathAhead) -> tuple[float | None, bool]:
+    """Return the distance of the next stop sign on the path, None without one, and whether it is known."""
+    lines = _sign_lines(log)
+    if lines is None or not path.given or not bool(path.valid.any()):
+        return None, False
+    return next((line_m for _, line_m in _on_path(lines, log, frame, path)), None), True
+
+
+def _on_path(lines: _StopLines, log: Log, frame: int, path: PathAhead) -> list[tuple[int, float]]:
+    """Return the rows of the lines on the path with their distances from the bumper, the nearest first."""
     if not len(lines.lane):
-        return LightState.NONE, 0.0, True, None
+        return []
     # Stop lines in the ego frame, then along and beside the path
     xyz = _in_ego_frame(lines.xyz, log, frame)
     along_m, left_m = along_path(torch.from_numpy(xyz[:, :2]).float(), path.xy, path.valid)
@@ -178,13 +203,8 @@ def _light(log: Log, frame: int, path: PathAhead) -> tuple[LightState, float, bo
         & (distance_m > -PASSED_M)
         & (distance_m <= LIGHT_RANGE_M)
     )
-    # The nearest line on the path whose light has a known state
-    for row in sorted(np.flatnonzero(on_path).tolist(), key=distance_m.__getitem__):
-        lane = int(lines.lane[row])
-        state = STATE_OF_STATUS.get(shown.get(lane, TrafficLightStatus.UNKNOWN))
-        if state is not None:
-            return state, float(distance_m[row]), True, lane
-    return LightState.NONE, 0.0, True, None
+    rows = sorted(np.flatnonzero(on_path).tolist(), key=distance_m.__getitem__)
+    return [(row, float(distance_m[row])) for row in rows]
 
 
 def read_stop_lines(log: Log, frame: int) -> list[tuple[LightState, Float64[np.ndarray, "2 2"]]]:
@@ -220,9 +240,28 @@ def _stop_lines(log: Log) -> _StopLines | None:
     shown = read_traffic_lights(log, 0)
     with reading(log.path.folder, "its map"):
         api = log.scene.get_map_api()
-        if shown is None or api is None:
+        return None if shown is None or api is None else _begins(api, shown)
+
+
+@functools.lru_cache(maxsize=64)
+def _sign_lines(log: Log) -> _StopLines | None:
+    """Return the lanes behind the stop signs of the log's map. None without a map that has stop zones."""
+    with reading(log.path.folder, "its map"):
+        api = log.scene.get_map_api()
+        if api is None or MapLayer.STOP_ZONE not in api.get_available_map_layers():
             return None
-        by_name = {name: api.get_map_object_in_layer(name, MapLayer.LANE) for name in shown}
+        zones = api.get_all_map_objects_in_layer(MapLayer.STOP_ZONE)
+        signs = [
+            zone
+            for zone in zones
+            if isinstance(zone, StopZone) and zone.stop_zone_type is StopZoneType.STOP_SIGN
+        ]
+        return _begins(api, dict.fromkeys(lane for zone in signs for lane in zone.lane_ids))
+
+
+def _begins(api: MapAPI, names: Iterable[int | str]) -> _StopLines:
+    """Return where lanes begin, and in which direction."""
+    by_name = {name: api.get_map_object_in_layer(name, MapLayer.LANE) for name in names}
     lanes = {name: lane for name, lane in by_name.items() if isinstance(lane, Lane)}
     # The first two points of a lane's centre line give its begin and direction
     starts = [np.asarray(lane.centerline_3d.array, dtype=np.float64)[:2] for lane in lanes.values()]

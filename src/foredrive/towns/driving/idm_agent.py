@@ -4,12 +4,13 @@ from collections.abc import Callable
 
 import numpy as np
 import torch
-from jaxtyping import Float64
+from jaxtyping import Bool, Float64
 
 from foredrive.data.truth.affordances import PASSED_M, PathAhead, lead_of, occupied_by, path_ahead
 from foredrive.driving.lane_rules import LEVEL_M
 from foredrive.driving.simple_agents import plan_of
 from foredrive.driving.speed_rule import FRONT_M, Obstacle, PathView, rule_progress, waypoints_along
+from foredrive.driving.stop_signs import StopSigns
 from foredrive.geometry.path_frame import along_path, path_headings
 from foredrive.geometry.polylines import arc_lengths
 from foredrive.scene import Boxes, Clip, Trajectory
@@ -52,14 +53,15 @@ class IdmAgent:
 
 
 class TruePerception:
-    """What is on the route, read from the simulator.
+    """What is on the route in one drive, read from the simulator. It remembers at which signs it has stood.
 
     Args:
         simulator: the town that is driven in.
     """
 
     def __init__(self, simulator: TownSimulator) -> None:
-        self._simulator = simulator
+        self._simulator, self._signs = simulator, StopSigns()
+        self._before_xy: Float64[np.ndarray, 2] | None = None
 
     def __call__(self, observation: Clip) -> PathEstimate:
         """Return the view of an observation of a batch of one as an estimate that is sure."""
@@ -80,13 +82,33 @@ class TruePerception:
     def view(self, observation: Clip, path: PathAhead) -> PathView:
         """Return what is on a path: the state of its light, and boxes that go on at constant velocity."""
         clip = observation[0]
-        light, light_m = self._light(path, clip.T_world_ego[clip.now].numpy())
+        T_world_ego = clip.T_world_ego[clip.now].numpy()
+        states = self._simulator.traffic.zone_lights(self._simulator.state.decided.time_s)
+        light, light_m = LightState.NONE, 0.0
+        if (nearest := self._nearest(path, T_world_ego, states != LightState.NONE)) is not None:
+            light, light_m = LightState(int(states[nearest[0]])), nearest[1]
+        # A sign is a red light until the vehicle has stood at it
+        xy, before_xy = T_world_ego[:2, 3], self._before_xy
+        self._before_xy = xy
+        moved_m = 0.0 if before_xy is None else float(np.linalg.norm(xy - before_xy))
+        sign = self._nearest(path, T_world_ego, None)
+        speed_mps = float(clip.ego_speed_mps[clip.now])
+        stop_m = self._signs.update(None if sign is None else sign[1], moved_m, speed_mps)
+        stops = light in (LightState.RED, LightState.YELLOW)
+        if stop_m is not None and not (stops and light_m < stop_m):
+            light, light_m = LightState.RED, stop_m
         return true_view(clip.boxes[clip.now], path, light, light_m)
 
-    def _light(self, path: PathAhead, T_world_ego: Float64[np.ndarray, "4 4"]) -> tuple[LightState, float]:
-        """Return state and distance of the next light on the path."""
+    def _nearest(
+        self, path: PathAhead, T_world_ego: Float64[np.ndarray, "4 4"], lit: Bool[np.ndarray, "Z"] | None
+    ) -> tuple[int, float] | None:
+        """Return the stop zone and the distance of the next light that works, or of the next stop sign.
+
+        Args:
+            lit: stop zones whose lights work. None: signs are looked for.
+        """
         lines = stop_lines(load_town_map(self._simulator.scenario.town))
-        states = self._simulator.traffic.zone_lights(self._simulator.state.decided.time_s)
+        asked = lines.is_sign if lit is None else ~lines.is_sign & lit[lines.zone]
         # Stop lines into the ego frame, then to distance along and beside the path
         T_ego_world = np.linalg.inv(T_world_ego)
         xyz = lines.xyz @ T_ego_world[:3, :3].T + T_ego_world[:3, 3]
@@ -96,15 +118,14 @@ class TruePerception:
         # Gap from the front bumper, not from the rear axle
         gap_m = along.double().numpy() - path.front_m
         height_m = np.interp(along.numpy(), np.arange(len(path.z)), path.z)
-        # Lines of lights across this path, in its direction, ahead,
-        # on its level, and with a light that works
-        mine = (left.abs().numpy() < BESIDE_M) & ((heading * ahead).sum(-1) > 0.5) & ~lines.is_sign
-        mine &= (gap_m > -PASSED_M) & (gap_m < LIGHT_RANGE_M) & (states[lines.zone] != LightState.NONE)
+        # Lines across this path, in its direction, ahead and on its level
+        mine = asked & (left.abs().numpy() < BESIDE_M) & ((heading * ahead).sum(-1) > 0.5)
+        mine &= (gap_m > -PASSED_M) & (gap_m < LIGHT_RANGE_M)
         mine &= np.abs(xyz[:, 2] - height_m) < LEVEL_M
         if not mine.any():
-            return LightState.NONE, 0.0
+            return None
         row = int(np.where(mine, gap_m, np.inf).argmin())
-        return LightState(int(states[lines.zone[row]])), float(gap_m[row])
+        return int(lines.zone[row]), float(gap_m[row])
 
 
 def true_view(boxes: Boxes, path: PathAhead, light: LightState, light_m: float) -> PathView:

@@ -1,0 +1,61 @@
+"""What is remembered of stop signs in a drive: each stops the vehicle until it has stood at its line."""
+
+from foredrive.driving.lane_rules import STOP_WITHIN_M, STOPPED_MPS
+
+PASSED_M = 4.4
+"""Distance behind its line from which a sign is forgotten."""
+OTHER_M = 6.0
+"""Difference from the remembered distance by which a reading is of another sign."""
+SHARE = 0.5
+"""Share by which a reading moves the remembered line."""
+UNSEEN, IN_VIEW_M = 4, 6.0
+"""Readings without a sign after which it is forgotten, where its line should be in view: from this far on."""
+TOO_LATE_M = -1.0
+"""Distance of the line from which the vehicle does not stop any more."""
+
+
+class StopSigns:
+    """Remembers the next stop sign.
+
+    Args:
+        confirmed: readings of a line at about the same place from which it counts.
+    """
+
+    def __init__(self, confirmed: int = 1) -> None:
+        self._confirmed = confirmed
+        self._line_m: float | None = None
+        self._readings, self._unseen, self._has_stood = 0, 0, False
+
+    def update(self, sign_m: float | None, moved_m: float, speed_mps: float) -> float | None:
+        """Return the distance of the line at which the vehicle still has to stop, m, or None.
+
+        Args:
+            sign_m: distance of the line of the next sign from the front bumper as it is read now, or None.
+            moved_m: distance driven since the reading before.
+            speed_mps: speed of the vehicle.
+        """
+        if self._line_m is not None:
+            self._line_m -= moved_m
+            if self._line_m < -PASSED_M:
+                self._line_m = None
+        if sign_m is not None:
+            self._read(sign_m)
+        elif self._line_m is not None and self._line_m > IN_VIEW_M:
+            self._unseen += 1
+            if self._unseen >= UNSEEN:
+                self._line_m = None
+        if self._line_m is None or self._readings < self._confirmed:
+            return None
+        # A stop counts as the rules count it (`lane_rules`)
+        self._has_stood |= speed_mps < STOPPED_MPS and TOO_LATE_M < self._line_m < STOP_WITHIN_M
+        return None if self._has_stood or self._line_m < TOO_LATE_M else self._line_m
+
+    def _read(self, sign_m: float) -> None:
+        self._unseen = 0
+        beyond_m = None if self._line_m is None else sign_m - self._line_m
+        if beyond_m is not None and abs(beyond_m) <= OTHER_M and self._line_m is not None:
+            self._line_m += SHARE * beyond_m
+            self._readings += 1
+        elif beyond_m is None or beyond_m < 0 or self._has_stood:
+            # The first one, a nearer one, or the next one behind a line that has been waited at
+            self._line_m, self._readings, self._has_stood = sign_m, 1, False
