@@ -1,7 +1,8 @@
 """What the package does on a card, each in a function that returns figures: `python cases.py DEVICE CASE …`.
 
 A case makes its input on the CPU and moves it, as the package does. Where the package chooses the device, it
-finds the emulated one. Prints a line of JSON for each case: its figures, or where and why it failed.
+finds the emulated one. The device "unusable" is a card that PyTorch finds and on which nothing can be done.
+Prints a line of JSON for each case: its figures, or where and why it failed.
 """
 
 import dataclasses
@@ -27,8 +28,9 @@ sys.path[:0] = [
 import emulation  # noqa: E402
 
 COUNTS = emulation.Counts()
-if DEVICE == "cuda":
+if DEVICE in ("cuda", "unusable"):
     emulation.start(Path(HOOKS))
+if DEVICE == "cuda":
     import emulated_card
 
     COUNTS = emulated_card.begin()
@@ -157,6 +159,20 @@ def run(folder: Path) -> Figures:
     return figures | {"rendered": float(imagined.rendered.mean())}
 
 
+def export(folder: Path) -> Figures:
+    """`export` of a run that was trained on the CPU: it needs no card, and uses none that is there."""
+    log = miniature.write_log(folder)
+    save_recipe(miniature.miniature(), folder / "own.yaml")
+    made, split = folder / "run", log.folder.parent
+    for words in (
+        ["train", folder / "own.yaml", "--logs", split, "--out", made, "--device", "cpu"],
+        ["export", made, "--logs", split, "--clips", 1],
+    ):
+        assert program([*map(str, words)]) == 0, words
+    differences = json.loads((made / "export" / "export.json").read_text())["largest_difference"]
+    return {f"{runtime}_{name}": value for runtime, row in differences.items() for name, value in row.items()}
+
+
 def driver(folder: Path) -> Figures:
     """A driver: its eyes and its planner, trained and judged, and a plan."""
     sensors = SensorSuite(camera_rig(plan=FRONT_TELE.of_size((32, 64))), None)
@@ -259,7 +275,14 @@ def alignment(_: Path) -> Figures:
 
 CASES |= {"nemo": nemo, "driveworld": driveworld, "heads": heads, "run": run, "gaussians": gaussians}
 CASES["gsplat"] = gsplat
-CASES |= {"field": field, "sets": sets, "alignment": alignment, "driver": driver, "search": search}
+CASES |= {
+    "export": export,
+    "field": field,
+    "sets": sets,
+    "alignment": alignment,
+    "driver": driver,
+    "search": search,
+}
 
 
 def main() -> None:
@@ -269,7 +292,7 @@ def main() -> None:
         began = time.perf_counter()
         try:
             with tempfile.TemporaryDirectory() as folder:
-                outcome: dict[str, object] = {"figures": CASES[name](Path(folder))}
+                outcome: dict[str, object] = {"figures": (CASES | {"export": export})[name](Path(folder))}
         except Exception as error:
             own = [f for f in traceback.extract_tb(error.__traceback__) if emulation.PACKAGE in f.filename]
             lines = [f"{f.filename.rpartition(emulation.PACKAGE)[2]}:{f.lineno}" for f in own[-4:]]

@@ -56,6 +56,16 @@ def test_a_card_gives_the_figures_of_the_cpu(case: str, outcomes: dict[str, dict
     assert not on_cpu["counts"]
 
 
+@pytest.mark.slow
+def test_an_export_uses_no_card_that_is_there(hooks: Path) -> None:
+    program = [sys.executable, str(HERE / "cases.py"), "unusable", str(hooks), "export"]
+    done = subprocess.run(program, capture_output=True, text=True)
+    (line,) = [json.loads(line) for line in done.stdout.splitlines() if line.startswith('{"case"')]
+    assert "error" not in line, (line["error"], line["lines"])
+    assert len(line["figures"]) > 4
+    assert max(line["figures"].values()) < 1e-3
+
+
 @pytest.mark.parametrize("case", MOST_WAITS)
 def test_a_step_makes_the_host_wait_seldom(case: str, outcomes: dict[str, dict[str, Outcome]]) -> None:
     counts = outcomes["cuda"][case]["counts"]
