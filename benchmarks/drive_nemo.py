@@ -6,6 +6,9 @@ virtual egos of the training towns for the same number of visits, and drive with
 with the package, from scratch, and with black images. `gain` compares the two first of these, paired over
 routes and seeds.
 
+`left_out_TOWN` has learned as `same_small` from all other towns, and drives the training routes of this one,
+beside `same_small` itself.
+
 **Rounds of DAgger**: `small_K` has learned from more egos and from K rounds of what it met when it drove the
 training routes itself, in all weathers, driven by the driver of the round before with seed 0. `small_blind`
 learned from all of them with black images. `rules_by_sight` has the rule in place of the planner of `small`,
@@ -34,6 +37,8 @@ from benchmarks.common.benchmark import Benchmark, study_identity
 from benchmarks.common.driver_study import (
     EGOS,
     PRETRAINED,
+    SIGN_TILES,
+    TRAINING_TOWNS,
     egos,
     figures_on_its_way,
     recipe_of,
@@ -46,6 +51,7 @@ from benchmarks.common.study import seeded
 from foredrive.data import LogPath, find_all_logs
 from foredrive.driver.recipes import DRIVER_RECIPES, DriverRecipe
 from foredrive.driving.drive_record import DriveRecord
+from foredrive.driving.route_sets import load_route_set
 from foredrive.errors import InputError
 from foredrive.methods.recipe import rescheduled
 from foredrive.runs.drive.agent_inputs import rig_of
@@ -69,6 +75,7 @@ ROUND_ROUTES, ROUND_LR, ROUND_EPOCHS = "training-short", 1e-3, 2
 """Routes of a round, and the learning rate and the epochs in which a driver goes on."""
 SHIPPED, PARTS = "embedded:driver", ("true", "true-lights", "true-users", "idm")
 """The driver that comes with the package, and agents of which it is a part."""
+LEFT_OUT = ("Town03", "Town07", "Town10HD")
 REGRESSING, REGRESSING_STEPS = "nemo_drive", 600
 DEMONSTRATED, ROUTES_A_TOWN = ("Town01", "Town02", "Town03", "Town04", "Town06"), 4
 """Towns of the demonstrations, and the routes in each."""
@@ -83,7 +90,7 @@ CORES = len(os.sched_getaffinity(0))
 CONFIG = {
     "recipes": {name: dataclasses.asdict(recipe) for name, recipe in DRIVER_RECIPES.items()}
     | {REGRESSING: dataclasses.asdict(find_recipe(REGRESSING))},
-    "egos": [EGOS, EGO_SEEDS, SAME_EGO_SEEDS, SAME_EPOCHS],
+    "egos": [EGOS, EGO_SEEDS, SIGN_TILES, SAME_EGO_SEEDS, SAME_EPOCHS],
     "rounds": [ROUNDS, ROUND_ROUTES, ROUND_LR, ROUND_EPOCHS],
     "demonstrations": [*DEMONSTRATED, ROUTES_A_TOWN, REGRESSING_STEPS],
     "routes": JUDGED,
@@ -116,10 +123,10 @@ def small(rounds: int, seed: int) -> DriverRun:
     """Return the small driver after some rounds of DAgger; train and drive what is missing."""
     recipe, folder = recipe_of("driver_small", seed), WORK / "runs" / f"small_{rounds}_seed{seed}"
     if rounds == 0:
-        return trained(recipe, _egos(EGO_SEEDS), folder, WORK / "cache")
+        return trained(recipe, _all_egos(), folder, WORK / "cache")
     recipe = _once(recipe)
     start = small(rounds - 1, seed).folder
-    return trained(recipe, [*_egos(EGO_SEEDS), *rounds_until(rounds)], folder, WORK / "cache", start)
+    return trained(recipe, [*_all_egos(), *rounds_until(rounds)], folder, WORK / "cache", start)
 
 
 def _once(recipe: DriverRecipe) -> DriverRecipe:
@@ -142,21 +149,30 @@ def _egos(seeds: int) -> list[LogPath]:
     return egos(range(seeds), WORK / "egos", CORES)
 
 
+def _all_egos() -> list[LogPath]:
+    """Return the egos of all seeds, with those of tiles that have many stop signs."""
+    return egos(range(EGO_SEEDS), WORK / "egos", CORES, towns=(*TRAINING_TOWNS, *SIGN_TILES))
+
+
 def blind(seed: int) -> DriverRun:
     """Return the small driver that sees black images and learned from the same clips."""
     recipe = recipe_of("driver_small", seed)
     recipe = dataclasses.replace(recipe, eyes=dataclasses.replace(recipe.eyes, blind=True))
-    logs = [*_egos(EGO_SEEDS), *rounds_until(ROUNDS)]
+    logs = [*_all_egos(), *rounds_until(ROUNDS)]
     return trained(recipe, logs, WORK / "runs" / f"small_blind_seed{seed}", WORK / "cache")
 
 
 def same(name: str, recipe: str, seed: int, start: Path | None = None, *, blind: bool = False) -> DriverRun:
     """Return a driver of NeMo's claim."""
-    chosen = recipe_of(recipe, seed)
-    eyes, see = dataclasses.replace(chosen.eyes, blind=blind), chosen.see
-    chosen = dataclasses.replace(chosen, eyes=eyes, see=dataclasses.replace(see, epochs=SAME_EPOCHS))
+    chosen = _same_recipe(recipe, seed)
+    chosen = dataclasses.replace(chosen, eyes=dataclasses.replace(chosen.eyes, blind=blind))
     folder = WORK / "runs" / f"{name}_seed{seed}"
     return trained(chosen, _egos(SAME_EGO_SEEDS), folder, WORK / "cache", start)
+
+
+def _same_recipe(recipe: str, seed: int) -> DriverRecipe:
+    chosen = recipe_of(recipe, seed)
+    return dataclasses.replace(chosen, see=dataclasses.replace(chosen.see, epochs=SAME_EPOCHS))
 
 
 def regressing(seed: int) -> Path:
@@ -272,6 +288,24 @@ WITH_NEMO: Mapping[str, Callable[[int], DriverRun]] = {
 }
 
 
+def left_out(town: str, seed: int) -> Mapping[str, float]:
+    """Return the scores in a town of a driver that never was there, and of one that was."""
+    logs = [log for log in _egos(SAME_EGO_SEEDS) if not log.folder.name.startswith(f"{town}_")]
+    name = f"left_out_{town}_seed{seed}"
+    runs = {
+        "": trained(_same_recipe("driver_small", seed), logs, WORK / "runs" / name, WORK / "cache"),
+        "_seen": WITH_NEMO["same_small"](seed),
+    }
+    routes = tuple(route.id for route in load_route_set(ROUND_ROUTES) if route.town == town)
+    figures: dict[str, float] = {}
+    for ending, run in runs.items():
+        source = TownRoutes(ROUND_ROUTES, repetitions=2, rig=FRONT_TELE, only=routes)
+        drives = _driven(DriveSuite(_agent(run), source, sensors=False), _folder(name, f"town{ending}"))
+        found = _figures(list(drives.drives.values()))
+        figures |= {f"{key}_town{ending}": found[key] for key in ("ds", "rc", "red_lights", "collisions")}
+    return figures
+
+
 def gain(seed: int, routes: str) -> Mapping[str, float]:
     """Return what pre-training gains, with 95 % intervals over routes and trainings.
 
@@ -325,7 +359,8 @@ BENCHMARK = Benchmark(
         name if routes == "short" else f"{name}@{routes}": _of_routes(arm, routes)
         for routes in JUDGED
         for name, arm in {**ARMS, "gain": gain}.items()
-    },
+    }
+    | {f"left_out_{town}": partial(left_out, town) for town in LEFT_OUT},
     seeds=SEEDS,
     config=CONFIG,
     decided_by=DECIDED_BY,

@@ -18,6 +18,8 @@ from foredrive.sensors.rigs import FRONT_TELE
 from foredrive.towns.map.names import TEST_TOWNS, TOWNS, is_held_out
 
 TRAINING_TOWNS = tuple(town for town in TOWNS if not is_held_out(town))
+SIGN_TILES = ("Town12_Tile_10_-6", "Town12_Tile_-3_-19", "Town12_Tile_5_-22")
+"""Tiles with many stop signs, which are rare in the training towns."""
 EGOS, TEST_EGOS = 60, 300
 """Logs of virtual egos of each training town and seed, and of Town05: five clips each."""
 PRETRAINED = "embedded:nemo_town"
@@ -25,17 +27,24 @@ SCENARIO_S = 8.0
 ON_ITS_WAY = ("light_accuracy_40m", "red_missed_40m", "conflict_recall", "conflict_false", "conflicts")
 
 
-def egos(seeds: Sequence[int], folder: Path, workers: int, conditions: Sequence[str] = ()) -> list[LogPath]:
+def egos(
+    seeds: Sequence[int],
+    folder: Path,
+    workers: int,
+    conditions: Sequence[str] = (),
+    towns: Sequence[str] = TRAINING_TOWNS,
+) -> list[LogPath]:
     """Return the virtual egos of the training towns, by seed and then by town; record those that are missing.
 
     Args:
+        towns: of which towns and tiles.
         conditions: names of `CONDITIONS`, of which one is drawn for each ego; by default a bright day.
 
     Raises:
         InputError: some failed: all arms must have the same data.
     """
     return recorded(
-        [EgosPlan(town, seed, EGOS, tuple(conditions)) for seed in seeds for town in TRAINING_TOWNS],
+        [EgosPlan(town, seed, EGOS, tuple(conditions)) for seed in seeds for town in towns],
         folder,
         workers,
     )
