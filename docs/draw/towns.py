@@ -21,6 +21,7 @@ from foredrive.towns.traffic.traffic import Traffic
 from foredrive.towns.world import SensorFrame, World
 
 DOCS = Path(__file__).parents[1]
+TILES = ("Town11_Tile_-7_42", "Town12_Tile_4_-15", "Town13_Tile_14_-16")
 SIZE_HW = (216, 384)
 SEED = 4
 GAP = 6
@@ -103,7 +104,7 @@ def _colours(values: np.ndarray) -> np.ndarray:
 def main() -> None:
     """Every town by day, one place in all conditions, one sweep in three views."""
     fair = {"clear": CONDITIONS["clear"]}
-    days = {town: see(town, CONDITIONS if town == "Town05" else fair) for town in TOWNS}
+    days = {town: see(town, CONDITIONS if town == "Town05" else fair) for town in (*TOWNS, *TILES)}
     sheet([(town, frames["clear"].images["PCAM_F0"]) for town, frames in days.items()], 4).save(
         DOCS / "towns_places.jpg", quality=88
     )
