@@ -127,6 +127,7 @@ def test_the_next_stop_sign_is_that_of_the_map(log: Log, tmp_path: Path) -> None
     corners = np.array([[17.0, -1.75, 0.0], [18.0, -1.75, 0.0], [18.0, 1.75, 0.0], [17.0, -1.75, 0.0]])
     outline = Polyline3D.from_array(corners + world.WORLD_OFFSET)
     for kind, lane, there in (
+        (StopZoneType.UNKNOWN, 5, None),
         (StopZoneType.STOP_SIGN, 5, True),
         (StopZoneType.TRAFFIC_LIGHT, 5, False),
         (StopZoneType.STOP_SIGN, 6, False),
@@ -138,8 +139,8 @@ def test_the_next_stop_sign_is_that_of_the_map(log: Log, tmp_path: Path) -> None
             for index in range(0, 30, 5):
                 writer.write(frame(index))
         found = read_affordances(Log(find_logs(folder)[0]), FRAME // 5)
-        assert (bool(found.sign_known), bool(found.sign)) == (True, there), (kind, lane)
-        assert float(found.sign_m) == pytest.approx((LINE_X - front_x(log)) * there, abs=0.02)
+        assert (bool(found.sign_known), bool(found.sign)) == (there is not None, bool(there)), (kind, lane)
+        assert float(found.sign_m) == pytest.approx((LINE_X - front_x(log)) * bool(there), abs=0.02)
 
 
 def test_cells_of_the_path_are_occupied_over_time(log: Log) -> None:

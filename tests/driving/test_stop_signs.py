@@ -2,7 +2,8 @@
 
 import pytest
 
-from foredrive.driving.stop_signs import PASSED_M, UNSEEN, StopSigns
+from foredrive.data.truth.affordances import PASSED_M
+from foredrive.driving.stop_signs import UNSEEN, StopSigns
 
 
 def driven(signs: StopSigns, line_m: float, to_m: float, speed_mps: float, seen: bool = True) -> float | None:

@@ -33,7 +33,7 @@ def test_a_tile_holds_its_points_with_room_around_them() -> None:
 @pytest.mark.parametrize(
     ("name", "said"),
     [
-        ("Town12", "in tiles of 1000 m.*for example Town12_Tile_0_0"),
+        ("Town12", "in tiles of 1000 m.*for example Town12_Tile_4_-16"),
         ("Town05_Tile_0_0", "unknown town.*Town11_Tile_X_Y"),
         ("Town12_Tile_a_0", "unknown town"),
     ],

@@ -32,7 +32,7 @@ class CameraEyesConfig:
     cameras: int = 2
     """Number of cameras that are read."""
     signs: bool = False
-    """Whether stop signs are read too."""
+    """Stop signs are read too."""
     blind: bool = False
     """Images are black, to measure what follows from the route alone."""
     kind: Literal["cameras"] = "cameras"

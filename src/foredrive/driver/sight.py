@@ -21,7 +21,7 @@ CONTEXT = 64
 ROUTE_SCALE_M, VELOCITY_SCALE_MPS = 20.0, 5.0
 FADES_M = 1.5
 """Distance beyond half the width of the path over which a road user beside it counts less, m."""
-RARE_LOGIT, NONE_LOGIT, NO_SIGN_LOGIT = -4.0, -2.0, -20.0
+RARE_LOGIT, NONE_LOGIT, NO_SIGN_LOGIT = -4.0, -2.0, 20.0
 LIGHT_SCALE_M, LINE_BEFORE_LAMP_M = 20.0, 4.0
 """Scale of a stop line's distance as it is read at a lamp, where the line is not seen: log((m + 4) / 20)."""
 
@@ -150,7 +150,7 @@ class RouteReader(nn.Module):
         line = self.line(ground, context)
         # Eyes that do not know signs see none
         sign = torch.zeros_like(line)
-        sign[:, -1] = -NO_SIGN_LOGIT
+        sign[:, -1] = NO_SIGN_LOGIT
         if self.signs is not None:
             sign = self.signs(fine, ground, context)
         # Where each cell is: its place, and its distance beside the route

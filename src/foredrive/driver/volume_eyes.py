@@ -36,7 +36,7 @@ class VolumeEyesConfig:
     frozen: bool = False
     """The backbone and the encoder stay as they were pre-trained; what reads them is trained."""
     signs: bool = False
-    """Whether stop signs are read too."""
+    """Stop signs are read too."""
     blind: bool = False
     """Images are black, to measure what follows from the route alone."""
     kind: Literal["volume"] = "volume"

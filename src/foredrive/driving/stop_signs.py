@@ -1,9 +1,8 @@
-"""What is remembered of stop signs in a drive: each stops the vehicle until it has stood at its line."""
+"""Memory of the stop signs of a drive: each stops the vehicle until it has stood at its line."""
 
+from foredrive.data.truth.affordances import PASSED_M
 from foredrive.driving.lane_rules import STOP_WITHIN_M, STOPPED_MPS
 
-PASSED_M = 4.4
-"""Distance behind its line from which a sign is forgotten."""
 OTHER_M = 6.0
 """Difference from the remembered distance by which a reading is of another sign."""
 SHARE = 0.5
@@ -34,12 +33,14 @@ class StopSigns:
             moved_m: distance driven since the reading before.
             speed_mps: speed of the vehicle.
         """
+        # The line comes nearer by the distance driven
         if self._line_m is not None:
             self._line_m -= moved_m
             if self._line_m < -PASSED_M:
                 self._line_m = None
         if sign_m is not None:
             self._read(sign_m)
+        # A line that should be in view and is not seen again was none
         elif self._line_m is not None and self._line_m > IN_VIEW_M:
             self._unseen += 1
             if self._unseen >= UNSEEN:

@@ -1,4 +1,4 @@
-"""What a driver must see of its path: the next light and stop sign, and the road users in it over time."""
+"""Records of what a driver must see of its path: next light and stop sign, and road users over time."""
 
 from dataclasses import dataclass
 
@@ -41,7 +41,7 @@ class Affordances(Record):
     """False for padding."""
     lamps_known: Bool[Tensor, "*b"]
     sign: Bool[Tensor, "*b"]
-    """Whether a stop sign is on the path within `LIGHT_RANGE_M`."""
+    """True if a stop sign is on the path within `LIGHT_RANGE_M`."""
     sign_m: Float[Tensor, "*b"]
     """Distance of the stop line of the next one, as `light_m`."""
     sign_known: Bool[Tensor, "*b"]

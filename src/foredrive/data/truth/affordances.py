@@ -245,17 +245,17 @@ def _stop_lines(log: Log) -> _StopLines | None:
 
 @functools.lru_cache(maxsize=64)
 def _sign_lines(log: Log) -> _StopLines | None:
-    """Return the lanes behind the stop signs of the log's map. None without a map that has stop zones."""
+    """Return the lanes behind the stop signs of the log's map. None where it does not tell all of them."""
     with reading(log.path.folder, "its map"):
         api = log.scene.get_map_api()
         if api is None or MapLayer.STOP_ZONE not in api.get_available_map_layers():
             return None
-        zones = api.get_all_map_objects_in_layer(MapLayer.STOP_ZONE)
-        signs = [
-            zone
-            for zone in zones
-            if isinstance(zone, StopZone) and zone.stop_zone_type is StopZoneType.STOP_SIGN
-        ]
+        layer = api.get_all_map_objects_in_layer(MapLayer.STOP_ZONE)
+        zones = [zone for zone in layer if isinstance(zone, StopZone)]
+        # A zone of an unknown kind may be of a sign
+        if any(zone.stop_zone_type is StopZoneType.UNKNOWN for zone in zones):
+            return None
+        signs = [zone for zone in zones if zone.stop_zone_type is StopZoneType.STOP_SIGN]
         return _begins(api, dict.fromkeys(lane for zone in signs for lane in zone.lane_ids))
 
 

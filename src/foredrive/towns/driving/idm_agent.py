@@ -53,7 +53,7 @@ class IdmAgent:
 
 
 class TruePerception:
-    """What is on the route in one drive, read from the simulator. It remembers at which signs it has stood.
+    """Reads what is on the route in one drive from the simulator. It remembers at which signs it has stood.
 
     Args:
         simulator: the town that is driven in.

@@ -21,7 +21,7 @@ MAP_FOLDER = Path(py123d.parser.opendrive.__file__).parent / "carla_maps"
 
 @lru_cache(maxsize=2)
 def load_town_map(name: str) -> TownMap:
-    """Read the map of a town or of a tile (takes 0.2 to 4 s).
+    """Read the map of a town or of a tile (takes 0.2 to 9 s).
 
     Raises:
         InputError: there is no such town, or no road in the tile.

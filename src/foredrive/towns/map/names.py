@@ -13,8 +13,12 @@ from foredrive.errors import InputError
 
 TOWNS = ("Town01", "Town02", "Town03", "Town04", "Town05", "Town06", "Town07", "Town10HD", "Town15")
 """Towns that are built whole."""
-LARGE_TOWNS = ("Town11", "Town12", "Town13")
-"""Towns of many kilometres, which are built in tiles."""
+LARGE_TOWNS = {
+    "Town11": "Town11_Tile_-7_42",
+    "Town12": "Town12_Tile_4_-16",
+    "Town13": "Town13_Tile_14_-16",
+}
+"""Towns of many kilometres, which are built in tiles, each with a tile in the middle of streets."""
 TEST_TOWNS = ("Town05",)
 """Towns held out for testing, as in the papers."""
 UNSEEN_TOWNS = ("Town13", "Town15")
@@ -32,7 +36,7 @@ def check_town(name: str) -> None:
     if name in LARGE_TOWNS:
         raise InputError(
             f"{name} is built in tiles of {TILE_M:.0f} m: name one by its centre in steps of "
-            f"{TILE_STEP_M:.0f} m, for example {name}_Tile_0_0"
+            f"{TILE_STEP_M:.0f} m, for example {LARGE_TOWNS[name]}"
         )
     tile = _TILE.fullmatch(name)
     if name not in TOWNS and (tile is None or tile[1] not in LARGE_TOWNS):

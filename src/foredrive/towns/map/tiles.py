@@ -25,11 +25,11 @@ NO_JUNCTION = "-1"
 
 @dataclass(frozen=True)
 class _Outline:
-    """What is known of a road before it is read."""
+    """Holds what is known of a road before it is read."""
 
     junction: str
     touches: bool
-    """Whether it may touch the tile."""
+    """True if it may touch the tile."""
     roads: tuple[str, ...]
     """Roads that it is linked to; `junctions` likewise."""
     junctions: tuple[str, ...]

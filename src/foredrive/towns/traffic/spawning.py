@@ -70,6 +70,7 @@ class Spawner:
         Args:
             ego_m: position of the ego vehicle if it is driven from outside, m.
         """
+        # Those whose front is beyond the end of a lane that leads nowhere
         v = state.vehicles
         left = (
             v.active & (v.front_m > self._lanes.length_m[v.lane]) & (self._lanes.successor_count[v.lane] == 0)
