@@ -4,6 +4,7 @@ import dataclasses
 from pathlib import Path
 from typing import Any
 
+import pytest
 import synthetic_log
 from flat_street import street
 
@@ -11,6 +12,7 @@ from foredrive.data import ClipConfig, LogPath, find_logs
 from foredrive.data.logs import Log
 from foredrive.data.maps import write_map
 from foredrive.engine.loop import Schedule
+from foredrive.engine.metrics_log import read_metrics
 from foredrive.methods.blocks.backbone import BackboneConfig
 from foredrive.methods.blocks.bev import BevConfig
 from foredrive.methods.blocks.lift_splat import LiftSplatConfig
@@ -116,6 +118,35 @@ def with_steps(recipe: Recipe, pretrain: int, finetune: int) -> Recipe:
         )
     }
     return dataclasses.replace(recipe, **stages)
+
+
+def in_two_parts() -> Recipe[Any, Any]:
+    """Return the miniature with two parts in each step, and a checkpoint after each."""
+    recipe = miniature()
+    stages = {
+        name: dataclasses.replace(
+            stage, schedule=dataclasses.replace(stage.schedule, accumulate=2, checkpoint_every=1)
+        )
+        for name, stage in (("pretrain", recipe.pretrain), ("finetune", recipe.finetune))
+        if stage is not None
+    }
+    return dataclasses.replace(recipe, name="in two parts", **stages)
+
+
+def losses(run: Path, stage: str) -> list[dict[str, float]]:
+    """Return the losses of the steps of a stage."""
+    timed = ("step_s", "cpu_s")
+    lines = read_metrics(run / stage / "metrics.jsonl")
+    return [{name: value for name, value in line.items() if name not in timed} for line in lines]
+
+
+def assert_same_losses(run: Path, other: Path) -> None:
+    """Compare the losses of two runs in both stages."""
+    for stage in ("pretrain", "finetune"):
+        found, expected = losses(run, stage), losses(other, stage)
+        assert len(found) == len(expected) == STEPS
+        for one, two in zip(found, expected, strict=True):
+            assert one == pytest.approx(two, rel=1e-4)
 
 
 def write_log(root: Path, name: str = "flat", frames: int = 51) -> LogPath:

@@ -30,5 +30,5 @@ def page_faults(kept: bool) -> int:
 
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="glibc alone")
 def test_freed_memory_is_used_again() -> None:
-    """Twenty arrays of 40 MB, one after another, need the memory of one, or of two where a small one lies between."""
+    """Twenty arrays of 40 MB, one after another, need the memory of one, or of two on a heap with a gap."""
     assert page_faults(kept=True) < page_faults(kept=False) / 8

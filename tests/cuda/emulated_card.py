@@ -1,9 +1,11 @@
-"""The emulated card: what PyTorch does with a tensor on cuda:0, computed on the CPU.
+"""The emulated card: what PyTorch does with a tensor on a CUDA device, computed on the CPU.
 
-To be imported after `emulation.start`; `begin` then changes PyTorch for the whole process.
+To be imported after `emulation.start`; `begin` then changes PyTorch for the whole process. Of processes that
+torchrun started, each has a card of its own; without it, the card is cuda:0.
 """
 
 import contextlib
+import os
 from typing import Any
 
 import torch
@@ -13,7 +15,8 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_flatten, tree_map
 
 aten = torch.ops.aten
-CARD, COUNTS = torch.device("cuda", 0), Counts()
+CARD, COUNTS = torch.device("cuda", int(os.environ.get("LOCAL_RANK", "0"))), Counts()
+CARDS = int(os.environ.get("LOCAL_WORLD_SIZE", "1"))
 
 INDEXING = {
     *(aten.index.Tensor, aten._unsafe_index.Tensor, aten.index_put.default, aten.index_put_.default),
@@ -190,7 +193,7 @@ ANSWERS: dict[str, Any] = {
     **dict.fromkeys(("_lazy_init", "set_device", "synchronize", "empty_cache", "init"), None),
     **dict.fromkeys(("reset_peak_memory_stats", "manual_seed", "manual_seed_all"), None),
     **dict.fromkeys(("get_rng_state", "set_rng_state", "set_rng_state_all"), None),
-    **{"device_count": 1, "current_device": 0, "max_memory_allocated": 0, "memory_allocated": 0},
+    **{"device_count": CARDS, "current_device": CARD.index, "max_memory_allocated": 0, "memory_allocated": 0},
     **{"is_current_stream_capturing": False, "get_device_name": "emulated"},
     **{"get_device_properties": Properties(), "get_device_capability": (9, 0)},
     "get_rng_state_all": [],

@@ -1,4 +1,4 @@
-"""An emulated CUDA device: tensors that say they are on cuda:0, obey CUDA's rules and compute on the CPU.
+"""An emulated CUDA device: tensors that say they are on a card, obey CUDA's rules and compute on the CPU.
 
 A program that mixes devices, reads a tensor of the card into NumPy or draws random numbers with a generator
 of the CPU fails here as it fails on a card. Values are those of the CPU, so both devices can be compared.

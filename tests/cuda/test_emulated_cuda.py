@@ -1,8 +1,6 @@
 """The package on an emulated card: the same figures as on the CPU, and nothing that CUDA refuses."""
 
 import json
-import os
-import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -16,20 +14,12 @@ CASES = (
     *("nemo", "driveworld", "heads", "run", "gaussians", "gsplat"),
     *("field", "sets", "alignment", "driver", "search"),
 )
-CACHE = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "foredrive" / "tests"
 CLOSE = {"gaussians": 1e-3, "gsplat": 1e-3, "field": 1e-3, "search": 1e-2, "run": 1e-3}
 """Relative differences where kernels of the CPU and plain PyTorch add up in another order."""
 MOST_WAITS = {"nemo": 16, "driveworld": 20, "heads": 80}
 """Waits of the host in a step of fine-tuning and a plan."""
 
 Outcome = dict[str, Any]
-
-
-@pytest.fixture(scope="module")
-def hooks() -> Path:
-    if shutil.which("g++") is None:
-        pytest.skip("no g++ to build an emulated card")
-    return emulation.built_hooks(CACHE)
 
 
 @pytest.fixture(scope="module")

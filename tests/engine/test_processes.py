@@ -1,26 +1,21 @@
 """Training by two processes of torchrun: losses of one, files of the first, a lost process, going on."""
 
-import dataclasses
 import json
 import os
 import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
-from miniature import miniature
+from miniature import assert_same_losses, in_two_parts, losses
 from safetensors.torch import load_file
 
 from foredrive.data import LogPath
 from foredrive.engine.config import save_recipe
-from foredrive.engine.metrics_log import read_metrics
-from foredrive.methods.recipe import Recipe
 from foredrive.runs import Run, open_run, train_run
 
 TESTS = Path(__file__).parents[1]
-STEPS = 3
 BOTH = """
 import os, signal, sys
 from pathlib import Path
@@ -60,33 +55,6 @@ assert train("fsdp", "--strategy", "fsdp") == 0
 calls, stop_at, number = 0, 3 + 3, signal.SIGKILL  # in the last step of fine-tuning
 sys.exit(train("ddp"))
 """
-
-
-def in_two_parts() -> Recipe[Any, Any]:
-    """The miniature with two parts in each step, and a checkpoint after each."""
-    recipe = miniature()
-    stages = {
-        name: dataclasses.replace(
-            stage, schedule=dataclasses.replace(stage.schedule, accumulate=2, checkpoint_every=1)
-        )
-        for name, stage in (("pretrain", recipe.pretrain), ("finetune", recipe.finetune))
-        if stage is not None
-    }
-    return dataclasses.replace(recipe, name="in two parts", **stages)
-
-
-def losses(run: Path, stage: str) -> list[dict[str, float]]:
-    timed = ("step_s", "cpu_s")
-    lines = read_metrics(run / stage / "metrics.jsonl")
-    return [{name: value for name, value in line.items() if name not in timed} for line in lines]
-
-
-def assert_same_losses(run: Path, other: Path) -> None:
-    for stage in ("pretrain", "finetune"):
-        found, expected = losses(run, stage), losses(other, stage)
-        assert len(found) == len(expected) == STEPS
-        for one, two in zip(found, expected, strict=True):
-            assert one == pytest.approx(two, rel=1e-4)
 
 
 @pytest.fixture(scope="module")
