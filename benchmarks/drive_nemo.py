@@ -11,9 +11,10 @@ beside `same_small` itself.
 
 **Rounds of DAgger**: `small_K` has learned from more egos and from K rounds of what it met when it drove the
 training routes itself, in all weathers, driven by the driver of the round before with seed 0. `small_blind`
-learned from all of them with black images. `rules_by_sight` has the rule in place of the planner of `small`,
-`true*` is told road users, lights or both as they are. `regressing` is NeMo's own planner, which learns from
-an expert's demonstrations.
+learned from all of them with black images. `taught_K` is the shipped driver, which learned on with stop
+signs, from fewer egos and K rounds of its own. `rules_by_sight` has the rule in place of the planner of
+`small`, `true*` is told road users, lights or both as they are. `regressing` is NeMo's own planner, which
+learns from an expert's demonstrations.
 
 `shipped` is the driver that comes with the package, `shipped_*` has parts of it, or drives through the
 interface of CARLA's leaderboards.
@@ -38,7 +39,6 @@ from benchmarks.common.driver_study import (
     EGOS,
     PRETRAINED,
     SIGN_TILES,
-    TRAINING_TOWNS,
     egos,
     figures_on_its_way,
     recipe_of,
@@ -124,9 +124,17 @@ def small(rounds: int, seed: int) -> DriverRun:
     recipe, folder = recipe_of("driver_small", seed), WORK / "runs" / f"small_{rounds}_seed{seed}"
     if rounds == 0:
         return trained(recipe, _all_egos(), folder, WORK / "cache")
-    recipe = _once(recipe)
     start = small(rounds - 1, seed).folder
-    return trained(recipe, [*_all_egos(), *rounds_until(rounds)], folder, WORK / "cache", start)
+    logs = [*_all_egos(), *rounds_until(rounds, small, "round")]
+    return trained(_once(recipe), logs, folder, WORK / "cache", start)
+
+
+def taught(rounds: int, seed: int) -> DriverRun:
+    """Return the shipped driver, which has learned on with stop signs and some rounds of DAgger."""
+    start = run_folder(Path(SHIPPED)) if rounds == 0 else taught(rounds - 1, seed).folder
+    logs = [*_egos(SAME_EGO_SEEDS), *_sign_egos(), *rounds_until(rounds, taught, "taught_round")]
+    folder = WORK / "runs" / f"taught_{rounds}_seed{seed}"
+    return trained(_once(recipe_of("driver_small", seed)), logs, folder, WORK / "cache", start)
 
 
 def _once(recipe: DriverRecipe) -> DriverRecipe:
@@ -134,13 +142,18 @@ def _once(recipe: DriverRecipe) -> DriverRecipe:
     return dataclasses.replace(recipe, see=see)
 
 
-def rounds_until(last: int) -> list[LogPath]:
-    """Return the logs of the rounds of DAgger up to one; drive what is missing."""
+def rounds_until(last: int, driver: Callable[[int, int], DriverRun], name: str) -> list[LogPath]:
+    """Return the logs of the rounds of DAgger up to one; drive what is missing.
+
+    Args:
+        driver: gives the driver after some rounds, of a seed.
+        name: of the rounds' folders.
+    """
     folders = []
     for number in range(1, last + 1):
         source = TownRoutes(ROUND_ROUTES, seed=number, conditions="any", rig=FRONT_TELE)
-        folder = WORK / "rounds" / f"round{number}"
-        _driven(DriveSuite(_agent(small(number - 1, 0)), source, lidar=False), folder)
+        folder = WORK / "rounds" / f"{name}{number}"
+        _driven(DriveSuite(_agent(driver(number - 1, 0)), source, lidar=False), folder)
         folders.append(folder)
     return list(find_all_logs(folders))
 
@@ -149,16 +162,20 @@ def _egos(seeds: int) -> list[LogPath]:
     return egos(range(seeds), WORK / "egos", CORES)
 
 
+def _sign_egos() -> list[LogPath]:
+    return egos(range(EGO_SEEDS), WORK / "egos", CORES, towns=SIGN_TILES)
+
+
 def _all_egos() -> list[LogPath]:
     """Return the egos of all seeds, with those of tiles that have many stop signs."""
-    return egos(range(EGO_SEEDS), WORK / "egos", CORES, towns=(*TRAINING_TOWNS, *SIGN_TILES))
+    return [*_egos(EGO_SEEDS), *_sign_egos()]
 
 
 def blind(seed: int) -> DriverRun:
     """Return the small driver that sees black images and learned from the same clips."""
     recipe = recipe_of("driver_small", seed)
     recipe = dataclasses.replace(recipe, eyes=dataclasses.replace(recipe.eyes, blind=True))
-    logs = [*_all_egos(), *rounds_until(ROUNDS)]
+    logs = [*_all_egos(), *rounds_until(ROUNDS, small, "round")]
     return trained(recipe, logs, WORK / "runs" / f"small_blind_seed{seed}", WORK / "cache")
 
 
@@ -338,6 +355,10 @@ ARMS: Mapping[str, Arm] = {
     "constant_velocity": untrained(CONSTANT_VELOCITY, "constant_velocity"),
     **{
         f"small_{rounds}": by_sight(f"small_{rounds}", partial(small, rounds)) for rounds in range(ROUNDS + 1)
+    },
+    **{
+        f"taught_{rounds}": by_sight(f"taught_{rounds}", partial(taught, rounds))
+        for rounds in range(ROUNDS + 1)
     },
     "small_blind": by_sight("small_blind", blind),
     **{name: by_sight(name, run_of) for name, run_of in WITH_NEMO.items()},

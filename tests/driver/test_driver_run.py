@@ -158,11 +158,20 @@ def test_a_driver_becomes_a_model_of_the_package(
 
 
 def test_a_run_goes_on_from_another_drivers_weights(logs: list[LogPath], tmp_path: Path) -> None:
-    first = train_driver(recipe(), logs, tmp_path / "first", tmp_path / "cache")
-    none = dataclasses.replace(recipe(), see=dataclasses.replace(recipe().see, steps=0))
-    second = load_driver(train_driver(none, logs, tmp_path / "second", tmp_path / "cache", first.folder))
-    for name, weight in load_driver(first).eyes.state_dict().items():
-        torch.testing.assert_close(second.eyes.state_dict()[name], weight)
+    """A driver that knows no stop signs may learn them, one that knows them must not forget them."""
+    before = dataclasses.replace(recipe(), eyes=dataclasses.replace(recipe().eyes, signs=False))
+    first = train_driver(before, logs, tmp_path / "first", tmp_path / "cache")
+    see = dataclasses.replace(recipe().see, steps=0)
+    for name, signs in (("second", False), ("third", True)):
+        more = dataclasses.replace(before, see=see, eyes=dataclasses.replace(before.eyes, signs=signs))
+        run = train_driver(more, logs, tmp_path / name, tmp_path / "cache", first.folder)
+        own = load_driver(run).eyes.state_dict()
+        assert any(".signs." in weight for weight in own) == signs
+        for weight, value in load_driver(first).eyes.state_dict().items():
+            torch.testing.assert_close(own[weight], value)
+    none = dataclasses.replace(before, see=see)
+    with pytest.raises(InputError, match="another architecture"):
+        train_driver(none, logs, tmp_path / "fourth", tmp_path / "cache", tmp_path / "third")
 
 
 def test_eyes_that_read_a_volume_start_from_a_pretrained_run(logs: list[LogPath], tmp_path: Path) -> None:

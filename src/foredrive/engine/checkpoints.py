@@ -93,11 +93,12 @@ def save_weights(model: nn.Module, path: Path) -> None:
     save_file(whole_weights(model), path)
 
 
-def load_weights(model: nn.Module, path: Path, part: str = "") -> None:
+def load_weights(model: nn.Module, path: Path, part: str = "", fresh: tuple[str, ...] = ()) -> None:
     """Load weights into a model of the same architecture, from `save_weights` or `save_small`.
 
     Args:
         part: prefix of the model in the file, such as "world_model"; "" is the whole file.
+        fresh: prefixes of parts that keep their weights if the file lacks them.
 
     Raises:
         InputError: the file cannot be read or is of another architecture.
@@ -108,14 +109,17 @@ def load_weights(model: nn.Module, path: Path, part: str = "") -> None:
     except (OSError, SafetensorError) as error:
         raise InputError(f"{path}: weights cannot be read: {error}") from error
     state = {name.removeprefix(prefix): value for name, value in saved.items() if name.startswith(prefix)}
-    own = model.state_dict()
+    kept = tuple(start for start in fresh if not any(name.startswith(start) for name in state))
+    own = {name: value for name, value in model.state_dict().items() if not name.startswith(kept)}
     # Names that only one side has, then names with different shapes
     wrong = sorted(set(own) ^ set(state)) + [
         name for name in sorted(set(own) & set(state)) if own[name].shape != state[name].shape
     ]
     if wrong:
         raise InputError(f"{path}: weights of another architecture: {wrong[0]} ({len(wrong)} entries differ)")
-    model.load_state_dict({name: placed_like(value, own[name]) for name, value in state.items()})
+    model.load_state_dict(
+        {name: placed_like(value, own[name]) for name, value in state.items()}, strict=not kept
+    )
 
 
 def _flatten_optimizer(optimizer: Optimizer) -> tuple[dict[str, Tensor], dict[str, Any]]:

@@ -33,6 +33,8 @@ from foredrive.runs.train.run import pretrained_weights, read_log, written_log
 
 SEE, PLAN = "see", "plan"
 """Folders of the stages."""
+SIGN_HEAD = ("eyes.reader.signs.",)
+"""Weights that drivers without stop signs lack."""
 
 
 @dataclass(frozen=True)
@@ -137,8 +139,9 @@ def train_driver(
         logs: logs with boxes and routes, and with lights to learn them.
         folder: folder of the run.
         cache_dir: folder of packed clips; by default in `folder`.
-        start: a run to start from. A driver's run gives its weights, and clips in which it is wrong are drawn
-            more often (`DriverRecipe.emphasis`); a world model's run gives its pre-trained encoder.
+        start: a run to start from. A driver's run gives its weights (stop signs are learned afresh if it
+            knows none), and clips in which it is wrong are drawn more often (`DriverRecipe.emphasis`); a
+            world model's run gives its pre-trained encoder.
         progress: shows how far packing and looking at the clips are.
 
     Raises:
@@ -160,7 +163,7 @@ def train_driver(
         driver, drawn = build_driver(recipe), None
         eyes = folder / SEE / WEIGHTS
         if start is not None and is_driver(start):
-            load_weights(driver, open_driver(start).weights)
+            load_weights(driver, open_driver(start).weights, fresh=SIGN_HEAD)
             if not eyes.is_file():
                 with progress("looking for mistakes", batches(len(clips))) as tick:
                     drawn = _drawn(driver.eval(), clips, recipe.emphasis, tick)
