@@ -1,9 +1,11 @@
 """What is remembered of stop signs."""
 
+import numpy as np
 import pytest
 
 from foredrive.data.truth.affordances import PASSED_M
-from foredrive.driving.stop_signs import UNSEEN, StopSigns
+from foredrive.driving.stop_signs import PATIENCE, UNSEEN, StopSigns
+from foredrive.scene.affordances import CELL_M, CELLS, TIMES
 
 
 def driven(signs: StopSigns, line_m: float, to_m: float, speed_mps: float, seen: bool = True) -> float | None:
@@ -57,3 +59,22 @@ def test_a_sign_behind_the_next_one_waits() -> None:
     signs = StopSigns()
     assert signs.update(8.0, 0.0, 5.0) == 8.0
     assert signs.update(40.0, 2.0, 5.0) == 6.0
+
+
+def crossed(*places_m: float) -> np.ndarray:
+    """Who is on the path in three seconds, by distances from the front bumper."""
+    occupied = np.zeros((TIMES, CELLS), bool)
+    for place_m in places_m:
+        occupied[6, int(place_m / CELL_M)] = True
+    return occupied
+
+
+def test_who_has_stood_gives_way_to_those_who_cross_behind_the_line() -> None:
+    signs = StopSigns()
+    assert signs.update(3.0, 0.0, 0.0, crossed(9.0)) == 3.0
+    assert signs.update(3.0, 0.0, 0.0, crossed(9.0)) == 3.0
+    assert signs.update(3.0, 0.0, 0.0, crossed(1.0, 25.0)) is None  # before the line, and far beyond
+    assert signs.update(2.5, 0.5, 1.0, crossed(9.0)) is None  # who drives already is not stopped again
+    patient = StopSigns()
+    answers = [patient.update(3.0, 0.0, 0.0, crossed(9.0)) for _ in range(PATIENCE + 1)]
+    assert answers == [3.0] * PATIENCE + [None]

@@ -55,8 +55,8 @@ creeps in spite of a light: it is seen wrongly, or no light at all."""
 NEAR_CELLS, STAYS = 3, 3
 """Cells of the route next to the vehicle; who is in them now is taken to stay for so many steps of half a
 second. Who stands close ahead is often expected to leave."""
-SIGN_READINGS = 2
-"""Readings of a stop sign's line from which it counts."""
+SIGN_READINGS, PROBABLE = 2, 0.5
+"""Readings of a stop sign's line from which it counts, and the probability of those it gives way to there."""
 SURE = 0.93
 """While it creeps, only road users that are as probable as this stop it."""
 
@@ -193,7 +193,8 @@ class Perception:
         view = self._lights.update(view, moved_m, line_seen=line_seen)
         view = PathEstimate(view.light, view.light_m, staying(view.occupied))
         speed_mps, sign_m = float(ego_speeds(observation)[0, observation.now]), float(sight.sign_m[0])
-        stop_m = self._signs.update(sign_m if np.isfinite(sign_m) else None, moved_m, speed_mps)
+        occupied = (view.occupied[0] > PROBABLE).cpu().numpy()
+        stop_m = self._signs.update(sign_m if np.isfinite(sign_m) else None, moved_m, speed_mps, occupied)
         return stopped_by_sign(self._patient(view, speed_mps), stop_m)
 
     def _patient(self, view: PathEstimate, speed_mps: float) -> PathEstimate:

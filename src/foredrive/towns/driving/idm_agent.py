@@ -87,17 +87,18 @@ class TruePerception:
         light, light_m = LightState.NONE, 0.0
         if (nearest := self._nearest(path, T_world_ego, states != LightState.NONE)) is not None:
             light, light_m = LightState(int(states[nearest[0]])), nearest[1]
-        # A sign is a red light until the vehicle has stood at it
+        view = true_view(clip.boxes[clip.now], path, light, light_m)
+        # A sign is a red light until the vehicle has stood at it and given way
         xy, before_xy = T_world_ego[:2, 3], self._before_xy
         self._before_xy = xy
         moved_m = 0.0 if before_xy is None else float(np.linalg.norm(xy - before_xy))
         sign = self._nearest(path, T_world_ego, None)
-        speed_mps = float(clip.ego_speed_mps[clip.now])
-        stop_m = self._signs.update(None if sign is None else sign[1], moved_m, speed_mps)
+        sign_m, speed_mps = None if sign is None else sign[1], float(clip.ego_speed_mps[clip.now])
+        stop_m = self._signs.update(sign_m, moved_m, speed_mps, view.occupied)
         stops = light in (LightState.RED, LightState.YELLOW)
-        if stop_m is not None and not (stops and light_m < stop_m):
-            light, light_m = LightState.RED, stop_m
-        return true_view(clip.boxes[clip.now], path, light, light_m)
+        if stop_m is None or (stops and light_m < stop_m):
+            return view
+        return view._replace(light=LightState.RED, light_m=stop_m)
 
     def _nearest(
         self, path: PathAhead, T_world_ego: Float64[np.ndarray, "4 4"], lit: Bool[np.ndarray, "Z"] | None
