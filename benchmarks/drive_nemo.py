@@ -66,9 +66,9 @@ from foredrive.runs.train.run import train_run
 from foredrive.sensors.rigs import FRONT_TELE, SURROUND
 from foredrive.tasks.bootstrap import bootstrap_mean
 
-EGO_SEEDS, SAME_EGO_SEEDS, SAME_EPOCHS = 8, 3, 2
+EGO_SEEDS, SAME_EGO_SEEDS, SAME_EPOCHS, TAUGHT_SIGN_SEEDS = 8, 3, 2, 4
 """Seeds of the towns from which the small driver learns; those from which all drivers of NeMo's claim do, and
-how often."""
+how often; those of the tiles with stop signs from which the shipped driver learns on."""
 SEEDS = (0, 1, 2)
 ROUNDS = 2
 ROUND_ROUTES, ROUND_LR, ROUND_EPOCHS = "training-short", 1e-3, 2
@@ -90,7 +90,7 @@ CORES = len(os.sched_getaffinity(0))
 CONFIG = {
     "recipes": {name: dataclasses.asdict(recipe) for name, recipe in DRIVER_RECIPES.items()}
     | {REGRESSING: dataclasses.asdict(find_recipe(REGRESSING))},
-    "egos": [EGOS, EGO_SEEDS, SIGN_TILES, SAME_EGO_SEEDS, SAME_EPOCHS],
+    "egos": [EGOS, EGO_SEEDS, SIGN_TILES, SAME_EGO_SEEDS, SAME_EPOCHS, TAUGHT_SIGN_SEEDS],
     "rounds": [ROUNDS, ROUND_ROUTES, ROUND_LR, ROUND_EPOCHS],
     "demonstrations": [*DEMONSTRATED, ROUTES_A_TOWN, REGRESSING_STEPS],
     "routes": JUDGED,
@@ -132,7 +132,11 @@ def small(rounds: int, seed: int) -> DriverRun:
 def taught(rounds: int, seed: int) -> DriverRun:
     """Return the shipped driver, which has learned on with stop signs and some rounds of DAgger."""
     start = run_folder(Path(SHIPPED)) if rounds == 0 else taught(rounds - 1, seed).folder
-    logs = [*_egos(SAME_EGO_SEEDS), *_sign_egos(), *rounds_until(rounds, taught, "taught_round")]
+    logs = [
+        *_egos(SAME_EGO_SEEDS),
+        *_sign_egos(TAUGHT_SIGN_SEEDS),
+        *rounds_until(rounds, taught, "taught_round"),
+    ]
     folder = WORK / "runs" / f"taught_{rounds}_seed{seed}"
     return trained(_once(recipe_of("driver_small", seed)), logs, folder, WORK / "cache", start)
 
@@ -162,13 +166,13 @@ def _egos(seeds: int) -> list[LogPath]:
     return egos(range(seeds), WORK / "egos", CORES)
 
 
-def _sign_egos() -> list[LogPath]:
-    return egos(range(EGO_SEEDS), WORK / "egos", CORES, towns=SIGN_TILES)
+def _sign_egos(seeds: int) -> list[LogPath]:
+    return egos(range(seeds), WORK / "egos", CORES, towns=SIGN_TILES)
 
 
 def _all_egos() -> list[LogPath]:
     """Return the egos of all seeds, with those of tiles that have many stop signs."""
-    return [*_egos(EGO_SEEDS), *_sign_egos()]
+    return [*_egos(EGO_SEEDS), *_sign_egos(EGO_SEEDS)]
 
 
 def blind(seed: int) -> DriverRun:
