@@ -4,13 +4,14 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from py123d.datatypes import Lane
+from py123d.datatypes import Intersection, IntersectionType, Lane
+from py123d.geometry import Polyline3D
 
 from foredrive.driving.route_sets import RouteWaypoints
 from foredrive.errors import InputError
 from foredrive.towns.driving.routes import snap_route
 from foredrive.towns.map.loading import load_town_map
-from foredrive.towns.map.map_objects import map_objects
+from foredrive.towns.map.map_objects import map_objects, objects_within
 from foredrive.towns.map.names import TILE_M, check_town, tile_around, tile_bounds_m
 from foredrive.towns.map.tiles import cut_out
 from foredrive.towns.map.town_map import Marking, Strip, TownMap, marking_at
@@ -117,6 +118,17 @@ def test_a_tile_is_read_with_the_objects_of_its_lanes() -> None:
     assert [item.object_id for item in objects] == [lane.lane_id for lane in tile.lanes]
     known = {lane.lane_id for lane in tile.lanes}
     assert all({*item.successor_ids, *item.predecessor_ids} <= known for item in objects)
+
+
+def test_an_intersection_without_outline_is_left_out(cut: TownMap) -> None:
+    """Such are two in Town12_Tile_-3_-19, by py123d 0.7.0."""
+    square = np.array([[0.0, 0, 0], [9, 0, 0], [9, 9, 0], [0, 9, 0], [0, 0, 0]])
+    made = [
+        Intersection(name, IntersectionType.DEFAULT, [], Polyline3D.from_array(xyz))
+        for name, xyz in (("square", square), ("none", square[:0]))
+    ]
+    kept = objects_within(made, cut, (-20.0, -20.0, 20.0, 20.0))
+    assert [item.object_id for item in kept] == ["square"]
 
 
 def test_traffic_leaves_a_tile_at_its_edges_and_others_come() -> None:

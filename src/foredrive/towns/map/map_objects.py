@@ -34,11 +34,11 @@ def map_objects(town: str) -> Iterator[BaseMapObject]:
             item.successor_ids.sort()
     _lift(items, load_roads(town))
     bounds_m = tile_bounds_m(town)
-    yield from items if bounds_m is None else _within(items, load_town_map(town), bounds_m)
+    yield from items if bounds_m is None else objects_within(items, load_town_map(town), bounds_m)
 
 
-def _within(items: list[BaseMapObject], tile: TownMap, bounds_m: Bounds) -> Iterator[BaseMapObject]:
-    """Yield the objects of a tile."""
+def objects_within(items: list[BaseMapObject], tile: TownMap, bounds_m: Bounds) -> Iterator[BaseMapObject]:
+    """Yield the objects of a tile, with the links between them."""
     lanes, (x0, y0, x1, y1) = {lane.lane_id for lane in tile.lanes}, bounds_m
     groups = {lane.group_id for lane in tile.lanes}
     for item in items:
@@ -54,7 +54,8 @@ def _within(items: list[BaseMapObject], tile: TownMap, bounds_m: Bounds) -> Iter
                 item._left_lane_id = item.left_lane_id if item.left_lane_id in lanes else None
                 item._right_lane_id = item.right_lane_id if item.right_lane_id in lanes else None
         else:
-            line = getattr(item, "outline_3d", None) or item.polyline_3d
+            # py123d finds no outline for some intersections: theirs is empty, and they are left out
+            line = item.outline_3d if isinstance(item, BaseMapSurfaceObject) else item.polyline_3d
             x, y = line.array[:, :2].T
             if not ((x > x0) & (x < x1) & (y > y0) & (y < y1)).any():
                 continue
