@@ -42,3 +42,24 @@ def test_faint_ones_walk_within_their_shape_and_opaque_ones_stay() -> None:
     expected = 2.0 * free * torch.tensor([0.01, 1.0, 0.25])
     assert torch.allclose(walk[::2].std(0), expected, rtol=0.06)
     assert float(walk[1::2].abs().max()) < 1e-12
+
+
+def test_the_kernel_walks_as_plain_pytorch_does() -> None:
+    """Plain PyTorch computes in 64 bits; both draw the same noise."""
+    rng, count = torch.Generator().manual_seed(1), 5000
+    gaussians = Gaussians(
+        mean_m=torch.zeros(count, 3),
+        quaternion=3 * torch.randn(count, 4, generator=rng),
+        log_scale=torch.randn(count, 3, generator=rng),
+        opacity_logit=torch.randn(count, generator=rng) - 3,
+        feature=torch.zeros(count, 3),
+    )
+    exact = Gaussians(
+        **{name: getattr(gaussians, name).double() for name in ("mean_m", "quaternion", "log_scale")},
+        opacity_logit=gaussians.opacity_logit.double(),
+        feature=gaussians.feature,
+    )
+    found = random_walk_m(gaussians, 2.0, torch.Generator().manual_seed(0))
+    expected = random_walk_m(exact, 2.0, torch.Generator().manual_seed(0))
+    assert 0.2 < float((expected.abs().sum(1) > 0).float().mean()) < 0.95
+    torch.testing.assert_close(found.double(), expected, rtol=1e-3, atol=1e-4)

@@ -1,4 +1,4 @@
-"""Losses of rendered images and sweeps (Hess et al., "SplatAD", 2025, §3.5)."""
+"""Losses of rendered sweeps (Hess et al., "SplatAD", 2025, §3.5)."""
 
 import torch
 import torch.nn.functional as F
@@ -6,35 +6,6 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from foredrive.ops.masked import masked_mean
-
-_SSIM_WINDOW_PX, _SSIM_SIGMA_PX = 11, 1.5
-_SSIM_C1, _SSIM_C2 = 0.01**2, 0.03**2
-
-
-def photometric_loss(
-    rendered: Float[Tensor, "3 H W"], real: Float[Tensor, "3 H W"], ssim_share: float = 0.2
-) -> Float[Tensor, ""]:
-    """Return (1 - λ) L1 + λ (1 - SSIM), RGB in 0 to 1 (Kerbl et al., 2023, eq. 7); 6 px a side at least."""
-    l1 = (rendered - real).abs().mean()
-    return (1 - ssim_share) * l1 + ssim_share * (1 - _mean_ssim(rendered[None], real[None]))
-
-
-def _mean_ssim(a: Float[Tensor, "1 3 H W"], b: Float[Tensor, "1 3 H W"]) -> Float[Tensor, ""]:
-    """Return structural similarity (Wang et al., 2004) with a separable window, borders mirrored."""
-    offset = torch.arange(_SSIM_WINDOW_PX, device=a.device) - _SSIM_WINDOW_PX // 2
-    # Normalised Gaussian weights: a softmax of -x²/2σ² sums to 1
-    window = torch.softmax(-0.5 * (offset / _SSIM_SIGMA_PX) ** 2, dim=0).to(a)
-    # All five local moments go through one convolution
-    stack = torch.cat([a, b, a * a, b * b, a * b], dim=1)  # [1 15 H W]
-    stack = F.pad(stack, (_SSIM_WINDOW_PX // 2,) * 4, mode="reflect")
-    # Separable window: rows, then columns, each channel on its own
-    for kernel in (window[None], window[:, None]):
-        stack = F.conv2d(stack, kernel.expand(15, 1, -1, -1), groups=15)
-    mean_a, mean_b, aa, bb, ab = stack[0].unflatten(0, (5, 3)).unbind(0)
-    # Variance and covariance from the moments
-    var_a, var_b, cov = aa - mean_a**2, bb - mean_b**2, ab - mean_a * mean_b
-    similarity = (2 * mean_a * mean_b + _SSIM_C1) * (2 * cov + _SSIM_C2)
-    return (similarity / ((mean_a**2 + mean_b**2 + _SSIM_C1) * (var_a + var_b + _SSIM_C2))).mean()
 
 
 def range_loss(

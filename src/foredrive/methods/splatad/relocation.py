@@ -12,10 +12,15 @@ from torch import Tensor
 
 from foredrive.geometry.quaternions import multiply_quaternions
 from foredrive.methods.splatad import Gaussians
+from foredrive.methods.splatad.walk_kernel import walk_rows
+from foredrive.ops.precision import numba_supports
+from foredrive.ops.threads import in_parallel
 
 MIN_OPACITY = 0.005
 """Gaussians with a lower opacity are dead."""
 MAX_COPIES = 51
+MIN_ROWS = 4096
+"""Minimum number of Gaussians per thread."""
 _STEEPNESS = 100.0
 _STAYS = 0.15
 """Opacity above which the walk is less than a millionth of its full size."""
@@ -51,16 +56,32 @@ def random_walk_m(gaussians: Gaussians, step_m: float, generator: torch.Generato
         generator: on the CPU, so that a run is the same on any device.
     """
     opacity = gaussians.opacity_logit.sigmoid()
-    walking = (opacity < _STAYS).nonzero()[:, 0]
-    them = gaussians[walking]
-    noise = torch.randn(len(walking), 3, generator=generator).to(them.mean_m)
+    walking = opacity < _STAYS
+    place = walking.cumsum(0)
+    noise = torch.randn(int(place[-1]) if len(place) else 0, 3, generator=generator).to(gaussians.mean_m)
     # The walk fades for opaque Gaussians: a steep sigmoid about the limit of dead ones
-    free = torch.sigmoid(-_STEEPNESS * (opacity[walking] - MIN_OPACITY))
-    # Σ · noise with Σ = R S² Rᵀ: turn to the Gaussian's axes, scale, turn back
-    scaled = them.log_scale.exp() ** 2 * _turned(them.quaternion, noise, inverse=True)
-    way = torch.zeros_like(gaussians.mean_m)
-    way[walking] = step_m * free[:, None] * _turned(them.quaternion, scaled)
+    size = step_m * torch.sigmoid(-_STEEPNESS * (opacity - MIN_OPACITY)) * walking
+    parts = (size, gaussians.log_scale, gaussians.quaternion, noise)
+    if not numba_supports(*parts):
+        way = torch.zeros_like(gaussians.mean_m)
+        way[walking] = size[walking, None] * shaped(
+            gaussians.log_scale[walking], gaussians.quaternion[walking], noise
+        )
+        return way
+    way = torch.empty_like(gaussians.mean_m)
+    rows = [
+        value.detach().contiguous().numpy()
+        for value in (size, (2 * gaussians.log_scale).exp(), gaussians.quaternion, noise, place - 1, way)
+    ]
+    in_parallel(lambda start, stop: walk_rows(*rows, start, stop), len(way), MIN_ROWS)
     return way
+
+
+def shaped(
+    log_scale: Float[Tensor, "N 3"], quaternion: Float[Tensor, "N 4"], noise: Float[Tensor, "N 3"]
+) -> Float[Tensor, "N 3"]:
+    """Return Σ · noise with Σ = R S² Rᵀ: turned to the Gaussian's axes, scaled, turned back."""
+    return _turned(quaternion, log_scale.exp() ** 2 * _turned(quaternion, noise, inverse=True))
 
 
 def _turned(

@@ -18,13 +18,13 @@ from foredrive.methods.splatad.losses import (
     drop_loss,
     intensity_loss,
     line_of_sight_loss,
-    photometric_loss,
     published_lidar_losses,
     range_loss,
 )
 from foredrive.methods.splatad.rates import LearningRates
 from foredrive.methods.splatad.relocation import MAX_COPIES, MIN_OPACITY, random_walk_m, split_evenly
 from foredrive.methods.splatad.scene import GAUSSIAN_PARAMETERS, GaussianScene
+from foredrive.ops.photometric import photometric_loss
 from foredrive.scene import LidarSweep
 
 
@@ -223,7 +223,9 @@ class GaussianTraining:
                 continue
             else:
                 parameters = list(learned.parameters()) if isinstance(learned, nn.Module) else [learned]
-            groups.append(ParameterGroup(rate.name, parameters, getattr(rates, rate.name)))
+            # Fused, the moments of a CNN in channels-last order would be read in another order
+            fused, its_rate = rate.name != "decoders", getattr(rates, rate.name)
+            groups.append(ParameterGroup(rate.name, parameters, its_rate, fused=fused))
         return groups
 
     def losses(self, step: int, generator: torch.Generator) -> StepLosses:
