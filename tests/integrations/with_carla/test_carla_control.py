@@ -79,6 +79,24 @@ def test_carlas_satellites_are_read_although_its_north_is_the_routes_south(carla
         assert found == pytest.approx((x, y), abs=0.1)
 
 
+@pytest.mark.parametrize(
+    ("xy", "lat_deg", "lon_deg"),
+    [
+        ((0.0, 0.0), 41.09374957104911, -81.59374804575259),
+        ((-4200.5, -3100.25), 41.121599878893356, -81.643858300507),
+        ((5000.0, 2500.0), 41.071267347319086, -81.5341457691484),
+    ],
+)
+def test_satellites_far_from_the_origin_of_town13(
+    xy: tuple[float, float], lat_deg: float, lon_deg: float
+) -> None:
+    """Places and what `carla.Map.transform_to_geolocation` of 0.9.16 gives for them, y turned round."""
+    origin = (41.09374957104912, -81.59374804575259)
+    route = np.array([xy, [xy[0] + 80.0, xy[1]], [xy[0] + 80.0, xy[1] - 150.0]])
+    frame = fit_geo_frame(np.array([lat_lon(x, y, *origin) for x, y in route]), route)
+    assert frame.xy(lat_deg, lon_deg, np.array(xy) + 3.0) == pytest.approx(xy, abs=0.01)
+
+
 def test_whereabouts_are_steadier_than_satellites() -> None:
     """Half a minute along a circle of 50 m at 8 m/s, with satellites half a metre off."""
     rng = np.random.default_rng(3)

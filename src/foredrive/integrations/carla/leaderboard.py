@@ -6,9 +6,10 @@ route.
 
 The vehicle is localized by satellite navigation, compass and speedometer, which the leaderboard allows. No
 map is needed to read the satellite positions. The route is given both in world coordinates and in latitude
-and longitude, related by a Mercator projection of unknown scale and origin. CARLA 0.9.16 projects differently
-from the leaderboard's routes: 0.04 % larger, and with north and south exchanged. A reading may therefore mean
-two places, and the one nearer to the expected position is taken.
+and longitude, related by a Mercator projection of unknown scale and origin. CARLA 0.9.15 projects its
+satellites as the leaderboard does its routes. CARLA 0.9.16 uses a transverse Mercator projection about the
+same origin, with north and south exchanged. A reading may therefore mean two places, and the one nearer to
+the expected position is taken.
 """
 
 import dataclasses
@@ -42,6 +43,8 @@ GAIN = 0.02
 """Share of the difference between satellites and dead reckoning that is corrected in one step of 0.05 s.
 It balances satellites with an error of 0.56 m (the leaderboard's 5e-6 degrees) and dead reckoning with an
 error of 1 cm per step."""
+RADIUS_M = 0.9996 * 6378137.0
+"""Radius of the sphere that CARLA 0.9.16 projects, with the scale along its meridian."""
 SPREAD_M = 1.0
 """A shorter route, m, does not determine the scale."""
 
@@ -60,12 +63,22 @@ class GeoFrame:
     def xy(
         self, lat_deg: float, lon_deg: float, near_xy: Float64[np.ndarray, "2"]
     ) -> Float64[np.ndarray, "2"]:
-        """Return the place in our world or its mirror image in y, m, whichever is nearer to `near_xy`."""
+        """Return the place in our world, m, by CARLA 0.9.15 or 0.9.16, whichever is nearer to `near_xy`."""
         east, north = _mercator(lat_deg, lon_deg)
         xy = np.array([self.scale_m * east + self.x_m, self.scale_m * north + self.y_m])
-        mirrored = xy * [1.0, -1.0]
-        is_nearer = np.hypot(*(mirrored - near_xy)) < np.hypot(*(xy - near_xy))
-        return mirrored if is_nearer else xy
+        transverse = self._transverse(lat_deg, lon_deg)
+        is_nearer = np.hypot(*(transverse - near_xy)) < np.hypot(*(xy - near_xy))
+        return transverse if is_nearer else xy
+
+    def _transverse(self, lat_deg: float, lon_deg: float) -> Float64[np.ndarray, "2"]:
+        """Return the place by CARLA 0.9.16: a spherical transverse Mercator projection (Snyder, 1987, §8)."""
+        # The origin of the world is where both coordinates of the route's projection are 0
+        lat_0 = 2 * math.atan(math.exp(-self.y_m / self.scale_m)) - 0.5 * math.pi
+        lat, aside = math.radians(lat_deg), math.radians(lon_deg) + self.x_m / self.scale_m
+        east = math.atanh(math.cos(lat) * math.sin(aside))
+        north = math.atan2(math.tan(lat), math.cos(aside)) - lat_0
+        # CARLA's y, which points to the right of x, counts as north
+        return RADIUS_M * np.array([east, -north])
 
 
 def fit_geo_frame(lat_lon_deg: Float64[np.ndarray, "N 2"], xy: Float64[np.ndarray, "N 2"]) -> GeoFrame:
