@@ -144,6 +144,19 @@ def test_a_volume_read_beyond_its_border(tmp_path: Path) -> None:
     assert_translated(Read(), (torch.rand(1, 2, 3, 4, 5), grid), tmp_path)
 
 
+def test_attention_of_a_row_without_keys_is_zero(tmp_path: Path) -> None:
+    class Attend(nn.Module):
+        def forward(self, q: torch.Tensor, kv: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
+            return nn.functional.scaled_dot_product_attention(q, kv, kv, attn_mask=mask)
+
+    rng = torch.Generator().manual_seed(0)
+    q, kv = torch.randn(2, 2, 3, 4, generator=rng), torch.randn(2, 2, 5, 4, generator=rng)
+    mask = torch.zeros(2, 1, 3, 5)
+    mask[0, 0, 1], mask[1, 0, 0, 2:] = -torch.inf, -torch.inf
+    assert float(Attend()(q, kv, mask)[0, :, 1].abs().max()) == 0.0
+    assert_translated(Attend(), (q, kv, mask), tmp_path)
+
+
 def assert_translated(module: nn.Module, inputs: tuple[torch.Tensor, ...], folder: Path) -> None:
     """An operator that PyTorch's exporter does not know says in onnxruntime what it says in PyTorch."""
     expected = module(*inputs)

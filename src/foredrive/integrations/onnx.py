@@ -97,9 +97,13 @@ def _attention(
     # Scaling the query instead of the scores needs fewer products
     scaled = op.Mul(query, op.Constant(value_float=int(query.shape[-1]) ** -0.5))
     score = op.MatMul(scaled, turned)
-    if attn_mask is not None:
-        score = op.Add(score, attn_mask)
-    return op.MatMul(op.Softmax(score, axis=-1), value)
+    if attn_mask is None:
+        return op.MatMul(op.Softmax(score, axis=-1), value)
+    score = op.Add(score, attn_mask)
+    # A row without keys is 0 in PyTorch; the softmax of -∞ alone would be NaN
+    has_key = op.Greater(op.ReduceMax(score, _ints(-1), keepdims=1), op.Constant(value_float=float("-inf")))
+    weights = op.Softmax(op.Where(has_key, score, op.CastLike(_ints(0), score)), axis=-1)
+    return op.MatMul(op.Mul(weights, op.CastLike(has_key, score)), value)
 
 
 def _slice(tensor: Any, axis: int, start: int, stop: int) -> Any:
