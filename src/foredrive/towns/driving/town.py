@@ -311,8 +311,18 @@ class TownSimulator:
         T[:3, 3] = ego.x_m, ego.y_m, rear_m
         return T
 
+    def now(self) -> Clip:
+        """Return what is sensed now, between key frames too: a clip of one frame. It changes no drive."""
+        sensors = self._scenario.sensors
+        return self._route.observe(
+            (self._frame(self.state),), self.state.progress, None if sensors is None else sensors.rig
+        )
+
     def _with_frame(self, state: TownState) -> tuple[KeyFrame, ...]:
         """Append the current key frame and return the latest frames, as many as an observation has."""
+        return (*state.frames, self._frame(state))[-1 - self._scenario.past_frames :]
+
+    def _frame(self, state: TownState) -> KeyFrame:
         T, sensors = self._pose(state.ego, state.z_m), self._scenario.sensors
         actors = self._traffic.actors(state.decided)
         near = in_box_range([*actors, *self._world.parked], T)
@@ -327,8 +337,7 @@ class TownSimulator:
             # Images as [camera, channel, row, column]
             images = torch.from_numpy(np.stack(list(seen.images.values()))).permute(0, 3, 1, 2).contiguous()
             sweep = seen.sweep
-        frame = KeyFrame(state.t_s, T, state.ego.speed_mps, images, sweep, boxes_in_ego_frame(near, T))
-        return (*state.frames, frame)[-1 - self._scenario.past_frames :]
+        return KeyFrame(state.t_s, T, state.ego.speed_mps, images, sweep, boxes_in_ego_frame(near, T))
 
     def _make_clip(self, state: TownState) -> Clip:
         sensors = self._scenario.sensors
