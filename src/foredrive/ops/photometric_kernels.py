@@ -60,8 +60,8 @@ def _mirrored(place, count):
 
 @inlined_part
 @no_type_check
-def _add_rows(values, starts, weights, taps, out, at, width):
-    """Set out[at + x] to the sum over k of weights[k] · values[starts[k] + x], in whole vectors.
+def _add_rows(values, starts, weights, taps, out, first, width):
+    """Set out[first + x] to the sum over k of weights[k] · values[starts[k] + x], in whole vectors.
 
     Args:
         values, out: contiguous arrays, with flat indices.
@@ -72,7 +72,7 @@ def _add_rows(values, starts, weights, taps, out, at, width):
         total = broadcast(ZERO)
         for k in range(taps):
             total = total + load_row(values, starts[k] + x) * broadcast(weights[k])
-        store(out, at + x, total)
+        store(out, first + x, total)
 
 
 @kernel
@@ -93,8 +93,8 @@ def local_means(pair, start, stop):
         for moment in range(MOMENTS):
             for k in range(taps):
                 starts[k] = moment * longer + k
-            at = ((channel * MOMENTS + moment) * height + y) * across
-            _add_rows(row, starts, pair.window, taps, pair.moments, at, across)
+            place = ((channel * MOMENTS + moment) * height + y) * across
+            _add_rows(row, starts, pair.window, taps, pair.moments, place, across)
 
 
 @kernel
@@ -113,8 +113,8 @@ def compare(pair, c1, c2, start, stop):
                 read = _mirrored(y + k - taps // 2, height)
                 starts[k] = ((channel * MOMENTS + moment) * height + read) * across
             _add_rows(pair.moments, starts, pair.window, taps, local, moment * across, across)
-        at = (channel * SLOPES * height + y) * across
-        _slopes(local, c1, c2, pair.slopes, at, height * across, ssim)
+        place = (channel * SLOPES * height + y) * across
+        _slopes(local, c1, c2, pair.slopes, place, height * across, ssim)
         a, b = pair.a[channel, y], pair.b[channel, y]
         for x in range(width):
             apart[x] = abs(a[x] - b[x])
@@ -127,11 +127,11 @@ def compare(pair, c1, c2, start, stop):
 
 @inlined_part
 @no_type_check
-def _slopes(local, c1, c2, slopes, at, step, ssim):
+def _slopes(local, c1, c2, slopes, first, step, ssim):
     """Compute SSIM (Wang et al., 2004, eq. 13) and its derivatives by the local means of a, a² and ab.
 
     Args:
-        at, step: flat index of the first derivative's row in `slopes`, and from one derivative to the next.
+        first, step: flat index in `slopes` of the first derivative, and from one derivative to the next.
     """
     across = local.shape[1]
     for x in range(0, across, ROW):
@@ -144,9 +144,9 @@ def _slopes(local, c1, c2, slopes, at, step, ssim):
         similarity = up_mean * up_var * share
         # Variances contain the mean of a too
         of_a = TWO * (b * (up_var - up_mean) * share + similarity * a * (by_var - by_mean))
-        store(slopes, at + x, of_a)
-        store(slopes, at + step + x, ZERO - similarity * by_var)
-        store(slopes, at + 2 * step + x, TWO * up_mean * share)
+        store(slopes, first + x, of_a)
+        store(slopes, first + step + x, ZERO - similarity * by_var)
+        store(slopes, first + 2 * step + x, TWO * up_mean * share)
         store(ssim, x, similarity)
 
 
@@ -172,8 +172,8 @@ def spread_columns(pair, start, stop):
                     if 0 <= reader < height:
                         starts[count], weights[count] = (first + reader) * across, pair.window[k]
                         count += 1
-            at = ((channel * MOMENTS + slope) * height + y) * across
-            _add_rows(pair.slopes, starts, weights, count, pair.moments, at, across)
+            place = ((channel * MOMENTS + slope) * height + y) * across
+            _add_rows(pair.slopes, starts, weights, count, pair.moments, place, across)
 
 
 @kernel
