@@ -6,6 +6,7 @@ torchrun started, each has a card of its own; without it, the card is cuda:0.
 
 import contextlib
 import os
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -83,23 +84,27 @@ def tensors(values: Any) -> list[Tensor]:
     return [value for value in tree_flatten(values)[0] if isinstance(value, Tensor)]
 
 
-def device_of(func: Any, args: Any, kwargs: Any) -> bool:
+def _is_on_card(value: object) -> bool:
+    return isinstance(value, OnCard)
+
+
+def device_of(func: Any, args: Any, kwargs: Any, is_on_card: Callable[[object], bool] = _is_on_card) -> bool:
     """Return whether an operation runs on the card; raise where CUDA does."""
     if func in ACROSS:
-        return any(isinstance(value, OnCard) for value in tensors((args, kwargs)))
+        return any(is_on_card(value) for value in tensors((args, kwargs)))
     judged = tensors((args, kwargs))
     if func in INDEXING:
         # An index on the host may read a tensor of the card, but not the other way round
         indices = tensors(args[1])
-        if not isinstance(args[0], OnCard) and any(isinstance(index, OnCard) for index in indices):
+        if not is_on_card(args[0]) and any(is_on_card(index) for index in indices):
             raise RuntimeError(
                 "indices should be either on cpu or on the same device as the indexed tensor (cpu)"
             )
-        if isinstance(args[0], OnCard) and any(not isinstance(index, OnCard) for index in indices):
+        if is_on_card(args[0]) and any(not is_on_card(index) for index in indices):
             COUNTS.note(TO_CARD)
         judged = tensors((args[0], args[2:]))
     # Numbers of the host may join tensors of the card; other tensors may not
-    on_card = [isinstance(value, OnCard) for value in judged]
+    on_card = [is_on_card(value) for value in judged]
     numbers = [value.device.type == "cpu" and value.dim() == 0 for value in judged]
     if any(on_card) and not all(card or number for card, number in zip(on_card, numbers, strict=True)):
         shapes = [(tuple(value.shape), value.device.type) for value in judged]

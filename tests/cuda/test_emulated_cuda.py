@@ -1,6 +1,8 @@
 """The package on an emulated card: the same figures as on the CPU, and nothing that CUDA refuses."""
 
 import json
+import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -8,18 +10,31 @@ from typing import Any
 
 import emulation
 import pytest
+from miniature import assert_same_losses, in_two_parts
+
+from foredrive.data import LogPath
+from foredrive.engine.config import save_recipe
+from foredrive.runs import train_run
 
 HERE = Path(__file__).parent
 CASES = (
     *("nemo", "driveworld", "heads", "run", "gaussians", "gsplat"),
     *("field", "sets", "alignment", "driver", "search"),
 )
+CACHE = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "foredrive" / "tests"
 CLOSE = {"gaussians": 1e-3, "gsplat": 1e-3, "field": 1e-3, "search": 1e-2, "run": 1e-3}
 """Relative differences where kernels of the CPU and plain PyTorch add up in another order."""
 MOST_WAITS = {"nemo": 16, "driveworld": 20, "heads": 80}
 """Waits of the host in a step of fine-tuning and a plan."""
 
 Outcome = dict[str, Any]
+
+
+@pytest.fixture(scope="module")
+def hooks() -> Path:
+    if shutil.which("g++") is None:
+        pytest.skip("no g++ to build an emulated card")
+    return emulation.built_hooks(CACHE)
 
 
 @pytest.fixture(scope="module")
@@ -97,3 +112,38 @@ assert x.cpu().numpy().sum() == 3.0
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert done.stdout == ""
+
+
+ON_CARDS = """
+import pathlib, sys
+here, hooks, recipe, log, out = sys.argv[1:]
+sys.path[:0] = [here]
+import emulation
+emulation.start(pathlib.Path(hooks))
+import emulated_card, emulated_processes
+emulated_card.begin()
+emulated_processes.begin()
+from foredrive.ops import precision
+precision._has_triton = lambda: False  # No card is here that could start kernels
+from foredrive.cli.main import main
+assert main(["train", recipe, "--logs", log, "--out", out]) == 0
+import torch
+assert torch.distributed.get_world_size() == 2
+try:
+    torch.distributed.all_reduce(torch.ones(2))
+except RuntimeError:
+    sys.exit(0)
+sys.exit("NCCL refuses tensors of the host")
+"""
+
+
+def test_two_cards_train_like_one_process(hooks: Path, log: LogPath, tmp_path: Path) -> None:
+    recipe, script, out = tmp_path / "recipe.yaml", tmp_path / "on_cards.py", tmp_path / "run"
+    save_recipe(in_two_parts(), recipe)
+    script.write_text(ON_CARDS)
+    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2"]
+    arguments = [script, HERE, hooks, recipe, log.folder, out]
+    done = subprocess.run([*command, *map(str, arguments)], capture_output=True, text=True, timeout=600)
+    assert done.returncode == 0, done.stderr[-3000:]
+    alone = train_run(in_two_parts(), [log], tmp_path / "alone")
+    assert_same_losses(out, alone.folder)
