@@ -151,8 +151,10 @@ def _restore_optimizer(optimizer: Optimizer, tensors: dict[str, Tensor], scalars
         index, name = key.split(".", 1)
         own = parameters[int(index)]
         # Moments are sharded as their parameter is. The count of steps is a scalar, which is not sharded
-        placed = placed_like(value, own) if value.shape == own.shape else value
-        state.setdefault(int(index), {})[name] = placed
+        if value.shape == own.shape:
+            # Fused Adam (PyTorch 2.13) takes their numbers to lie in the order of the parameter's
+            value = torch.empty_like(own, dtype=value.dtype).copy_(placed_like(value, own))
+        state.setdefault(int(index), {})[name] = value
     optimizer.load_state_dict({"state": state, "param_groups": scalars["param_groups"]})
 
 

@@ -223,9 +223,7 @@ class GaussianTraining:
                 continue
             else:
                 parameters = list(learned.parameters()) if isinstance(learned, nn.Module) else [learned]
-            # Fused, the moments of a CNN in channels-last order would be read in another order
-            fused, its_rate = rate.name != "decoders", getattr(rates, rate.name)
-            groups.append(ParameterGroup(rate.name, parameters, its_rate, fused=fused))
+            groups.append(ParameterGroup(rate.name, parameters, getattr(rates, rate.name)))
         return groups
 
     def losses(self, step: int, generator: torch.Generator) -> StepLosses:
