@@ -62,7 +62,8 @@ from foredrive.engine.summary import Summary, numbers, read_summary  # noqa: E40
 from foredrive.methods.lidarclip import LidarEncoder, LidarEncoderConfig, PointCloud  # noqa: E402
 from foredrive.methods.lidarclip.alignment import DistillationObjective, ImagedSweeps  # noqa: E402
 from foredrive.methods.recipe import Recipe  # noqa: E402
-from foredrive.ops import precision, splatting, splatting_gsplat  # noqa: E402
+from foredrive.methods.splatad import relocation  # noqa: E402
+from foredrive.ops import photometric, precision, splatting, splatting_gsplat  # noqa: E402
 from foredrive.ops.splat_points import pixel_points  # noqa: E402
 from foredrive.runs.build import build_agent, build_objective  # noqa: E402
 from foredrive.runs.drive.agents import make_agent  # noqa: E402
@@ -83,6 +84,8 @@ from foredrive.towns.virtual_egos import record_virtual_egos  # noqa: E402
 
 # Kernels are held to plain PyTorch by tests/ops; no card is here that could start them
 precision._has_triton = lambda: False  # type: ignore[assignment]
+# Their last digits would grow over the steps of a reconstruction
+photometric.numba_supports = relocation.numba_supports = lambda *_: False  # type: ignore[assignment]
 Figures = dict[str, float]
 CASES: dict[str, Callable[[Path], Figures]] = {}
 

@@ -183,7 +183,9 @@ class FieldTraining:
         }
         for rate in dataclasses.fields(self.schedule.rates):
             parameters = by_name.get(rate.name) or [getattr(scene, rate.name)]
-            groups.append(ParameterGroup(rate.name, parameters, getattr(self.schedule.rates, rate.name)))
+            # Fused, the moments of a CNN in channels-last order would be read in another order.
+            fused, its_rate = rate.name == "grids", getattr(self.schedule.rates, rate.name)
+            groups.append(ParameterGroup(rate.name, parameters, its_rate, fused=fused))
         return groups
 
     def losses(self, step: int, generator: torch.Generator) -> StepLosses:

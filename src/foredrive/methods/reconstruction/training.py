@@ -42,6 +42,8 @@ class ParameterGroup(NamedTuple):
     rate: Rate
     eps: float = 1e-15
     """Term that Adam adds to the root of the second moment."""
+    fused: bool = False
+    """One pass over the numbers in place of one for each operation: the same step but for the last digits."""
 
 
 class StepLosses(NamedTuple):
@@ -138,10 +140,10 @@ def make_optimizer(training: SceneTraining) -> Adam:
                 "name": group.name,
                 "lr": group.rate.first,
                 "eps": group.eps,
+                "fused": group.fused,
             }
             for group in training.parameter_groups()
-        ],
-        fused=True,  # one pass over the numbers in place of one for each operation
+        ]
     )
 
 
