@@ -62,7 +62,7 @@ def test_a_sign_behind_the_next_one_waits() -> None:
 
 
 def crossed(*places_m: float) -> np.ndarray:
-    """Who is on the path in three seconds, by distances from the front bumper."""
+    """Return who is on the path in three seconds, by distances from the front bumper."""
     occupied = np.zeros((TIMES, CELLS), bool)
     for place_m in places_m:
         occupied[6, int(place_m / CELL_M)] = True

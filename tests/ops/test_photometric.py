@@ -46,6 +46,13 @@ def test_kernels_give_value_and_gradient_of_the_reference(
     torch.testing.assert_close(rendered.grad.double(), exact.grad, atol=1e-4 * largest, rtol=1e-3)
 
 
+@pytest.mark.parametrize("size_hw", [(5, 20), (20, 5)])
+def test_images_smaller_than_the_window_are_refused(size_hw: tuple[int, int]) -> None:
+    a, b = images(*size_hw)
+    with pytest.raises(RuntimeError, match="adding"):
+        photometric_loss(a, b)
+
+
 def test_views_of_images_and_many_threads_give_the_same() -> None:
     a, b = images(160, 40)
     rendered = a.transpose(1, 2).contiguous().transpose(1, 2).requires_grad_()

@@ -35,7 +35,9 @@ def photometric_loss(
 
     On the CPU, kernels compute loss and gradient together. The real image gets no gradient there.
     """
-    if not numba_supports(rendered, real) or real.requires_grad:
+    # Kernels check no sizes; plain PyTorch refuses images that differ or are smaller than the window's half
+    is_sound = rendered.shape == real.shape and min(rendered.shape[-2:]) > WINDOW_PX // 2
+    if not is_sound or real.requires_grad or not numba_supports(rendered, real):
         return photometric_loss_reference(rendered, real, ssim_share)
     loss: Tensor = _Photometric.apply(rendered.float(), real.float(), ssim_share)
     return loss
