@@ -59,6 +59,33 @@ def test_a_stop_zone_says_which_way_its_traffic_drives(town02: TownMap) -> None:
             assert step @ ahead > 0.9 * np.linalg.norm(step)
 
 
+def test_a_lane_that_opens_has_the_width_of_the_file_and_leaves_the_lane_beside(
+    town_of: Callable[[str], TownMap],
+) -> None:
+    """Lane -2 of road 26 of Town07 opens from nothing within 12 m."""
+    town = town_of("Town07")
+    lanes, name = {lane.lane_id: lane for lane in town.lanes}, "26_0_right_-2"
+    strip = next(strip for strip in town.strips if strip.id == name)
+    width_m = np.linalg.norm(strip.left_xyz - strip.right_xyz, axis=1)
+    assert width_m[0] < 0.01
+    assert (np.diff(width_m[:13]) > 0).all()
+    np.testing.assert_allclose(width_m[13:], 3.5, atol=0.01)
+    (before,) = lanes[name].predecessor_ids
+    assert np.linalg.norm(lanes[name].centreline_xyz[0] - lanes[before].centreline_xyz[-1]) < 0.05
+    np.testing.assert_allclose(lanes[name].centreline_xyz[-1], 0.5 * (strip.left_xyz + strip.right_xyz)[-1])
+
+
+def test_a_light_that_names_its_lanes_itself_faces_their_traffic(town_of: Callable[[str], TownMap]) -> None:
+    """Those of road 516 of Town10HD, whose lanes run against the road."""
+    town = town_of("Town10HD")
+    zones = {lane: zone for zone in town.stop_zones for lane in zone.lane_ids}
+    for name in ("516_0_left_1", "516_0_left_2"):
+        lane = next(lane for lane in town.lanes if lane.lane_id == name)
+        x, y = (lane.centreline_xyz[-1] - lane.centreline_xyz[0])[:2]
+        assert zones[name].kind is StopZoneKind.TRAFFIC_LIGHT
+        assert abs(np.angle(np.exp(1j * (zones[name].post_yaw - np.arctan2(y, x))))) < 0.1
+
+
 def test_heights_follow_the_road_where_later_lane_sections_begin(town_of: Callable[[str], TownMap]) -> None:
     """Left and right border of a lane are level, in a town on hills and with bridges."""
     town = town_of("Town04")

@@ -1,5 +1,6 @@
 """Maps of OpenDRIVE files, read with py123d's parser."""
 
+import copy
 import dataclasses
 import logging
 from pathlib import Path
@@ -9,6 +10,7 @@ import numpy as np
 import shapely
 from py123d.geometry.utils.rotation_utils import normalize_angle
 from py123d.parser.opendrive.utils.collection import collect_element_helpers
+from py123d.parser.opendrive.utils.signal_helper import OpenDriveSignalHelper
 from py123d.parser.opendrive.utils.stop_zone_helper import create_stop_zones_from_signals
 from py123d.parser.opendrive.xodr_parser.opendrive import XODR
 from py123d.parser.opendrive.xodr_parser.reference import XODRReferenceLine
@@ -36,6 +38,7 @@ CONNECTION_TOLERANCE_M = 0.5
 """Largest gap between linked lanes, m. Town12 has gaps of 0.13 m, over which py123d's default drops links."""
 MIN_MARKING_M = 0.1
 DEFAULT_LINE_WIDTH_M = 0.125
+_BORDERS = "inner_polyline_3d", "outer_polyline_3d"
 
 
 def read_opendrive(path: Path, name: str) -> TownMap:
@@ -51,10 +54,11 @@ def read_opendrive(path: Path, name: str) -> TownMap:
     )
     # Heights from the elevation profile, then junctions brought to one height
     strips = _level([_strip(helper, helpers, centre_marks, roads) for helper in helpers.values()])
-    lanes = tuple(_lane(strip, helpers) for strip in strips if strip.kind is StripKind.DRIVING)
+    lanes = tuple(_lane(strip, helpers, roads) for strip in strips if strip.kind is StripKind.DRIVING)
     crosswalks = tuple(
         Crosswalk(o.object_id, np.concatenate([o.outline_3d, o.outline_3d[:1]])) for o in objects.values()
     )
+    _add_own_lanes(signals, helpers, xodr)
     stop_zones = tuple(_stop_zones(helpers, signals, xodr))
     return TownMap(name, lanes, strips, crosswalks, stop_zones, junction_areas(strips))
 
@@ -91,13 +95,17 @@ def _strip(
     # On the reference line, "solid broken" names the left line first. Elsewhere it names the inner line
     # first.
     swap_inner = abs(int(index)) > 1 or helper.id < 0
+    # py123d moves the borders of lanes that open or end between others; without them it computes the file's
+    written = copy.copy(helper)
+    for name in _BORDERS:
+        written.__dict__.pop(name, None)
     return Strip(
         id=helper.lane_id,
         kind=StripKind(helper.type if helper.type in set(StripKind) else StripKind.NONE),
         road_id=road.id,
         junction_id=None if road.junction is None else int(road.junction),
-        left_xyz=_with_road_height(helper, helper.inner_polyline_3d.array, roads),
-        right_xyz=_with_road_height(helper, helper.outer_polyline_3d.array, roads),
+        left_xyz=_with_road_height(helper, written.inner_polyline_3d.array, roads),
+        right_xyz=_with_road_height(helper, written.outer_polyline_3d.array, roads),
         left_markings=_markings(helper, inner_marks, swap_inner),
         right_markings=_markings(helper, helper.open_drive_lane.road_marks, swap=False),
     )
@@ -151,8 +159,13 @@ def _markings(helper: Any, marks: list[Any], swap: bool) -> tuple[Marking, ...]:
     return tuple(sorted(markings, key=lambda marking: marking.start_m))
 
 
-def _lane(strip: Strip, helpers: dict[str, Any]) -> Lane:
-    helper = helpers[strip.id]
+def _lane(strip: Strip, helpers: dict[str, Any], roads: dict[int, Any]) -> Lane:
+    helper, borders = helpers[strip.id], [strip.left_xyz, strip.right_xyz]
+    # A lane that opens branches off from the one that py123d links it to, at full width
+    moved = [getattr(helper, name).array for name in _BORDERS]
+    if not all(np.allclose(xyz[:, :2], own[:, :2]) for xyz, own in zip(moved, borders, strict=True)):
+        borders = [_with_road_height(helper, xyz, roads) for xyz in moved]
+    left_xyz, right_xyz = borders
 
     def driving(lane_ids: list[str]) -> tuple[str, ...]:
         return tuple(sorted({i for i in lane_ids if i in helpers and helpers[i].type == "driving"}))
@@ -166,9 +179,9 @@ def _lane(strip: Strip, helpers: dict[str, Any]) -> Lane:
         lane_id=strip.id,
         group_id=strip.id.rsplit("_", 1)[0],
         junction_id=strip.junction_id,
-        centreline_xyz=0.5 * (strip.left_xyz + strip.right_xyz),
-        left_boundary_xyz=strip.left_xyz,
-        right_boundary_xyz=strip.right_xyz,
+        centreline_xyz=0.5 * (left_xyz + right_xyz),
+        left_boundary_xyz=left_xyz,
+        right_boundary_xyz=right_xyz,
         speed_limit_mps=None if limit is None else float(limit),
         successor_ids=driving(helper.successor_lane_ids),
         predecessor_ids=driving(helper.predecessor_lane_ids),
@@ -177,6 +190,28 @@ def _lane(strip: Strip, helpers: dict[str, Any]) -> Lane:
         left_marking=kind_halfway(strip.left_markings),
         right_marking=kind_halfway(strip.right_markings),
     )
+
+
+def _add_own_lanes(signals: dict[int, Any], helpers: dict[str, Any], xodr: XODR) -> None:
+    """Add the signals that name their lanes themselves: py123d only reads those of references to signals."""
+    of_road: dict[int, list[Any]] = {}
+    for helper in helpers.values():
+        of_road.setdefault(int(helper.lane_id.split("_")[0]), []).append(helper)
+    for road in xodr.roads:
+        for signal in road.signals:
+            ranges = [sorted((valid.from_lane, valid.to_lane)) for valid in signal.validity]
+            lane_ids = [
+                helper.lane_id
+                for helper in of_road.get(road.id, [])
+                if helper.s_range[0] <= signal.s <= helper.s_range[1]
+                and any(low <= helper.id <= high for low, high in ranges)
+            ]
+            if not lane_ids or signal.id in signals:
+                continue
+            signals[signal.id] = OpenDriveSignalHelper(signal.id, signal.type, lane_ids, None, signal)
+            # Such a signal has no heading of its own; lanes on the left run against the road
+            if all(low > 0 for low, _ in ranges):
+                signal.h_offset = (signal.h_offset or 0.0) + np.pi
 
 
 def _stop_zones(helpers: dict[str, Any], signals: dict[int, Any], xodr: XODR) -> list[StopZone]:

@@ -87,7 +87,11 @@ class Strip:
 
 @dataclass(frozen=True)
 class Lane:
-    """One driving lane, in the direction of travel. The ids are py123d's."""
+    """One driving lane, in the direction of travel. The ids are py123d's.
+
+    Its line is the middle of its strip, but for lanes that open from no width or end so: these branch off
+    from the lane beside, or run into it, at full width.
+    """
 
     lane_id: str
     group_id: str
