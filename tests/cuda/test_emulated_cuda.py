@@ -39,13 +39,19 @@ def hooks() -> Path:
 
 @pytest.fixture(scope="module")
 def outcomes(hooks: Path) -> dict[str, dict[str, Outcome]]:
-    """What each case gives on both devices, from a process for each."""
+    """What each case gives on both devices, from two processes side by side."""
     program = [sys.executable, str(HERE / "cases.py")]
+    started = {
+        device: subprocess.Popen(
+            [*program, device, str(hooks), *CASES], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        )
+        for device in ("cpu", "cuda")
+    }
     found = {}
-    for device in ("cpu", "cuda"):
-        done = subprocess.run([*program, device, str(hooks), *CASES], capture_output=True, text=True)
-        lines = [json.loads(line) for line in done.stdout.splitlines() if line.startswith('{"case"')]
-        assert len(lines) == len(CASES), done.stderr[-2000:]
+    for device, process in started.items():
+        out, error = process.communicate()
+        lines = [json.loads(line) for line in out.splitlines() if line.startswith('{"case"')]
+        assert len(lines) == len(CASES), error[-2000:]
         found[device] = {line["case"]: line for line in lines}
     return found
 
