@@ -63,6 +63,7 @@ DECIDING = {
     "occupancy.above_ground.iou_future_1s.continued_copy occupancy.moving.iou_future_1s "
     "occupancy.moving.iou_future_1s.continued_copy detection.car_ap_2m_30m map.maptr.map "
     "occupancy.uniad.vpq_near_pct occupancy.uniad.vpq_near_pct.constant_velocity",
+    "town-maps": "lane_max_m height_p95_m width_max_m heading_p95_deg links_equal_pct lights_equal_pct",
     "trust": "psnr_held_out_db psnr_db calibration_error_db correlation good_of_trusted psnr_trusted_db "
     "psnr_untrusted_db detection_f1_trusted detection_f1_untrusted",
 }
