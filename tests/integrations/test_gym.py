@@ -82,3 +82,26 @@ def test_what_cannot_be_driven_is_refused() -> None:
         TownEnv("Town02", skip=3)
     with pytest.raises(InputError, match="no route x; there are"):
         TownEnv("Town02").reset(seed=0, options={"route": "x"})
+
+
+@pytest.mark.slow
+def test_stable_baselines3_learns_to_drive_in_about_a_minute() -> None:
+    """Untrained, the policy stands; trained, it gets on along the route."""
+    library = pytest.importorskip("stable_baselines3", reason="stable-baselines3 is not installed")
+    env = TownEnv("Town02", scenarios=False, skip=4)
+    model = library.PPO(
+        "MultiInputPolicy", env, n_steps=512, batch_size=128, gamma=0.97, seed=0, device="cpu"
+    )
+
+    def driven_m() -> float:
+        observation, _ = env.reset(seed=3)
+        for _ in range(100):
+            action, _ = model.predict(observation, deterministic=True)
+            observation, _, ended, cut, _ = env.step(action)
+            if ended or cut:
+                break
+        return float(env._simulator.done_m)
+
+    before_m = driven_m()
+    model.learn(6 * 512)
+    assert driven_m() > before_m + 10.0
