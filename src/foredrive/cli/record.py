@@ -49,8 +49,7 @@ def record(
 
     Args:
         town: Town01 to Town07, Town10HD or Town15, or a tile of Town11 to Town13 such as Town12_Tile_4_-16;
-            Town05, Town13 and Town15 are held out for testing. Towns of other road maps (.xodr) cannot be
-            recorded.
+            Town05, Town13 and Town15 are held out for testing. Or the path of a road map (.xodr).
         out: 123D data root; logs and the towns' maps are written into it.
         seconds: Length of each drive, s.
         seed: Seed of the buildings, the route, the traffic and all noise; the same seed gives the same bytes.

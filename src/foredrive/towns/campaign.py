@@ -11,6 +11,7 @@ from foredrive.errors import InputError
 from foredrive.scene import Command
 from foredrive.scene.conditions import ANY_CONDITIONS, CONDITIONS, BackgroundTraffic, find_conditions
 from foredrive.towns.map.loading import load_town_map
+from foredrive.towns.map.names import map_name
 from foredrive.towns.recorder import MAX_RATE_HZ
 from foredrive.towns.traffic.expert import SETTLE_S, ExpertDrive, plan_route
 from foredrive.towns.traffic.fleet import find_start_points
@@ -42,7 +43,7 @@ class DrivePlan:
         Town01_seed3_night_45v10p."""
         conditions = "" if self.conditions is None else f"_{self.conditions}"
         usual = (self.vehicles, self.people) == (BackgroundTraffic.vehicles, BackgroundTraffic.pedestrians)
-        return f"{self.town}_seed{self.seed}{conditions}" + (
+        return f"{map_name(self.town)}_seed{self.seed}{conditions}" + (
             "" if usual else f"_{self.vehicles}v{self.people}p"
         )
 
@@ -112,7 +113,7 @@ def plan_drives(campaign: Campaign) -> list[DrivePlan]:
 
 def _plan_drive(campaign: Campaign, town: str, seed: int, conditions: str | None) -> DrivePlan:
     """Plan one drive. Its traffic is the same under all conditions."""
-    rng = np.random.default_rng([seed, *town.encode()])
+    rng = np.random.default_rng([seed, *map_name(town).encode()])
     vehicles, people = (
         int(rng.integers(minimum, maximum + 1)) for minimum, maximum in (campaign.vehicles, campaign.people)
     )

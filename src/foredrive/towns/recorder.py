@@ -36,7 +36,7 @@ from foredrive.towns.labels.semantics import (
 from foredrive.towns.labels.visibility import is_point_visible
 from foredrive.towns.map.loading import load_town_map
 from foredrive.towns.map.map_objects import map_objects
-from foredrive.towns.map.names import is_held_out
+from foredrive.towns.map.names import is_held_out, map_name
 from foredrive.towns.map.town_map import TownMap
 from foredrive.towns.sensing.capture import SensorSuite
 from foredrive.towns.traffic.expert import DriveSnapshot, ExpertDrive
@@ -102,7 +102,7 @@ def record(
     visible ones.
 
     Args:
-        town: one of `TOWNS`.
+        town: one of `TOWNS`, a tile, or the path of an OpenDRIVE file.
         seconds: duration of the drive, s.
         seed: seed of the buildings, the route, the traffic and all noise.
         out: 123D data root.
@@ -132,12 +132,14 @@ def record(
     traffic = Traffic(town_map, seed, background_traffic.vehicles + 1, background_traffic.pedestrians)
     drive = ExpertDrive(traffic, seconds)
     maps = write_town_map(town, out)
-    name, count = log_name or f"{town}_seed{seed}", max(1, round(seconds * rate_hz))
+    name, count = log_name or f"{map_name(town)}_seed{seed}", max(1, round(seconds * rate_hz))
     collector = FactCollector(town_map, traffic.lanes, drive.route, world.conditions, world.signal_xyz)
     # The next frame is rendered while the labels of the present one are computed
     sensed = prefetched(_sense(world, drive.snapshots(count, 1 / rate_hz), sensors, seed))
     route = drive.route.polyline(traffic.lanes)
-    with LogWriter(out, split_of(town), name, camera_specs(sensors.rig), maps, town, route) as writer:
+    with LogWriter(
+        out, split_of(town), name, camera_specs(sensors.rig), maps, map_name(town), route
+    ) as writer:
         for snapshot in track(sensed, description=f"recording {name}", total=count):
             writer.write(_frame(world, snapshot, sensors, labels, collector))
     return LogPath(writer.folder, maps)
@@ -145,7 +147,7 @@ def record(
 
 def write_town_map(town: str, out: Path) -> Path:
     """Write the town's map, once for all of its logs, and return the folder of the maps."""
-    return write_map(map_objects(town), town, out)
+    return write_map(map_objects(town), map_name(town), out)
 
 
 def traffic_light_states(town: TownMap, lights: Int[np.ndarray, "Z"]) -> dict[int, TrafficLightStatus]:

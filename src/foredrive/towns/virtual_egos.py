@@ -20,7 +20,7 @@ from foredrive.scene import Category, VoxelSpec
 from foredrive.scene.actors import ActorState, boxes_in_ego_frame, in_box_range
 from foredrive.scene.conditions import Conditions, draw_daylight
 from foredrive.towns.map.loading import load_town_map
-from foredrive.towns.map.names import is_held_out
+from foredrive.towns.map.names import is_held_out, map_name
 from foredrive.towns.map.town_map import TownMap
 from foredrive.towns.recorder import (
     FIRST_TIME_US,
@@ -140,7 +140,7 @@ def record_virtual_egos(
     are kept.
 
     Args:
-        town: one of `TOWNS`.
+        town: one of `TOWNS`, a tile, or the path of an OpenDRIVE file.
         seed: seed of the town, its traffic and all that is drawn.
         count: number of logs; each has `IMAGES` key frames with images.
         out: 123D data root.
@@ -156,7 +156,9 @@ def record_virtual_egos(
         OSError: the disk is full.
     """
     split = split_of(town)
-    folders = [out / "logs" / split / f"{town}_seed{seed}_ego{number:04d}" for number in range(count)]
+    folders = [
+        out / "logs" / split / f"{map_name(town)}_seed{seed}_ego{number:04d}" for number in range(count)
+    ]
     # All logs exist: nothing to do
     if all((folder / "sync.arrow").is_file() for folder in folders):  # without growing the town again
         return [LogPath(folder, out / "maps") for folder in folders]
@@ -175,7 +177,15 @@ def record_virtual_egos(
             if not (path.folder / "sync.arrow").is_file():  # logs get their names when they are whole
                 world = worlds[int(of_log.integers(len(worlds)))]
                 inserted = _insert_all(window, ego, of_log)
-                place = (out, split, path.folder.name, camera_specs(sensors.rig), maps, town, ego.route_xyz)
+                place = (
+                    out,
+                    split,
+                    path.folder.name,
+                    camera_specs(sensors.rig),
+                    maps,
+                    map_name(town),
+                    ego.route_xyz,
+                )
                 with LogWriter(*place) as writer:
                     for k in range(len(window.moments)):
                         numbers = (seed, len(logs), k)

@@ -1,10 +1,13 @@
 """Names of the towns, for modules that need only the names.
 
 A town of `LARGE_TOWNS` is driven in tiles: `Town12_Tile_4_-7` is the square of `TILE_M` around the point
-(4, -7) × `TILE_STEP_M` of Town12, so neighbouring tiles overlap.
+(4, -7) × `TILE_STEP_M` of Town12, so neighbouring tiles overlap. The path of an OpenDRIVE file is a town too.
 """
 
+import hashlib
 import re
+from functools import cache
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float64
@@ -32,7 +35,12 @@ _TILE = re.compile(r"(\w+)_Tile_(-?\d+)_(-?\d+)")
 
 
 def check_town(name: str) -> None:
-    """Raise an `InputError` that lists the known towns if there is no town or tile of this name."""
+    """Raise an `InputError` that lists the known towns if there is no town, tile or file of this name."""
+    file = own_map(name)
+    if file is not None:
+        if not file.is_file():
+            raise InputError(f"{name}: there is no such file")
+        return
     if name in LARGE_TOWNS:
         raise InputError(
             f"{name} is built in tiles of {TILE_M:.0f} m: name one by its centre in steps of "
@@ -41,7 +49,23 @@ def check_town(name: str) -> None:
     tile = _TILE.fullmatch(name)
     if name not in TOWNS and (tile is None or tile[1] not in LARGE_TOWNS):
         tiles = ", ".join(f"{town}_Tile_X_Y" for town in LARGE_TOWNS)
-        raise InputError(f"unknown town {name!r}: one of {', '.join(TOWNS)}, or a tile: {tiles}")
+        raise InputError(
+            f"unknown town {name!r}: one of {', '.join(TOWNS)}, a tile: {tiles}, or a file that ends in .xodr"
+        )
+
+
+def own_map(name: str) -> Path | None:
+    """Return the OpenDRIVE file that a town's name is the path of, or None."""
+    return Path(name) if name.endswith((".xodr", ".xodr.gz")) else None
+
+
+@cache
+def map_name(town: str) -> str:
+    """Return what logs call a town: its name, or that of its file with a digest of what is in it."""
+    file = own_map(town)
+    if file is None:
+        return town
+    return f"{file.name.split('.')[0]}_{hashlib.sha256(file.read_bytes()).hexdigest()[:8]}"
 
 
 def town_of(name: str) -> str:

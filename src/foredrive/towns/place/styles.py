@@ -53,5 +53,5 @@ _STYLES = {
 
 
 def style_of(town: str) -> Style:
-    """Return the style of a town or of a tile."""
-    return _STYLES[town_of(town)]
+    """Return the style of a town or of a tile. Maps of one's own are suburbs, as Town03."""
+    return _STYLES.get(town_of(town), _STYLES["Town03"])

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64, Int
 
+from foredrive.errors import InputError
 from foredrive.scene import Command
 from foredrive.towns.traffic.fleet import StartPoints
 from foredrive.towns.traffic.lane_changes import ChangeRanges, find_change_ranges
@@ -89,6 +90,15 @@ class Route:
     def distance_m(self, graph: LaneGraph, seconds: float) -> float:
         """Return the approximate distance that is driven in a time, m, with delays by other traffic and
         lights."""
+        at_s, at_m = self._progress(graph)
+        return float(np.interp(seconds, at_s, at_m))
+
+    def duration_s(self, graph: LaneGraph) -> float:
+        """Return the approximate time to the end of the route, s."""
+        return float(self._progress(graph)[0][-1])
+
+    def _progress(self, graph: LaneGraph) -> tuple[Float64[np.ndarray, "P"], Float64[np.ndarray, "P"]]:
+        """Return times, s, and distances at these times, m: between them the distance grows evenly."""
         # Mean time per metre on each lane: mean of 1 / speed over its samples
         pace_s = np.add.reduceat(1 / graph.speed_mps, graph.first) / graph.count
         length = graph.length_m[self.lanes].copy()
@@ -98,9 +108,8 @@ class Route:
         waits_s[0] = 0.0
         steps_s = np.stack([waits_s, TRAFFIC_FACTOR * pace_s[self.lanes] * length], axis=1)
         steps_m = np.stack([np.zeros(len(length)), length], axis=1)
-        # Distance over time is piecewise linear: flat while waiting
-        at_s, at_m = (np.append(0.0, np.cumsum(steps)) for steps in (steps_s, steps_m))
-        return float(np.interp(seconds, at_s, at_m))
+        # Flat while waiting
+        return np.append(0.0, np.cumsum(steps_s)), np.append(0.0, np.cumsum(steps_m))
 
 
 def draw_route(
@@ -116,9 +125,13 @@ def draw_route(
     Routes from random starts are tried. The part that counts is driven from `from_s` to `until_s`. The first
     route is taken that has a turn and at least two different commands, or on long drives all commands. If
     there is none, the route with the most different commands is taken. Ties go to routes that contain a
-    command drawn at random, then to routes with more turns. Routes that end at the edge of a tile come last.
+    command drawn at random, then to routes with more turns. Routes that end at the edge of a tile come last,
+    and of these those that end too early.
+
+    Raises:
+        InputError: all that were tried end too early, as on a small map.
     """
-    best, best_key = None, (False, -1, False, -1)
+    best, best_key = None, (False, False, -1, False, -1)
     wanted = rng.choice(list(Command))
     change_ranges = find_change_ranges(graph)
     for start in rng.choice(len(starts.lane), CANDIDATES):
@@ -132,10 +145,15 @@ def draw_route(
         # Good enough: a turn, and the wanted variety of commands
         if goes_on and turns and options >= (len(Command) if until_m - from_m > LONG_DRIVE_M else 2):
             return route
-        key = (goes_on, options, wanted in commands, turns)
+        key = (goes_on, route.duration_s(graph) >= until_s, options, wanted in commands, turns)
         if best is None or key > best_key:
             best, best_key = route, key
     assert best is not None
+    if not any(best_key[:2]):
+        raise InputError(
+            f"the roads end after {best.duration_s(graph):.0f} s; a drive of {until_s - from_s:.0f} s needs "
+            f"{until_s:.0f} s: record less, or take a larger map"
+        )
     return best
 
 
