@@ -156,10 +156,10 @@ def _arcs_of(geometry: ElementTree.Element, shape: ElementTree.Element) -> list[
     along = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(np.polyval(u, p)), np.diff(np.polyval(v, p))))])
     along *= length / along[-1]
     ends = np.linspace(0.0, length, int(np.ceil(length / PIECE_M)) + 1)
-    at = np.interp(ends, along, p)
+    p_end = np.interp(ends, along, p)
     yaw = np.interp(ends, along, np.unwrap(np.arctan2(dv, du)))
     # From the cubic's frame to the map's
-    x, y = np.polyval(u, at), np.polyval(v, at)
+    x, y = np.polyval(u, p_end), np.polyval(v, p_end)
     x, y = x0 + np.cos(yaw0) * x - np.sin(yaw0) * y, y0 + np.sin(yaw0) * x + np.cos(yaw0) * y
     pieces = []
     for k, piece_m in enumerate(np.diff(ends).tolist()):
