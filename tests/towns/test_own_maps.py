@@ -104,6 +104,15 @@ def test_a_polynomial_is_followed_by_its_length(tmp_path: Path) -> None:
     np.testing.assert_allclose(found, np.column_stack([at, at * at / 500]), atol=2e-3)
 
 
+def test_a_spiral_of_one_curvature_is_an_arc(tmp_path: Path) -> None:
+    """py123d refuses it; `carla.Map` of 0.9.16 puts it nowhere."""
+    spiral = '<spiral curvStart="0.02" curvEnd="0.02"/>'
+    (lane,) = load_town_map(written(tmp_path, road(1, spiral, (0.0, 0.0, 0.0), 100.0, ""))).lanes
+    turned = np.linspace(0.0, 2.0, len(lane.centreline_xyz))
+    expected = 50.0 * np.column_stack([np.sin(turned), 1 - np.cos(turned)])
+    np.testing.assert_allclose(lane.left_boundary_xyz[:, :2], expected, atol=1e-6)
+
+
 @pytest.mark.parametrize(
     ("text", "why"),
     [
@@ -113,6 +122,7 @@ def test_a_polynomial_is_followed_by_its_length(tmp_path: Path) -> None:
         (road(1, '<poly3 a="0" b="0" c="0" d="0"/>', (0.0, 0.0, 0.0), 9.0, ""), "is a poly3"),
         (road(1, "<line/>", (0.0, 0.0, 0.0), 9.0, "").replace('id="1" j', 'id="A" j'), "is no number"),
         (road(1, "<line/>", (0.0, 0.0, 0.0), 9.0, "").replace("driving", "biking"), "no road to drive on"),
+        (road(1, "<line/>", (0.0, 0.0, 0.0), 9.0, "").replace('a="3.5"', ""), "Error parsing road element"),
     ],
 )
 def test_what_cannot_be_driven_is_refused(text: str, why: str, tmp_path: Path) -> None:

@@ -7,6 +7,7 @@ It also removes lanes that begin or end beside another one, as all but one do at
 
 import contextlib
 import gzip
+import io
 import tempfile
 import unittest.mock
 import xml.etree.ElementTree as ElementTree
@@ -25,7 +26,11 @@ KMH = {"m/s": 3.6, "mph": 1.609344, "km/h": 1.0, None: 3.6}
 READ = ("line", "arc", "spiral", "paramPoly3")
 """Shapes of reference lines that are read."""
 STRAIGHT = 1e-9
-"""Curvature of a line, and difference of curvatures of an arc, at most, 1/m."""
+"""Curvature below which an arc is a line, 1/m."""
+EVEN = 2e-10
+"""Change of curvature below which a spiral is an arc, 1/m²."""
+DROPPED = "Error parsing road element"
+"""What py123d prints of a road that it leaves out."""
 PIECE_M = 1.0
 """Length of the arcs that stand for a polynomial, m."""
 
@@ -75,13 +80,18 @@ def completed(path: Path) -> Iterator[Path]:
 
 @contextlib.contextmanager
 def reading_own(path: Path) -> Iterator[None]:
-    """Turn the errors of py123d over a file of one's own into an `InputError`."""
+    """Turn the errors of py123d over a file of one's own, printed ones too, into an `InputError`."""
+    printed = io.StringIO()
     try:
-        yield
+        with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(printed):
+            yield
     except InputError:
         raise
     except (LookupError, ValueError, TypeError, AssertionError, AttributeError, NotImplementedError) as error:
         raise InputError(f"{path}: not read by py123d: {type(error).__name__}: {error}") from error
+    dropped = [line for line in printed.getvalue().splitlines() if line.startswith(DROPPED)]
+    if dropped:
+        raise InputError(f"{path}: not read by py123d: {dropped[0]}")
 
 
 def _check(path: Path, road: ElementTree.Element) -> None:
@@ -139,8 +149,8 @@ def _as_read(geometry: ElementTree.Element) -> list[ElementTree.Element]:
     # py123d refuses a spiral without change of curvature, and an arc without curvature
     if shape.tag == "spiral":
         begin, end = (float(shape.get(key, "nan")) for key in ("curvStart", "curvEnd"))
-        if abs(end - begin) < STRAIGHT:
-            shape.tag, shape.attrib = "arc", {"curvature": repr(begin)}
+        if abs(end - begin) < EVEN * float(geometry.get("length", "nan")):
+            shape.tag, shape.attrib = "arc", {"curvature": repr(0.5 * (begin + end))}
     if shape.tag == "arc" and abs(float(shape.get("curvature", "nan"))) < STRAIGHT:
         shape.tag = "line"
     return [geometry]
