@@ -62,14 +62,18 @@ class ClientMap:
     @classmethod
     def read(cls, town: str) -> "ClientMap":
         """Read a town's OpenDRIVE file with the client."""
-        text = gzip.decompress((MAP_FOLDER / f"{town}.xodr.gz").read_bytes()).decode()
+        return cls.of(town, gzip.decompress((MAP_FOLDER / f"{town}.xodr.gz").read_bytes()).decode())
+
+    @classmethod
+    def of(cls, name: str, text: str) -> "ClientMap":
+        """Read the text of an OpenDRIVE file with the client."""
         sections = {}
         for road in ElementTree.fromstring(text).iter("road"):
             starts = [float(section.get("s", "nan")) for section in road.iterfind("lanes/laneSection")]
             ends = [*starts[1:], float(road.get("length", "nan"))]
             for index, ends_at in enumerate(zip(starts, ends, strict=True)):
                 sections[int(road.get("id", "")), index] = ends_at
-        return cls(import_carla().Map(town, text), sections)
+        return cls(import_carla().Map(name, text), sections)
 
     def lane_at(self, key: LaneKey, share: Float64[np.ndarray, "N"]) -> list[Any]:
         """Return the waypoints of a lane at shares of its length, in the direction of travel."""
