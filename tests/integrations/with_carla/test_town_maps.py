@@ -48,7 +48,8 @@ LENGTH_M = 60.472524
 @pytest.mark.parametrize("shape", SHAPES)
 def test_a_road_of_ones_own_lies_where_carla_puts_it(shape: str, carla: Any, tmp_path: Path) -> None:
     text = f"""<OpenDRIVE><header revMajor="1" revMinor="6"/><road id="4" length="{LENGTH_M}" junction="-1">
-    <planView><geometry s="0" x="20" y="-30" hdg="0.8" length="{LENGTH_M}">{SHAPES[shape]}</geometry></planView>
+    <planView><geometry s="0" x="20" y="-30" hdg="0.8" length="{LENGTH_M}">
+    {SHAPES[shape]}</geometry></planView>
     <elevationProfile><elevation s="0" a="2" b="0.05" c="0.001" d="0"/></elevationProfile>
     <lanes><laneOffset s="0" a="1" b="0" c="0" d="0"/><laneSection s="0">
     <center><lane id="0" type="none"/></center>
