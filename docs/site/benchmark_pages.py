@@ -25,6 +25,7 @@ DECIDING = {
     "driven.driving_score_1_0 rebuilt.psnr_db improved.round_1.driving_score_1_0",
     "domain-gap": "lidar.drop_pct lidar.range_p50_m lidar.intensity_p50 image.brightness image.gradient",
     "drive-expert": "ds_short rc_short ds_long rc_long",
+    "drive-nemo": "ds_short red_lights_short collisions_short ds_long ds_unseen_short ds_unseen_long",
     "driveworld-ablation": "occupancy_iou l2_m ego_mlp.uniad.l2_avg_m collision_pct",
     "driveworld-forecast": "above_ground.iou_now above_ground.iou_future_1s above_ground.iou_future_1s.copy "
     "above_ground.iou_future_1s.carried_copy occupancy.above_ground.iou_now "
