@@ -9,7 +9,6 @@ import contextlib
 import gzip
 import io
 import tempfile
-import unittest.mock
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator, Set
 from pathlib import Path
@@ -35,7 +34,7 @@ PIECE_M = 1.0
 """Length of the arcs that stand for a polynomial, m."""
 
 
-def completed_root(path: Path) -> ElementTree.Element:
+def _completed_root(path: Path) -> ElementTree.Element:
     """Return an OpenDRIVE file (`.xodr` or `.xodr.gz`), with what it leaves out written down.
 
     Raises:
@@ -70,12 +69,17 @@ def completed(path: Path) -> Iterator[Path]:
     Raises:
         InputError: it is no OpenDRIVE file, or has roads that are not read.
     """
-    root = completed_root(path)
+    root = _completed_root(path)
     with tempfile.TemporaryDirectory() as folder:
         whole = Path(folder) / f"{path.name.split('.')[0]}.xodr"
         ElementTree.ElementTree(root).write(whole)
-        with unittest.mock.patch.object(collection, "_correct_lanes_with_no_connections"):
+        # py123d looks the function up while it reads
+        removing = collection._correct_lanes_with_no_connections
+        collection._correct_lanes_with_no_connections = lambda lanes: None
+        try:
             yield whole
+        finally:
+            collection._correct_lanes_with_no_connections = removing
 
 
 @contextlib.contextmanager
