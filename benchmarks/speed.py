@@ -38,7 +38,7 @@ class Command:
     short: str = ""
     """More words for the run that compiles and fills caches."""
     quality: Callable[[Path], float] | None = None
-    """What it made is worth, of its folder; more is better."""
+    """Returns what it made is worth, of its folder; more is better."""
     before: str = ""
     """A command whose results in `{out}` it needs; its time does not count."""
 

@@ -39,7 +39,7 @@ def hooks() -> Path:
 
 @pytest.fixture(scope="module")
 def outcomes(hooks: Path) -> dict[str, dict[str, Outcome]]:
-    """What each case gives on both devices, from two processes side by side."""
+    """Return what each case gives on both devices, from two processes side by side."""
     program = [sys.executable, str(HERE / "cases.py")]
     started = {
         device: subprocess.Popen(

@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 from foredrive.errors import InputError
 from foredrive.towns.map import opendrive
 from foredrive.towns.map.junction_heights import level_junction
-from foredrive.towns.map.loading import load_roads, load_town_map
+from foredrive.towns.map.loading import load_town_map, xodr_file
 from foredrive.towns.map.map_objects import map_objects
 from foredrive.towns.map.town_map import MarkingKind, StopZoneKind, StripKind, TownMap
 
@@ -151,7 +151,8 @@ def test_a_lane_without_road_marks_has_no_markings(monkeypatch: pytest.MonkeyPat
         return elements
 
     monkeypatch.setattr(opendrive, "collect_element_helpers", without_marks_of_road_0)
-    bare = {strip.id: strip for strip in load_roads.__wrapped__("Town02").strips}
+    with xodr_file("Town02") as path:
+        bare = {strip.id: strip for strip in opendrive.read_opendrive(path, "Town02").strips}
     of_road_0 = [strip for strip in painted.strips if strip.id.startswith("0_")]
     assert any(strip.right_markings for strip in of_road_0)
     assert not any(bare[strip.id].right_markings for strip in of_road_0)

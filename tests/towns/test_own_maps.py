@@ -122,6 +122,7 @@ def test_a_spiral_of_one_curvature_is_an_arc(tmp_path: Path) -> None:
         (road(1, '<poly3 a="0" b="0" c="0" d="0"/>', (0.0, 0.0, 0.0), 9.0, ""), "is a poly3"),
         (road(1, "<line/>", (0.0, 0.0, 0.0), 9.0, "").replace('id="1" j', 'id="A" j'), "is no number"),
         (road(1, "<line/>", (0.0, 0.0, 0.0), 9.0, "").replace("driving", "biking"), "no road to drive on"),
+        (road(1, "<line/>", (0.0, 0.0, 0.0), 9.0, "").replace("width", "border"), "borders are not read"),
         (road(1, "<line/>", (0.0, 0.0, 0.0), 9.0, "").replace('a="3.5"', ""), "Error parsing road element"),
     ],
 )
@@ -146,11 +147,20 @@ def test_a_drive_through_a_map_of_ones_own_is_a_log_as_any_other(tmp_path: Path)
     # A file with other roads is another town
     before = map_name(town)
     other = written(tmp_path, road(1, "<line/>", (0.0, 0.0, 0.0), 30.0, ""))
-    map_name.cache_clear()
     assert map_name(other) != before
+    assert len(load_town_map(other).lanes) == 1
 
 
 def test_too_small_a_map_is_refused_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     town = written(tmp_path, road(1, "<line/>", (0.0, 0.0, 0.0), 60.0, ""))
     assert main(["record", "--town", town, "--seconds", "10", "--out", str(tmp_path / "data")]) == 2
     assert "take a larger map" in capsys.readouterr().err
+
+
+def test_what_is_not_read_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    more = """<lateralProfile><superelevation s="0" a="0.1" b="0" c="0" d="0"/></lateralProfile>
+    <signals><signal id="1" s="1" t="0" type="1000001"/></signals>
+    <objects><object id="2" type="tree"/></objects></road>"""
+    town = written(tmp_path, road(1, "<line/>", (0.0, 0.0, 0.0), 60.0, "").replace("</road>", more))
+    assert main(["record", "--town", town, "--out", str(tmp_path / "data")]) == 2  # too small
+    assert "not read: 1 tilts of roads, 1 signals outside of junctions, 1 objects" in capsys.readouterr().out

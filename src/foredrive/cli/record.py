@@ -12,7 +12,7 @@ from foredrive.cli.failures import listed_failures
 from foredrive.cli.progress import job_progress
 from foredrive.errors import InputError
 from foredrive.lazy import importing
-from foredrive.towns.map.names import check_town
+from foredrive.towns.map.names import check_town, own_map
 
 if TYPE_CHECKING:
     from foredrive.runs.drive.recording import RecordingResult
@@ -88,6 +88,7 @@ def record(
     weather = _conditions(conditions)
     for name in town:
         check_town(name)
+        _tell_left_out(name)
     cameras = chosen_rig(rig, image_size)
 
     with importing():
@@ -109,6 +110,18 @@ def record(
     with job_progress("recording drives", len(plans)) as tick:
         done = record_drives(plans, out, cameras, workers, on_ray=ray, tick=tick)
     _tell(done, plans, out)
+
+
+def _tell_left_out(town: str) -> None:
+    """Print what of a road map of one's own is not read."""
+    file = own_map(town)
+    if file is None:
+        return
+    with importing():
+        from foredrive.towns.map.own_maps import left_out
+
+    if missing := left_out(file):
+        print(f"{file}: not read: {missing}")
 
 
 def _record_egos(

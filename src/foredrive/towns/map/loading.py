@@ -20,13 +20,19 @@ from foredrive.towns.map.town_map import TownMap
 MAP_FOLDER = Path(py123d.parser.opendrive.__file__).parent / "carla_maps"
 
 
-@lru_cache(maxsize=2)
 def load_town_map(name: str) -> TownMap:
     """Read the map of a town, of a tile or of a file (takes 0.2 to 9 s).
 
     Raises:
         InputError: there is no such town, or no road in it.
     """
+    check_town(name)
+    return _town_map(name, map_name(name))
+
+
+@lru_cache(maxsize=2)
+def _town_map(name: str, written: str) -> TownMap:
+    """Read the map of a town once for each content of its file, which `written` has a digest of."""
     roads, bounds_m = load_roads(name), tile_bounds_m(name)
     town = roads if bounds_m is None else cut_out(roads, bounds_m)
     if not town.lanes:
@@ -34,15 +40,20 @@ def load_town_map(name: str) -> TownMap:
     return town
 
 
-@lru_cache(maxsize=1)
 def load_roads(name: str) -> TownMap:
     """Read the whole roads of a town or of a file, or of a tile and around it.
 
     Raises:
         InputError: there is no such town, or the file cannot be read.
     """
+    check_town(name)
+    return _roads(name, map_name(name))
+
+
+@lru_cache(maxsize=1)
+def _roads(name: str, written: str) -> TownMap:
     with xodr_file(name) as path:
-        return read_opendrive(path, map_name(name))
+        return read_opendrive(path, written)
 
 
 @contextlib.contextmanager

@@ -6,7 +6,6 @@ A town of `LARGE_TOWNS` is driven in tiles: `Town12_Tile_4_-7` is the square of 
 
 import hashlib
 import re
-from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -59,7 +58,6 @@ def own_map(name: str) -> Path | None:
     return Path(name) if name.endswith((".xodr", ".xodr.gz")) else None
 
 
-@cache
 def map_name(town: str) -> str:
     """Return what logs call a town: its name, or that of its file with a digest of what is in it."""
     file = own_map(town)

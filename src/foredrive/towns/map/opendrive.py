@@ -193,12 +193,15 @@ def _lane(strip: Strip, helpers: dict[str, Any], roads: dict[int, Any]) -> Lane:
 
 
 def _add_own_lanes(signals: dict[int, Any], helpers: dict[str, Any], xodr: XODR) -> None:
-    """Add the signals that name their lanes themselves: py123d only reads those of references to signals."""
+    """Add the signals of junctions that name their lanes themselves: py123d reads those of references alone.
+
+    Elsewhere a lane of a signal does not begin at its line.
+    """
     of_road: dict[int, list[Any]] = {}
     for helper in helpers.values():
         of_road.setdefault(int(helper.lane_id.split("_")[0]), []).append(helper)
     for road in xodr.roads:
-        for signal in road.signals:
+        for signal in road.signals if road.junction is not None else ():
             ranges = [sorted((valid.from_lane, valid.to_lane)) for valid in signal.validity]
             lane_ids = [
                 helper.lane_id

@@ -29,7 +29,7 @@ STRAIGHT = 1e-9
 EVEN = 2e-10
 """Change of curvature below which a spiral is an arc, 1/m²."""
 DROPPED = "Error parsing road element"
-"""What py123d prints of a road that it leaves out."""
+"""Begins the line that py123d prints of a road that it leaves out."""
 PIECE_M = 1.0
 """Length of the arcs that stand for a polynomial, m."""
 
@@ -40,12 +40,7 @@ def _completed_root(path: Path) -> ElementTree.Element:
     Raises:
         InputError: it is no OpenDRIVE file, or has roads that are not read.
     """
-    opened = gzip.open if path.suffix == ".gz" else open
-    try:
-        with opened(path, "rb") as file:
-            root = ElementTree.parse(file).getroot()
-    except (OSError, EOFError, ElementTree.ParseError) as error:
-        raise InputError(f"{path}: {error}") from error
+    root = _root(path)
     if root.tag != "OpenDRIVE" or root.find("road") is None:
         raise InputError(f"{path}: no OpenDRIVE file with roads")
     header = _child(root, "header")
@@ -98,12 +93,42 @@ def reading_own(path: Path) -> Iterator[None]:
         raise InputError(f"{path}: not read by py123d: {dropped[0]}")
 
 
+def left_out(path: Path) -> str:
+    """Return what of a file is not read, in words; empty if it is all read.
+
+    Raises:
+        InputError: it is no OpenDRIVE file, or has roads that are not read.
+    """
+    written = _root(path)
+    tilted = sum(
+        any(float(tilt.get(key, "0")) for tilt in road.iter("superelevation") for key in "abcd")
+        for road in written.iter("road")
+    )
+    outside = (road for road in written.iter("road") if road.get("junction", "-1") == "-1")
+    signals = sum(len(road.findall("signals/signal")) for road in outside)
+    things = sum(thing.get("type") != "crosswalk" for thing in written.iter("object"))
+    counts = ((tilted, "tilts of roads"), (signals, "signals outside of junctions"), (things, "objects"))
+    return ", ".join(f"{count} {what}" for count, what in counts if count)
+
+
+def _root(path: Path) -> ElementTree.Element:
+    try:
+        text = path.read_bytes()
+        return ElementTree.fromstring(gzip.decompress(text) if path.suffix == ".gz" else text)
+    except (OSError, EOFError, ElementTree.ParseError) as error:
+        raise InputError(f"{path}: {error}") from error
+
+
 def _check(path: Path, road: ElementTree.Element) -> None:
     name = road.get("id", "")
     if road.get("rule", "RHT") != "RHT":
         raise InputError(f"{path}: road {name} has traffic on the left, which towns have not")
     if not name.lstrip("-").isdigit():
         raise InputError(f"{path}: the id of road {name!r} is no number")
+    if any(
+        lane.find("width") is None for side in ("left", "right") for lane in road.iterfind(f".//{side}/lane")
+    ):
+        raise InputError(f"{path}: road {name} has a lane without width; borders are not read")
     shapes = {shape.tag for geometry in road.iterfind("planView/geometry") for shape in geometry}
     if other := shapes - {*READ, "userData"}:
         raise InputError(f"{path}: road {name} is a {min(other)}; {', '.join(READ)} are read")
